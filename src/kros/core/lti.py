@@ -1,0 +1,153 @@
+"""Linear time-invariant systems in state space, alone or in batches.
+
+A batch has leading axes, the unit axis first; all systems of a batch share sizes and the sampling period.
+
+Symbols
+-------
+A, B, C, D : state-space matrices, x+ = A x + B u, y = C x + D u (dt > 0) or dx/dt = A x + B u (dt = 0)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .errors import DimensionError
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpace:
+    """State-space system, or a batch of them.
+
+    Parameters
+    ----------
+    A : ndarray, shape (..., n, n)
+    B : ndarray, shape (..., n, m)
+    C : ndarray, shape (..., p, n)
+    D : ndarray, shape (..., p, m)
+    dt : float, s
+        Sampling period; 0 means continuous time.
+
+    Raises
+    ------
+    DimensionError
+        When the shapes do not fit together or `dt` is negative.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    dt: float
+
+    def __post_init__(self) -> None:
+        for name in "ABCD":
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        n, m, p = self.A.shape[-1], self.B.shape[-1], self.C.shape[-2]
+        expected = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}
+        for name, shape in expected.items():
+            if getattr(self, name).shape[-2:] != shape:
+                found = {key: getattr(self, key).shape for key in "ABCD"}
+                raise DimensionError(f"State space: {name} should end in shape {shape}, found {found}; transpose or pad the offending matrix.")
+        if self.dt < 0:
+            raise DimensionError(f"State space: sampling period {self.dt} s is negative; use 0 for continuous time.")
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return self.A.shape[-1]
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return self.B.shape[-1]
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return self.C.shape[-2]
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes shared by the four matrices."""
+        return np.broadcast_shapes(*(getattr(self, name).shape[:-2] for name in "ABCD"))
+
+    def __getitem__(self, index: Any) -> StateSpace:
+        """Return one system, or a smaller batch, of a batch."""
+        shape = self.batch_shape
+        return StateSpace(*(np.broadcast_to(getattr(self, x), shape + getattr(self, x).shape[-2:])[index] for x in "ABCD"), self.dt)
+
+    def poles(self) -> Array:
+        """Return the eigenvalues of A, shape (..., n)."""
+        return np.linalg.eigvals(self.A) if self.n_states else np.zeros(self.A.shape[:-1], complex)
+
+    def spectral_radius(self) -> Array:
+        """Return the largest pole magnitude, shape (...); zero without states."""
+        return np.abs(self.poles()).max(axis=-1, initial=0.0)
+
+    def is_stable(self) -> Array:
+        """Tell whether every pole is inside the unit circle (or the left half-plane)."""
+        poles = self.poles()
+        return np.all(np.abs(poles) < 1 if self.dt > 0 else poles.real < 0, axis=-1)
+
+    def frequency_response(self, freqs_hz: npt.ArrayLike) -> Array:
+        """Evaluate the transfer matrix on the unit circle (or imaginary axis).
+
+        Parameters
+        ----------
+        freqs_hz : array_like, shape (n_freqs,), Hz
+
+        Returns
+        -------
+        ndarray, shape (..., n_freqs, p, m), complex
+        """
+        s = 2j * np.pi * np.asarray(freqs_hz, dtype=float)
+        # zeta = z - 1 keeps full relative precision at low frequency, where z and A are both close to one.
+        zeta = np.expm1(s * self.dt) if self.dt > 0 else s
+        eye = np.eye(self.n_states)
+        shifted = self.A - eye if self.dt > 0 else self.A
+        resolvent = zeta[:, None, None] * eye - shifted[..., None, :, :]
+        states = np.linalg.solve(resolvent, np.broadcast_to(self.B[..., None, :, :] + 0j, resolvent.shape[:-1] + (self.n_inputs,)))
+        return self.C[..., None, :, :] @ states + self.D[..., None, :, :]
+
+    def __matmul__(self, other: StateSpace) -> StateSpace:
+        """Series connection `self * other`: the input passes through `other` first."""
+        if self.n_inputs != other.n_outputs or self.dt != other.dt:
+            raise DimensionError(
+                f"Series connection: {self.n_inputs} inputs at {self.dt} s against {other.n_outputs} outputs at {other.dt} s; match sizes and sampling periods."
+            )
+        zero = np.zeros((other.n_states, self.n_states))
+        return StateSpace(
+            np.block([[self.A, self.B @ other.C], [zero, other.A]]),
+            np.block([[self.B @ other.D], [other.B]]),
+            np.block([[self.C, self.D @ other.C]]),
+            self.D @ other.D,
+            self.dt,
+        )
+
+
+def gain(matrix: npt.ArrayLike, dt: float) -> StateSpace:
+    """Return a static gain as a system without states."""
+    D = np.atleast_2d(np.asarray(matrix, dtype=float))
+    p, m = D.shape
+    return StateSpace(np.zeros((0, 0)), np.zeros((0, m)), np.zeros((p, 0)), D, dt)
+
+
+def block_diagonal(systems: Sequence[StateSpace]) -> StateSpace:
+    """Stack systems side by side: inputs and outputs are concatenated."""
+    from scipy.linalg import block_diag
+
+    if not systems or len({s.dt for s in systems}) > 1:
+        raise DimensionError(f"Block diagonal: needs systems with one sampling period, found {[s.dt for s in systems]} s; resample first.")
+
+    def stack(blocks: list[Array]) -> Array:
+        rows, cols = sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)
+        return block_diag(*blocks).reshape(rows, cols)
+
+    return StateSpace(*(stack([getattr(s, name) for s in systems]) for name in "ABCD"), systems[0].dt)

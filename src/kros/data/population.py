@@ -1,0 +1,204 @@
+"""The population: units, each recorded in conditions, each condition in episodes.
+
+    Population ── units ── conditions ── episodes ── (sample, channel)
+
+Episodes are read lazily, one at a time, through a source; the population itself holds only names and facts.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError
+
+DEFAULT_CONDITION = "default"
+OUTLIERS = "outliers"  # units of this group are scored, but take no part in pooled results
+EpisodeSource = Callable[["EpisodeKey"], npt.NDArray[np.float64]]
+
+
+class Role(str, Enum):
+    """What a channel is to the model."""
+
+    STATE = "state"
+    INPUT = "input"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One recorded signal.
+
+    Parameters
+    ----------
+    name : str
+    role : Role
+    unit : str
+        Unit of measure, for example ``rad/s``; empty where unknown.
+    measured : bool
+        Whether a state is available at run time; synthesis uses exactly those as ``y``.
+    """
+
+    name: str
+    role: Role
+    unit: str = ""
+    measured: bool = False
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One machine of the batch, with what is known about it."""
+
+    id: str
+    group: str = ""
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class EpisodeKey:
+    """Where an episode stands in the population."""
+
+    unit: str
+    condition: str
+    episode: str
+
+    def __str__(self) -> str:
+        return f"episode {self.episode} of unit {self.unit} ({self.condition})"
+
+
+def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key that orders ``2`` before ``10``."""
+    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", text) if part)
+
+
+@dataclass(frozen=True)
+class Split:
+    """Training and test episodes, in natural order."""
+
+    train: tuple[EpisodeKey, ...]
+    test: tuple[EpisodeKey, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Population:
+    """Recordings of nominally identical machines.
+
+    Parameters
+    ----------
+    channels : tuple of Channel
+        Column order of every episode: states first, inputs after them.
+    sample_period_s : float
+    units : tuple of Unit
+    episodes : tuple of EpisodeKey
+        In natural order of unit, condition and episode.
+    source : callable
+        Returns an episode's samples, float64, shape (n_samples, n_channels).
+    metadata : mapping
+        Facts about the batch, for example ``{"plant": "harmonic-drive", "gear_ratio": 100}``.
+    """
+
+    channels: tuple[Channel, ...]
+    sample_period_s: float
+    units: tuple[Unit, ...]
+    episodes: tuple[EpisodeKey, ...]
+    source: EpisodeSource
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states, in column order."""
+        return tuple(c.name for c in self.channels if c.role is Role.STATE)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs, in column order."""
+        return tuple(c.name for c in self.channels if c.role is Role.INPUT)
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the states that are available at run time."""
+        return tuple(c.name for c in self.channels if c.role is Role.STATE and c.measured)
+
+    @property
+    def unit_ids(self) -> tuple[str, ...]:
+        """Identifiers of the units, in order."""
+        return tuple(u.id for u in self.units)
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Conditions, in natural order."""
+        return tuple(sorted({e.condition for e in self.episodes}, key=natural_key))
+
+    def unit(self, unit_id: str) -> Unit:
+        """Return one unit's facts."""
+        for unit in self.units:
+            if unit.id == unit_id:
+                return unit
+        raise DataError(f"Asked for unit {unit_id!r}; the population has {', '.join(self.unit_ids[:10])}{' ...' if len(self.units) > 10 else ''}.")
+
+    def keys(self, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
+        """Return the episodes of a unit, a condition or both."""
+        return tuple(e for e in self.episodes if unit in (None, e.unit) and condition in (None, e.condition))
+
+    def read(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
+        """Read one episode, shape (n_samples, n_channels)."""
+        return self.source(key)
+
+    def read_parts(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Read one episode as states (n_samples, n) and inputs (n_samples, m)."""
+        values = self.read(key)
+        n = len(self.states)
+        return values[:, :n], values[:, n:]
+
+    def select(self, units: Iterable[str] | None = None, conditions: Iterable[str] | None = None) -> Population:
+        """Return the population restricted to some units or conditions; nothing is read."""
+        wanted = set(self.unit_ids if units is None else units)
+        allowed = set(self.conditions if conditions is None else conditions)
+        return replace(
+            self,
+            units=tuple(u for u in self.units if u.id in wanted),
+            episodes=tuple(e for e in self.episodes if e.unit in wanted and e.condition in allowed),
+        )
+
+    def groups(self) -> Iterator[tuple[str, str, tuple[EpisodeKey, ...]]]:
+        """Iterate over (unit, condition, episodes)."""
+        found: dict[tuple[str, str], list[EpisodeKey]] = {}
+        for key in self.episodes:
+            found.setdefault((key.unit, key.condition), []).append(key)
+        for (unit, condition), keys in found.items():
+            yield unit, condition, tuple(keys)
+
+
+def split_episodes(population: Population, test: Iterable[str] | None = None) -> dict[tuple[str, str], Split]:
+    """Split the episodes of each unit and condition into training and test.
+
+    The last ``max(1, n // 10)`` in natural order are for testing, unless `test` names the test episodes.
+
+    Raises
+    ------
+    DataError
+        When a unit and condition has fewer than two episodes, or is left without training or test episodes.
+    """
+    named = None if test is None else set(test)
+    splits = {}
+    for unit, condition, keys in population.groups():
+        ordered = sorted(keys, key=lambda k: natural_key(k.episode))
+        if len(ordered) < 2:
+            raise DataError(
+                f"Splitting the episodes of unit {unit} ({condition}) into training and test needs at least two, found {len(ordered)}; "
+                "record more, or leave the unit out."
+            )
+        held_out = {k.episode for k in ordered[-max(1, len(ordered) // 10) :]} if named is None else named
+        split = Split(tuple(k for k in ordered if k.episode not in held_out), tuple(k for k in ordered if k.episode in held_out))
+        if not split.train or not split.test:
+            raise DataError(
+                f"Splitting the episodes of unit {unit} ({condition}): split.test = {sorted(held_out, key=natural_key)} leaves {len(split.train)} for training and "
+                f"{len(split.test)} for testing of {[k.episode for k in ordered]}; name some of them, not all."
+            )
+        splits[unit, condition] = split
+    return splits

@@ -1,0 +1,27 @@
+"""Identification: phase calibration, triangular factors, EDMD, free run. The stage's result is a `ModelSet`."""
+
+from .edmd import KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
+from .factors import Factor, combine, lifted_factor, reduce_episode
+from .free_run import free_run
+from .model_set import ModelSet
+from .phase import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
+
+__all__ = [
+    "Factor",
+    "KoopmanMatrices",
+    "ModelSet",
+    "PhaseCalibration",
+    "PhaseSpec",
+    "Segment",
+    "UnitPhase",
+    "combine",
+    "edmd",
+    "find_segments",
+    "free_run",
+    "lifted_factor",
+    "reduce_episode",
+    "residual_covariance",
+    "resolve_branches",
+    "smallest_stabilising_alpha",
+    "unit_phase",
+]

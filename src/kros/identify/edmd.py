@@ -1,0 +1,133 @@
+"""Extended dynamic mode decomposition with Tikhonov regularisation, (30)-(33), on triangular factors.
+
+    min_U ||Theta_plus - U Psi||_F^2 + alpha ||U||_F^2,      U = [A B]
+
+is solved by QR of ``[R; sqrt(alpha) I]``, with `alpha` added to the unnormalised Gram matrix as in the paper and in pykoop.
+
+Symbols
+-------
+R11, R12 : blocks of the factor of [Psi | Theta_plus]
+U        : Koopman matrix [A B], (n_lifted, n_lifted + m)
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import IdentificationError
+
+log = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
+
+_PER_DECADE = 10
+_DECADES_BELOW = 14
+_BISECTIONS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class KoopmanMatrices:
+    """Koopman matrices of a batch of units, A (..., n, n) and B (..., n, m)."""
+
+    A: Array
+    B: Array
+
+    def spectral_radius(self) -> Array:
+        """Return the largest eigenvalue magnitude of each A."""
+        return np.abs(np.linalg.eigvals(self.A)).max(axis=-1)
+
+
+def edmd(R: Array, n_lifted: int, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices:
+    """Solve the regularised least-squares problem from factors.
+
+    Parameters
+    ----------
+    R : ndarray, shape (..., p + n_lifted, p + n_lifted)
+        Factors of [Psi | Theta_plus], with p = n_lifted + m.
+    n_lifted : int
+    alpha : array_like
+        Tikhonov coefficients that broadcast against the batch.
+
+    Returns
+    -------
+    KoopmanMatrices
+
+    Raises
+    ------
+    IdentificationError
+        When a column of Psi depends on the others and `alpha` is zero.
+    """
+    p = R.shape[-1] - n_lifted
+    alpha = np.asarray(alpha, dtype=float)
+    batch = np.broadcast_shapes(R.shape[:-2], alpha.shape)
+    ridge = np.sqrt(alpha)[..., None, None] * np.eye(p)
+    top = np.broadcast_to(R[..., :p, :], (*batch, p, R.shape[-1]))
+    bottom = np.concatenate([np.broadcast_to(ridge, (*batch, p, p)), np.zeros((*batch, p, n_lifted))], axis=-1)
+    triangle = np.linalg.qr(np.concatenate([top, bottom], axis=-2), mode="r")
+    R11, R12 = triangle[..., :p, :p], triangle[..., :p, p:]
+    pivots = np.abs(np.diagonal(R11, axis1=-2, axis2=-1)) / np.maximum(np.linalg.norm(R11, axis=-2), np.finfo(float).tiny)
+    if np.any(pivots < p * np.finfo(float).eps):
+        *unit, column = (int(i) for i in np.argwhere(pivots < p * np.finfo(float).eps)[0])
+        raise IdentificationError(
+            f"EDMD: column {column} of the lifted data{f' of unit number {unit[0]}' if unit else ''} depends on the others (relative pivot "
+            f"{pivots.min():.1e}); remove the lifting function or input, excite it, or use alpha > 0."
+        )
+    U = np.swapaxes(np.linalg.solve(R11, R12), -1, -2)
+    return KoopmanMatrices(U[..., :n_lifted], U[..., n_lifted:])
+
+
+def residual_covariance(R: Array, n_lifted: int, matrices: KoopmanMatrices, n_samples: npt.ArrayLike) -> Array:
+    """Return the covariance of the one-step residual of given models, shape (..., n_lifted, n_lifted)."""
+    p = R.shape[-1] - n_lifted
+    U = np.concatenate([matrices.A, matrices.B], axis=-1)
+    rest = R[..., :, p:] - R[..., :, :p] @ np.swapaxes(U, -1, -2)
+    return np.swapaxes(rest, -1, -2) @ rest / np.asarray(n_samples, dtype=float)[..., None, None]
+
+
+def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float = 0.0) -> float:
+    """Find the infimum of the interval ``[alpha, inf)`` on which every model of every unit is stable.
+
+    The stabilising set need not be an interval, so the search comes down from above: ten values per decade until a model is
+    unstable, then bisection between the last two.
+
+    Parameters
+    ----------
+    factors : list of (R, n_lifted)
+        One batch of factors over units for every kind of model that has to share `alpha`.
+    margin : float
+        Stable means a spectral radius below ``1 - margin``.
+
+    Returns
+    -------
+    float
+        Zero where no regularisation is needed.
+    """
+
+    def radius(alphas: Array) -> Array:
+        radii = [edmd(R[None], n, alphas[:, None]).spectral_radius().max(axis=-1) for R, n in factors]
+        return np.max(radii, axis=0)
+
+    top = 2 + np.ceil(np.log10(max(float(np.linalg.norm(R[..., : -n or None, : -n or None], axis=(-2, -1)).max()) ** 2 for R, n in factors)))
+    grid = 10.0 ** np.arange(top, top - 2 - _DECADES_BELOW, -1 / _PER_DECADE)
+    stable = radius(grid) < 1 - margin
+    if not stable[0]:
+        raise IdentificationError(f"EDMD: models stay unstable up to alpha = {grid[0]:.1e} with a stability margin of {margin}; lower identify.margin.")
+    if stable.all():
+        return 0.0 if _stable_without(factors, margin) else float(grid[-1])
+    first_unstable = int(np.argmin(stable))
+    low, high = np.log10(grid[first_unstable]), np.log10(grid[first_unstable - 1])
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if radius(np.array([10**middle]))[0] < 1 - margin else (middle, high)
+    return float(10**high)
+
+
+def _stable_without(factors: list[tuple[Array, int]], margin: float) -> bool:
+    try:
+        return all(bool(np.all(edmd(R, n).spectral_radius() < 1 - margin)) for R, n in factors)
+    except IdentificationError:  # a dependent column: some regularisation is needed, however small
+        log.info("some lifted data are rank deficient, so alpha = 0 is not an option")
+        return False

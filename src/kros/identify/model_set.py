@@ -1,0 +1,128 @@
+"""The models of a population, one kind of lifting, one condition: the stage's result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.artifacts import load_artifact, save_artifact
+from ..core.lti import StateSpace
+from ..data.population import Channel, Role
+from ..lifting import Lifting
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSet:
+    """Koopman (or linear) models of all units, identified in one condition.
+
+    Parameters
+    ----------
+    name : str
+        Kind of model, for example ``koopman_edmd``.
+    condition : str
+    lifting : Lifting
+    channels : tuple of Channel
+    sample_period_s : float
+    unit_ids : tuple of str
+    A : ndarray, shape (unit, n, n)
+    B : ndarray, shape (unit, n, m)
+    parameters : mapping of str to ndarray, shape (unit,)
+        Per-unit parameters of the lifting.
+    residual_covariance : ndarray, shape (unit, n, n)
+        Covariance of the one-step residual on the training episodes.
+    output_scale : ndarray, shape (n,)
+        Range of every lifted state over the pooled training episodes; uncertainty and weights work in these units.
+    input_scale : ndarray, shape (m,)
+    alpha : float or None
+        Tikhonov coefficient, where there is one.
+    status : tuple of str
+        Per unit ``ok``, or what is wrong.
+    """
+
+    name: str
+    condition: str
+    lifting: Lifting
+    channels: tuple[Channel, ...]
+    sample_period_s: float
+    unit_ids: tuple[str, ...]
+    A: Array
+    B: Array
+    parameters: Mapping[str, Array]
+    residual_covariance: Array
+    output_scale: Array
+    input_scale: Array
+    alpha: float | None = None
+    status: tuple[str, ...] = field(default=())
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return tuple(c.name for c in self.channels if c.role is Role.INPUT)
+
+    @property
+    def measured(self) -> tuple[int, ...]:
+        """Indices of the states that are available at run time."""
+        states = [c for c in self.channels if c.role is Role.STATE]
+        return tuple(i for i, c in enumerate(states) if c.measured)
+
+    def systems(self, units: Sequence[str] | None = None) -> StateSpace:
+        """Return the models as a batch from input to lifted state, all of it or some units."""
+        rows = [self.index(u) for u in units] if units is not None else slice(None)
+        A, B = self.A[rows], self.B[rows]
+        n, m = B.shape[-2:]
+        return StateSpace(A, B, np.broadcast_to(np.eye(n), A.shape), np.zeros((len(A), n, m)), self.sample_period_s)
+
+    def index(self, unit: str) -> int:
+        """Return the row of a unit."""
+        return self.unit_ids.index(unit)
+
+    def unit_parameters(self, units: Sequence[str]) -> dict[str, Array]:
+        """Return the lifting's parameters for some units, each of shape (len(units),)."""
+        rows = [self.index(u) for u in units]
+        return {name: values[rows] for name, values in self.parameters.items()}
+
+    def spectral_radius(self) -> Array:
+        """Return the spectral radius of every unit's model."""
+        return np.abs(np.linalg.eigvals(self.A)).max(axis=-1)
+
+    def save(self, folder: Path) -> None:
+        """Write ``arrays.npz`` and ``model.json``."""
+        content = {
+            "name": self.name,
+            "condition": self.condition,
+            "unit_ids": self.unit_ids,
+            "channels": self.channels,
+            "states": self.lifting.states,
+            "inputs": self.inputs,
+            "lifting": self.lifting.functions,
+            "parameters": {k: dict(zip(self.unit_ids, v.tolist(), strict=True)) for k, v in self.parameters.items()},
+            "sample_period_s": self.sample_period_s,
+            "alpha": self.alpha,
+            "status": self.status,
+        }
+        arrays = {name: getattr(self, name) for name in ("A", "B", "residual_covariance", "output_scale", "input_scale")}
+        save_artifact(folder, "model", content, arrays)
+
+    @classmethod
+    def load(cls, folder: Path) -> ModelSet:
+        """Read what `save` wrote."""
+        content, arrays = load_artifact(folder, "model")
+        parameters = {k: np.array([v[u] for u in content["unit_ids"]], dtype=float) for k, v in content["parameters"].items()}
+        return cls(
+            name=content["name"],
+            condition=content["condition"],
+            lifting=Lifting(tuple(content["states"]), tuple(content["lifting"]), tuple(content["parameters"])),
+            channels=tuple(Channel(c["name"], Role(c["role"]), c["unit"], c["measured"]) for c in content["channels"]),
+            sample_period_s=content["sample_period_s"],
+            unit_ids=tuple(content["unit_ids"]),
+            parameters=parameters,
+            alpha=content["alpha"],
+            status=tuple(content["status"]),
+            **arrays,
+        )

@@ -1,0 +1,200 @@
+"""Phase calibration of a periodic disturbance that is fixed to an angle (Appendix B, (40)-(41)).
+
+A disturbance ``sin(r*theta + phi)`` reaches the tracking error through a loop with a lag ``eta`` that depends on speed. In steady
+motion the error's phase against the angle is ``phi + eta`` forward and ``phi - eta`` in reverse, so the mean over both directions
+that the paper takes cancels to noise where ``eta`` is near 90 degrees. Here each direction is averaged by itself:
+
+    phi = (psi_forward + psi_reverse) / 2  (modulo pi),      eta = (psi_forward - psi_reverse) / 2  (modulo pi, the same branch)
+
+and the branch is chosen for the whole population at once, so that every unit's lag lies near the population's mean lag.
+
+Symbols
+-------
+e     : tracking error, reference - measured
+theta : angle, rad;  r : ratio of the disturbance to the angle
+psi_i : phase of the error in segment i, ``atan2(<e, cos r theta>, <e, sin r theta>)``, the closed form of (40)
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.artifacts import load_artifact, save_artifact
+from ..core.errors import IdentificationError
+
+log = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
+
+_STEADY = 1e-3  # a reference velocity that moves less than this share of its maximum from sample to sample is constant
+_SPEED_TOLERANCE = 0.02  # segments within 2 % of each other's speed share a lag
+_LOW_CONCENTRATION = 0.8
+
+
+@dataclass(frozen=True)
+class PhaseSpec:
+    """What to calibrate: the disturbance ``sin(ratio * angle + parameter)`` seen in ``reference - measured``."""
+
+    angle: str = "position"
+    ratio: float = 100.0
+    reference: str = "target_velocity"
+    measured: str = "velocity"
+    parameter: str = "phase"
+    settle_s: float = 0.1
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Phase of the error over one stretch of constant velocity."""
+
+    speed: float
+    phase: float
+    amplitude: float
+    n_samples: int
+
+    @property
+    def forward(self) -> bool:
+        """Direction of motion."""
+        return self.speed > 0
+
+
+@dataclass(frozen=True)
+class UnitPhase:
+    """Calibration of one unit: phase and lag on the same branch, and how well the segments agree."""
+
+    phase_rad: float
+    lag_rad: float
+    concentration: float
+    n_segments: int
+
+    def on_branch_of(self, lag_rad: float) -> UnitPhase:
+        """Return the same calibration with the lag within 90 degrees of `lag_rad`."""
+        turns = np.round((self.lag_rad - lag_rad) / np.pi)
+        return UnitPhase(wrap(self.phase_rad - turns * np.pi), self.lag_rad - turns * np.pi, self.concentration, self.n_segments)
+
+
+@dataclass(frozen=True)
+class PhaseCalibration:
+    """Phases of a population, on one branch.
+
+    `lag_rad` is the mean lag of the population; a new unit is put on its branch by it.
+    """
+
+    spec: PhaseSpec
+    lag_rad: float
+    units: Mapping[str, UnitPhase]
+
+    def save(self, folder: Path) -> None:
+        """Write the calibration as readable JSON."""
+        save_artifact(folder, "calibration", {"spec": self.spec, "lag_rad": self.lag_rad, "units": self.units})
+
+    @classmethod
+    def load(cls, folder: Path) -> PhaseCalibration:
+        """Read what `save` wrote."""
+        content, _ = load_artifact(folder, "calibration")
+        return cls(PhaseSpec(**content["spec"]), content["lag_rad"], {k: UnitPhase(**v) for k, v in content["units"].items()})
+
+    def calibrate(self, segments: Sequence[Segment], unit: str) -> UnitPhase:
+        """Calibrate a new unit on the population's branch."""
+        return unit_phase(segments, unit).on_branch_of(self.lag_rad)
+
+
+def wrap(angle: float) -> float:
+    """Return an angle in [0, 2 pi)."""
+    return float(np.mod(angle, 2 * np.pi))
+
+
+def find_segments(angle: Array, reference: Array, measured: Array, dt: float, spec: PhaseSpec) -> list[Segment]:
+    """Find the constant-velocity segments of an episode and the phase of the error in each.
+
+    Parameters
+    ----------
+    angle, reference, measured : ndarray, shape (n_samples,), rad, rad/s, rad/s
+    dt : float, s
+    spec : PhaseSpec
+
+    Returns
+    -------
+    list of Segment
+    """
+    top = np.max(np.abs(reference))
+    if top == 0:
+        return []
+    steady = (np.abs(np.diff(reference, prepend=reference[:1])) < _STEADY * top * dt / 1e-3) & (np.abs(reference) > 0.1 * top)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
+    segments = []
+    for start, stop in zip(edges[::2] + round(spec.settle_s / dt), edges[1::2], strict=True):
+        speed = float(np.mean(reference[start:stop])) if stop > start else 0.0
+        period = 2 * np.pi / (spec.ratio * abs(speed) * dt) if speed else np.inf
+        if stop - start >= 5 * period and period > 4:
+            phase, amplitude = _error_phase(spec.ratio * angle[start:stop], reference[start:stop] - measured[start:stop])
+            segments.append(Segment(speed, phase, amplitude, int(stop - start)))
+    return segments
+
+
+def _error_phase(turn: Array, error: Array) -> tuple[float, float]:
+    """Phase and amplitude of the error at the disturbance's frequency; drift and second harmonic are fitted beside it."""
+    ramp = np.linspace(-1, 1, turn.size)
+    columns = np.stack([np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn), np.ones_like(ramp), ramp, ramp**2], axis=1)
+    along_sin, along_cos = np.linalg.lstsq(columns, error, rcond=None)[0][:2]
+    return float(np.arctan2(along_cos, along_sin)), float(np.hypot(along_cos, along_sin))
+
+
+def unit_phase(segments: Sequence[Segment], unit: str) -> UnitPhase:
+    """Combine a unit's segments, each direction by itself and each speed by itself.
+
+    Raises
+    ------
+    IdentificationError
+        When no speed occurs in both directions.
+    """
+    phases, lags, weights, concentrations = [], [], [], []
+    remaining = sorted(segments, key=lambda s: -abs(s.speed))
+    while remaining:
+        speed = abs(remaining[0].speed)
+        group = [s for s in remaining if abs(s.speed) > (1 - _SPEED_TOLERANCE) * speed]
+        remaining = remaining[len(group) :]
+        forward, reverse = ([s for s in group if s.forward is ahead] for ahead in (True, False))
+        if forward and reverse:
+            (psi_f, r_f), (psi_r, r_r) = _circular_mean(forward), _circular_mean(reverse)
+            phases.append((psi_f + psi_r) / 2)
+            lags.append((psi_f - psi_r) / 2)
+            concentrations.append(min(r_f, r_r))
+            weights.append(min(len(forward), len(reverse)))
+    if not phases:
+        directions = {"forward": sum(s.forward for s in segments), "reverse": sum(not s.forward for s in segments)}
+        raise IdentificationError(
+            f"Phase calibration of unit {unit}: needs constant-velocity segments of equal speed in both directions, found {directions}; "
+            "record such motion, or lift with sine and cosine and no phase parameter."
+        )
+    best = int(np.argmax(weights))
+    # Phases of the other speeds are put on the best speed's branch before averaging; their lags differ and are not mixed.
+    aligned = [p + np.pi * np.round((phases[best] - p) / np.pi) for p in phases]
+    concentration = float(np.average(concentrations, weights=weights))
+    if concentration < _LOW_CONCENTRATION:
+        log.warning("phase calibration of unit %s: its segments agree poorly, concentration %.2f", unit, concentration)
+    return UnitPhase(wrap(float(np.average(aligned, weights=weights))), float(lags[best]), concentration, len(segments))
+
+
+def _circular_mean(segments: Sequence[Segment]) -> tuple[float, float]:
+    resultant = np.mean([np.exp(1j * s.phase) for s in segments])
+    return float(np.angle(resultant)), float(np.abs(resultant))
+
+
+def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec: PhaseSpec) -> PhaseCalibration:
+    """Choose the branch of the half sum for the whole population.
+
+    Lags are known modulo pi; their mean is taken over doubled angles of the `pooled` units, and every unit is moved to the branch
+    whose lag lies within 90 degrees of it. What remains free is one pi common to all units, fixed by a mean lag in [-pi, 0).
+    """
+    doubled = np.mean([np.exp(2j * units[u].lag_rad) for u in pooled])
+    lag = float(np.angle(doubled)) / 2
+    lag = lag - np.pi if lag >= 0 else lag
+    if np.abs(doubled) < _LOW_CONCENTRATION:
+        log.warning("phase calibration: lags differ so much between units (resultant %.2f) that some may be on the wrong branch", np.abs(doubled))
+    return PhaseCalibration(spec, lag, {name: unit.on_branch_of(lag) for name, unit in units.items()})

@@ -1,0 +1,99 @@
+"""System norms against closed forms, scipy's Lyapunov solver and dense grids."""
+
+import numpy as np
+import pytest
+import scipy.linalg as sl
+
+from kros.core import StateSpace, gain, h2_norm, hinf_norm
+
+
+def oscillator(zeta, omega):
+    return StateSpace([[0, 1], [-(omega**2), -2 * zeta * omega]], [[0], [omega**2]], [[1, 0]], [[0]], 0.0)
+
+
+def rotation(radius, angle, dt=1e-3):
+    A = radius * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    return StateSpace(A, [[1], [0]], [[1, 0]], [[0]], dt)
+
+
+def random_stable(rng, n, dt, m=3, p=2):
+    A = rng.standard_normal((n, n))
+    radius = np.abs(np.linalg.eigvals(A)).max()
+    A = A * rng.uniform(0.3, 1 - 10 ** rng.uniform(-6, -1)) / radius
+    if dt == 0:
+        A = A - np.eye(n)
+    D = rng.standard_normal((p, m)) if dt > 0 else np.zeros((p, m))
+    return StateSpace(A, rng.standard_normal((n, m)), rng.standard_normal((p, n)), D, dt)
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.5, -0.9, 0.999999, -0.999999])
+def test_first_order_discrete(pole):
+    system = StateSpace([[pole]], [[2.0]], [[3.0]], [[0.0]], 1e-3)
+    assert h2_norm(system) == pytest.approx(6 / np.sqrt(1 - pole**2), rel=1e-9)
+    assert hinf_norm(system) == pytest.approx(6 / (1 - abs(pole)), rel=1e-9)
+
+
+def test_first_order_discrete_with_feedthrough():
+    system = StateSpace([[0.5]], [[1.0]], [[1.0]], [[-1.0]], 1.0)
+    assert h2_norm(system) == pytest.approx(np.sqrt(1 / 0.75 + 1))
+    # G(z) = 1 / (z - 0.5) - 1: one at z = 1, and -1/1.5 - 1 at z = -1
+    assert hinf_norm(system) == pytest.approx(1 / 1.5 + 1)
+
+
+@pytest.mark.parametrize("zeta", [0.6, 1e-2, 1e-6])
+def test_second_order_continuous(zeta):
+    omega = 2 * np.pi * 50
+    assert h2_norm(oscillator(zeta, omega)) == pytest.approx(np.sqrt(omega / (4 * zeta)), rel=1e-9)
+    assert hinf_norm(oscillator(zeta, omega)) == pytest.approx(1 / (2 * zeta * np.sqrt(1 - zeta**2)), rel=1e-6)
+
+
+@pytest.mark.parametrize(("gap", "angle"), [(1e-6, 0.3), (1e-9, 1e-3), (1e-7, np.pi - 1e-3), (1e-6, np.pi / 2)])
+def test_lightly_damped_discrete_where_a_grid_fails(gap, angle):
+    system = rotation(1 - gap, angle)
+    local = angle + gap * np.linspace(-5, 5, 20001)
+    truth = np.abs(system.frequency_response(local / (2 * np.pi * 1e-3))).max()
+    grid = np.abs(system.frequency_response(np.linspace(0, 500, 4001) + 0.0625)).max()
+    assert hinf_norm(system) == pytest.approx(truth, rel=2e-6)
+    assert grid < 0.5 * truth, "the example should be one where a grid fails"
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0, 1e-3])
+def test_random_systems_against_a_dense_grid_and_scipy(dt):
+    rng = np.random.default_rng(7)
+    for _ in range(25):
+        system = random_stable(rng, int(rng.integers(1, 11)), dt)
+        sizes = np.abs(system.poles() - (dt > 0))
+        freqs = np.geomspace(sizes.min() / 30, np.pi if dt > 0 else 30 * sizes.max(), 3000) / (2 * np.pi * (dt or 1))
+        grid = np.linalg.norm(system.frequency_response(np.append(freqs, 0)), 2, axis=(-2, -1)).max()
+        norm = hinf_norm(system)
+        assert grid <= norm * (1 + 2e-6)
+        assert norm <= grid * 1.05
+        B = system.B @ system.B.T
+        P = sl.solve_discrete_lyapunov(system.A, B) if dt > 0 else sl.solve_continuous_lyapunov(system.A, -B)
+        assert h2_norm(system) == pytest.approx(np.sqrt(np.trace(system.C @ P @ system.C.T) + np.sum(system.D**2)), rel=1e-6)
+
+
+def test_h2_norm_is_the_integral_of_the_spectrum():
+    system = random_stable(np.random.default_rng(3), 5, 1.0)
+    response = system.frequency_response(np.arange(20000) / 20000)
+    assert h2_norm(system) == pytest.approx(np.sqrt(np.sum(np.abs(response) ** 2) / 20000), rel=1e-6)
+
+
+def test_peak_at_nyquist_and_at_dc():
+    assert hinf_norm(rotation(0.9, np.pi)) == pytest.approx(10)
+    assert hinf_norm(StateSpace(np.diag([0.5, -0.5]), np.eye(2), np.eye(2), np.zeros((2, 2)), 1.0)) == pytest.approx(2)
+
+
+def test_norms_of_series_agree_with_python_control():
+    control = pytest.importorskip("control")
+    system = random_stable(np.random.default_rng(11), 4, 1.0, m=2, p=2)
+    other = control.ss(system.A, system.B, system.C, system.D, 1.0)
+    assert h2_norm(other) == pytest.approx(h2_norm(system))
+    assert hinf_norm(other) == pytest.approx(hinf_norm(system))
+
+
+def test_static_gain():
+    matrix = np.array([[3.0, 0.0], [4.0, 0.0]])
+    assert hinf_norm(gain(matrix, 1.0)) == pytest.approx(5)
+    assert h2_norm(gain(matrix, 1.0)) == pytest.approx(5)
+    assert h2_norm(gain(np.zeros((2, 1)), 0.0)) == 0

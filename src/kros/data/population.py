@@ -139,7 +139,9 @@ class Population:
         for unit in self.units:
             if unit.id == unit_id:
                 return unit
-        raise DataError(f"Asked for unit {unit_id!r}; the population has {', '.join(self.unit_ids[:10])}{' ...' if len(self.units) > 10 else ''}.")
+        raise DataError(
+            f"Asked for unit {unit_id!r}; the population has {', '.join(self.unit_ids[:10])}{' ...' if len(self.units) > 10 else ''}."
+        )
 
     def keys(self, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
         """Return the episodes of a unit, a condition or both."""

@@ -1,0 +1,207 @@
+"""Checks of content: what makes an episode or a population unusable, said in full before anything is computed from it."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError, DataError
+from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
+from .recording import title
+
+logger = logging.getLogger(__name__)
+
+MIN_SAMPLES = 3  # two consecutive states and one more
+
+
+class OnNan(str, Enum):
+    """What to do with an episode that holds NaN or infinity."""
+
+    ERROR = "error"
+    DROP_EPISODE = "drop_episode"
+
+
+class NonFiniteError(DataError):
+    """An episode holds NaN or infinity."""
+
+
+def parse_on_nan(value: str) -> OnNan:
+    """Return the policy named by `data.on_nan`."""
+    try:
+        return OnNan(value)
+    except ValueError as error:
+        raise ConfigError(f"data.on_nan should be one of {[p.value for p in OnNan]}, found {value!r}; correct it.") from error
+
+
+def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel], min_samples: int = MIN_SAMPLES) -> None:
+    """Check one episode's samples.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n_samples, n_channels)
+    key : EpisodeKey
+    channels : sequence of Channel
+    min_samples : int
+        Fewest samples that can be used, for example one more than the lifting's delays.
+
+    Raises
+    ------
+    NonFiniteError
+        NaN or infinity.
+    DataError
+        Wrong number of columns, too short, or a state that never changes. (An input may rest in one episode; see `check_inputs`.)
+    """
+    if values.ndim != 2 or values.shape[1] != len(channels):
+        raise DataError(
+            f"{title(key)}: {len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape {values.shape}; transpose or correct it."
+        )
+    if len(values) < min_samples:
+        raise DataError(
+            f"{title(key)}: at least {min_samples} samples are needed, found {len(values)}; leave the episode out or record longer."
+        )
+    if not np.isfinite(values.sum()):
+        _check_finite(values, key, channels)
+    for column, channel in enumerate(channels):
+        if channel.role is Role.STATE and is_constant(values[:, column]):
+            raise DataError(
+                f"{title(key)}: channel {channel.name!r} is a state and stays at {values[0, column]:g} in all {len(values)} samples; "
+                "check the sensor and the column, or leave the episode out."
+            )
+
+
+def is_constant(column: npt.NDArray[np.float64]) -> bool:
+    """Tell whether a signal never changes; a changing one is recognised early."""
+    return bool(column[0] == column[len(column) // 2] and np.all(column == column[0]))
+
+
+def _check_finite(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel]) -> None:
+    for column, channel in enumerate(channels):
+        bad = np.flatnonzero(~np.isfinite(values[:, column]))
+        if bad.size:
+            kinds = " and ".join(sorted({"NaN" if np.isnan(v) else "infinity" for v in values[bad, column]}))
+            where = f"sample {bad[0]}" if bad.size == 1 else f"samples {bad[0]}-{bad[-1]}"
+            raise NonFiniteError(
+                f'{title(key)}: channel {channel.name!r} has {bad.size} {kinds} at {where}; fix the source or set data.on_nan = "drop_episode".'
+            )
+
+
+class InputWatch:
+    """Notice inputs that never change over all episodes of one unit and condition."""
+
+    def __init__(self, channels: Sequence[Channel]) -> None:
+        self._columns = [(i, c.name) for i, c in enumerate(channels) if c.role is Role.INPUT]
+        self._resting: dict[int, float] = {}
+        self._seen = 0
+
+    def add(self, values: npt.NDArray[np.float64]) -> None:
+        """Look at one more episode."""
+        resting = {i: float(values[0, i]) for i, _ in self._columns if is_constant(values[:, i])}
+        self._resting = resting if not self._seen else {i: v for i, v in self._resting.items() if resting.get(i) == v}
+        self._seen += 1
+
+    def check(self, unit: str, condition: str) -> None:
+        """Raise DataError where an input never changed."""
+        for i, name in self._columns:
+            if self._seen and i in self._resting:
+                raise DataError(
+                    f"Unit {unit} ({condition}): input {name!r} stays at {self._resting[i]:g} in all {self._seen} episodes, so nothing can be learned from it; "
+                    "check the column, or remove the channel."
+                )
+
+
+def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey]) -> None:
+    """Check names: at least one state, no channel and no episode twice."""
+    twice = [name for name, count in Counter(c.name for c in channels).items() if count > 1]
+    if twice:
+        raise DataError(f"Channel names should differ, found {twice} more than once in {[c.name for c in channels]}; rename them.")
+    if not any(c.role is Role.STATE for c in channels):
+        raise DataError(
+            f"A population needs at least one channel with role 'state', found {[(c.name, c.role.value) for c in channels]}; declare one."
+        )
+    if not episodes:
+        raise DataError("The population is empty: no episode was found; check the source and the reader.")
+    doubled = [key for key, count in Counter(episodes).items() if count > 1]
+    if doubled:
+        raise DataError(
+            f"Duplicate episodes: {doubled[0]} occurs {episodes.count(doubled[0])} times ({len(doubled)} such episodes); rename or remove the copies."
+        )
+
+
+def check_population(population: Population, allow_single: bool = False) -> None:
+    """Check what can be told without reading: not empty, no duplicates, a state, a measured state, more than one unit.
+
+    Parameters
+    ----------
+    population : Population
+    allow_single : bool
+        Accept one unit, which suffices for identification but not for uncertainty. Units of the group ``outliers`` do not count.
+
+    Raises
+    ------
+    DataError
+    """
+    check_structure(population.channels, population.episodes)
+    if not population.measured:
+        raise DataError(
+            f"No state of {list(population.states)} is measured, so an observer would have nothing to correct with; declare measured = true for at least one."
+        )
+    if not allow_single:
+        recorded = {key.unit for key in population.episodes}
+        units = [u.id for u in population.units if u.group != OUTLIERS and u.id in recorded]
+        if len(units) < 2:
+            raise DataError(
+                f"A population needs at least two units outside the group {OUTLIERS!r}, found {len(units)} ({', '.join(units) or 'none'}): uncertainty is the difference "
+                'between units; add recordings of more units, or stop after identification ("--until identify").'
+            )
+
+
+def scan_population(population: Population, min_samples: int = MIN_SAMPLES, on_nan: OnNan = OnNan.ERROR) -> Population:
+    """Read every episode once and check it.
+
+    Parameters
+    ----------
+    population : Population
+    min_samples : int
+    on_nan : OnNan
+        With ``drop_episode``, episodes with NaN or infinity are left out and logged.
+
+    Returns
+    -------
+    Population
+        Without the dropped episodes.
+
+    Raises
+    ------
+    DataError
+    """
+    kept: list[EpisodeKey] = []
+    for unit, condition, keys in population.groups():
+        watch = InputWatch(population.channels)
+        for key in keys:
+            values = read_or_drop(population, key, on_nan)
+            if values is not None:
+                check_episode(values, key, population.channels, min_samples)
+                watch.add(values)
+                kept.append(key)
+        watch.check(unit, condition)
+    left = {key.unit for key in kept}
+    return replace(population, episodes=tuple(kept), units=tuple(u for u in population.units if u.id in left))
+
+
+def read_or_drop(population: Population, key: EpisodeKey, on_nan: OnNan) -> npt.NDArray[np.float64] | None:
+    """Read and check for NaN; None where the episode is to be dropped, which is logged."""
+    try:
+        values = population.read(key)
+        check_episode(values, key, population.channels)
+    except NonFiniteError as error:
+        if on_nan is OnNan.ERROR:
+            raise
+        logger.warning("Dropped, as data.on_nan asks: %s", error)
+        return None
+    return values

@@ -1,0 +1,1 @@
+"""One reader per file; each returns a lazy `Population`."""

@@ -1,0 +1,154 @@
+"""The paper's raw recordings of motor drives with Harmonic Drive gearboxes.
+
+    raw/batch_b/{population,outliers}/<YYYYmmddTHHMMSS>_<serial>_<load|noload>/*_<episode>.csv
+
+Columns, by position after one header line: time (s), position (deg), velocity (deg/s), torque (% of full scale), target position (deg),
+target velocity (deg/s), all on the motor side of a gear of ratio 100. `STEPS` declares the preparation.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...core.errors import DataError
+from ..csvfile import first_fields, read_columns
+from ..population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
+from ..prepare import Recorded, assemble
+from ..recording import Recording
+from ..steps import Offset, Scale, Shift, Step, Trim
+
+GEAR_RATIO = 100
+REST_SAMPLES = 1000
+TARGET_LAG = 1
+GROUPS = ("population", OUTLIERS)
+METADATA = {"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO}
+COLUMNS = ("time", "position", "velocity", "current", "target_position", "target_velocity")
+CHANNELS = (
+    Channel("position", Role.STATE, "deg", measured=True),
+    Channel("velocity", Role.STATE, "deg/s"),
+    Channel("current", Role.STATE, "%"),
+    Channel("target_position", Role.INPUT, "deg"),
+    Channel("target_velocity", Role.INPUT, "deg/s"),
+)
+MOTOR_DEG_TO_RAD = math.pi / 180 / GEAR_RATIO
+PERCENT = 0.01
+STEPS: tuple[Step, ...] = (
+    Scale(("position", "target_position"), MOTOR_DEG_TO_RAD, "rad"),
+    Scale(("velocity", "target_velocity"), MOTOR_DEG_TO_RAD, "rad/s"),
+    Scale(("current",), PERCENT, ""),
+    Shift(("target_position", "target_velocity"), TARGET_LAG),
+    Offset("position", "target_position", 500, 1000),
+    Trim(start=REST_SAMPLES),
+)
+FOLDER = re.compile(r"\d{8}T\d{6}_(?P<unit>\d{6})_(?P<condition>load|noload)")
+
+
+@dataclass(frozen=True, eq=False)
+class RawRecordings:
+    """Reads one raw file at a time."""
+
+    files: Mapping[EpisodeKey, str]
+
+    def __call__(self, key: EpisodeKey) -> Recording:
+        """Return one episode as recorded."""
+        columns = read_columns(Path(self.files[key]), COLUMNS, COLUMNS)
+        return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0])
+
+
+def find_root(source: Path) -> Path | None:
+    """Return the folder that holds ``population`` or ``outliers``, at `source` or in its ``batch_b`` (also below ``raw``)."""
+    for candidate in (source, source / "batch_b", source / "raw" / "batch_b"):
+        if any((candidate / group).is_dir() for group in GROUPS):
+            return candidate
+    return None
+
+
+def read_motor_drive_raw(source: Path | str, prepare: Iterable[Step] = ()) -> Population:
+    """Read the paper's raw layout.
+
+    Parameters
+    ----------
+    source : Path
+        The folder that holds ``batch_b``, or the one that holds ``population`` and ``outliers``.
+    prepare : iterable of Step
+        Further steps, after `STEPS`.
+
+    Returns
+    -------
+    Population
+        States position (rad, gear output, measured), velocity (rad/s), current (fraction of full scale); inputs target_position (rad),
+        target_velocity (rad/s). Files are listed and their header lines read; samples are read on demand.
+
+    Raises
+    ------
+    DataError
+        A folder or file that does not fit the layout, missing or extra columns, duplicate episodes, a unit in two groups.
+    """
+    root = find_root(Path(source))
+    if root is None:
+        raise DataError(
+            f"Reading {source} as motor-drive-raw: found no folder 'population' or 'outliers', nor 'batch_b' with one of them; check the path."
+        )
+    groups: dict[str, str] = {}
+    files: dict[EpisodeKey, str] = {}
+    for group, path, match in _folders(root):
+        unit = match["unit"]
+        if groups.setdefault(unit, group) != group:
+            raise DataError(f"Unit {unit} is in both groups {groups[unit]!r} and {group!r} of {root}; move its folders to one of them.")
+        for episode, file in _episodes(path):
+            key = EpisodeKey(unit, match["condition"], episode)
+            if key in files:
+                raise DataError(f"Duplicate episodes: {key} is in {files[key]} and in {file}; remove or renumber one of them.")
+            files[key] = file
+    for file in files.values():
+        _check_header(Path(file))
+    units = [Unit(unit, group) for unit, group in groups.items()]
+    if not files:
+        raise DataError(f"Reading {source} as motor-drive-raw: found {len(groups)} folders of units and no .csv in them; check the path.")
+    return assemble(Recorded(CHANNELS, units, list(files), RawRecordings(files), metadata=METADATA), (*STEPS, *prepare))
+
+
+def _folders(root: Path) -> Iterator[tuple[str, Path, re.Match[str]]]:
+    for group in GROUPS:
+        if not (root / group).is_dir():
+            continue
+        for path in sorted(p for p in (root / group).iterdir() if p.is_dir() and not p.name.startswith(".")):
+            match = FOLDER.fullmatch(path.name)
+            if match is None:
+                raise DataError(
+                    f"Folder {path} should be named <YYYYmmddTHHMMSS>_<serial, 6 digits>_<load|noload>; rename it or move it away."
+                )
+            yield group, path, match
+
+
+def _episodes(folder: Path) -> Iterator[tuple[str, str]]:
+    """Yield (episode, file) of one folder; the last three characters of the stem number the episode."""
+    for name in sorted(os.listdir(folder)):
+        if not name.endswith(".csv") or name.startswith("."):
+            continue
+        number = name[:-4][-3:]
+        if not re.fullmatch(r"[0-9]{3}", number):
+            raise DataError(
+                f"File {folder / name}: the last three characters before .csv should number the episode, found {number!r}; rename it."
+            )
+        yield str(int(number)), str(folder / name)
+
+
+def _check_header(file: Path) -> None:
+    fields = first_fields(file)
+    if len(fields) != len(COLUMNS):
+        problem = "missing" if len(fields) < len(COLUMNS) else "extra"
+        raise DataError(
+            f"Reading {file}: {len(COLUMNS)} columns are needed ({', '.join(COLUMNS)}), found {len(fields)}: {fields}; {problem} columns, correct the file."
+        )
+    if all(re.fullmatch(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?", field) for field in fields):
+        raise DataError(
+            f"Reading {file}: one header line is needed, found numbers in the first line: {fields}; put the names of the columns first."
+        )

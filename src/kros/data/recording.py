@@ -1,0 +1,121 @@
+"""One episode as recorded: samples and, where there is one, a time column. Checks of time live here.
+
+reader ── Recording ── steps ── Recording ── checks ── samples
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError
+from .population import EpisodeKey
+
+TIME_TOLERANCE = 1e-3  # largest deviation of one time step, in sampling periods
+PERIOD_TOLERANCE = 1e-4  # largest relative difference of the sampling periods of two episodes
+
+Float1D = npt.NDArray[np.float64]
+Float2D = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One episode before or between preparation steps.
+
+    Parameters
+    ----------
+    key : EpisodeKey
+    values : ndarray, shape (n_samples, n_channels)
+    time_s : ndarray, shape (n_samples,), s, or None
+        None where the samples are known to be even.
+    """
+
+    key: EpisodeKey
+    values: Float2D
+    time_s: Float1D | None = None
+
+
+RecordingSource = Callable[[EpisodeKey], Recording]
+
+
+def title(key: EpisodeKey) -> str:
+    """Return how a message names an episode, for example ``Episode 7 of unit 001011 (load)``."""
+    return f"E{str(key)[1:]}"
+
+
+def estimate_period(recording: Recording) -> float:
+    """Return the median time step, rounded to six digits so that 0.0010000000000000009 s reads 0.001 s.
+
+    Raises
+    ------
+    DataError
+        When the recording has fewer than two samples, or time does not advance.
+    """
+    time = recording.time_s
+    if time is None or len(time) < 2:
+        found = 0 if time is None else len(time)
+        raise DataError(
+            f"{title(recording.key)}: the sampling period needs at least two samples with time, found {found}; leave the episode out."
+        )
+    period = float(np.median(np.diff(time)))
+    if not period > 0:
+        raise DataError(
+            f"{title(recording.key)}: the median time step is {period:g} s; name the column that holds time, in seconds and increasing."
+        )
+    return float(f"{period:.6g}")
+
+
+def check_increasing(recording: Recording) -> None:
+    """Refuse time that stands still, runs backwards or is not a number."""
+    time = recording.time_s
+    if time is None:
+        return
+    bad = np.flatnonzero(~(np.diff(time) > 0))
+    if bad.size:
+        k = int(bad[0])
+        raise DataError(
+            f"{title(recording.key)}: time should increase, found {time[k]:g} s at sample {k} and {time[k + 1]:g} s at sample {k + 1} "
+            f"({bad.size} such steps); remove repeated or disordered samples."
+        )
+
+
+def check_even(recording: Recording, period_s: float, reference: EpisodeKey, tolerance: float = TIME_TOLERANCE) -> None:
+    """Check that an episode is sampled evenly, at the population's period.
+
+    Parameters
+    ----------
+    recording : Recording
+    period_s : float
+        The population's sampling period, found in the episode `reference`.
+    reference : EpisodeKey
+    tolerance : float
+        Largest deviation of one step, in sampling periods.
+
+    Raises
+    ------
+    DataError
+        Uneven time, or another sampling period.
+    """
+    time = recording.time_s
+    if time is None or len(time) < 2:
+        return
+    check_increasing(recording)
+    steps = np.diff(time)
+    own = estimate_period(recording)
+    deviation = np.abs(steps - own)
+    worst = int(deviation.argmax())
+    if deviation[worst] > tolerance * own:
+        count = int(np.count_nonzero(deviation > tolerance * own))
+        raise DataError(
+            f"{title(recording.key)}: uneven time, {count} of {len(steps)} steps differ from {own:g} s by more than {tolerance:g} of it, the worst "
+            f'{steps[worst]:g} s at sample {worst}; declare [[data.prepare]] step = "resample", period_s = {own:g}, or fix the source.'
+        )
+    mean = float((time[-1] - time[0]) / len(steps))
+    if abs(mean - period_s) > max(PERIOD_TOLERANCE, tolerance / len(steps)) * period_s:
+        raise DataError(
+            f"Two sampling periods: {period_s:g} s in {reference} and {own:g} s in {recording.key}; a population has one, "
+            f'declare [[data.prepare]] step = "resample", period_s = {max(own, period_s):g}, or leave one out.'
+        )

@@ -1,0 +1,199 @@
+"""Write a population in kros's native format.
+
+    <out>/population.json                    channels, period, units, episodes with their lengths
+    <out>/<unit>@<condition>.parquet         one row group an episode: unit, condition, episode, k, then the channels
+
+Names of files are percent-encoded, so any id works. A study writes groups from several processes (`write_group`), then the index.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.artifacts import save_artifact
+from ..core.errors import DataError
+from .checks import InputWatch, OnNan, check_structure, read_or_drop
+from .folders import whole_folder
+from .population import EpisodeKey, Population
+from .readers.parquet import INDEX
+
+Progress = Callable[[int, int], None]
+COMPRESSION = "none"
+
+
+@dataclass(frozen=True)
+class GroupRecord:
+    """What `write_group` wrote: one unit in one condition.
+
+    Parameters
+    ----------
+    unit, condition, file : str
+    episodes : tuple of str
+        In the order of the row groups.
+    samples : tuple of int
+        Length of each episode.
+    """
+
+    unit: str
+    condition: str
+    file: str
+    episodes: tuple[str, ...]
+    samples: tuple[int, ...]
+
+
+def group_file(unit: str, condition: str) -> str:
+    """Return the name of the file of one unit and condition; different ids never share a name."""
+    return f"{quote(unit, safe='')}@{quote(condition, safe='')}.parquet"
+
+
+def write_group(population: Population, unit: str, condition: str, folder: Path | str, on_nan: str = "error") -> GroupRecord:
+    """Read, prepare, check and write all episodes of one unit and condition.
+
+    Parameters
+    ----------
+    population : Population
+    unit, condition : str
+    folder : Path
+        Exists; the file appears whole or not at all.
+    on_nan : {"error", "drop_episode"}
+
+    Returns
+    -------
+    GroupRecord
+
+    Raises
+    ------
+    DataError
+        An episode that cannot be used, or none left.
+    """
+    keys = population.keys(unit, condition)
+    if not keys:
+        raise DataError(f"Asked to write unit {unit} ({condition}); the population has no episode of it.")
+    path = Path(folder) / group_file(unit, condition)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    watch = InputWatch(population.channels)
+    try:
+        written = list(_write_episodes(population, keys, temporary, OnNan(on_nan), watch))
+        if not written:
+            raise DataError(
+                f"Unit {unit} ({condition}): no episode is left of {len(keys)} after dropping those with NaN; fix the source or leave the unit out."
+            )
+        watch.check(unit, condition)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return GroupRecord(unit, condition, path.name, tuple(e for e, _ in written), tuple(n for _, n in written))
+
+
+def write_index(population: Population, records: Iterable[GroupRecord], folder: Path | str) -> None:
+    """Write `population.json` for groups that were written; with it the folder is a population.
+
+    Parameters
+    ----------
+    population : Population
+        Whose channels, units and metadata are stored; units without a record are left out.
+    records : iterable of GroupRecord
+    folder : Path
+    """
+    groups = list(records)
+    written = {g.unit for g in groups}
+    check_structure(population.channels, [EpisodeKey(g.unit, g.condition, e) for g in groups for e in g.episodes])
+    content = {
+        "sample_period_s": population.sample_period_s,
+        "channels": population.channels,
+        "units": [u for u in population.units if u.id in written],
+        "metadata": population.metadata,
+        "groups": groups,
+    }
+    save_artifact(Path(folder), INDEX, content)
+
+
+def write_parquet(
+    population: Population,
+    out: Path | str,
+    progress: Progress | None = None,
+    *,
+    on_nan: str = "error",
+    overwrite: bool = False,
+    workers: int | None = None,
+) -> None:
+    """Write a population as a folder of Parquet files; it appears whole or not at all.
+
+    Parameters
+    ----------
+    population : Population
+    out : Path
+        Folder to make.
+    progress : callable, optional
+        Called with the groups done and their number.
+    on_nan : {"error", "drop_episode"}
+    overwrite : bool
+        Replace what is at `out`.
+    workers : int, optional
+        Threads; default one per processor.
+
+    Raises
+    ------
+    DataError
+        `out` exists, or an episode cannot be used.
+    """
+    groups = [(unit, condition) for unit, condition, _ in population.groups()]
+    with whole_folder(Path(out), overwrite) as folder, ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+        tasks = [pool.submit(write_group, population, unit, condition, folder, on_nan) for unit, condition in groups]
+        records = []
+        try:
+            for task in tasks:
+                records.append(task.result())
+                if progress is not None:
+                    progress(len(records), len(groups))
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+        write_index(population, records, folder)
+
+
+def _write_episodes(
+    population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: OnNan, watch: InputWatch
+) -> Iterable[tuple[str, int]]:
+    from pyarrow import parquet
+
+    names = [c.name for c in population.channels]
+    schema = _schema(names)
+    options: dict[str, Any] = {"compression": COMPRESSION, "use_dictionary": list(KEYS), "write_statistics": False}
+    with parquet.ParquetWriter(path, schema, column_encoding={"k": "DELTA_BINARY_PACKED"}, **options) as writer:
+        for key in keys:
+            values = read_or_drop(population, key, on_nan)
+            if values is not None:
+                watch.add(values)
+                writer.write_table(_table(key, values, schema), row_group_size=len(values))
+                yield key.episode, len(values)
+
+
+KEYS = ("unit", "condition", "episode")
+
+
+def _schema(names: Sequence[str]) -> Any:
+    import pyarrow as pa
+
+    clash = sorted({*KEYS, "k"} & set(names))
+    if clash:
+        raise DataError(f"Writing Parquet: channels {clash} have the name of a key column ({', '.join(KEYS)}, k); rename them.")
+    text = pa.dictionary(pa.int32(), pa.string())
+    return pa.schema([*((name, text) for name in KEYS), ("k", pa.int64()), *((name, pa.float64()) for name in names)])
+
+
+def _table(key: EpisodeKey, values: npt.NDArray[np.float64], schema: Any) -> Any:
+    import pyarrow as pa
+
+    zeros = pa.array(np.zeros(len(values), np.int32))
+    keys = [pa.DictionaryArray.from_arrays(zeros, pa.array([text])) for text in (key.unit, key.condition, key.episode)]
+    columns = [pa.array(np.ascontiguousarray(column)) for column in values.T]
+    return pa.Table.from_arrays([*keys, pa.array(np.arange(len(values))), *columns], schema=schema)

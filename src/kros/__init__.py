@@ -1,0 +1,45 @@
+"""Koopman robust observer synthesis.
+
+Recordings of nominally identical machines go in; one observer that works on all of them comes out, with a statement of how well and why.
+
+Importing this package imports nothing else: ``kros.synthesis``, ``kros.uncertainty`` and the others load when first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_SUBPACKAGES = (
+    "core",
+    "data",
+    "evaluate",
+    "export",
+    "identify",
+    "interop",
+    "lifting",
+    "observer",
+    "plants",
+    "report",
+    "study",
+    "synthesis",
+    "uncertainty",
+)
+
+__all__ = ["__version__", *_SUBPACKAGES]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a subpackage, or look up the version, on first use (PEP 562)."""
+    if name in _SUBPACKAGES:
+        return import_module(f"{__name__}.{name}")
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version(__name__)
+    raise AttributeError(f"Asked for kros.{name}; the package has {', '.join(_SUBPACKAGES)} and __version__.")
+
+
+def __dir__() -> list[str]:
+    """Names a user may ask for, loaded or not."""
+    return sorted(__all__)

@@ -1,0 +1,1 @@
+"""Bridges to pykoop, scikit-learn and python-control."""

@@ -13,50 +13,56 @@ _SEGMENT = 512  # samples of a Welch segment, as in the paper
 
 @dataclass(frozen=True, eq=False)
 class ErrorSummary:
-    """Errors of an estimate over a batch of episodes, each of shape (batch, n).
+    """Errors of an estimate over a batch of episodes.
 
     Parameters
     ----------
-    rms : ndarray
-    percent : ndarray
+    rms : ndarray, shape (batch, n)
+    percent : ndarray, shape (batch, n)
         ``100 rms(x_hat - x) / max|x|`` of every episode.
-    band_power : ndarray or None
-        Power of the error in the band asked for.
+    spectra : ndarray, shape (batch, n_freqs, n)
+        Welch's power spectral density of the error.
+    freqs_hz : ndarray, shape (n_freqs,)
     """
 
     rms: Array
     percent: Array
-    band_power: Array | None
+    spectra: Array
+    freqs_hz: Array
+
+    def band_power(self, band_hz: tuple[float, float]) -> Array:
+        """Return the error's power inside a band, shape (batch, n)."""
+        inside = (self.freqs_hz >= band_hz[0]) & (self.freqs_hz <= band_hz[1])
+        return self.spectra[:, inside].sum(axis=1) * (self.freqs_hz[1] - self.freqs_hz[0])
 
 
-def summarise(estimate: Array, truth: Array, dt: float, band_hz: tuple[float, float] | None = None) -> ErrorSummary:
+def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> ErrorSummary:
     """Summarise the error of an estimate.
 
     Parameters
     ----------
     estimate, truth : ndarray, shape (n_samples, batch, n)
+    lengths : ndarray, shape (batch,)
+        Samples of every episode that count.
     dt : float, s
-    band_hz : tuple of float, optional
-        Band over which the error's power is integrated.
 
     Returns
     -------
     ErrorSummary
-        Not-a-number and infinite where the estimate diverged.
+        Not-a-number or infinite where the estimate diverged.
     """
-    error = estimate - truth
-    with np.errstate(over="ignore", invalid="ignore"):
-        rms = np.sqrt(np.mean(error**2, axis=0))
-    percent = 100 * rms / np.maximum(np.abs(truth).max(axis=0), np.finfo(float).tiny)
-    band = None
-    if band_hz is not None:
-        freqs, spectrum = error_spectrum(error, dt)
-        inside = (freqs >= band_hz[0]) & (freqs <= band_hz[1])
-        band = spectrum[inside].sum(axis=0) * (freqs[1] - freqs[0])
-    return ErrorSummary(rms, percent, band)
+    rms, percent, spectra = [], [], []
+    for i, length in enumerate(lengths):
+        error = estimate[:length, i] - truth[:length, i]
+        with np.errstate(over="ignore", invalid="ignore"):
+            rms.append(np.sqrt(np.mean(error**2, axis=0)))
+            percent.append(100 * rms[-1] / np.maximum(np.abs(truth[:length, i]).max(axis=0), np.finfo(float).tiny))
+            freqs, density = error_spectrum(error, dt, int(min(_SEGMENT, lengths.min())))
+        spectra.append(density)
+    return ErrorSummary(np.array(rms), np.array(percent), np.array(spectra), freqs)
 
 
-def error_spectrum(error: Array, dt: float) -> tuple[Array, Array]:
+def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT) -> tuple[Array, Array]:
     """Return Welch's estimate of the error's power spectral density.
 
     Parameters
@@ -70,7 +76,5 @@ def error_spectrum(error: Array, dt: float) -> tuple[Array, Array]:
     """
     from scipy.signal import welch
 
-    length = min(_SEGMENT, len(error))
-    with np.errstate(over="ignore", invalid="ignore"):
-        freqs, density = welch(error, fs=1 / dt, nperseg=length, axis=0)
+    freqs, density = welch(error, fs=1 / dt, nperseg=segment, axis=0)
     return freqs, density

@@ -1,0 +1,213 @@
+"""The command line: a thin face of `kros.study`.
+
+Exit codes: 0 done; 1 failed; 2 wrong usage or bad input, and then nothing was written; 3 done, but a requirement is not met.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from .core.errors import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
+
+app = typer.Typer(name="kros", help="From recordings of a batch of machines to one robust observer for all of them.", no_args_is_help=True, add_completion=False)
+export_app = typer.Typer(help="Hand the deployed observer over.", no_args_is_help=True)
+
+FAILED, BAD_INPUT, NOT_MET = 1, 2, 3
+
+Quiet = Annotated[bool, typer.Option("--json", help="Print metrics.json and nothing else on standard output.")]
+Workers = Annotated[int | None, typer.Option(help="Processes for maps over units; default: one a core.")]
+Scheduler = Annotated[str | None, typer.Option(help="Address of a Dask scheduler to use instead of processes.")]
+Seed = Annotated[int, typer.Option(min=0)]
+
+
+@contextmanager
+def _exit_codes() -> Iterator[None]:
+    """Turn kros's errors into one message on standard error and an exit code."""
+    try:
+        yield
+    except (ConfigError, DataError, DimensionError, MissingDependencyError) as error:
+        _fail(error, BAD_INPUT)
+    except KrosError as error:
+        _fail(error, FAILED)
+
+
+def _fail(error: KrosError, code: int) -> None:
+    typer.echo(f"kros: {error}", err=True)
+    raise typer.Exit(code)
+
+
+def _say(text: str, quiet: bool = False) -> None:
+    if not quiet:
+        typer.echo(text)
+
+
+@app.callback()
+def main(verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens to standard error.")] = False) -> None:
+    """Set up logging."""
+    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Run folder; emptied first when it is an earlier demo.")] = Path("runs/demo"),
+    units: Annotated[int, typer.Option(min=2)] = 12,
+    episodes: Annotated[int, typer.Option(min=2, max=1000)] = 10,
+    seconds: Annotated[float, typer.Option(min=5)] = 20.0,
+    seed: Seed = 0,
+    workers: Workers = None,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a population with one badly assembled drive and run the whole study on it."""
+    from .study.demo import run_demo
+    from .study.progress import make_progress
+
+    with _exit_codes(), make_progress(quiet) as progress:
+        result = run_demo(out, units, episodes, seconds, seed, workers, progress)
+    _finish(result, quiet)
+
+
+@app.command()
+def simulate(
+    out: Annotated[Path, typer.Argument(help="New folder for the recordings.")],
+    plant: Annotated[str, typer.Option()] = "harmonic-drive",
+    units: Annotated[int, typer.Option(min=1)] = 12,
+    episodes: Annotated[int, typer.Option(min=1, max=1000)] = 10,
+    seconds: Annotated[float, typer.Option(min=5)] = 20.0,
+    seed: Seed = 0,
+    spread: Annotated[float, typer.Option(min=0, help="Manufacturing spread; 1 means 5 to 15 % on every physical parameter.")] = 1.0,
+    loop: Annotated[str, typer.Option(help="Velocity loop: stiff or soft.")] = "stiff",
+    outlier: Annotated[bool, typer.Option("--outlier", help="Add one badly assembled unit.")] = False,
+    format_: Annotated[str, typer.Option("--format", help="parquet or raw, the paper's layout.")] = "parquet",
+) -> None:
+    """Simulate a population with known truth."""
+    from .study.demo import simulate_to
+
+    with _exit_codes():
+        simulate_to(out, plant, units, episodes, seconds, seed, spread, loop, outlier, format_)
+    _say(f"recordings in {out}")
+
+
+@app.command()
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="SRC")],
+    out: Path,
+    reader: Annotated[str | None, typer.Option(help="motor-drive-raw, parquet or csv; guessed by default.")] = None,
+    mapping: Annotated[Path | None, typer.Option(help="TOML file that maps CSV columns to channels.")] = None,
+    workers: Workers = None,
+) -> None:
+    """Convert any supported recording to Parquet."""
+    from .study.convert import convert_recordings
+    from .study.progress import make_progress
+
+    with _exit_codes(), make_progress(False) as progress:
+        population = convert_recordings(source, out, reader, mapping, workers, progress)
+    _say(f"{len(population.episodes)} episodes of {len(population.units)} units in {out}")
+
+
+@app.command()
+def run(
+    study: Annotated[Path, typer.Argument(metavar="STUDY.toml")],
+    out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/<study> beside the study file.")] = None,
+    until: Annotated[str, typer.Option(help="Last stage: read, calibrate, identify, quantify, synthesize, evaluate or report.")] = "report",
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the study.")] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    quiet: Quiet = False,
+) -> None:
+    """Run a study: recordings to verified observer and report."""
+    from .study import Stage, load_config, run_study
+    from .study.progress import make_progress
+
+    with _exit_codes(), make_progress(quiet) as progress:
+        if until not in [s.value for s in Stage]:
+            raise ConfigError(f"--until {until!r}: stages are {', '.join(s.value for s in Stage)}.")
+        config = load_config(study, set_ or ())
+        folder = out if out is not None else study.parent / "runs" / study.stem
+        result = run_study(config, folder, Stage(until), workers, scheduler, progress)
+    _finish(result, quiet)
+
+
+def _finish(result: Any, quiet: bool) -> None:
+    if quiet:
+        typer.echo(json.dumps(result.metrics, indent=1, ensure_ascii=False))
+    else:
+        from .study.summary import summary_lines
+
+        for line in summary_lines(result):
+            typer.echo(line)
+    for violation in result.violations:
+        typer.echo(f"kros: not met: {violation}", err=True)
+    if result.violations:
+        raise typer.Exit(NOT_MET)
+
+
+@app.command()
+def check(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN")],
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder in the run's own reader, or a TOML with [data].")],
+    workers: Workers = None,
+    quiet: Annotated[bool, typer.Option("--json", help="Print scores as JSON and nothing else.")] = False,
+) -> None:
+    """Score new units against a finished study; exit code 3 when one is flagged."""
+    from .study.check import check_units
+
+    with _exit_codes():
+        scores = check_units(run_folder, data, workers)
+    if quiet:
+        typer.echo(json.dumps(scores, indent=1, ensure_ascii=False))
+    else:
+        for row in scores:
+            typer.echo(f"{row['unit']}  {row['condition']}  score {row['score']:.2f} (threshold {row['threshold']:.2f})  {'OUTLIER' if row['outlier'] else 'ok'}")
+    if any(row["outlier"] for row in scores):
+        raise typer.Exit(NOT_MET)
+
+
+@app.command()
+def estimate(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN")],
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder in the run's own reader, or a TOML with [data].")],
+    out: Annotated[Path, typer.Argument(help="Parquet file to write.")],
+) -> None:
+    """Write the deployed observer's estimates on recordings."""
+    from .study.estimate import estimate_recordings
+
+    with _exit_codes():
+        count = estimate_recordings(run_folder, data, out)
+    _say(f"estimates of {count} episodes in {out}")
+
+
+@app.command()
+def report(run_folder: Annotated[Path, typer.Argument(metavar="RUN")]) -> None:
+    """Write the report of a run again, from the run folder only."""
+    from .study.stages.report import render_run
+
+    with _exit_codes():
+        path = render_run(run_folder)
+    _say(f"report: {path}")
+
+
+@app.command()
+def figures(run_folder: Annotated[Path, typer.Argument(metavar="RUN")], out: Path) -> None:
+    """Write the report's figures as PNG and PDF."""
+    from .study.stages.report import write_figures
+
+    with _exit_codes():
+        names = write_figures(run_folder, out)
+    _say(f"{len(names)} figures in {out}")
+
+
+@app.command()
+def doctor() -> None:
+    """Tell versions, solvers and what is missing."""
+    from .study.doctor import diagnose
+
+    for line in diagnose():
+        typer.echo(line)

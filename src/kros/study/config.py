@@ -1,0 +1,196 @@
+"""The study: one TOML file, validated; unknown keys are errors; the resolved form is stored with the results."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from ..core.errors import ConfigError
+
+FORMS = Literal[
+    "additive",
+    "input_multiplicative",
+    "output_multiplicative",
+    "inverse_additive",
+    "inverse_input_multiplicative",
+    "inverse_output_multiplicative",
+]
+
+
+class Stage(str, Enum):
+    """Stages in the order in which data flow."""
+
+    READ = "read"
+    CALIBRATE = "calibrate"
+    IDENTIFY = "identify"
+    QUANTIFY = "quantify"
+    SYNTHESIZE = "synthesize"
+    EVALUATE = "evaluate"
+    REPORT = "report"
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DataConfig(_Section):
+    """Where the recordings are and how they are prepared."""
+
+    source: Path
+    reader: str = "motor-drive-raw"
+    identify_on: str | None = None
+    on_nan: Literal["error", "drop_episode"] = "error"
+    prepare: tuple[dict[str, Any], ...] = ()
+    csv: dict[str, Any] | None = None
+
+
+class SplitConfig(_Section):
+    """Which episodes are held out."""
+
+    test: tuple[str, ...] | None = None
+
+
+class LiftingConfig(_Section):
+    """Lifted functions of the Koopman model; ``None`` takes what suits the plant that the reader names."""
+
+    functions: tuple[str, ...] | None = None
+    parameters: tuple[str, ...] | None = None
+
+
+class CalibrateConfig(_Section):
+    """Phase calibration; ``None`` takes what suits the plant that the reader names."""
+
+    angle: str | None = None
+    ratio: float | None = Field(None, gt=0)
+    reference: str | None = None
+    measured: str | None = None
+    settle_s: float = Field(0.1, ge=0)
+
+
+class IdentifyConfig(_Section):
+    """Regularisation; ``auto`` is the smallest coefficient that stabilises every model."""
+
+    alpha: float | Literal["auto"] = "auto"
+    margin: float = Field(0.0, ge=0, lt=1)
+
+    @field_validator("alpha")
+    @classmethod
+    def _not_negative(cls, value: float | str) -> float | str:
+        if isinstance(value, float) and value < 0:
+            raise ValueError("alpha should be 'auto' or a number of at least 0")
+        return value
+
+
+class UncertaintyConfig(_Section):
+    """Uncertainty model and outlier scores."""
+
+    form: FORMS = "inverse_input_multiplicative"
+    nominal: str | None = None
+    n_freqs: int = Field(1000, ge=50)
+    max_order: int = Field(4, ge=1, le=8)
+    tolerance_db: float = Field(1.0, gt=0)
+    drop_outliers: bool = False
+    false_alarm_rate: float = Field(1e-3, gt=0, lt=1)
+
+
+class SynthesisConfig(_Section):
+    """Observer synthesis."""
+
+    methods: tuple[Literal["mixed", "worst_case_h2"], ...] = ("mixed", "worst_case_h2")
+    injection: Literal["state", "input"] = "state"
+    noise: dict[str, float] = Field(default_factory=dict, description="standard deviation of the measurement noise per measured channel")
+    penalty: float = Field(1e-3, gt=0)
+    time_limit_s: float = Field(60.0, gt=0)
+
+
+class ObserverConfig(_Section):
+    """Which observers are compared, and which one is handed over."""
+
+    baselines: tuple[Literal["open_loop", "kalman_white", "kalman_tuned"], ...] = ("open_loop", "kalman_white", "kalman_tuned")
+    deployed: str | None = None
+
+
+class RequireConfig(_Section):
+    """Requirements whose violation ends the run with exit code 3."""
+
+    robust: bool = False
+    no_outliers: bool = False
+
+
+class StudyConfig(_Section):
+    """A whole study."""
+
+    name: str = "study"
+    data: DataConfig
+    split: SplitConfig = SplitConfig()
+    lifting: LiftingConfig = LiftingConfig()
+    calibrate: CalibrateConfig = CalibrateConfig()
+    identify: IdentifyConfig = IdentifyConfig()
+    uncertainty: UncertaintyConfig = UncertaintyConfig()
+    synthesis: SynthesisConfig = SynthesisConfig()
+    observer: ObserverConfig = ObserverConfig()
+    require: RequireConfig = RequireConfig()
+
+    def dump(self) -> dict[str, Any]:
+        """Return the resolved study in JSON's types."""
+        return self.model_dump(mode="json")
+
+
+def load_config(path: Path, overrides: Sequence[str] = ()) -> StudyConfig:
+    """Read a study file and apply ``KEY=VALUE`` overrides such as ``identify.alpha=90``.
+
+    Raises
+    ------
+    ConfigError
+        When the file is missing, not TOML, or holds unknown keys or values out of range.
+    """
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"Study: there is no file {path}; write one with [data] source and reader.") from error
+    except (IsADirectoryError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"Study {path}: not a TOML file ({error}); see the smallest study in the README.") from error
+    for override in overrides:
+        _apply(raw, override)
+    raw.setdefault("name", path.stem)
+    return validate_config(raw, path.parent, str(path))
+
+
+def validate_config(raw: dict[str, Any], base: Path, origin: str = "study") -> StudyConfig:
+    """Validate a study given as nested tables; a relative source is relative to `base`."""
+    try:
+        config = StudyConfig.model_validate(raw)
+    except ValidationError as error:
+        problems = "; ".join(f"{'.'.join(str(p) for p in e['loc'])}: {_explain(e)}" for e in error.errors())
+        raise ConfigError(f"Study {origin}: {problems}.") from error
+    source = (base / config.data.source).resolve()
+    return config.model_copy(update={"data": config.data.model_copy(update={"source": source})})
+
+
+def _explain(error: Any) -> str:
+    if error["type"] == "extra_forbidden":
+        return "unknown key; check the spelling against the documentation"
+    found = error.get("input")
+    return f"{error['msg'].lower()}, found {found!r}" if not isinstance(found, dict) else error["msg"].lower()
+
+
+def _apply(raw: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"--set {override!r}: should look like KEY=VALUE, for example identify.alpha=90.")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *tables, last = key.strip().split(".")
+    table = raw
+    for name in tables:
+        table = table.setdefault(name, {})
+        if not isinstance(table, dict):
+            raise ConfigError(f"--set {override!r}: {name} is a value, not a table; check the key.")
+    table[last] = value

@@ -1,0 +1,163 @@
+"""What every stage gets: the study, its run folder, an executor and somebody to tell about progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from ..core.artifacts import load_artifact
+from ..core.errors import DataError
+from ..data.population import OUTLIERS, EpisodeKey, Population
+from ..identify import ModelSet, PhaseSpec
+from ..lifting import Lifting
+from .config import StudyConfig
+from .executors import Executor
+from .store import Store
+
+T = TypeVar("T")
+
+
+class Progress(Protocol):
+    """Told which stage runs and how far it is."""
+
+    def start(self, stage: str, total: int | None) -> None:
+        """A stage (or a part of one) begins."""
+
+    def advance(self) -> None:
+        """One of its steps is done."""
+
+    def finish(self, stage: str, seconds: float, skipped: bool) -> None:
+        """A stage is done, or was found done."""
+
+
+class Silent:
+    """A progress listener that ignores everything."""
+
+    def start(self, stage: str, total: int | None) -> None:
+        """Ignore."""
+
+    def advance(self) -> None:
+        """Ignore."""
+
+    def finish(self, stage: str, seconds: float, skipped: bool) -> None:
+        """Ignore."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """Surroundings of a stage."""
+
+    config: StudyConfig
+    store: Store
+    executor: Executor
+    progress: Progress
+
+    def map(self, title: str, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
+        """Map a function over tasks, in order, telling the progress listener."""
+        tasks = list(tasks)
+        self.progress.start(title, len(tasks))
+        for result in self.executor.map(function, tasks):
+            self.progress.advance()
+            yield result
+
+    @cached_property
+    def facts(self) -> Facts:
+        """What the read stage found."""
+        return Facts.load(self.store.path("population"))
+
+    @cached_property
+    def population(self) -> Population:
+        """The prepared recordings."""
+        from ..data import read_parquet
+
+        return read_parquet(self.facts.recordings if self.facts.recordings.is_absolute() else self.store.folder / self.facts.recordings)
+
+    @cached_property
+    def lifting(self) -> Lifting:
+        """The Koopman lifting of the study; without functions where none is declared and none suits the plant."""
+        from .presets import resolve_lifting
+
+        return resolve_lifting(self.config, self.population)
+
+    @cached_property
+    def phase_spec(self) -> PhaseSpec | None:
+        """What is calibrated, if anything."""
+        from .presets import resolve_phase
+
+        return resolve_phase(self.config, self.population, self.lifting)
+
+    @property
+    def model_names(self) -> tuple[str, ...]:
+        """Kinds of models that the study identifies; the one that others follow comes first."""
+        return ("koopman_edmd", "linear_edmd") if self.lifting.functions else ("linear_edmd",)
+
+    def models(self, name: str, condition: str | None = None) -> ModelSet:
+        """Load the models of one kind, in the condition that feeds the synthesis or another."""
+        return ModelSet.load(self.model_folder(name, condition))
+
+    def model_folder(self, name: str, condition: str | None = None) -> Path:
+        """Return where models of a kind and condition are kept."""
+        if condition in (None, self.facts.identify_on):
+            return self.store.path("models", name)
+        from urllib.parse import quote
+
+        return self.store.path("models", f"{name}@{quote(str(condition), safe='')}")
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the read stage leaves for all others.
+
+    Parameters
+    ----------
+    recordings : Path
+        Native Parquet folder, relative to the run folder when it lies inside.
+    identify_on : str
+    groups : mapping of unit to group
+    train, test : tuple of EpisodeKey
+    resolution : mapping of channel to float
+        Quantisation step found in every measured channel.
+    dropped : tuple of str
+        Episodes that were left out, with the reason.
+    """
+
+    recordings: Path
+    identify_on: str
+    groups: dict[str, str]
+    train: tuple[EpisodeKey, ...]
+    test: tuple[EpisodeKey, ...]
+    resolution: dict[str, float]
+    dropped: tuple[str, ...] = ()
+
+    @property
+    def pooled(self) -> tuple[str, ...]:
+        """Units that take part in pooled results."""
+        return tuple(u for u, group in self.groups.items() if group != OUTLIERS)
+
+    def keys(self, part: str, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
+        """Return training or test episodes of a unit, a condition or both."""
+        return tuple(k for k in getattr(self, part) if unit in (None, k.unit) and condition in (None, k.condition))
+
+    @classmethod
+    def load(cls, folder: Path) -> Facts:
+        """Read what the read stage wrote."""
+        content, _ = load_artifact(folder, "facts")
+
+        def keys(rows: list[list[str]]) -> tuple[EpisodeKey, ...]:
+            return tuple(EpisodeKey(*row) for row in rows)
+
+        try:
+            return cls(
+                Path(content["recordings"]),
+                content["identify_on"],
+                content["groups"],
+                keys(content["train"]),
+                keys(content["test"]),
+                content["resolution"],
+                tuple(content["dropped"]),
+            )
+        except KeyError as error:
+            raise DataError(f"Loading the facts of {folder}: {error} is missing; run the study again.") from error

@@ -1,0 +1,98 @@
+"""Where maps over units run: here, in processes on this machine, or on a Dask cluster. The same code, the same bytes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, Protocol, TypeVar
+
+from ..core.errors import ConfigError, MissingDependencyError
+
+T = TypeVar("T")
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ARROW_NUM_THREADS")
+
+
+class Executor(Protocol):
+    """Maps a function over tasks, in order."""
+
+    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
+        """Yield results in the order of the tasks."""
+        ...
+
+
+class SerialExecutor:
+    """Runs every task in this process."""
+
+    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
+        """Yield results in the order of the tasks."""
+        return map(function, tasks)
+
+
+class ProcessExecutor:
+    """Runs tasks in worker processes, each with a single BLAS thread."""
+
+    def __init__(self, pool: Any) -> None:
+        self._pool = pool
+
+    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
+        """Yield results in the order of the tasks."""
+        return self._pool.map(function, tasks)
+
+
+class DaskExecutor:
+    """Runs tasks on a Dask cluster."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+
+    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
+        """Yield results in the order of the tasks."""
+        for future in self._client.map(function, list(tasks), pure=False):
+            yield future.result()
+
+
+@contextmanager
+def open_executor(workers: int | None = None, scheduler: str | None = None) -> Iterator[Executor]:
+    """Open the executor that fits: Dask for a scheduler's address, processes for more than one worker.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Number of processes; as many as there are cores by default.
+    scheduler : str, optional
+        Address of a Dask scheduler.
+    """
+    if scheduler is not None:
+        try:
+            from distributed import Client
+        except ImportError as error:
+            raise MissingDependencyError(f"--scheduler {scheduler} needs Dask; install it with: pip install 'kros[dask]'.") from error
+        with Client(scheduler) as client:
+            yield DaskExecutor(client)
+        return
+    count = workers if workers is not None else available_cores()
+    if count < 1:
+        raise ConfigError(f"--workers {count}: at least 1 is needed.")
+    if count == 1:
+        yield SerialExecutor()
+        return
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
+    saved = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    try:
+        with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
+            yield ProcessExecutor(pool)
+    finally:
+        for name, value in saved.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def available_cores() -> int:
+    """Return the number of cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

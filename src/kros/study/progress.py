@@ -1,0 +1,69 @@
+"""Progress for people: bars on a terminal, plain lines elsewhere, nothing when only JSON is wanted."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from .context import Progress, Silent
+
+
+class Lines:
+    """One line a finished stage."""
+
+    def start(self, stage: str, total: int | None) -> None:
+        """Say nothing until it is done."""
+
+    def advance(self) -> None:
+        """Say nothing until it is done."""
+
+    def finish(self, stage: str, seconds: float, skipped: bool) -> None:
+        """Write one line."""
+        sys.stderr.write(f"{stage:<12} {'unchanged' if skipped else f'{seconds:6.1f} s'}\n")
+        sys.stderr.flush()
+
+
+class Bars:
+    """A bar for what is running, a line for what is done."""
+
+    def __init__(self, display: Any) -> None:
+        self._display = display
+        self._task: Any = None
+
+    def start(self, stage: str, total: int | None) -> None:
+        """Show a bar; it pulses while the number of steps is unknown."""
+        self._clear()
+        self._task = self._display.add_task(stage, total=total)
+
+    def advance(self) -> None:
+        """Move the bar."""
+        self._display.advance(self._task)
+
+    def finish(self, stage: str, seconds: float, skipped: bool) -> None:
+        """Replace the bar by a line."""
+        self._clear()
+        self._display.console.print(f"{stage:<12} {'unchanged' if skipped else f'{seconds:6.1f} s'}", highlight=False)
+
+    def _clear(self) -> None:
+        if self._task is not None:
+            self._display.remove_task(self._task)
+            self._task = None
+
+
+@contextmanager
+def make_progress(quiet: bool) -> Iterator[Progress]:
+    """Return the progress listener that fits where standard error goes."""
+    if quiet:
+        yield Silent()
+    elif not sys.stderr.isatty():
+        yield Lines()
+    else:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as Display
+
+        columns = (TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        with Display(*columns, console=Console(stderr=True), transient=True) as display:
+            yield Bars(display)

@@ -1,0 +1,175 @@
+"""Stage: run every model freely and every observer on all held-out episodes of all units in all conditions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.artifacts import load_artifact, save_artifact
+from ...data.population import EpisodeKey, Population
+from ...evaluate import EpisodeBatch, ErrorSummary, summarise
+from ...identify import ModelSet, free_run
+from ...observer import Observer, run_observer
+from ..context import Context
+from ..presets import gearbox_band_hz
+from . import calibrate
+
+Array = npt.NDArray[np.float64]
+UnitParameters = dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one model or observer did on the test episodes: errors, and trajectories of the episodes that are shown."""
+
+    summary: ErrorSummary
+    shown: list[Array]
+
+
+def evaluate_observer(observer: Observer, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]) -> Outcome:
+    """Run an observer on test episodes."""
+    batch = EpisodeBatch.read(population, keys)
+    estimate = run_observer(observer, batch.states[..., list(observer.measured)], batch.inputs, batch.parameters(units) if observer.lifting.parameters else None)
+    return _outcome(estimate, batch, population.sample_period_s, shown)
+
+
+def evaluate_model(models: ModelSet, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]) -> Outcome:
+    """Run every unit's own model freely from the true first state."""
+    batch = EpisodeBatch.read(population, keys)
+    rows = [models.index(k.unit) for k in keys]
+    parameters = batch.parameters(units) if models.lifting.parameters else {}
+    states = free_run(models.A[rows], models.B[rows], models.lifting, parameters, batch.states[0], np.swapaxes(batch.inputs, 0, 1))
+    return _outcome(np.swapaxes(states, 0, 1), batch, population.sample_period_s, shown)
+
+
+def _outcome(estimate: Array, batch: EpisodeBatch, dt: float, shown: tuple[int, ...]) -> Outcome:
+    return Outcome(summarise(estimate, batch.states, batch.lengths, dt), [estimate[: batch.lengths[i], i] for i in shown])
+
+
+def _call(task: Any) -> Outcome:
+    return task()
+
+
+def run(context: Context) -> list[Path]:
+    """Evaluate and save errors, spectra and the trajectories that are shown."""
+    facts, population = context.facts, context.population
+    calibration = calibrate.load(context)
+    units: UnitParameters = {u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in _usable(context)}
+    keys = tuple(k for k in facts.test if k.unit in units)
+    on = tuple(k for k in keys if k.condition == facts.identify_on)
+    roles = unit_roles(context)
+    shown = showcase(context, keys, roles)
+    shown_on = tuple(on.index(keys[i]) for i in shown if keys[i] in on)
+
+    observers = load_observers(context)
+    tasks = [partial(evaluate_observer, observer, population, keys, units, shown) for observer in observers.values()]
+    models = {name: context.models(name) for name in context.model_names}
+    tasks += [partial(evaluate_model, m, population, on, units, shown_on) for m in models.values()]
+    outcomes = list(context.map("evaluate", _call, tasks))
+
+    top_speed = _top_speed(context, models)
+    band = gearbox_band_hz(context.config, population, top_speed)
+    rows = []
+    for name, outcome in zip(observers, outcomes, strict=False):
+        rows += error_rows(name, outcome.summary, keys, roles, population.states, band)
+    free = {name: free_run_percent(o.summary, on, facts.pooled, population.states) for name, o in zip(models, outcomes[len(observers) :], strict=True)}
+    folder = context.store.path("evaluation")
+    content = {"rows": rows, "free_run": free, "band_hz": band, "roles": roles, "shown": [[k.unit, k.condition, k.episode] for k in (keys[i] for i in shown)]}
+    content |= {"observers": list(observers), "models": list(models), "states": population.states}
+    save_artifact(folder, "evaluation", content, _arrays(population, keys, on, shown, shown_on, roles, list(observers), list(models), outcomes))
+    return [folder / "evaluation.json", folder / "arrays.npz"]
+
+
+def _usable(context: Context) -> list[str]:
+    ids = context.models(context.model_names[0]).unit_ids
+    return [u for u in context.facts.groups if u in ids]
+
+
+def _top_speed(context: Context, models: dict[str, ModelSet]) -> float:
+    spec = context.phase_spec
+    if spec is None:
+        return 0.0
+    first = next(iter(models.values()))
+    return float(first.input_scale[first.inputs.index(spec.reference)]) if spec.reference in first.inputs else 0.0
+
+
+def unit_roles(context: Context) -> dict[str, str]:
+    """Return for every unit whether it is the nominal one, another of the population, or filed as an outlier."""
+    nominal = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
+    pooled = context.facts.pooled
+    return {u: "nominal" if u == nominal else ("off_nominal" if u in pooled else "outlier") for u in context.facts.groups}
+
+
+def showcase(context: Context, keys: tuple[EpisodeKey, ...], roles: dict[str, str]) -> tuple[int, ...]:
+    """Choose the episodes that are shown: nominal, worst off-nominal, and the nominal unit in every other condition."""
+    facts = context.facts
+    nominal = next(u for u, role in roles.items() if role == "nominal")
+    worst = load_artifact(context.store.path("uncertainty"), "choice")[0]["worst_off_nominal"]
+    wanted = [(nominal, facts.identify_on), (worst, facts.identify_on)]
+    wanted += [(nominal, c) for c in sorted({k.condition for k in keys}) if c != facts.identify_on]
+    firsts = [next((i for i, k in enumerate(keys) if (k.unit, k.condition) == w), None) for w in wanted]
+    return tuple(dict.fromkeys(i for i in firsts if i is not None))
+
+
+def error_rows(
+    name: str, summary: ErrorSummary, keys: tuple[EpisodeKey, ...], roles: dict[str, str], channels: tuple[str, ...], band: tuple[float, float] | None
+) -> list[dict[str, Any]]:
+    """Return a row for every unit, condition and channel: the mean over the unit's test episodes."""
+    power = None if band is None else summary.band_power(band)
+    rows = []
+    for unit, condition in dict.fromkeys((k.unit, k.condition) for k in keys):
+        chosen = [i for i, k in enumerate(keys) if (k.unit, k.condition) == (unit, condition)]
+        for j, channel in enumerate(channels):
+            row = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition, "channel": channel}
+            row |= {"rms": summary.rms[chosen, j].mean(), "error_percent": summary.percent[chosen, j].mean()}
+            rows.append(row | ({} if power is None else {"gearbox_band_power": power[chosen, j].mean()}))
+    return rows
+
+
+def free_run_percent(summary: ErrorSummary, keys: tuple[EpisodeKey, ...], pooled: tuple[str, ...], channels: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    """Return median and worst free-run error over the pooled units, channel by channel."""
+    per_unit = np.array([summary.percent[[i for i, k in enumerate(keys) if k.unit == u]].mean(axis=0) for u in pooled if any(k.unit == u for k in keys)])
+    return {c: {"median": float(np.median(per_unit[:, j])), "worst": float(per_unit[:, j].max())} for j, c in enumerate(channels)}
+
+
+def load_observers(context: Context) -> dict[str, Observer]:
+    """Load all observers that the synthesis stage left, in its order."""
+    names = load_artifact(context.store.path("observers"), "observers")[0]["names"]
+    return {name: Observer.load(context.store.path("observers", f"{name}.json")) for name in names}
+
+
+def _arrays(
+    population: Population,
+    keys: tuple[EpisodeKey, ...],
+    on: tuple[EpisodeKey, ...],
+    shown: tuple[int, ...],
+    shown_on: tuple[int, ...],
+    roles: dict[str, str],
+    observers: list[str],
+    models: list[str],
+    outcomes: list[Outcome],
+) -> dict[str, npt.NDArray[Any]]:
+    """Collect what the figures need: shown trajectories (float32) and mean error spectra by role and condition."""
+    arrays: dict[str, npt.NDArray[Any]] = {"freqs_hz": outcomes[0].summary.freqs_hz}
+    for number, i in enumerate(shown):
+        states, inputs = population.read_parts(keys[i])
+        arrays[f"shown{number}/states"], arrays[f"shown{number}/inputs"] = states.astype(np.float32), inputs.astype(np.float32)
+        for name, outcome in zip(observers, outcomes, strict=False):
+            arrays[f"shown{number}/observer/{name}"] = outcome.shown[number].astype(np.float32)
+    for name, outcome in zip(models, outcomes[len(observers) :], strict=True):
+        for number, _ in enumerate(shown_on):
+            arrays[f"shown{number}/model/{name}"] = outcome.shown[number].astype(np.float32)
+        arrays[f"spectrum/model/{name}"] = outcome.summary.spectra.mean(axis=0)
+    conditions = sorted({k.condition for k in keys})
+    for name, outcome in zip(observers, outcomes, strict=False):
+        for role in ("nominal", "off_nominal"):
+            for condition in conditions:
+                chosen = [i for i, k in enumerate(keys) if roles[k.unit] == role and k.condition == condition]
+                if chosen:
+                    arrays[f"spectrum/{role}/{condition}/{name}"] = outcome.summary.spectra[chosen].mean(axis=0)
+    return arrays

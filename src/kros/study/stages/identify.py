@@ -1,0 +1,115 @@
+"""Stage: one pass over the training episodes to factors, then models of every kind in every condition."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.artifacts import load_artifact, save_artifact
+from ...data.population import EpisodeKey, Population
+from ...identify import Factor, ModelSet, combine, edmd, lifted_factor, reduce_episode, residual_covariance, smallest_stabilising_alpha
+from ...lifting import Lifting
+from ..context import Context
+from . import calibrate
+
+log = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
+Task = tuple[Population, tuple[EpisodeKey, ...], Lifting]
+
+
+def reduce_episodes(task: Task) -> Factor:
+    """Reduce every episode of a task to its factor, stacked on the first axis."""
+    population, keys, lifting = task
+    factors = [reduce_episode(*population.read_parts(key), lifting) for key in keys]
+    return Factor(*(np.stack([getattr(f, name) for f in factors]) for name in ("R", "peak", "n_samples")))
+
+
+def run(context: Context) -> list[Path]:
+    """Reduce, identify, save."""
+    facts, lifting = context.facts, context.lifting
+    calibration = calibrate.load(context)
+    known = [u for u in facts.groups if calibration is None or u in calibration.units]
+    files: list[Path] = []
+    for condition in sorted({k.condition for k in facts.train}, key=lambda c: c != facts.identify_on):
+        units = [u for u in known if facts.keys("train", u, condition)]
+        tasks = [(context.population.select([u], [condition]), facts.keys("train", u, condition), lifting) for u in units]
+        episodes = list(context.map(f"identify ({condition})", reduce_episodes, tasks))
+        files += _save_factors(context, condition, units, episodes)
+        whole = [combine(f) for f in episodes]
+        factor = Factor(*(np.stack([getattr(f, name) for f in whole]) for name in ("R", "peak", "n_samples")))
+        parameters = {} if calibration is None else {calibration.spec.parameter: np.array([calibration.units[u].phase_rad for u in units])}
+        for models in identify_models(context, condition, units, factor, parameters):
+            folder = context.model_folder(models.name, condition)
+            models.save(folder)
+            files += [folder / "model.json", folder / "arrays.npz"]
+    return files
+
+
+def identify_models(context: Context, condition: str, units: list[str], factor: Factor, parameters: dict[str, Array]) -> list[ModelSet]:
+    """Identify every kind of model of one condition with one common regularisation."""
+    kinds = {name: context.lifting if name.startswith("koopman") else Lifting(context.lifting.states) for name in context.model_names}
+    factors = {name: lifted_factor(factor, context.lifting, parameters, lifting) for name, lifting in kinds.items()}
+    pooled = np.array([u in context.facts.pooled for u in units])
+    alpha = context.config.identify.alpha
+    if alpha == "auto":
+        shared = [(factors[name].R[pooled if pooled.any() else slice(None)], kinds[name].n_lifted) for name in kinds]
+        alpha = smallest_stabilising_alpha(shared, context.config.identify.margin)
+        log.info("%s: alpha = %.4g is the smallest that stabilises every model", condition, alpha)
+    return [
+        fit(name, condition, kinds[name], context, units, factors[name], parameters if kinds[name].parameters else {}, float(alpha), pooled) for name in kinds
+    ]
+
+
+def fit(
+    name: str,
+    condition: str,
+    lifting: Lifting,
+    context: Context,
+    units: list[str],
+    factor: Factor,
+    parameters: dict[str, Array],
+    alpha: float,
+    pooled: npt.NDArray[np.bool_],
+) -> ModelSet:
+    """Fit the models of one kind in one condition."""
+    n = lifting.n_lifted
+    matrices = edmd(factor.R, n, alpha)
+    scale = factor.peak[pooled if pooled.any() else slice(None)].max(axis=0)
+    limit = 1 - context.config.identify.margin
+    radius = matrices.spectral_radius()
+    return ModelSet(
+        name=name,
+        condition=condition,
+        lifting=lifting,
+        channels=context.population.channels,
+        sample_period_s=context.population.sample_period_s,
+        unit_ids=tuple(units),
+        A=matrices.A,
+        B=matrices.B,
+        parameters=parameters,
+        residual_covariance=residual_covariance(factor.R, n, matrices, factor.n_samples),
+        output_scale=scale[:n],
+        input_scale=scale[n:],
+        alpha=alpha,
+        status=tuple("ok" if r < limit else f"unstable, spectral radius {r:.6f}" for r in radius),
+    )
+
+
+def _save_factors(context: Context, condition: str, units: list[str], episodes: list[Factor]) -> list[Path]:
+    from urllib.parse import quote
+
+    folder = context.store.path("factors", quote(condition, safe=""))
+    keys = [[k.unit, k.episode] for u in units for k in context.facts.keys("train", u, condition)]
+    arrays = {name: np.concatenate([getattr(f, name) for f in episodes]) for name in ("R", "peak", "n_samples")}
+    content = {"condition": condition, "states": context.lifting.states, "functions": context.lifting.functions, "inputs": context.population.inputs}
+    save_artifact(folder, "factors", {**content, "rows": keys}, arrays)
+    return [folder / "factors.json", folder / "arrays.npz"]
+
+
+def load_factors(folder: Path) -> tuple[list[tuple[str, str]], Factor]:
+    """Read per-episode factors: the (unit, episode) of every row, and the batch."""
+    content, arrays = load_artifact(folder, "factors")
+    return [tuple(row) for row in content["rows"]], Factor(**arrays)

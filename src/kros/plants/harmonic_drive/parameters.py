@@ -1,0 +1,149 @@
+"""What a drive is made of, and how the drives of a batch differ.
+
+All mechanical quantities are referred to the gearbox output. Draws are log-normal around the nominal value; phases are uniform.
+Each unit has its own random stream, so that unit `k` is the same whatever the number of units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+GEAR_RATIO = 100
+HARMONICS = 8
+UNIT_STREAM, OUTLIER_STREAM = 1, 2  # first word of the spawn key
+
+# name: (nominal value, relative deviation at spread 1)
+NOMINAL: dict[str, tuple[float, float]] = {
+    "motor_inertia": (0.5, 0.05),
+    "flange_inertia": (0.01, 0.05),
+    "stiffness": (1.0e4, 0.10),
+    "damping": (6.0, 0.15),
+    "torque_constant": (40.0, 0.05),
+    "current_lag_s": (3.0e-4, 0.10),
+    "coulomb_torque": (3.2, 0.15),
+    "breakaway_torque": (1.0, 0.15),
+    "stribeck_velocity": (0.1, 0.15),
+    "viscous_friction": (1.0, 0.15),
+    "load_inertia": (0.4, 0.05),
+    "load_moment": (8.0, 0.05),
+}
+# Amplitudes of (34) and of the fainter harmonics seen in Figure 4, as fractions of the full-scale current.
+RIPPLE = np.array([6.0e-2, 6.0e-3, 4.0e-3, 3.0e-3, 2.4e-3, 2.0e-3, 1.7e-3, 1.5e-3])
+RIPPLE_DEVIATION = 0.15
+
+# Loose fasteners: factor on each parameter at severity s is exp(s * value).
+OUTLIER_LOG_FACTORS = {
+    "stiffness": -0.9,
+    "damping": -0.5,
+    "coulomb_torque": 0.4,
+    "breakaway_torque": 0.4,
+    "viscous_friction": 0.5,
+    "ripple": 0.6,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class DriveParameters:
+    """Physical parameters of a batch of drives; every field has the unit axis first.
+
+    Parameters
+    ----------
+    motor_inertia : ndarray, shape (n_units,), kg m^2
+        Rotor and wave generator, times the squared gear ratio.
+    flange_inertia : ndarray, shape (n_units,), kg m^2
+        Output flange without load.
+    stiffness : ndarray, shape (n_units,), N m/rad
+        Of the gear (flexspline).
+    damping : ndarray, shape (n_units,), N m s/rad
+        Of the gear.
+    torque_constant : ndarray, shape (n_units,), N m
+        Torque at full-scale current.
+    current_lag_s : ndarray, shape (n_units,), s
+        Time constant of the current loop.
+    coulomb_torque, breakaway_torque : ndarray, shape (n_units,), N m
+        Coulomb friction, and what breakaway adds to it at standstill.
+    stribeck_velocity : ndarray, shape (n_units,), rad/s
+        Where half of the breakaway torque is left.
+    viscous_friction : ndarray, shape (n_units,), N m s/rad
+    load_inertia : ndarray, shape (n_units,), kg m^2
+        Of the asymmetric load, about the output axis.
+    load_moment : ndarray, shape (n_units,), N m
+        Mass times gravity times lever arm of the asymmetric load.
+    ripple : ndarray, shape (n_units, n_harmonics), fraction of full-scale current
+        Amplitudes `a1, a2, ...` of (34).
+    phase_rad : ndarray, shape (n_units, n_harmonics), rad
+        Phases `phi1, phi2, ...` of (34), in [0, 2 pi).
+    """
+
+    motor_inertia: Array
+    flange_inertia: Array
+    stiffness: Array
+    damping: Array
+    torque_constant: Array
+    current_lag_s: Array
+    coulomb_torque: Array
+    breakaway_torque: Array
+    stribeck_velocity: Array
+    viscous_friction: Array
+    load_inertia: Array
+    load_moment: Array
+    ripple: Array
+    phase_rad: Array
+
+    def __len__(self) -> int:
+        return len(self.motor_inertia)
+
+    def take(self, rows: Any) -> DriveParameters:
+        """Return the parameters of some units, or of the same unit several times."""
+        return DriveParameters(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def friction_torque(self, velocity: Array) -> Array:
+        """Steady friction torque of each unit at its own velocity, shape (n_units,), N m."""
+        from .dynamics import smooth_friction
+
+        return smooth_friction(self, np.asarray(velocity, float)) + self.viscous_friction * velocity
+
+    def gearbox_current(self, position: Array) -> Array:
+        """Disturbance (34) of each unit at its own output angle, shape (n_units,), fraction of full scale."""
+        order = np.arange(1, self.ripple.shape[1] + 1)
+        angle = GEAR_RATIO * order * np.asarray(position, float)[..., None]
+        return np.sum(self.ripple * np.sin(angle + self.phase_rad), axis=-1)
+
+
+def draw_parameters(seed: int, n_units: int, spread: float) -> DriveParameters:
+    """Draw the drives of a batch."""
+    return _stack([_draw(seed, (UNIT_STREAM, k), spread) for k in range(n_units)])
+
+
+def draw_outlier(seed: int, spread: float, severity: float) -> DriveParameters:
+    """Draw one drive with loose fasteners: softer, more friction, larger gearbox oscillation."""
+    values = _draw(seed, (OUTLIER_STREAM, 0), spread)
+    for name, log_factor in OUTLIER_LOG_FACTORS.items():
+        values[name] = values[name] * np.exp(severity * log_factor)
+    return _stack([values])
+
+
+def concatenate(first: DriveParameters, second: DriveParameters) -> DriveParameters:
+    """Append a batch to another."""
+    return DriveParameters(**{f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(first)})
+
+
+def _draw(seed: int, stream: tuple[int, int], spread: float) -> dict[str, Any]:
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=stream))
+    values: dict[str, Any] = {
+        name: nominal * np.exp(spread * deviation * rng.standard_normal()) for name, (nominal, deviation) in NOMINAL.items()
+    }
+    values["ripple"] = RIPPLE * np.exp(spread * RIPPLE_DEVIATION * rng.standard_normal(HARMONICS))
+    values["phase_rad"] = rng.uniform(0.0, 2 * np.pi, HARMONICS)
+    return values
+
+
+def _stack(units: Sequence[dict[str, Any]]) -> DriveParameters:
+    return DriveParameters(**{f.name: np.array([unit[f.name] for unit in units], dtype=float) for f in fields(DriveParameters)})

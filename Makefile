@@ -60,19 +60,22 @@ LOCK = $(CLEAN_ENV) "$$uv" pip compile -q --upgrade --universal --fork-strategy 
 	--no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" pyproject.toml
 
 # Sets the shell variable `python`, or says what to install. A launcher on the PATH may exist and yet not run, so each is tried.
+PYTHONS = $(if $(PYTHON),"$(PYTHON)",python3.13 python3.12 python3.11 python3 python)
 define FIND_PYTHON
-python=; for candidate in $(or $(PYTHON),python3.13 python3.12 python3.11 python3 python); do \
-  if "$$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then python=$$candidate; break; fi; \
+python=; bare=; \
+for candidate in $(PYTHONS); do \
+  "$$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 || continue; \
+  if "$$candidate" -c 'import venv, ensurepip' >/dev/null 2>&1; then python=$$candidate; break; fi; \
+  bare=$${bare:-$$candidate}; \
 done; \
-if [ -z "$$python" ]; then \
-  echo "kros needs Python 3.11 or newer; tried: $(or $(PYTHON),python3.13 python3.12 python3.11 python3 python)." >&2; \
-  echo "Install it (Debian 12, Ubuntu 24.04: apt install python3 python3-venv; Fedora: dnf install python3.13; macOS: brew install python@3.13)," >&2; \
+if [ -z "$$python" ] && [ -n "$$bare" ]; then \
+  version=$$("$$bare" -c 'import sys; print("%d.%d" % sys.version_info[:2])'); \
+  echo "$$bare is Python $$version but cannot create virtual environments: its modules venv and ensurepip are not installed." >&2; \
+  echo "Install them (Debian, Ubuntu: apt install python$$version-venv), or name another: make install PYTHON=/path/to/python3.12" >&2; exit 1; \
+elif [ -z "$$python" ]; then \
+  echo "kros needs Python 3.11 or newer; tried:" $(PYTHONS) >&2; \
+  echo "Install it (Debian 12, Ubuntu 24.04: apt install python3 python3-venv; Fedora: dnf install python3; macOS: brew install python@3.13)," >&2; \
   echo "or name one that is elsewhere: make install PYTHON=/path/to/python3.12" >&2; exit 1; \
-fi; \
-if ! "$$python" -c 'import venv, ensurepip' >/dev/null 2>&1; then \
-  version=$$("$$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])'); \
-  echo "$$python (Python $$version) cannot create virtual environments: its modules venv and ensurepip are not installed." >&2; \
-  echo "Install them (Debian, Ubuntu: apt install python$$version-venv), or name another Python: make install PYTHON=/path/to/python3.12" >&2; exit 1; \
 fi
 endef
 
@@ -83,10 +86,12 @@ $(CREATED): requirements.lock requirements-dev.lock
 
 # The build backend is locked too: nothing is fetched that is not in requirements.lock.
 $(INSTALLED): $(CREATED) pyproject.toml
-	$(PIP) install -q --require-hashes -r requirements.lock
-	$(PIP) install -q --no-deps --no-build-isolation -e .
+	@echo "Installing kros and the packages of requirements.lock"
+	@$(PIP) install -q --require-hashes -r requirements.lock
+	@$(PIP) install -q --no-deps --no-build-isolation -e .
 	@touch $@
 
 $(INSTALLED_DEV): $(INSTALLED)
-	$(PIP) install -q --require-hashes -r requirements-dev.lock
+	@echo "Installing the packages of requirements-dev.lock"
+	@$(PIP) install -q --require-hashes -r requirements-dev.lock
 	@touch $@

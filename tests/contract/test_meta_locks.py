@@ -1,0 +1,81 @@
+"""The lock files hold for everybody: hashed, complete, and free of addresses and paths of one machine."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+RUN, DEV = "requirements.lock", "requirements-dev.lock"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def requirements(text: str) -> list[str]:
+    """Logical lines without comments."""
+    joined = re.sub(r"\\\n", " ", re.sub(r"#.*", "", text))
+    return [line.strip() for line in joined.splitlines() if line.strip()]
+
+
+def faults(text: str) -> list[str]:
+    """Lines that are not `name==version`, perhaps with a marker, followed by SHA-256 hashes."""
+    good = re.compile(r"[a-z0-9._-]+==[\w.!+]+( *;[^-]*(?:-(?!-)[^-]*)*)?( +--hash=sha256:[0-9a-f]{64})+")
+    return [line[:80] for line in requirements(text) if not good.fullmatch(line)]
+
+
+def pins(name: str) -> dict[str, str]:
+    lines = requirements((ROOT / name).read_text(encoding="utf-8"))
+    return dict(line.split(" ", 1)[0].split("==") for line in lines)
+
+
+def names(wanted: list[str]) -> set[str]:
+    return {re.split(r"[\[<>=!~ ;]", item, maxsplit=1)[0].lower() for item in wanted}
+
+
+@pytest.mark.parametrize("name", [RUN, DEV])
+def test_every_requirement_is_pinned_and_hashed(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    assert faults(text) == []
+    assert len(requirements(text)) > 20
+
+
+@pytest.mark.parametrize("name", [RUN, DEV])
+def test_no_address_and_no_path(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    assert re.findall(r"\w+://\S+|--(?:index|extra-index|find)\S*|(?<![\w.])/\w+/\S*", text) == []
+
+
+def test_locks_hold_what_the_project_asks_for() -> None:
+    run = PROJECT["project"]["dependencies"] + PROJECT["build-system"]["requires"] + PROJECT["dependency-groups"]["build"]
+    assert names(run) <= set(pins(RUN))
+    assert names(run + PROJECT["dependency-groups"]["dev"]) <= set(pins(DEV))
+
+
+def test_development_uses_the_versions_that_are_installed() -> None:
+    assert pins(RUN).items() <= pins(DEV).items()
+
+
+def test_dependencies_have_no_upper_bound() -> None:
+    groups = [PROJECT["project"]["dependencies"], *PROJECT["project"]["optional-dependencies"].values()]
+    assert [item for group in groups for item in group if re.search(r"<|==|~=", item)] == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "numpy==2.0",
+        "numpy>=2.0 --hash=sha256:" + "0" * 64,
+        "numpy @ https://example.org/numpy.whl --hash=sha256:" + "0" * 64,
+        "--index-url https://example.org/simple",
+        "-e .",
+    ],
+)
+def test_faults_are_found(line: str) -> None:
+    assert faults(line) == [line[:80]]
+
+
+def test_a_marker_and_several_hashes_are_no_fault() -> None:
+    hashes = " \\\n    --hash=sha256:".join(["", "0" * 64, "f" * 64])
+    assert faults(f"colorama==0.4.6 ; sys_platform == 'win32'{hashes}\n    # via click") == []

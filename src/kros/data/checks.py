@@ -59,7 +59,8 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
     """
     if values.ndim != 2 or values.shape[1] != len(channels):
         raise DataError(
-            f"{title(key)}: {len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape {values.shape}; transpose or correct it."
+            f"{title(key)}: {len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape "
+            f"{values.shape}; transpose or correct it."
         )
     if len(values) < min_samples:
         raise DataError(
@@ -87,7 +88,8 @@ def _check_finite(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
             kinds = " and ".join(sorted({"NaN" if np.isnan(v) else "infinity" for v in values[bad, column]}))
             where = f"sample {bad[0]}" if bad.size == 1 else f"samples {bad[0]}-{bad[-1]}"
             raise NonFiniteError(
-                f'{title(key)}: channel {channel.name!r} has {bad.size} {kinds} at {where}; fix the source or set data.on_nan = "drop_episode".'
+                f"{title(key)}: channel {channel.name!r} has {bad.size} {kinds} at {where}; fix the source or set "
+                'data.on_nan = "drop_episode".'
             )
 
 
@@ -110,7 +112,8 @@ class InputWatch:
         for i, name in self._columns:
             if self._seen and i in self._resting:
                 raise DataError(
-                    f"Unit {unit} ({condition}): input {name!r} stays at {self._resting[i]:g} in all {self._seen} episodes, so nothing can be learned from it; "
+                    f"Unit {unit} ({condition}): input {name!r} stays at {self._resting[i]:g} in all {self._seen} "
+                    "episodes, so nothing can be learned from it; "
                     "check the column, or remove the channel."
                 )
 
@@ -129,7 +132,8 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
     doubled = [key for key, count in Counter(episodes).items() if count > 1]
     if doubled:
         raise DataError(
-            f"Duplicate episodes: {doubled[0]} occurs {episodes.count(doubled[0])} times ({len(doubled)} such episodes); rename or remove the copies."
+            f"Duplicate episodes: {doubled[0]} occurs {episodes.count(doubled[0])} times ({len(doubled)} such episodes); "
+            "rename or remove the copies."
         )
 
 
@@ -149,14 +153,16 @@ def check_population(population: Population, allow_single: bool = False) -> None
     check_structure(population.channels, population.episodes)
     if not population.measured:
         raise DataError(
-            f"No state of {list(population.states)} is measured, so an observer would have nothing to correct with; declare measured = true for at least one."
+            f"No state of {list(population.states)} is measured, so an observer would have nothing to correct with; "
+            "declare measured = true for at least one."
         )
     if not allow_single:
         recorded = {key.unit for key in population.episodes}
         units = [u.id for u in population.units if u.group != OUTLIERS and u.id in recorded]
         if len(units) < 2:
             raise DataError(
-                f"A population needs at least two units outside the group {OUTLIERS!r}, found {len(units)} ({', '.join(units) or 'none'}): uncertainty is the difference "
+                f"A population needs at least two units outside the group {OUTLIERS!r}, found {len(units)} "
+                f"({', '.join(units) or 'none'}): uncertainty is the difference "
                 'between units; add recordings of more units, or stop after identification ("--until identify").'
             )
 

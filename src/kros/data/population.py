@@ -11,7 +11,8 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any
+from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from ..core.errors import DataError
 DEFAULT_CONDITION = "default"
 OUTLIERS = "outliers"  # units of this group are scored, but take no part in pooled results
 EpisodeSource = Callable[["EpisodeKey"], npt.NDArray[np.float64]]
+Source = TypeVar("Source")
 
 
 class Role(str, Enum):
@@ -73,7 +75,13 @@ class EpisodeKey:
 
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that orders ``2`` before ``10``."""
-    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", text) if part)
+    return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", text) if part)
+
+
+def restrict(source: Source, keys: Iterable[EpisodeKey]) -> Source:
+    """Return a source that knows fewer episodes where it can say so (`restricted`), else the source itself."""
+    restricted = getattr(source, "restricted", None)
+    return source if restricted is None else restricted(keys)
 
 
 @dataclass(frozen=True)
@@ -145,6 +153,8 @@ class Population:
 
     def keys(self, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
         """Return the episodes of a unit, a condition or both."""
+        if unit is not None and condition is not None:
+            return self._grouped.get((unit, condition), ())
         return tuple(e for e in self.episodes if unit in (None, e.unit) and condition in (None, e.condition))
 
     def read(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
@@ -161,19 +171,22 @@ class Population:
         """Return the population restricted to some units or conditions; nothing is read."""
         wanted = set(self.unit_ids if units is None else units)
         allowed = set(self.conditions if conditions is None else conditions)
+        episodes = tuple(e for e in self.episodes if e.unit in wanted and e.condition in allowed)
         return replace(
-            self,
-            units=tuple(u for u in self.units if u.id in wanted),
-            episodes=tuple(e for e in self.episodes if e.unit in wanted and e.condition in allowed),
+            self, units=tuple(u for u in self.units if u.id in wanted), episodes=episodes, source=restrict(self.source, episodes)
         )
 
     def groups(self) -> Iterator[tuple[str, str, tuple[EpisodeKey, ...]]]:
         """Iterate over (unit, condition, episodes)."""
+        for (unit, condition), keys in self._grouped.items():
+            yield unit, condition, keys
+
+    @cached_property
+    def _grouped(self) -> dict[tuple[str, str], tuple[EpisodeKey, ...]]:
         found: dict[tuple[str, str], list[EpisodeKey]] = {}
         for key in self.episodes:
             found.setdefault((key.unit, key.condition), []).append(key)
-        for (unit, condition), keys in found.items():
-            yield unit, condition, tuple(keys)
+        return {group: tuple(keys) for group, keys in found.items()}
 
 
 def split_episodes(population: Population, test: Iterable[str] | None = None) -> dict[tuple[str, str], Split]:
@@ -199,7 +212,8 @@ def split_episodes(population: Population, test: Iterable[str] | None = None) ->
         split = Split(tuple(k for k in ordered if k.episode not in held_out), tuple(k for k in ordered if k.episode in held_out))
         if not split.train or not split.test:
             raise DataError(
-                f"Splitting the episodes of unit {unit} ({condition}): split.test = {sorted(held_out, key=natural_key)} leaves {len(split.train)} for training and "
+                f"Splitting the episodes of unit {unit} ({condition}): split.test = {sorted(held_out, key=natural_key)} "
+                f"leaves {len(split.train)} for training and "
                 f"{len(split.test)} for testing of {[k.episode for k in ordered]}; name some of them, not all."
             )
         splits[unit, condition] = split

@@ -110,7 +110,8 @@ def check_even(recording: Recording, period_s: float, reference: EpisodeKey, tol
     if deviation[worst] > tolerance * own:
         count = int(np.count_nonzero(deviation > tolerance * own))
         raise DataError(
-            f"{title(recording.key)}: uneven time, {count} of {len(steps)} steps differ from {own:g} s by more than {tolerance:g} of it, the worst "
+            f"{title(recording.key)}: uneven time, {count} of {len(steps)} steps differ from {own:g} s by more than "
+            f"{tolerance:g} of it, the worst "
             f'{steps[worst]:g} s at sample {worst}; declare [[data.prepare]] step = "resample", period_s = {own:g}, or fix the source.'
         )
     mean = float((time[-1] - time[0]) / len(steps))

@@ -70,7 +70,8 @@ def write_raw(
 def _check_names(key: EpisodeKey) -> None:
     if not re.fullmatch("[0-9]{6}", key.unit) or key.condition not in ("load", "noload") or not re.fullmatch("[0-9]{1,3}", key.episode):
         raise DataError(
-            f"Writing the raw layout: needs a unit of six digits, a condition load or noload and an episode below 1000, found {key}; rename it or write Parquet instead."
+            "Writing the raw layout: needs a unit of six digits, a condition load or noload and an episode below 1000, "
+            f"found {key}; rename it or write Parquet instead."
         )
 
 

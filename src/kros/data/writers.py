@@ -85,7 +85,8 @@ def write_group(population: Population, unit: str, condition: str, folder: Path 
         written = list(_write_episodes(population, keys, temporary, OnNan(on_nan), watch))
         if not written:
             raise DataError(
-                f"Unit {unit} ({condition}): no episode is left of {len(keys)} after dropping those with NaN; fix the source or leave the unit out."
+                f"Unit {unit} ({condition}): no episode is left of {len(keys)} after dropping those with NaN; fix the "
+                "source or leave the unit out."
             )
         watch.check(unit, condition)
         temporary.replace(path)

@@ -20,13 +20,20 @@ class ArrayRecordings:
     """Episodes held in memory, columns already in the order of the channels."""
 
     values: Mapping[EpisodeKey, npt.NDArray[np.float64]]
+    times: Mapping[EpisodeKey, npt.NDArray[np.float64]] | None = None
 
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode."""
         try:
-            return Recording(key, self.values[key])
+            return Recording(key, self.values[key], None if self.times is None else self.times[key])
         except KeyError as error:
             raise DataError(f"Asked for {key}; these arrays hold {len(self.values)} other episodes.") from error
+
+    def restricted(self, keys: Iterable[EpisodeKey]) -> ArrayRecordings:
+        """Return the same for fewer episodes, cheaper to send to another process."""
+        wanted = tuple(keys)
+        times = None if self.times is None else {key: self.times[key] for key in wanted}
+        return ArrayRecordings({key: self.values[key] for key in wanted}, times)
 
 
 def from_arrays(
@@ -107,6 +114,7 @@ def _samples(key: EpisodeKey, episode: Any, channels: Sequence[Channel]) -> npt.
         ) from error
     if values.ndim != 2 or values.shape[1] != len(channels):
         raise DataError(
-            f"{title(key)}: needs shape (n_samples, {len(channels)}) for the channels {[c.name for c in channels]}, found {values.shape}; transpose or correct the array."
+            f"{title(key)}: needs shape (n_samples, {len(channels)}) for the channels {[c.name for c in channels]}, "
+            f"found {values.shape}; transpose or correct the array."
         )
     return values

@@ -61,6 +61,10 @@ class RawRecordings:
         columns = read_columns(Path(self.files[key]), COLUMNS, COLUMNS)
         return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0])
 
+    def restricted(self, keys: Iterable[EpisodeKey]) -> RawRecordings:
+        """Return the same for fewer episodes, cheaper to send to another process."""
+        return RawRecordings({key: self.files[key] for key in keys})
+
 
 def find_root(source: Path) -> Path | None:
     """Return the folder that holds ``population`` or ``outliers``, at `source` or in its ``batch_b`` (also below ``raw``)."""
@@ -94,7 +98,8 @@ def read_motor_drive_raw(source: Path | str, prepare: Iterable[Step] = ()) -> Po
     root = find_root(Path(source))
     if root is None:
         raise DataError(
-            f"Reading {source} as motor-drive-raw: found no folder 'population' or 'outliers', nor 'batch_b' with one of them; check the path."
+            f"Reading {source} as motor-drive-raw: found no folder 'population' or 'outliers', nor 'batch_b' with one of "
+            "them; check the path."
         )
     groups: dict[str, str] = {}
     files: dict[EpisodeKey, str] = {}
@@ -146,7 +151,8 @@ def _check_header(file: Path) -> None:
     if len(fields) != len(COLUMNS):
         problem = "missing" if len(fields) < len(COLUMNS) else "extra"
         raise DataError(
-            f"Reading {file}: {len(COLUMNS)} columns are needed ({', '.join(COLUMNS)}), found {len(fields)}: {fields}; {problem} columns, correct the file."
+            f"Reading {file}: {len(COLUMNS)} columns are needed ({', '.join(COLUMNS)}), found {len(fields)}: {fields}; "
+            f"{problem} columns, correct the file."
         )
     if all(re.fullmatch(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?", field) for field in fields):
         raise DataError(

@@ -1,0 +1,114 @@
+"""Open recordings by the name of a reader, and tell which reader fits a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import ConfigError, DataError
+from .checks import OnNan, parse_on_nan, scan_population
+from .population import Population
+from .readers.csv_folder import csv_files, read_csv_folder
+from .readers.csv_mapping import CsvMapping
+from .readers.motor_drive_raw import find_root, read_motor_drive_raw
+from .readers.parquet import INDEX, read_parquet
+from .steps import Step, parse_steps
+
+READERS = ("motor-drive-raw", "parquet", "csv")
+LOOKS = {
+    "motor-drive-raw": "holds a folder 'population' or 'outliers'",
+    "parquet": "holds population.json",
+    "csv": "holds CSV files",
+}
+
+
+def detect_reader(source: Path | str) -> str | None:
+    """Return the reader that fits a folder, or None where none does.
+
+    Parameters
+    ----------
+    source : Path
+    """
+    source = Path(source)
+    if (source / f"{INDEX}.json").is_file():
+        return "parquet"
+    if find_root(source) is not None:
+        return "motor-drive-raw"
+    return "csv" if any(True for _ in csv_files(source)) else None
+
+
+def open_population(
+    reader: str | None,
+    source: Path | str,
+    *,
+    mapping: CsvMapping | Mapping[str, Any] | Path | str | None = None,
+    prepare: Iterable[Step | Mapping[str, Any]] = (),
+    on_nan: str = "error",
+) -> Population:
+    """Open a folder of recordings; episodes are read on demand.
+
+    Parameters
+    ----------
+    reader : str, optional
+        ``motor-drive-raw``, ``parquet`` or ``csv``; None: the one that fits.
+    source : Path
+    mapping : CsvMapping, mapping or Path, optional
+        For ``csv``: a TOML file or the table ``[data.csv]``.
+    prepare : iterable of Step or mapping
+        Further steps, as in ``[[data.prepare]]``.
+    on_nan : {"error", "drop_episode"}
+        With ``drop_episode`` every episode is read once here, and those with NaN or infinity are left out and logged. To save that pass
+        keep ``error`` here and give the option to `write_parquet`.
+
+    Returns
+    -------
+    Population
+
+    Raises
+    ------
+    ConfigError
+        Unknown reader or option, invalid mapping or step.
+    DataError
+        No such folder, an empty one, one that another reader fits, or recordings that cannot be used.
+    """
+    steps, policy = parse_steps(prepare), parse_on_nan(on_nan)
+    if reader is not None and reader not in READERS:
+        raise ConfigError(f"data.reader should be one of {', '.join(READERS)}, found {reader!r}; correct it.")
+    chosen = _fitting(reader, Path(source), mapping is not None)
+    if chosen == "csv":
+        if mapping is None:
+            raise ConfigError(f"Reading {source} as csv needs a mapping of columns; give --mapping FILE or the table [data.csv].")
+        population = read_csv_folder(source, mapping, steps)
+    elif mapping is not None:
+        raise ConfigError(
+            f"Reading {source} as {chosen}: a CSV mapping is given, which only the reader 'csv' uses; remove it or set "
+            'data.reader = "csv".'
+        )
+    else:
+        population = read_parquet(source, steps) if chosen == "parquet" else read_motor_drive_raw(source, steps)
+    return population if policy is OnNan.ERROR else scan_population(population, on_nan=policy)
+
+
+def _fitting(reader: str | None, source: Path, with_mapping: bool) -> str:
+    """Return the reader to use, after checking that the folder fits it."""
+    if not source.exists():
+        raise DataError(f"Reading {source}: there is no such folder; check data.source (relative to the study file).")
+    if not source.is_dir():
+        raise DataError(f"Reading {source}: this is a file, and recordings are a folder; give the folder that holds it.")
+    if not any(source.iterdir()):
+        raise DataError(f"Reading {source}: the folder is empty; check data.source or record something.")
+    if reader == "csv" or (reader is None and with_mapping):
+        return "csv"  # a mapping may describe any layout
+    found = detect_reader(source)
+    if found is None:
+        raise DataError(
+            f"Reading {source}: no reader fits; it has neither population.json, nor 'population' and 'outliers', nor CSV "
+            "files; check data.source."
+        )
+    if reader not in (None, found):
+        raise DataError(
+            f"Reading {source} as {reader}: the folder {LOOKS[found]}, so it looks like {found}; set data.reader = "
+            f'"{found}", or check data.source.'
+        )
+    return found

@@ -1,0 +1,150 @@
+"""A folder of CSV files, described by a mapping."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import DataError
+from ..csvfile import Dialect, first_fields, read_columns
+from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Unit
+from ..prepare import Recorded, assemble
+from ..recording import Recording
+from ..steps import Step
+from .csv_mapping import Column, CsvMapping, UnitMapping, load_mapping
+
+ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz")
+DEFAULT_UNIT = "unit"
+DEFAULT_EPISODE = "0"
+
+
+@dataclass(frozen=True)
+class FilePlace:
+    """Where an episode is: a file, the names of its columns, and those wanted (time first, where there is one)."""
+
+    path: str
+    names: tuple[str, ...]
+    wanted: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class CsvRecordings:
+    """Reads one file at a time."""
+
+    places: Mapping[EpisodeKey, FilePlace]
+    dialect: Dialect
+    time_scale: float | None  # None: no column of time
+
+    def __call__(self, key: EpisodeKey) -> Recording:
+        """Return one episode as recorded."""
+        place = self.places[key]
+        columns = read_columns(Path(place.path), place.names, place.wanted, self.dialect)
+        if self.time_scale is None:
+            return Recording(key, np.ascontiguousarray(columns.T))
+        return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0] * self.time_scale)
+
+    def restricted(self, keys: Iterable[EpisodeKey]) -> CsvRecordings:
+        """Return the same for fewer episodes, cheaper to send to another process."""
+        return replace(self, places={key: self.places[key] for key in keys})
+
+
+def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str, prepare: Iterable[Step] = ()) -> Population:
+    """Read a folder of CSV files (also gzip-compressed).
+
+    Parameters
+    ----------
+    source : Path
+    mapping : CsvMapping, mapping or Path
+        See `CsvMapping`; a path names a TOML file.
+    prepare : iterable of Step
+        Further steps, after those of the mapping.
+
+    Returns
+    -------
+    Population
+        Files are listed and their first lines read; samples are read on demand.
+
+    Raises
+    ------
+    ConfigError
+        A mapping that is not valid.
+    DataError
+        No file matches, a column is missing, or two files are the same episode.
+    """
+    chosen, source = load_mapping(mapping), Path(source)
+    dialect = Dialect(chosen.delimiter, chosen.header)
+    places: dict[EpisodeKey, FilePlace] = {}
+    groups: dict[str, str] = {}
+    for path, match in _matches(source, chosen):
+        fields = first_fields(path, dialect)
+        found = match.groupdict()
+        for unit in chosen.units:
+            key = EpisodeKey(
+                f"{found.get('unit') or DEFAULT_UNIT}{unit.suffix}",
+                found.get("condition") or DEFAULT_CONDITION,
+                found.get("episode") or DEFAULT_EPISODE,
+            )
+            if key in places:
+                raise DataError(
+                    f"Duplicate episodes: {key} is in {places[key].path} and in {path}; name more groups in files, or exclude one."
+                )
+            places[key] = _place(path, fields, chosen, unit)
+            group = found.get("group") or ""
+            if groups.setdefault(key.unit, group) != group:
+                raise DataError(f"Unit {key.unit} is in both groups {groups[key.unit]!r} and {group!r} ({path}); a unit has one group.")
+    if not places:
+        raise DataError(f"Reading {source} as csv: no file matches files = {chosen.files!r}{_sample(source)}; correct the expression.")
+    recordings = CsvRecordings(places, dialect, None if chosen.time is None else chosen.time_scale)
+    units = [Unit(unit, group) for unit, group in groups.items()]
+    recorded = Recorded(chosen.channels, units, list(places), recordings, chosen.sample_period_s, chosen.metadata, chosen.time_tolerance)
+    return assemble(recorded, (*chosen.steps, *prepare))
+
+
+def csv_files(source: Path) -> Iterator[tuple[Path, str]]:
+    """Yield the text tables below a folder with their relative paths, in order."""
+    for folder, folders, names in os.walk(source):
+        folders[:] = sorted(f for f in folders if not f.startswith("."))
+        for name in sorted(names):
+            if name.endswith(ENDINGS) and not name.startswith("."):
+                path = Path(folder) / name
+                yield path, path.relative_to(source).as_posix()
+
+
+def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match[str]]]:
+    for path, relative in csv_files(source):
+        match = re.search(mapping.files, relative)
+        if match and not (mapping.exclude and re.search(mapping.exclude, relative)):
+            yield path, match
+
+
+def _sample(source: Path) -> str:
+    files = [relative for _, relative in csv_files(source)]
+    return (
+        f" of {len(files)} files such as {files[0]!r}"
+        if files
+        else f"; there is no file that ends in {', '.join(ENDINGS[:4])} (or with .gz)"
+    )
+
+
+def _place(path: Path, fields: list[str], mapping: CsvMapping, unit: UnitMapping) -> FilePlace:
+    numbered = tuple(f"column {i}" for i in range(1, len(fields) + 1))
+    wanted: list[Column | None] = [mapping.time] if mapping.time is not None else []
+    wanted += [mapping.column(channel, unit) for channel in mapping.ordered]
+    return FilePlace(str(path), numbered, tuple(numbered[_position(path, fields, column)] for column in wanted))
+
+
+def _position(path: Path, fields: list[str], column: Column | None) -> int:
+    if isinstance(column, int):
+        if column > len(fields):
+            raise DataError(f"Reading {path}: column {column} is asked for, found {len(fields)} columns; correct the mapping or the file.")
+        return column - 1
+    if fields.count(str(column)) != 1:
+        problem = "is missing" if column not in fields else f"occurs {fields.count(str(column))} times"
+        raise DataError(f"Reading {path}: column {column!r} {problem}, found {fields}; correct the mapping or the file.")
+    return fields.index(str(column))

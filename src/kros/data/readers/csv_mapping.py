@@ -1,0 +1,194 @@
+"""How a folder of CSV files maps to a population: the keys of a mapping file and of ``[data.csv]`` in a study."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import ConfigError
+from ..population import Channel, Role
+from ..recording import TIME_TOLERANCE
+from ..steps import Scale, Step, parse_steps
+from ..tables import build
+
+Column = str | int  # a name in the header, or a number counted from 1
+GROUPS = ("unit", "condition", "episode", "group")
+
+
+@dataclass(frozen=True)
+class ChannelMapping:
+    """``[[channel]]``: a channel and the column it is read from.
+
+    Parameters
+    ----------
+    name : str
+    role : Role
+    column : str or int, optional
+        Name in the header or number from 1; may be left out where every ``[[unit]]`` gives its own.
+    measured : bool
+    unit : str
+        Unit of measure after scaling.
+    scale : float
+        Factor from the column to the channel.
+    """
+
+    name: str
+    role: Role
+    column: Column | None = None
+    measured: bool = False
+    unit: str = ""
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class UnitMapping:
+    """``[[unit]]``: one of several units in the same file.
+
+    Parameters
+    ----------
+    suffix : str
+        Appended to the unit's id from the path.
+    columns : mapping
+        Column by name of channel; other channels keep the column of their ``[[channel]]``.
+    """
+
+    suffix: str = ""
+    columns: Mapping[str, Column] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CsvMapping:
+    r"""How a folder of CSV files maps to a population.
+
+    Parameters
+    ----------
+    files : str
+        Regular expression searched in the path relative to the folder (with ``/``); named groups `unit`, `condition`, `episode` and `group`
+        say what a file is. A missing group gets a default. Files that do not match are left alone.
+    channel : tuple of ChannelMapping
+    time : str or int, optional
+        Column of time.
+    unit : tuple of UnitMapping
+        Where one file holds several units.
+    time_scale : float
+        Factor from the column of time to seconds.
+    time_tolerance : float
+        Largest deviation of one time step, in sampling periods.
+    sample_period_s : float, optional
+        In place of a column of time.
+    exclude : str, optional
+        Regular expression; paths in which it is found are left out.
+    delimiter : str
+    header : bool
+        False where the first line holds numbers already; columns are then given by number.
+    prepare : tuple of mapping
+        Preparation steps of this mapping.
+    metadata : mapping
+        Facts about the batch, for example ``{plant = "harmonic-drive", gear_ratio = 100}``.
+    """
+
+    files: str
+    channel: tuple[ChannelMapping, ...]
+    time: Column | None = None
+    unit: tuple[UnitMapping, ...] = ()
+    time_scale: float = 1.0
+    time_tolerance: float = TIME_TOLERANCE
+    sample_period_s: float | None = None
+    exclude: str | None = None
+    delimiter: str = ","
+    header: bool = True
+    prepare: tuple[Mapping[str, Any], ...] = ()
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check what a type cannot say."""
+        if (self.time is None) == (self.sample_period_s is None):
+            raise ConfigError(
+                f"CSV mapping: give one of time and sample_period_s, found time = {self.time!r}, sample_period_s = "
+                f"{self.sample_period_s!r}."
+            )
+        if len(self.delimiter) != 1:
+            raise ConfigError(f"CSV mapping: delimiter should be one character, found {self.delimiter!r}; correct it.")
+        if not self.channel:
+            raise ConfigError("CSV mapping: there is no [[channel]]; declare each channel with name, column and role.")
+        self._check_pattern("files")
+        self._check_pattern("exclude")
+        self._check_columns()
+
+    def _check_pattern(self, name: str) -> None:
+        try:
+            found = re.compile(getattr(self, name) or "").groupindex
+        except re.error as error:
+            raise ConfigError(
+                f"CSV mapping: {name} = {getattr(self, name)!r} is not a regular expression ({error}); correct it."
+            ) from error
+        unknown = sorted(set(found) - set(GROUPS))
+        if unknown:
+            raise ConfigError(f"CSV mapping: {name} names the group {unknown[0]!r}; known groups are {', '.join(GROUPS)}.")
+
+    def _check_columns(self) -> None:
+        names = [c.name for c in self.channel]
+        for unit in self.units:
+            unknown = sorted(set(unit.columns) - set(names))
+            if unknown:
+                raise ConfigError(f"CSV mapping: [[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}; the channels are {names}.")
+            for channel in self.channel:
+                if self.column(channel, unit) is None:
+                    raise ConfigError(
+                        f"CSV mapping: channel {channel.name!r} has no column, neither its own nor in [[unit]] {unit.suffix!r}; add one."
+                    )
+        used = [self.time, *(c.column for c in self.channel), *(c for u in self.unit for c in u.columns.values())]
+        for column in used:
+            if isinstance(column, int) and column < 1:
+                raise ConfigError(f"CSV mapping: columns are numbered from 1, found {column}; correct it.")
+            if isinstance(column, str) and not self.header:
+                raise ConfigError(
+                    f"CSV mapping: header = false leaves columns without names, found {column!r}; give its number, counted from 1."
+                )
+
+    @property
+    def units(self) -> tuple[UnitMapping, ...]:
+        """The units of one file; one without a suffix where none is declared."""
+        return self.unit or (UnitMapping(),)
+
+    @property
+    def ordered(self) -> tuple[ChannelMapping, ...]:
+        """Channels, states before inputs."""
+        return tuple(sorted(self.channel, key=lambda c: c.role is Role.INPUT))
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """The population's channels."""
+        return tuple(Channel(c.name, c.role, c.unit, c.measured) for c in self.ordered)
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """Scaling as declared per channel, then the mapping's own steps."""
+        return (*(Scale((c.name,), c.scale) for c in self.ordered if c.scale != 1), *parse_steps(self.prepare, "CSV mapping: prepare"))
+
+    def column(self, channel: ChannelMapping, unit: UnitMapping) -> Column | None:
+        """Return where a channel of a unit is read from."""
+        return unit.columns.get(channel.name, channel.column)
+
+
+def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMapping:
+    """Return a mapping from a TOML file or a table with the same keys.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if isinstance(mapping, CsvMapping):
+        return mapping
+    if isinstance(mapping, Mapping):
+        return build(CsvMapping, mapping, "CSV mapping")
+    try:
+        return build(CsvMapping, tomllib.loads(Path(mapping).read_text(encoding="utf-8")), f"CSV mapping {mapping}")
+    except OSError as error:
+        raise ConfigError(f"CSV mapping {mapping}: cannot be read ({error}); give the path of a TOML file.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"CSV mapping {mapping}: not valid TOML ({error}); correct it.") from error

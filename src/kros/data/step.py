@@ -1,0 +1,38 @@
+"""What every preparation step is: facts about what it leaves, and its application to one recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ..core.errors import ConfigError
+from .population import Channel
+from .recording import Recording
+
+
+@dataclass(frozen=True)
+class Step:
+    """Base of all steps; `step` is the word that selects one in TOML."""
+
+    step: ClassVar[str] = ""
+
+    def channels_after(self, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
+        """Return the channels as this step leaves them."""
+        return channels
+
+    def period_after(self, period_s: float) -> float:
+        """Return the sampling period as this step leaves it, s."""
+        return period_s
+
+    def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
+        """Return the prepared recording; `channels` and `period_s` describe the one given."""
+        raise NotImplementedError
+
+    def columns(self, names: Sequence[str], channels: tuple[Channel, ...]) -> list[int]:
+        """Return the columns of named channels, or say which name is unknown."""
+        known = [c.name for c in channels]
+        for name in names:
+            if name not in known:
+                raise ConfigError(f"Step {self.step!r} asks for channel {name!r}; there are {known}; correct the name.")
+        return [known.index(name) for name in names]

@@ -1,0 +1,60 @@
+"""Synthesis: from an uncertain model to a verified correction filter.
+
+    UncertainModel --> ObserverProblem --> h2 | mixed | worst_case_h2 | kalman --> Synthesis
+
+Nothing leaves this layer unverified: norms and stability are recomputed by `kros.core`, failure is a `SynthesisError` that says why.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .generalized_plant import GeneralizedPlant
+    from .h2_optimal import h2
+    from .constant_gain import kalman, luenberger
+    from .mixed_lmi import mixed
+    from .observer_problem import ObserverProblem
+    from .result import Injection, Status, Synthesis
+    from .worst_case import worst_case_h2
+
+_HOME = {
+    "GeneralizedPlant": "generalized_plant",
+    "Injection": "result",
+    "ObserverProblem": "observer_problem",
+    "Status": "result",
+    "Synthesis": "result",
+    "h2": "h2_optimal",
+    "kalman": "constant_gain",
+    "luenberger": "constant_gain",
+    "mixed": "mixed_lmi",
+    "worst_case_h2": "worst_case",
+}
+
+__all__ = [
+    "GeneralizedPlant",
+    "Injection",
+    "ObserverProblem",
+    "Status",
+    "Synthesis",
+    "h2",
+    "kalman",
+    "luenberger",
+    "mixed",
+    "worst_case_h2",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the module behind a public name when it is first asked for."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f".{_HOME[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,142 @@
+"""The assumptions of H2 and H-infinity synthesis, each with its label and what to do when it fails.
+
+The labels follow Zhou, Doyle and Glover, *Robust and Optimal Control*, section 14.5 (continuous time) and 21.7 (discrete time).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import SynthesisError
+from .generalized_plant import GeneralizedPlant
+
+Array = npt.NDArray[Any]
+
+_RANK = 1e-10
+
+
+class Assumption(str, Enum):
+    """What the Riccati solution needs.
+
+    STABILISABLE
+        A1a: (A, B2) stabilisable; otherwise an unstable weight or mode is beyond the controller's reach. Make weights stable.
+    DETECTABLE
+        A1b: (C2, A) detectable; otherwise an unstable mode is invisible in y. Measure more, or make weights stable.
+    CONTROL_PENALTY
+        A2a: D12 has full column rank; every control must cost something. Add a small correction penalty to z.
+    MEASUREMENT_NOISE
+        A2b: D21 has full row rank; every measurement must carry noise. Add measurement noise to w.
+    NO_ZERO_CONTROL
+        A3: (A, B2, C1, D12) has no invariant zero on the unit circle (imaginary axis). Make weights stable and penalise more outputs.
+    NO_ZERO_MEASUREMENT
+        A4: (A, B1, C2, D21) has no invariant zero on the unit circle (imaginary axis). Make weights stable and add process noise.
+    PROPER
+        D11 = 0 in continuous time; otherwise the H2 norm is infinite. Use a strictly proper weight on w or on z.
+    """
+
+    STABILISABLE = "A1a: (A, B2) stabilisable"
+    DETECTABLE = "A1b: (C2, A) detectable"
+    CONTROL_PENALTY = "A2a: D12 of full column rank"
+    MEASUREMENT_NOISE = "A2b: D21 of full row rank"
+    NO_ZERO_CONTROL = "A3: no zero of (A, B2, C1, D12) on the stability boundary"
+    NO_ZERO_MEASUREMENT = "A4: no zero of (A, B1, C2, D21) on the stability boundary"
+    PROPER = "D11 = 0 in continuous time"
+
+
+_REMEDY = {
+    Assumption.STABILISABLE: "make the weights stable or let the control reach this mode",
+    Assumption.DETECTABLE: "make the weights stable or measure this mode",
+    Assumption.CONTROL_PENALTY: "add a small correction penalty to z",
+    Assumption.MEASUREMENT_NOISE: "add measurement noise to w",
+    Assumption.NO_ZERO_CONTROL: "make the weights stable, or penalise more outputs",
+    Assumption.NO_ZERO_MEASUREMENT: "make the weights stable, or add process noise",
+    Assumption.PROPER: "use a strictly proper weight",
+}
+
+
+@dataclass(frozen=True)
+class Violation:
+    """An assumption that fails, and what was found."""
+
+    assumption: Assumption
+    found: str
+
+    def __str__(self) -> str:
+        return f"{self.assumption.value} ({self.found}): {_REMEDY[self.assumption]}"
+
+
+def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
+    """Return the eigenvalues of A on or beyond the stability boundary that B does not reach (Hautus test)."""
+    modes = np.linalg.eigvals(A) if A.size else np.zeros(0)
+    outside = modes[np.abs(modes) >= 1 - 1e-12] if dt > 0 else modes[modes.real >= -1e-12 * (1 + np.abs(modes))]
+    found = []
+    for mode in outside:
+        pencil = np.hstack([A - mode * np.eye(len(A)), B])
+        values = np.linalg.svd(pencil, compute_uv=False)
+        if values[-1] <= 1e-9 * max(values[0], 1e-300):
+            found.append(complex(mode))
+    return found
+
+
+def h2_violations(plant: GeneralizedPlant) -> list[Violation]:
+    """Check every assumption of H2 synthesis and return those that fail.
+
+    Parameters
+    ----------
+    plant : GeneralizedPlant
+
+    Returns
+    -------
+    list of Violation
+    """
+    found = []
+    for mode in unreachable_modes(plant.A, plant.B2, plant.dt)[:1]:
+        found.append(Violation(Assumption.STABILISABLE, f"mode {mode:.6g}"))
+    for mode in unreachable_modes(plant.A.T, plant.C2.T, plant.dt)[:1]:
+        found.append(Violation(Assumption.DETECTABLE, f"mode {mode:.6g}"))
+    n, _, n_u, _, n_y = plant.sizes
+    rank12, rank21 = _rank(plant.D12), _rank(plant.D21)
+    if rank12 < n_u:
+        found.append(Violation(Assumption.CONTROL_PENALTY, f"rank {rank12}, {n_u} controls"))
+    if rank21 < n_y:
+        found.append(Violation(Assumption.MEASUREMENT_NOISE, f"rank {rank21}, {n_y} measurements"))
+    if plant.dt == 0 and np.any(plant.D11):
+        found.append(Violation(Assumption.PROPER, f"largest entry {np.abs(plant.D11).max():.3g}"))
+    if not found and n:
+        for zero in _boundary_zeros(plant.A, plant.B2, plant.C1, plant.D12, plant.dt)[:1]:
+            found.append(Violation(Assumption.NO_ZERO_CONTROL, f"zero {zero:.6g}"))
+        for zero in _boundary_zeros(plant.A.T, plant.C2.T, plant.B1.T, plant.D21.T, plant.dt)[:1]:
+            found.append(Violation(Assumption.NO_ZERO_MEASUREMENT, f"zero {zero:.6g}"))
+    return found
+
+
+def require(plant: GeneralizedPlant, method: str) -> None:
+    """Raise a `SynthesisError` that names every violated assumption."""
+    found = h2_violations(plant)
+    if found:
+        raise SynthesisError(f"{method} needs a regular generalized plant; violated: " + "; ".join(map(str, found)) + ".")
+
+
+def _rank(matrix: Array) -> int:
+    values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.zeros(0)
+    return int(np.sum(values > _RANK * max(values.max(initial=0.0), 1e-300)))
+
+
+def _boundary_zeros(A: Array, B: Array, C: Array, D: Array, dt: float) -> list[complex]:
+    """Invariant zeros on the stability boundary; D has full column rank, so zeros are eigenvalues of A - B D^+ C seen by the rest of C."""
+    pinv = np.linalg.pinv(D)
+    inner = A - B @ pinv @ C
+    rest = C - D @ (pinv @ C)
+    zeros = []
+    for mode in np.linalg.eigvals(inner):
+        distance = abs(abs(mode) - 1) if dt > 0 else abs(mode.real) / (1 + abs(mode))
+        if distance < 1e-12:
+            values = np.linalg.svd(np.vstack([inner - mode * np.eye(len(A)), rest]), compute_uv=False)
+            if values[-1] <= 1e-10 * values[0]:
+                zeros.append(complex(mode))
+    return zeros

@@ -1,0 +1,117 @@
+r"""The uncertain set per frequency: a matrix ball, its worst element and its average.
+
+Derivation. With ``N = W_R W_L`` and ``||N|| < 1``, let ``X = Delta (I - N Delta)^-1``, so that ``Delta = (I + X N)^-1 X`` and
+
+    ||Delta|| <= 1  <=>  X^H X <= (I + N X)^H (I + N X)  <=>  X^H Q X - X^H N^H - N X <= I,     Q = I - N^H N > 0.
+
+Completing the square with ``X_c = Q^-1 N^H = N^H (I - N N^H)^-1`` gives ``(X - X_c)^H Q (X - X_c) <= I + N Q^-1 N^H = (I - N N^H)^-1``:
+
+    { Delta (I - N Delta)^-1 : ||Delta|| <= 1 } = { X_c + R_l Theta R_r : ||Theta|| <= 1 },
+    R_l = (I - N^H N)^(-1/2),   R_r = (I - N N^H)^(-1/2).
+
+*Upper bound.* For a row block T and a column block M, ``||T X M||_F <= ||T X_c M||_F + ||T R_l Theta R_r M||_F``. By von Neumann's trace
+inequality ``||P Theta Q||_F^2 = tr(P^H P  Theta Q Q^H Theta^H) <= sum_i s_i(P)^2 s_i(Theta Q)^2 <= sum_i s_i(P)^2 s_i(Q)^2``, hence
+
+    ||T X M||_F <= ||T X_c M||_F + (sum_i s_i(T R_l)^2 s_i(R_r M)^2)^(1/2).
+
+*Lower bound.* The worst case is at least any average over the set. Theta uniform on the unitary matrices has mean zero and
+``E[Theta Q Q^H Theta^H] = I ||Q||_F^2 / m``, so for every T
+
+    max_X ||T X M||_F^2 >= tr T (X_c M M^H X_c^H + R_l R_l^H ||R_r M||_F^2 / m) T^H.
+
+If N and M are diagonal the set does not change under ``X -> V X V^H`` with V a diagonal matrix of signs, and averaging over V removes the
+off-diagonal entries of ``X M M^H X^H``. So *the diagonal of the spectrum of any element* gives a lower bound as well, and because the
+observer's error is linear in the spectrum, so does every convex combination of such spectra.
+
+Symbols
+-------
+N, M, X_c, R_l, R_r : as above, shape (f, m, m) over f frequencies;  T : error per unit disturbance, shape (f, p, m)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Ball:
+    """The set ``{X_c + R_l Theta R_r}`` over frequency, with the right factor M already multiplied in.
+
+    Parameters
+    ----------
+    center : ndarray, shape (f, m, m)
+        ``X_c M``.
+    left : ndarray, shape (f, m, m)
+        ``R_l``.
+    right : ndarray, shape (f, m, m)
+        ``R_r M``.
+    """
+
+    center: Array
+    left: Array
+    right: Array
+
+    @classmethod
+    def of(cls, N: Array, M: Array) -> Ball:
+        """Build the ball of ``Delta (I - N Delta)^-1 M`` from the loop N and the right factor M, both (f, m, m)."""
+        U, s, Vh = np.linalg.svd(N)
+        radius = 1 / np.sqrt(1 - s**2)
+        V, Uh = _hermitian(Vh), _hermitian(U)
+        X_c = (V * (s * radius**2)[..., None, :]) @ Uh
+        return cls(X_c @ M, (V * radius[..., None, :]) @ Vh, (U * radius[..., None, :]) @ Uh @ M)
+
+    def bound(self, T: Array) -> Array:
+        """Upper bound of ``||T X M||_F`` over the set, shape (f,)."""
+        inner = np.linalg.norm(T @ self.center, axis=(-2, -1))
+        return inner + spread(T @ self.left, self.right)
+
+    def average(self) -> Array:
+        """Diagonal of the average spectrum, shape (f, m)."""
+        m = self.right.shape[-2]
+        energy = np.sum(np.abs(self.right) ** 2, axis=(-2, -1)) / m
+        return np.sum(np.abs(self.center) ** 2, axis=-1) + energy[..., None] * np.sum(np.abs(self.left) ** 2, axis=-1)
+
+    def worst_spectrum(self, T: Array, iterations: int = 15) -> Array:
+        """Diagonal of the spectrum of an element that is (locally) worst for T, shape (f, m).
+
+        The squared error is convex in Theta, so its linearisation is a minorant, and moving to the maximiser of the linearisation, the
+        polar factor of the gradient, never decreases it.
+        """
+        P = T @ self.left
+        _, _, Vh_p = np.linalg.svd(P)
+        U_q, _, _ = np.linalg.svd(self.right)
+        best, best_value = None, None
+        for theta in (_hermitian(Vh_p) @ _hermitian(U_q), _polar(_hermitian(P) @ (T @ self.center) @ _hermitian(self.right))):
+            for _ in range(iterations):
+                error = T @ self.center + P @ theta @ self.right
+                theta = _polar(_hermitian(P) @ error @ _hermitian(self.right))
+            element = self.center + self.left @ theta @ self.right
+            value = np.linalg.norm(T @ element, axis=(-2, -1))
+            if best is None:
+                best, best_value = element, value
+            else:
+                best = np.where((value > best_value)[..., None, None], element, best)
+        assert best is not None
+        return np.sum(np.abs(best) ** 2, axis=-1)
+
+
+def spread(P: Array, Q: Array) -> Array:
+    """Largest ``||P Theta Q||_F`` over contractions, ``(sum_i s_i(P)^2 s_i(Q)^2)^(1/2)``, shape (f,)."""
+    s, t = np.linalg.svd(P, compute_uv=False), np.linalg.svd(Q, compute_uv=False)
+    k = min(s.shape[-1], t.shape[-1])
+    return np.sqrt(np.sum((s[..., :k] * t[..., :k]) ** 2, axis=-1))
+
+
+def _hermitian(matrix: Array) -> Array:
+    return np.conj(np.swapaxes(matrix, -1, -2))
+
+
+def _polar(matrix: Array) -> Array:
+    U, _, Vh = np.linalg.svd(matrix, full_matrices=False)
+    return U @ Vh

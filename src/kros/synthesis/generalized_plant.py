@@ -1,0 +1,151 @@
+r"""The generalized plant of Figure 1, and its closure with a controller.
+
+Symbols
+-------
+x : state, (n,);  w : disturbances, (n_w,);  u : control, (n_u,);  z : performance, (n_z,);  y : measurements, (n_y,)
+K : controller with matrices A^c, B^c, C^c, D^c
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DimensionError
+from ..core.lti import StateSpace
+
+Array = npt.NDArray[Any]
+
+_MATRICES = ("A", "B1", "B2", "C1", "C2", "D11", "D12", "D21", "D22")
+
+
+@dataclass(frozen=True, eq=False)
+class GeneralizedPlant:
+    r"""Plant with weights, before the controller is connected.
+
+    ::
+
+                 +-------------------------+
+        z <------| x+ = A x + B1 w  + B2 u |<------ w
+                 | z  = C1 x + D11 w + D12 u|
+            +----| y  = C2 x + D21 w + D22 u|<---+
+          y |    +-------------------------+    | u
+            |            +-----+                |
+            +----------->|  K  |----------------+      u = + K y
+                         +-----+
+
+    Parameters
+    ----------
+    A : ndarray, shape (n, n)
+    B1 : ndarray, shape (n, n_w)
+    B2 : ndarray, shape (n, n_u)
+    C1 : ndarray, shape (n_z, n)
+    C2 : ndarray, shape (n_y, n)
+    D11 : ndarray, shape (n_z, n_w)
+    D12 : ndarray, shape (n_z, n_u)
+    D21 : ndarray, shape (n_y, n_w)
+    D22 : ndarray, shape (n_y, n_u)
+    dt : float, s
+        Sampling period; 0 means continuous time.
+    n_w1 : int, optional
+        For `mixed`: the first `n_w1` disturbances are ``w1`` (performance), the others ``w2`` (uncertainty). Default all.
+    n_z1 : int, optional
+        For `mixed`: the first `n_z1` outputs are ``z1``, the others ``z2``. Default all.
+
+    Raises
+    ------
+    DimensionError
+        When shapes do not fit together, or a partition is out of range.
+    """
+
+    A: Array
+    B1: Array
+    B2: Array
+    C1: Array
+    C2: Array
+    D11: Array
+    D12: Array
+    D21: Array
+    D22: Array
+    dt: float
+    n_w1: int | None = None
+    n_z1: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in _MATRICES:
+            object.__setattr__(self, name, np.atleast_2d(np.asarray(getattr(self, name), dtype=float)))
+        n, n_w, n_u, n_z, n_y = self.A.shape[-1], self.B1.shape[-1], self.B2.shape[-1], self.C1.shape[0], self.C2.shape[0]
+        expected = {"A": (n, n), "B1": (n, n_w), "B2": (n, n_u), "C1": (n_z, n), "C2": (n_y, n)}
+        expected |= {"D11": (n_z, n_w), "D12": (n_z, n_u), "D21": (n_y, n_w), "D22": (n_y, n_u)}
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                found = {key: getattr(self, key).shape for key in _MATRICES}
+                raise DimensionError(f"Generalized plant: {name} should have shape {shape}, found {found}; transpose or pad the offending matrix.")
+        if not all(np.isfinite(getattr(self, name)).all() for name in _MATRICES):
+            raise DimensionError("Generalized plant: a matrix contains NaN or infinity; look at the weights that went into it.")
+        if self.dt < 0:
+            raise DimensionError(f"Generalized plant: sampling period {self.dt} s is negative; use 0 for continuous time.")
+        for name, part, whole in (("n_w1", self.n_w1, n_w), ("n_z1", self.n_z1, n_z)):
+            if part is not None and not 0 <= part <= whole:
+                raise DimensionError(f"Generalized plant: {name} = {part} should lie between 0 and {whole}.")
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int, int]:
+        """Sizes of x, w, u, z, y."""
+        return self.A.shape[0], self.B1.shape[1], self.B2.shape[1], self.C1.shape[0], self.C2.shape[0]
+
+    def rows(self, channel: int) -> slice:
+        """Rows of z that belong to channel 1 (performance) or 2 (uncertainty)."""
+        split = self.sizes[3] if self.n_z1 is None else self.n_z1
+        return slice(0, split) if channel == 1 else slice(split, None)
+
+    def columns(self, channel: int) -> slice:
+        """Columns of w that belong to channel 1 (performance) or 2 (uncertainty)."""
+        split = self.sizes[1] if self.n_w1 is None else self.n_w1
+        return slice(0, split) if channel == 1 else slice(split, None)
+
+    def channel(self, rows: slice, columns: slice) -> GeneralizedPlant:
+        """Return the plant restricted to some performance outputs and disturbances."""
+        D11 = self.D11[rows][:, columns]
+        return GeneralizedPlant(self.A, self.B1[:, columns], self.B2, self.C1[rows], self.C2, D11, self.D12[rows], self.D21[:, columns], self.D22, self.dt)
+
+    def open_loop(self) -> StateSpace:
+        """Return the plant as one system from (w, u) to (z, y)."""
+        D = np.block([[self.D11, self.D12], [self.D21, self.D22]])
+        return StateSpace(self.A, np.hstack([self.B1, self.B2]), np.vstack([self.C1, self.C2]), D, self.dt)
+
+    def close(self, controller: StateSpace) -> StateSpace:
+        r"""Lower linear fractional transformation: the system from w to z with ``u = K y``.
+
+        Parameters
+        ----------
+        controller : StateSpace
+            ``n_u`` outputs, ``n_y`` inputs, the plant's sampling period.
+
+        Raises
+        ------
+        DimensionError
+            When sizes or sampling periods differ, or the loop is not well posed (``I - D22 D^c`` singular).
+        """
+        K = controller
+        _, _, n_u, _, n_y = self.sizes
+        if (K.n_outputs, K.n_inputs) != (n_u, n_y) or K.dt != self.dt or K.batch_shape:
+            raise DimensionError(
+                f"Closing the loop: the controller should be {n_u} x {n_y} at {self.dt} s, found {K.n_outputs} x {K.n_inputs} at {K.dt} s; "
+                "match the sizes and resample one of them."
+            )
+        loop = np.eye(n_y) - self.D22 @ K.D
+        if np.linalg.cond(loop) > 1e14:
+            raise DimensionError("Closing the loop: I - D22 D^c is singular, so the algebraic loop has no solution; use a strictly proper controller.")
+        # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y
+        solved = np.linalg.solve(loop, np.hstack([self.C2, self.D22 @ K.C, self.D21]))
+        y_x, y_w = solved[:, : self.A.shape[0] + K.n_states], solved[:, self.A.shape[0] + K.n_states :]
+        u_x = K.D @ y_x + np.hstack([np.zeros((n_u, self.A.shape[0])), K.C])
+        u_w = K.D @ y_w
+        A = np.vstack([np.hstack([self.A, np.zeros((self.A.shape[0], K.n_states))]) + self.B2 @ u_x, K.B @ y_x])
+        A[self.A.shape[0] :, self.A.shape[0] :] += K.A
+        C = np.hstack([self.C1, np.zeros((self.C1.shape[0], K.n_states))]) + self.D12 @ u_x
+        return StateSpace(A, np.vstack([self.B1 + self.B2 @ u_w, K.B @ y_w]), C, self.D11 + self.D12 @ u_w, self.dt)

@@ -1,0 +1,109 @@
+"""What a synthesis returns: the correction filter K, what happened, and the numbers that were recomputed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+from ..core.artifacts import load_artifact, save_artifact
+from ..core.lti import StateSpace
+
+
+class Injection(str, Enum):
+    """Where the correction enters the observer.
+
+    INPUT
+        ``x_hat+ = A x_hat + B (u + K (y - C x_hat))``, as in the paper (20).
+    STATE
+        ``x_hat+ = A x_hat + B u + K (y - C x_hat)``.
+    NONE
+        The controller belongs to a general plant, not to an observer.
+    """
+
+    INPUT = "input"
+    STATE = "state"
+    NONE = "none"
+
+
+class Status(str, Enum):
+    """What happened, and what to change.
+
+    OPTIMAL
+        The optimum of the stated problem, verified: norms recomputed, loop stable.
+    CERTIFIED
+        Verified and its guarantee recomputed; the distance to the optimum is at most `gap_percent` (where it is known).
+        To narrow it raise the order of the weights or the number of refinements.
+    INACCURATE
+        The solver stopped early (time limit, or reduced accuracy), but what it returned passed the same verification.
+        Raise the time limit, or add measurement noise and penalty, to come closer to the optimum.
+    """
+
+    OPTIMAL = "optimal"
+    CERTIFIED = "certified"
+    INACCURATE = "inaccurate"
+
+
+@dataclass(frozen=True, eq=False)
+class Synthesis:
+    """A verified correction filter and its certificate.
+
+    Parameters
+    ----------
+    method : str
+        Name of the method, for example ``worst_case_h2``.
+    controller : StateSpace
+        The filter K, ``u = K y`` (positive feedback); for observers ``y`` is the innovation ``y - C x_hat``.
+    status : Status
+    injection : Injection
+    h2_norm : float or None
+        H2 norm of the closed loop from w (or w1) to z (or z1), recomputed.
+    hinf_norm : float or None
+        H-infinity norm of the closed loop from w (or w2) to z (or z2), recomputed.
+    worst_case_h2 : float or None
+        Certified H2 norm for every member of the uncertain set.
+    lower_bound : float or None
+        No controller of this kind does better.
+    gap_percent : float or None
+        ``100 (value / lower_bound - 1)``.
+    quadrature_error : float or None
+        Estimated error of `worst_case_h2`, already included in it.
+    spectral_radius : float or None
+        Of the nominal closed loop (for continuous systems the largest real part). It says nothing about robustness.
+    solve_s : float
+        Time of the numerical solution, without the fitting of weights.
+    solver : str
+    notes : tuple of str
+    """
+
+    method: str
+    controller: StateSpace
+    status: Status
+    injection: Injection = Injection.NONE
+    h2_norm: float | None = None
+    hinf_norm: float | None = None
+    worst_case_h2: float | None = None
+    lower_bound: float | None = None
+    gap_percent: float | None = None
+    quadrature_error: float | None = None
+    spectral_radius: float | None = None
+    solve_s: float = 0.0
+    solver: str = ""
+    notes: tuple[str, ...] = ()
+
+    def save(self, folder: Path) -> None:
+        """Write `synthesis.json` and `arrays.npz`."""
+        content = {name: getattr(self, name) for name in _PLAIN}
+        arrays = {name: getattr(self.controller, name) for name in "ABCD"}
+        save_artifact(Path(folder), "synthesis", {**content, "dt": self.controller.dt}, arrays)
+
+    @classmethod
+    def load(cls, folder: Path) -> Synthesis:
+        """Read what `save` wrote."""
+        content, arrays = load_artifact(Path(folder), "synthesis")
+        values = {name: content[name] for name in _PLAIN}
+        values |= {"status": Status(content["status"]), "injection": Injection(content["injection"]), "notes": tuple(content["notes"])}
+        return cls(controller=StateSpace(arrays["A"], arrays["B"], arrays["C"], arrays["D"], content["dt"]), **values)
+
+
+_PLAIN = tuple(name for name in Synthesis.__dataclass_fields__ if name != "controller")

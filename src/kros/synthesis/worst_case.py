@@ -2,7 +2,7 @@ r"""Worst-case H2 observers: filtering of a shaped disturbance, by one Riccati e
 
 K is outside the loop of the uncertainty, so the worst case over the set is a disturbance spectrum, and the best K for a given spectrum is a
 Kalman predictor (state injection) or an H2 controller (input injection). The game between K and the spectrum is solved by fictitious play:
-start from the average spectrum of the set, find the spectrum that is worst for the current K, average, repeat. Every iterate is certified
+start from the average spectrum of the set, find the spectrum that is worst for the resulting K, then for the next, and average these. Every iterate is certified
 independently, the best is kept; every averaged spectrum gives a lower bound, the best is kept.
 
 *State injection.* With ``d = C_d x_d + D_d nu``, ``x_d+ = A_d x_d + B_d nu`` the shaped input disturbance, and ``r`` the shaped remainder,
@@ -66,7 +66,7 @@ def worst_case_h2(
     order: int | None = None,
     max_order: int = 4,
     tolerance_db: float = 1.0,
-    refinements: int = 2,
+    refinements: int = 1,
     rtol: float = 1e-5,
     fit: Fit | None = None,
 ) -> Synthesis:
@@ -117,7 +117,7 @@ def worst_case_h2(
         if diagonal:
             lower = max(lower, lower_bound(problem, freqs, spectrum, shaping))
         if round_ < refinements:
-            spectrum = _mix(spectrum, worst_spectrum(problem, freqs, controller), 1 / (round_ + 2))
+            spectrum = _mix(spectrum, worst_spectrum(problem, freqs, controller), 1 / (round_ + 1))
     assert best is not None
     if diagonal:
         below = fit_spectrum(problem, freqs, spectrum, fit, "below", options)

@@ -1,0 +1,28 @@
+"""Settings of Sphinx; the documentation is built with warnings as errors (`make docs`)."""
+
+from importlib.metadata import version as installed
+
+project = "kros"
+author = "The kros developers"
+copyright = "2026, The kros developers"  # noqa: A001 - Sphinx's name
+release = version = installed("kros")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
+myst_enable_extensions = ["dollarmath", "deflist"]
+myst_heading_anchors = 3
+exclude_patterns = ["_build"]
+
+html_theme = "furo"
+html_title = f"kros {release}"
+
+# Docstrings: numpydoc, single backticks for code, annotations said once, in the list of parameters.
+default_role = "literal"
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+autodoc_class_signature = "separated"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+
+# The type of a parameter is prose, "ndarray, shape (n_samples, n_y), rad", of which Sphinx makes class names that nobody wrote.
+nitpick_ignore_regex = [("py:class", ".*")]

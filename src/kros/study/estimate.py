@@ -1,0 +1,129 @@
+"""The deployed observer on recordings, written as Parquet, one row group an episode."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import ConfigError, DataError
+from ..data import Population, open_population
+from ..data.population import EpisodeKey
+from ..evaluate import EpisodeBatch
+from ..identify import PhaseCalibration
+from ..observer import Observer, run_observer
+from .config import StudyConfig, validate_config
+from .pipeline import load_run
+from .stages.calibrate import segments_of
+from .store import Store
+
+_BATCH = 64
+
+
+def open_data(config: StudyConfig, data: Path) -> Population:
+    """Open a folder with the run's own reader, or what a TOML with ``[data]`` names."""
+    data = Path(data)
+    section = config.data
+    if data.is_file():
+        try:
+            raw = tomllib.loads(data.read_text(encoding="utf-8"))
+        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise ConfigError(f"DATA {data}: neither a folder of recordings nor a TOML file ({error}).") from error
+        section = validate_config({"data": raw.get("data", {})}, data.parent, str(data)).data
+    else:
+        section = section.model_copy(update={"source": data})
+    return open_population(section.reader, section.source, prepare=section.prepare, csv=section.csv)
+
+
+def check_channels(population: Population, observer: Observer) -> None:
+    """Refuse recordings whose channels or sampling period are not those of the run."""
+    expected, found = (observer.lifting.states, observer.inputs), (population.states, population.inputs)
+    if expected != found:
+        raise DataError(f"Channels: the run has states and inputs {expected}, the recordings {found}; read them the same way.")
+    if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=1e-6):
+        raise DataError(f"Sampling period: the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} s; declare a resample step.")
+
+
+def load_calibration(store: Store) -> PhaseCalibration | None:
+    """Return the run's calibration, where it has one."""
+    folder = store.path("calibration")
+    return PhaseCalibration.load(folder) if (folder / "calibration.json").exists() else None
+
+
+def unit_parameters(population: Population, calibration: PhaseCalibration | None, prefer: str) -> dict[str, dict[str, float]]:
+    """Return every unit's lifting parameters: from the run where it knows the unit, else calibrated on the recordings.
+
+    Parameters
+    ----------
+    prefer : str
+        Condition to calibrate on, where a unit has it.
+    """
+    parameters: dict[str, dict[str, float]] = {}
+    for unit in population.unit_ids:
+        if calibration is None:
+            parameters[unit] = {}
+        elif unit in calibration.units:
+            parameters[unit] = {calibration.spec.parameter: calibration.units[unit].phase_rad}
+        else:
+            keys = population.keys(unit, prefer) or population.keys(unit)
+            phase = calibration.calibrate(segments_of((population, keys, calibration.spec)), unit)
+            parameters[unit] = {calibration.spec.parameter: phase.phase_rad}
+    return parameters
+
+
+def estimate_recordings(run: Path, data: Path, out: Path) -> int:
+    """Write ``unit, condition, episode, k, <channel>_hat`` for every sample; return the number of episodes."""
+    config, store = load_run(run)
+    path = store.path("observers", "deployed.json")
+    if not path.exists():
+        raise ConfigError(f"Run {run}: has no deployed observer; run the study at least until synthesize.")
+    if out.exists():
+        raise ConfigError(f"Output {out}: exists; name a new file.")
+    observer = Observer.load(path)
+    population = open_data(config, data)
+    check_channels(population, observer)
+    facts = _identify_on(store)
+    units = unit_parameters(population, load_calibration(store), facts)
+    _write(out, population, observer, units)
+    return len(population.episodes)
+
+
+def _identify_on(store: Store) -> str:
+    from .context import Facts
+
+    return Facts.load(store.path("population")).identify_on
+
+
+def _write(out: Path, population: Population, observer: Observer, units: dict[str, dict[str, float]]) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    text = pa.dictionary(pa.int32(), pa.string())
+    names = [f"{s}_hat" for s in observer.lifting.states]
+    schema = pa.schema([("unit", text), ("condition", text), ("episode", text), ("k", pa.int64()), *((n, pa.float64()) for n in names)])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    temporary = out.with_name(f".{out.name}.partial")
+    try:
+        with parquet.ParquetWriter(temporary, schema) as writer:
+            for start in range(0, len(population.episodes), _BATCH):
+                keys = population.episodes[start : start + _BATCH]
+                batch = EpisodeBatch.read(population, keys)
+                values = batch.parameters(units) if observer.lifting.parameters else None
+                estimate = run_observer(observer, batch.states[..., list(observer.measured)], batch.inputs, values)
+                for i, key in enumerate(keys):
+                    table = _table(key, estimate[: batch.lengths[i], i], schema)
+                    writer.write_table(table, row_group_size=len(table))
+        temporary.replace(out)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _table(key: EpisodeKey, estimate: Any, schema: Any) -> Any:
+    import pyarrow as pa
+
+    zeros = pa.array(np.zeros(len(estimate), np.int32))
+    labels = [pa.DictionaryArray.from_arrays(zeros, pa.array([text])) for text in (key.unit, key.condition, key.episode)]
+    columns = [pa.array(np.ascontiguousarray(column)) for column in estimate.T]
+    return pa.Table.from_arrays([*labels, pa.array(np.arange(len(estimate))), *columns], schema=schema)

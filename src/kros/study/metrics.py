@@ -1,0 +1,141 @@
+"""`metrics.json`: the machine-readable result, a stable contract.
+
+What was not run is absent, what is unknown is null, nothing is invented.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..core.artifacts import load_artifact, plain, read_json
+from ..synthesis.result import Synthesis
+from ..uncertainty import UncertainModel
+from .config import Stage
+from .context import Context
+from .stages import calibrate
+
+
+def collect_metrics(context: Context, until: Stage, total_s: float | None) -> dict[str, Any]:
+    """Collect the metrics of all stages up to one."""
+    done = list(Stage)[: list(Stage).index(until) + 1]
+    metrics: dict[str, Any] = {"schema": 1, "study": _study(context, done), "timing_s": _timing(context, done, total_s)}
+    metrics["units"] = _units(context, done)
+    for stage, name, collect in _SECTIONS:
+        if stage in done:
+            metrics[name] = collect(context)
+    clean: dict[str, Any] = plain(metrics)
+    return clean
+
+
+def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
+    facts = context.facts
+    study: dict[str, Any] = {
+        "units": len(facts.pooled),
+        "conditions": context.population.conditions,
+        "identify_on": facts.identify_on,
+        "sample_period_s": context.population.sample_period_s,
+    }
+    if Stage.IDENTIFY in done:
+        study["alpha"] = context.models(context.model_names[0]).alpha
+    if Stage.SYNTHESIZE in done:
+        study["deployed"] = _observers_record(context)["deployed"]
+    return study
+
+
+def _timing(context: Context, done: list[Stage], total_s: float | None) -> dict[str, float]:
+    timing = {stage.value: record["seconds"] for stage in done if (record := context.store.record(stage)) is not None}
+    return timing | ({"total": total_s} if total_s is not None else {})
+
+
+def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
+    facts = context.facts
+    calibration = calibrate.load(context) if Stage.CALIBRATE in done else None
+    models = context.models(context.model_names[0]) if Stage.IDENTIFY in done else None
+    rows = []
+    for unit, group in facts.groups.items():
+        row: dict[str, Any] = {"unit": unit, "group": group}
+        status = "ok"
+        if calibration is not None:
+            phase = calibration.units.get(unit)
+            row |= {"phase_rad": phase.phase_rad if phase else None, "concentration": phase.concentration if phase else None}
+            status = status if phase else "not calibrated"
+        if models is not None and unit in models.unit_ids:
+            status = models.status[models.index(unit)]
+        rows.append(row | {"status": status})
+    return rows
+
+
+def _models(context: Context) -> dict[str, Any]:
+    return {name: {"order": m.lifting.n_lifted, "spectral_radius_max": _pooled_radius(context, name)} for name in context.model_names for m in [context.models(name)]}
+
+
+def _pooled_radius(context: Context, name: str) -> float:
+    models = context.models(name)
+    rows = [models.index(u) for u in context.facts.pooled if u in models.unit_ids]
+    return float(models.spectral_radius()[rows].max())
+
+
+def _uncertainty(context: Context) -> dict[str, Any]:
+    folder = context.store.path("uncertainty")
+    return {name: uncertainty_entry(UncertainModel.load(folder / name)) for name in context.model_names if (folder / name).exists()}
+
+
+def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
+    """Return the metrics of one uncertain model."""
+    weight = model.weight
+    entry: dict[str, Any] = {
+        "nominal": model.unit_ids[model.nominal],
+        "form": model.form,
+        "peak_db": model.peak_db,
+        "misfit_max": model.misfit_max,
+        "weight": {"structure": "diagonal", "orders": weight.orders, "cover_max": model.cover_max, "overbound_db_max": model.overbound_db_max},
+    }
+    return entry
+
+
+def _observers_record(context: Context) -> dict[str, Any]:
+    return load_artifact(context.store.path("observers"), "observers")[0]
+
+
+def _observers(context: Context) -> dict[str, Any]:
+    entries: dict[str, Any] = {}
+    record = _observers_record(context)
+    for name in record["names"]:
+        entry = dict(record["facts"][name])
+        folder = context.store.path("synthesis", name)
+        if folder.exists():
+            synthesis = Synthesis.load(folder)
+            entry |= {"status": synthesis.status, "solve_s": synthesis.solve_s}
+            entry |= {key: getattr(synthesis, key) for key in ("lower_bound", "gap_percent", "h2_norm", "hinf_norm")}
+        entries[name] = entry
+    return entries
+
+
+def _evaluation(context: Context) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = _evaluation_record(context)["rows"]
+    return rows
+
+
+def _evaluation_record(context: Context) -> dict[str, Any]:
+    return load_artifact(context.store.path("evaluation"), "evaluation")[0]
+
+
+def _outliers(context: Context) -> list[dict[str, Any]]:
+    path = context.store.path("outliers", "scores.json")
+    return [{k: row[k] for k in ("unit", "condition", "score", "outlier")} for row in read_json(path)["rows"]] if path.exists() else []
+
+
+def _free_run(context: Context) -> dict[str, Any]:
+    models = _models(context)
+    free = _evaluation_record(context)["free_run"]
+    return {name: entry | {"freerun_error_percent": free[name]} for name, entry in models.items()}
+
+
+_SECTIONS = (
+    (Stage.IDENTIFY, "models", _models),
+    (Stage.QUANTIFY, "uncertainty", _uncertainty),
+    (Stage.QUANTIFY, "outliers", _outliers),
+    (Stage.SYNTHESIZE, "observers", _observers),
+    (Stage.EVALUATE, "models", _free_run),
+    (Stage.EVALUATE, "evaluation", _evaluation),
+)

@@ -1,0 +1,125 @@
+"""Stage: read, prepare and check all recordings; what is not kros's own format yet is written to the run folder in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.artifacts import save_artifact
+from ...core.errors import DataError
+from ...data import EpisodeKey, Population, check_population, open_population, read_parquet, scan_population, split_episodes, write_group, write_index
+from ...data.population import DEFAULT_CONDITION
+from ...data.writers import GroupRecord
+from ..config import StudyConfig
+from ..context import Context
+
+PARQUET = "parquet"
+
+
+@dataclass(frozen=True)
+class GroupTask:
+    """One unit in one condition, for a worker; `folder` is None where the recordings stay where they are."""
+
+    population: Population
+    unit: str
+    condition: str
+    folder: Path | None
+    on_nan: str
+
+
+@dataclass(frozen=True)
+class GroupFacts:
+    """What a worker found in one unit and condition."""
+
+    unit: str
+    condition: str
+    record: GroupRecord | None
+    episodes: tuple[str, ...]
+    resolution: dict[str, float]
+
+
+def open_source(config: StudyConfig) -> Population:
+    """Open the study's recordings, lazily."""
+    data = config.data
+    return open_population(data.reader, data.source, prepare=data.prepare, csv=data.csv)
+
+
+def check_source(config: StudyConfig, single_allowed: bool) -> None:
+    """Refuse what can be refused from names alone, before anything is written."""
+    population = open_source(config)
+    check_population(population, allow_single=single_allowed)
+    split_episodes(population, config.split.test)
+    _identify_on(config, population)
+
+
+def read_group(task: GroupTask) -> GroupFacts:
+    """Read, check and, where asked, write one unit and condition."""
+    if task.folder is None:
+        population = scan_population(task.population.select([task.unit], [task.condition]), on_nan=task.on_nan)
+        episodes = tuple(k.episode for k in population.keys(task.unit, task.condition))
+        record = None
+    else:
+        record = write_group(task.population, task.unit, task.condition, task.folder, task.on_nan)
+        episodes, population = record.episodes, task.population
+    first = population.read(EpisodeKey(task.unit, task.condition, episodes[0]))
+    names = population.states + population.inputs
+    return GroupFacts(task.unit, task.condition, record, episodes, {m: resolution(first[:, names.index(m)]) for m in population.measured})
+
+
+def resolution(signal: npt.NDArray[np.float64]) -> float:
+    """Return the smallest step between samples, the quantisation of a digital sensor."""
+    steps = np.abs(np.diff(signal))
+    floor = 1e-9 * np.max(np.abs(signal))
+    return float(steps[steps > floor].min()) if np.any(steps > floor) else float(floor)
+
+
+def run(context: Context) -> list[Path]:
+    """Read everything once."""
+    config, population = context.config, open_source(context.config)
+    in_place = config.data.reader == PARQUET and not config.data.prepare
+    folder = None if in_place else context.store.path("recordings")
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    tasks = [GroupTask(population.select([u], [c]), u, c, folder, config.data.on_nan) for u, c, _ in population.groups()]
+    found = list(context.map("read", read_group, tasks))
+    files = []
+    if folder is not None:
+        records = [f.record for f in found if f.record is not None]
+        write_index(population, records, folder)
+        files = [folder / "population.json", *(folder / r.file for r in records)]
+        kept = read_parquet(folder)
+    else:
+        present = {(f.unit, f.condition, e) for f in found for e in f.episodes}
+        kept = population
+        if any((k.unit, k.condition, k.episode) not in present for k in population.episodes):
+            raise DataError("Dropping episodes needs a copy of the recordings; convert them first with on_nan = 'drop_episode'.")
+    save_facts(context, kept, found, population)
+    return [*files, context.store.path("population", "facts.json")]
+
+
+def save_facts(context: Context, kept: Population, found: list[GroupFacts], asked: Population) -> None:
+    """Write what all later stages need to know about the recordings."""
+    splits = split_episodes(kept, context.config.split.test)
+    steps = {m: min(f.resolution[m] for f in found) for m in kept.measured}
+    content = {
+        "recordings": "recordings" if kept is not asked else context.config.data.source,
+        "identify_on": _identify_on(context.config, kept),
+        "groups": {u.id: u.group for u in kept.units},
+        "train": [[k.unit, k.condition, k.episode] for s in splits.values() for k in s.train],
+        "test": [[k.unit, k.condition, k.episode] for s in splits.values() for k in s.test],
+        "resolution": steps,
+        "dropped": [str(k) for k in asked.episodes if k not in set(kept.episodes)],
+    }
+    save_artifact(context.store.path("population"), "facts", content)
+
+
+def _identify_on(config: StudyConfig, population: Population) -> str:
+    wanted = config.data.identify_on
+    if wanted is None:
+        return "noload" if "noload" in population.conditions else (population.conditions[0] if population.conditions else DEFAULT_CONDITION)
+    if wanted not in population.conditions:
+        raise DataError(f"data.identify_on = {wanted!r}: the recordings have the conditions {', '.join(population.conditions)}; name one of them.")
+    return wanted

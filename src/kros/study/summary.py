@@ -1,0 +1,38 @@
+"""A few lines about a finished run for people at a terminal."""
+
+from __future__ import annotations
+
+from .pipeline import RunResult
+
+
+def summary_lines(result: RunResult) -> list[str]:
+    """Return what was found and where the report is."""
+    metrics = result.metrics
+    study = metrics["study"]
+    lines = [f"{study['units']} units, conditions {', '.join(study['conditions'])}, {metrics['timing_s']['total']:.1f} s in all"]
+    lines += observer_lines(result)
+    flagged = sorted({f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]})
+    if "outliers" in metrics:
+        lines.append(f"flagged as outliers: {', '.join(flagged) if flagged else 'none'}")
+    report = result.folder / "report.html"
+    lines.append(f"report: {report}" if report.exists() else f"results: {result.folder}")
+    return lines
+
+
+def observer_lines(result: RunResult) -> list[str]:
+    """Return one line an observer: mean error of all units in the condition that was identified on."""
+    metrics = result.metrics
+    rows = [r for r in metrics.get("evaluation", []) if r["condition"] == metrics["study"]["identify_on"] and r["role"] != "outlier"]
+    channels = list(dict.fromkeys(r["channel"] for r in rows))
+    if not rows:
+        return []
+    width = max(len(r["observer"]) for r in rows)
+    lines = [f"{'error in percent of range':<{width}}  " + "".join(f"{c:>12}" for c in channels)]
+    for name in dict.fromkeys(r["observer"] for r in rows):
+        means = []
+        for channel in channels:
+            values = [r["error_percent"] for r in rows if r["observer"] == name and r["channel"] == channel]
+            means.append(f"{sum(values) / len(values):12.4g}" if None not in values else f"{'diverged':>12}")
+        mark = "  <- deployed" if name == metrics["study"].get("deployed") else ""
+        lines.append(f"{name:<{width}}  {''.join(means)}{mark}")
+    return lines

@@ -1,0 +1,127 @@
+"""EDMD against pykoop, against exact systems, and on data where normal equations fail."""
+
+import numpy as np
+import pytest
+
+from kros.core.errors import IdentificationError
+from kros.identify import Factor, combine, edmd, lifted_factor, reduce_episode, residual_covariance, smallest_stabilising_alpha
+from kros.lifting import Lifting
+
+LIFTING = Lifting(("position", "velocity"), ("sin(3*position + phase)",), ("phase",))
+A_TRUE = np.array([[0.9, 0.1, 0.02], [-0.05, 0.8, 0.1]])
+B_TRUE = np.array([[0.01, 0.0], [0.1, -0.2]])
+
+
+def simulate(seed, n_samples=400, phase=0.7, noise=0.0):
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(n_samples, 2))
+    x = np.zeros((n_samples, 2))
+    for k in range(n_samples - 1):
+        lifted = np.array([x[k, 0], x[k, 1], np.sin(3 * x[k, 0] + phase)])
+        x[k + 1] = A_TRUE @ lifted + B_TRUE @ u[k] + noise * rng.normal(size=2)
+    return x, u
+
+
+def stack(factors):
+    return Factor(*(np.stack([getattr(f, name) for f in factors]) for name in ("R", "peak", "n_samples")))
+
+
+def lifted_R(episodes, phase=0.7, model=LIFTING):
+    factor = combine(stack([reduce_episode(x, u, LIFTING) for x, u in episodes]))
+    batch = Factor(*(np.asarray(getattr(factor, name))[None] for name in ("R", "peak", "n_samples")))
+    return lifted_factor(batch, LIFTING, {"phase": np.array([phase])}, model)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1e-3, 1.0, 90.0])
+def test_equals_pykoop(alpha):
+    pykoop = pytest.importorskip("pykoop")
+    episodes = [simulate(seed, noise=0.01) for seed in range(4)]
+    rows = [np.column_stack([np.full(len(x), float(i)), x, np.sin(3 * x[:, :1] + 0.7), u]) for i, (x, u) in enumerate(episodes)]
+    pipeline = pykoop.KoopmanPipeline(regressor=pykoop.Edmd(alpha=alpha))
+    pipeline.fit(np.vstack(rows), n_inputs=2, episode_feature=True)
+    expected = pipeline.regressor_.coef_.T
+    found = edmd(lifted_R(episodes).R[0], 3, alpha)
+    np.testing.assert_allclose(np.hstack([found.A, found.B]), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_exact_system_is_recovered_to_rounding():
+    found = edmd(lifted_R([simulate(0), simulate(1)]).R[0], 3)
+    np.testing.assert_allclose(found.A[:2], A_TRUE, atol=1e-13)
+    np.testing.assert_allclose(found.B[:2], B_TRUE, atol=1e-13)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-7, 1e-8, 1e-9, 1e-12])
+def test_badly_scaled_states_are_identified(scale):
+    """Two decoupled states scaled 1 : s; the normal equations of (32) return 0 for the second one at s = 1e-8."""
+    rng = np.random.default_rng(5)
+    u = rng.normal(size=(500, 2))
+    x = np.zeros((500, 2))
+    for k in range(499):
+        x[k + 1] = [0.9 * x[k, 0] + u[k, 0], 0.5 * x[k, 1] + u[k, 1]]
+    lifting = Lifting(("a", "b"))
+    found = edmd(reduce_episode(x * [1.0, scale], u, lifting).R, 2)
+    np.testing.assert_allclose(np.diag(found.A), [0.9, 0.5], rtol=1e-12)
+
+
+def test_factors_equal_the_data_whatever_the_order_and_split():
+    x, u = simulate(6, n_samples=3000, noise=0.1)
+    whole = reduce_episode(x, u, LIFTING)
+    assert np.allclose(np.tril(whole.R, -1), 0)
+    g = LIFTING.separation.evaluate(x)
+    now = np.hstack([x, g, u])
+    data = np.hstack([now[:-1], now[1:, :4]])
+    np.testing.assert_allclose(whole.R.T @ whole.R, data.T @ data, rtol=1e-10, atol=1e-8)
+    parts = [reduce_episode(x[i : i + 1001], u[i : i + 1001], LIFTING) for i in (2000, 0, 1000)]
+    again = combine(stack(parts))
+    np.testing.assert_allclose(edmd(again.R, 4, 1.0).A, edmd(whole.R, 4, 1.0).A, rtol=1e-9, atol=1e-12)
+    assert again.n_samples == whole.n_samples
+
+
+def test_a_new_phase_needs_no_second_pass():
+    x, u = simulate(7, noise=0.05)
+    for phase in (0.0, 1.3, 4.0):
+        direct = reduce_episode(x, u, Lifting(("position", "velocity"), (f"sin(3*position + {phase})",)))
+        theta = np.column_stack([x, np.sin(3 * x[:, 0] + phase)])
+        U = np.linalg.lstsq(np.hstack([theta, u])[:-1], theta[1:], rcond=None)[0].T
+        found = edmd(lifted_R([(x, u)], phase).R[0], 3)
+        np.testing.assert_allclose(np.hstack([found.A, found.B]), U, rtol=1e-8, atol=1e-10)
+        assert direct.n_samples == len(x) - 1
+
+
+def test_residual_covariance_equals_the_residuals():
+    x, u = simulate(8, noise=0.05)
+    factor = lifted_R([(x, u)])
+    matrices = edmd(factor.R, 3, 2.0)
+    theta = LIFTING.lift(x, {"phase": np.full(len(x), 0.7)})
+    residual = theta[1:] - theta[:-1] @ matrices.A[0].T - u[:-1] @ matrices.B[0].T
+    np.testing.assert_allclose(residual_covariance(factor.R, 3, matrices, factor.n_samples)[0], residual.T @ residual / len(residual), rtol=1e-9, atol=1e-12)
+
+
+def test_smallest_alpha_is_the_edge_of_stability():
+    """A diverging scalar system needs regularisation; the edge has a closed form: h / (g + alpha) = 1."""
+    x = 1.01 ** np.arange(200.0)[:, None]
+    u = np.zeros((200, 1))
+    u[::7] = 1e-3
+    lifting = Lifting(("x",))
+    R = reduce_episode(x, u, lifting).R[None]
+    alpha = smallest_stabilising_alpha([(R, 1)])
+    radius = [edmd(R, 1, a).spectral_radius()[0] for a in (alpha, 0.999 * alpha)]
+    assert radius[0] < 1 < radius[1]
+    data = np.hstack([x, u])[:-1]
+    gram, cross = data.T @ data, data.T @ x[1:]
+
+    def pole(a):
+        return np.linalg.solve(gram + a * np.eye(2), cross)[0, 0]
+
+    assert pole(alpha) == pytest.approx(1, abs=1e-8)
+
+
+def test_no_regularisation_where_none_is_needed():
+    factor = lifted_R([simulate(9)], model=Lifting(("position", "velocity")))
+    assert smallest_stabilising_alpha([(factor.R, 2)]) == 0.0
+
+
+def test_dependent_columns_are_named():
+    x, u = simulate(10)
+    with pytest.raises(IdentificationError, match="depends on the others"):
+        edmd(reduce_episode(x, np.column_stack([u[:, 0], 2 * u[:, 0]]), Lifting(("position", "velocity"))).R, 2)

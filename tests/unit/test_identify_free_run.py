@@ -1,0 +1,83 @@
+"""Free run, models on disk, and the smallest parts around them."""
+
+import numpy as np
+import pytest
+
+from kros.core.errors import DataError, DimensionError
+from kros.data import Channel, Role
+from kros.identify import ModelSet, free_run
+from kros.lifting import Lifting
+
+LIFTING = Lifting(("position", "velocity"), ("sin(5*position + phase)",), ("phase",))
+
+
+def models(n_units=3, seed=0):
+    rng = np.random.default_rng(seed)
+    A = 0.5 * rng.normal(size=(n_units, 3, 3)) / 3
+    channels = (Channel("position", Role.STATE, "rad", True), Channel("velocity", Role.STATE, "rad/s"), Channel("u", Role.INPUT))
+    return ModelSet(
+        name="koopman_edmd",
+        condition="noload",
+        lifting=LIFTING,
+        channels=channels,
+        sample_period_s=0.01,
+        unit_ids=tuple(f"{i:06d}" for i in range(n_units)),
+        A=A,
+        B=rng.normal(size=(n_units, 3, 1)),
+        parameters={"phase": np.arange(n_units, dtype=float)},
+        residual_covariance=np.tile(np.eye(3), (n_units, 1, 1)),
+        output_scale=np.ones(3),
+        input_scale=np.ones(1),
+        alpha=90.0,
+        status=("ok",) * n_units,
+    )
+
+
+def test_free_run_equals_a_plain_loop_for_every_unit():
+    population = models()
+    rng = np.random.default_rng(1)
+    x0, u = rng.normal(size=(3, 2)), rng.normal(size=(3, 40, 1))
+    found = free_run(population.A, population.B, LIFTING, population.parameters, x0, u)
+    for i in range(3):
+        x = x0[i]
+        for k in range(40):
+            np.testing.assert_allclose(found[i, k], x, rtol=1e-12, atol=1e-12)
+            lifted = np.array([x[0], x[1], np.sin(5 * x[0] + i)])
+            x = (population.A[i] @ lifted + population.B[i] @ u[i, k])[:2]
+
+
+def test_an_exact_model_runs_free_without_error():
+    """The prediction at sample k is compared with the state at k: no shift by one sample."""
+    rng = np.random.default_rng(2)
+    A, B = np.array([[0.9, 0.1], [-0.2, 0.7]]), np.array([[0.0], [1.0]])
+    u = rng.normal(size=(1, 100, 1))
+    x = np.zeros((100, 2))
+    x[0] = [1.0, -1.0]
+    for k in range(99):
+        x[k + 1] = A @ x[k] + B @ u[0, k]
+    np.testing.assert_allclose(free_run(A, B, Lifting(("a", "b")), {}, x[:1], u)[0], x, atol=1e-13)
+
+
+def test_sizes_that_do_not_fit_are_named():
+    with pytest.raises(DimensionError, match="do not fit a lifting of 2 states to 3"):
+        free_run(np.eye(2), np.ones((2, 1)), LIFTING, {"phase": 0.0}, np.zeros((1, 2)), np.zeros((1, 5, 1)))
+
+
+def test_models_survive_the_disk(tmp_path):
+    population = models()
+    population.save(tmp_path)
+    again = ModelSet.load(tmp_path)
+    for name in ("A", "B", "residual_covariance", "output_scale", "input_scale"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(population, name))
+    assert (again.lifting, again.channels, again.unit_ids, again.alpha, again.status) == (LIFTING, population.channels, population.unit_ids, 90.0, population.status)
+    np.testing.assert_array_equal(again.parameters["phase"], population.parameters["phase"])
+    assert again.measured == (0,)
+    response = again.systems().frequency_response([1.0, 10.0])
+    assert response.shape == (3, 2, 3, 1)
+
+
+def test_a_damaged_model_is_refused(tmp_path):
+    models().save(tmp_path)
+    (tmp_path / "model.json").write_text('{"schema": 99, "kind": "model"}')
+    with pytest.raises(DataError, match=r"found \(99, 'model'\)"):
+        ModelSet.load(tmp_path)

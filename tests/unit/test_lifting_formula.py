@@ -1,0 +1,132 @@
+"""Formulas: what is read, what is refused, and that evaluation, derivative and C agree with NumPy."""
+
+import math
+import pickle
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError, DimensionError
+from kros.lifting import Formula, Lifting, parse
+
+NAMES = ("position", "velocity", "phase")
+
+
+@pytest.mark.parametrize(
+    ("text", "reference"),
+    [
+        ("sin(100*position + phase)", lambda p, v, q: np.sin(100 * p + q)),
+        ("position**2 * velocity - 3.5", lambda p, v, q: p**2 * v - 3.5),
+        ("-abs(velocity)/(1 + position**2)", lambda p, v, q: -np.abs(v) / (1 + p**2)),
+        ("tanh(velocity/0.05)", lambda p, v, q: np.tanh(v / 0.05)),
+        ("exp(-position**2/2)*cos(pi*phase)", lambda p, v, q: np.exp(-(p**2) / 2) * np.cos(np.pi * q)),
+        ("sqrt(1 + position**2) + log(2 + velocity**2) + atan(phase) + sign(position)", None),
+    ],
+)
+def test_evaluation_agrees_with_numpy(text, reference):
+    p, v, q = np.random.default_rng(0).normal(size=(3, 50))
+    if reference is None:
+
+        def reference(p, v, q):
+            return np.sqrt(1 + p**2) + np.log(2 + v**2) + np.arctan(q) + np.sign(p)
+
+    found = Formula(text, NAMES)(position=p, velocity=v, phase=q)
+    np.testing.assert_allclose(found, reference(p, v, q), rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('os').system('true')",
+        "position.real",
+        "lambda: 1",
+        "[x for x in (1,)]",
+        "position if velocity else 0",
+        "position**velocity",
+        "position**1000",
+        "unknown + 1",
+        "gamma(position)",
+        "sin(position, velocity)",
+        "sin(position=1)",
+        "True + position",
+        "'a'",
+        "1j*position",
+        "1/0",
+        "position = 1",
+        "",
+        "(" * 500 + "position" + ")" * 500,
+        "position + " * 500 + "1",
+    ],
+)
+def test_everything_else_is_refused(text):
+    with pytest.raises(ConfigError, match="Formula"):
+        parse(text, NAMES)
+
+
+def test_error_names_what_is_known():
+    with pytest.raises(ConfigError, match=r"unknown name 'speed'; known are position, velocity, phase and pi"):
+        parse("sin(speed)", NAMES)
+
+
+def test_jacobian_agrees_with_finite_differences():
+    lifting = Lifting(("position", "velocity"), ("sin(3*position + phase)", "position*velocity**2"), ("phase",))
+    x = np.random.default_rng(1).normal(size=(7, 2))
+    phase = {"phase": np.linspace(0, 6, 7)}
+    jacobian = lifting.jacobian(x, phase)
+    for j in range(2):
+        step = np.zeros(2)
+        step[j] = 1e-6
+        slope = (lifting.lift(x + step, phase) - lifting.lift(x - step, phase)) / 2e-6
+        np.testing.assert_allclose(jacobian[..., j], slope, rtol=1e-7, atol=1e-8)
+
+
+def test_c_expression_computes_the_same(tmp_path):
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("no C compiler on this machine")
+    formula = Formula("sin(100*position + phase)*velocity**3 - abs(position)/3", NAMES)
+    source = f'#include <math.h>\n#include <stdio.h>\nint main(void){{double position=0.7,velocity=-1.3,phase=2.1;printf("%.17g",{formula.c_expression()});return 0;}}'
+    (tmp_path / "f.c").write_text(source)
+    subprocess.run([compiler, str(tmp_path / "f.c"), "-o", str(tmp_path / "f"), "-lm"], check=True)
+    printed = float(subprocess.run([str(tmp_path / "f")], check=True, capture_output=True, text=True).stdout)
+    expected = math.sin(100 * 0.7 + 2.1) * (-1.3) ** 3 - 0.7 / 3
+    assert printed == pytest.approx(expected, rel=1e-14)
+
+
+def test_separation_rebuilds_the_lifting_for_any_phase():
+    lifting = Lifting(("position", "velocity"), ("sin(100*position + phase)", "2*cos(position - 3*phase)*velocity", "velocity**2"), ("phase",))
+    x = np.random.default_rng(2).normal(size=(30, 2))
+    phase = np.random.default_rng(3).uniform(0, 2 * np.pi, 30)
+    separation = lifting.separation
+    rebuilt = np.einsum("kij,kj->ki", separation.matrix({"phase": phase}), separation.evaluate(x))
+    np.testing.assert_allclose(rebuilt, lifting.lift(x, {"phase": phase})[:, 2:], atol=1e-12)
+
+
+def test_a_parameter_inside_another_function_does_not_separate():
+    lifting = Lifting(("position",), ("tanh(position*phase)",), ("phase",))
+    with pytest.raises(ConfigError, match="must enter as factors or as phases"):
+        _ = lifting.separation
+
+
+def test_retraction_undoes_lifting_and_travels_between_processes():
+    lifting = Lifting(("position", "velocity"), ("sin(position + phase)",), ("phase",))
+    x = np.random.default_rng(4).normal(size=(5, 4, 2))
+    phase = {"phase": np.arange(20.0).reshape(5, 4)}
+    lifted = lifting.lift(x, phase)
+    assert lifted.shape == (5, 4, 3)
+    np.testing.assert_array_equal(lifting.retract(lifted), x)
+    copy = pickle.loads(pickle.dumps(lifting))
+    np.testing.assert_array_equal(copy.lift(x, phase), lifted)
+
+
+def test_bad_liftings_are_refused():
+    with pytest.raises(ConfigError, match="depends on no state"):
+        Lifting(("position",), ("3 + phase",), ("phase",))
+    with pytest.raises(ConfigError, match="repeat"):
+        Lifting(("position",), ("position**2", "position**2"))
+    with pytest.raises(DimensionError, match="parameter values for"):
+        Lifting(("position",), ("sin(position + phase)",), ("phase",)).lift(np.zeros((2, 1)))
+    with pytest.raises(DimensionError, match="expected 1 states"):
+        Lifting(("position",)).lift(np.zeros((2, 3)))

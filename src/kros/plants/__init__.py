@@ -1,5 +1,9 @@
 """Simulated populations with known truth. Returns populations and truth; writing to disk is `kros.data`'s."""
 
 from .harmonic_drive import HarmonicDrivePopulation
+from .pendulum import PendulumPopulation
+from .simulated import SimulatedPopulation
 
-__all__ = ["HarmonicDrivePopulation"]
+PLANTS = {"harmonic-drive": HarmonicDrivePopulation, "pendulum": PendulumPopulation}
+
+__all__ = ["PLANTS", "HarmonicDrivePopulation", "PendulumPopulation", "SimulatedPopulation"]

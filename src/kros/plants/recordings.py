@@ -6,7 +6,7 @@ Undoing the one-sample lag of the targets costs a reader the last sample, so the
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,26 +28,25 @@ class Recordings:
 
     Parameters
     ----------
-    rows : mapping
-        Row of `states` and row of `inputs` that belong to an episode.
-    states : ndarray, shape (n_states, n_trajectories, n_samples)
-    inputs : ndarray, shape (n_inputs, n_references, n_samples)
-        Trajectories that follow the same reference share a row.
+    parts : mapping
+        States, shape (n_states, n_samples), and inputs, shape (n_inputs, n_samples), of each episode.
+        Episodes that follow the same reference share one array of inputs.
     """
 
-    rows: Mapping[EpisodeKey, tuple[int, int]]
-    states: Array
-    inputs: Array
+    parts: Mapping[EpisodeKey, tuple[Array, Array]]
 
     def __call__(self, key: EpisodeKey) -> Array:
         """Return the samples of an episode, shape (n_samples, n_states + n_inputs)."""
-        if key not in self.rows:
-            first = next(iter(self.rows), None)
+        if key not in self.parts:
+            first = next(iter(self.parts), None)
             raise DataError(
-                f"Asked for {key}; the simulation has {len(self.rows)} episodes, first {first}; take keys from population.episodes."
+                f"Asked for {key}; the simulation has {len(self.parts)} episodes, first {first}; take keys from population.episodes."
             )
-        state, reference = self.rows[key]
-        return np.concatenate([self.states[:, state], self.inputs[:, reference]]).T.copy()
+        return np.ascontiguousarray(np.concatenate(self.parts[key]).T)
+
+    def restricted(self, keys: Iterable[EpisodeKey]) -> Recordings:
+        """Return the same for fewer episodes, cheaper to send to another process."""
+        return Recordings({key: self.parts[key] for key in keys})
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,3 +70,7 @@ class Prepared:
         rest = values[OFFSET_WINDOW]
         values[:, self.measured] += np.mean(rest[:, self.target] - rest[:, self.measured])
         return values[REST_SAMPLES:-1]
+
+    def restricted(self, keys: Iterable[EpisodeKey]) -> Prepared:
+        """Return the same for fewer episodes, cheaper to send to another process."""
+        return Prepared(self.raw.restricted(keys), self.measured, self.target)

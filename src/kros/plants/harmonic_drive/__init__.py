@@ -6,7 +6,7 @@
 
 from .control import GAINS, Gains, Loop
 from .parameters import GEAR_RATIO, NOMINAL, DriveParameters
-from .population import HarmonicDrivePopulation, SimulatedPopulation
+from .population import HarmonicDrivePopulation
 from .truth import Truth
 
-__all__ = ["GAINS", "GEAR_RATIO", "NOMINAL", "DriveParameters", "Gains", "HarmonicDrivePopulation", "Loop", "SimulatedPopulation", "Truth"]
+__all__ = ["GAINS", "GEAR_RATIO", "NOMINAL", "DriveParameters", "Gains", "HarmonicDrivePopulation", "Loop", "Truth"]

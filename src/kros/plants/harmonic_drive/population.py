@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ...core.errors import ConfigError
 from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
 from ..recordings import REST_SAMPLES, Prepared, Recordings
+from ..simulated import SimulatedPopulation
 from .control import CURRENT_NOISE, GAINS, SAMPLE_PERIOD_S, Loop
 from .parameters import GEAR_RATIO, DriveParameters, concatenate, draw_outlier, draw_parameters
 from .reference import episode_reference
@@ -31,24 +32,6 @@ OUTLIER_SERIAL = "000000"
 FIRST_SERIAL = 1001
 RECORDING_STREAM = 3  # first word of the spawn key of noise and offsets
 MAX_OFFSET_RAD = 0.02  # of the measured position, at the gearbox output
-
-
-@dataclass(frozen=True, eq=False)
-class SimulatedPopulation:
-    """Recordings and what is true about them.
-
-    Parameters
-    ----------
-    population : Population
-        As the reader of the raw layout yields it: offset calibrated, rest dropped.
-    raw : Population
-        Before preparation: a second at rest at the start, an offset of the measured position in each episode, targets not lagged.
-    truth : Truth
-    """
-
-    population: Population
-    raw: Population
-    truth: Truth
 
 
 @dataclass(frozen=True)
@@ -106,14 +89,21 @@ class HarmonicDrivePopulation:
         if not self.conditions or len(set(self.conditions)) < len(self.conditions) or not set(self.conditions) <= set(CONDITIONS):
             raise ConfigError(f"Harmonic Drive population: conditions {self.conditions} should be one or both of {CONDITIONS}, each once.")
         low = {"n_units": 1, "n_episodes": 1, "seconds": 2.0, "seed": 0, "spread": 0.0, "outlier_severity": 0.0}
-        high = {"n_units": 998_998, "n_episodes": 1000, "seconds": 3600.0, "seed": 2**63, "spread": 10.0, "outlier_severity": 2.0}
+        high = {"n_units": 998_998, "n_episodes": 1000, "seconds": 3600.0, "seed": 2**63, "spread": 5.0, "outlier_severity": 2.0}
         for name, least in low.items():
             value = getattr(self, name)
             if not least <= value <= high[name]:
                 raise ConfigError(f"Harmonic Drive population: {name} = {value} is out of range; use {least} to {high[name]}.")
 
-    def simulate(self) -> SimulatedPopulation:
-        """Simulate all episodes of all units."""
+    def simulate(self) -> SimulatedPopulation[Truth]:
+        """Simulate all episodes of all units.
+
+        Returns
+        -------
+        SimulatedPopulation
+            `population` as the reader of the raw layout yields it, offset calibrated and rest dropped; `raw` before preparation, with
+            a second at rest at the start, an offset of the measured position in each episode, targets not lagged.
+        """
         units, parameters = self._units()
         keys = tuple(EpisodeKey(u.id, c, str(e)) for u in units for c in sorted(self.conditions) for e in range(self.n_episodes))
         trajectory = np.arange(len(keys))
@@ -123,9 +113,9 @@ class HarmonicDrivePopulation:
         loop = Loop(self.loop)
         rows = trajectory // (self.n_episodes * len(self.conditions))
         signals = simulate(parameters.take(rows), loaded, episode, (targets[0], targets[1]), GAINS[loop])
-        states = np.stack([signals.position, signals.velocity, signals.current])
-        self._disturb(states, keys, units)
-        recordings = Recordings({key: (i, int(e)) for i, (key, e) in enumerate(zip(keys, episode, strict=True))}, states, targets)
+        self._disturb(signals.states, keys)
+        inputs = [np.ascontiguousarray(targets[:, e]) for e in range(self.n_episodes)]
+        recordings = Recordings({key: (signals.states[i], inputs[episode[i]]) for i, key in enumerate(keys)})
         raw = Population(CHANNELS, SAMPLE_PERIOD_S, units, keys, recordings, {"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO})
         load_rows = {key: i for i, key in enumerate(k for k in keys if k.condition == "load")}
         truth = Truth(tuple(u.id for u in units), parameters, loop, GAINS[loop], load_rows, signals.load_torque[:, REST_SAMPLES:-1])
@@ -146,10 +136,10 @@ class HarmonicDrivePopulation:
         pairs = [episode_reference(self.seed, e, n_samples, REST_SAMPLES, SAMPLE_PERIOD_S) for e in range(self.n_episodes)]
         return np.stack([np.stack(pair) for pair in pairs], axis=1)
 
-    def _disturb(self, states: Array, keys: tuple[EpisodeKey, ...], units: tuple[Unit, ...]) -> None:
+    def _disturb(self, states: Array, keys: tuple[EpisodeKey, ...]) -> None:
         """Add what the recording adds: an offset of the position in each episode, noise on the current."""
         for row, key in enumerate(keys):
             stream = (RECORDING_STREAM, int(key.unit), CONDITIONS.index(key.condition), int(key.episode))
             rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=stream))
-            states[0, row] += rng.uniform(-MAX_OFFSET_RAD, MAX_OFFSET_RAD)
-            states[2, row] += CURRENT_NOISE * rng.standard_normal(states.shape[2])
+            states[row, 0] += rng.uniform(-MAX_OFFSET_RAD, MAX_OFFSET_RAD)
+            states[row, 2] += CURRENT_NOISE * rng.standard_normal(states.shape[-1])

@@ -18,9 +18,11 @@ ACCELERATION_SAMPLES = 150  # length of the ramps of the trapezoid
 JERK_SAMPLES = 60  # length of the ramps of the acceleration
 SETTLE_SAMPLES = 20  # shortest rest before the first move
 SECONDS_PER_CHECKPOINT = 2.0
-LEAST_IN_MOTION = 0.8  # share of the episode
+LEAST_IN_MOTION = 0.75  # share of the episode
+LEAST_HOLD_SAMPLES = 350  # at full speed, at least once in each direction
 REVOLUTION = 2 * np.pi
 _RAMPS = ACCELERATION_SAMPLES + JERK_SAMPLES
+SHORTEST_MOVE_SAMPLES = _RAMPS  # length at full speed: shorter moves would not reach it
 _CANDIDATES = 64
 _TRIES = 1000
 
@@ -77,24 +79,36 @@ def _draw_checkpoints(rng: np.random.Generator, n_samples: int, period_s: float)
     """Draw a start and checkpoints within one revolution in either direction that fit into the episode."""
     seconds = n_samples * period_s
     n_moves = max(2, round(seconds / SECONDS_PER_CHECKPOINT))
-    cruise = 2 * _RAMPS  # samples: every move reaches full speed and holds it
     for _ in range(_TRIES):
-        drawn = rng.uniform(-REVOLUTION, REVOLUTION, (_CANDIDATES, n_moves + 1))
-        moves = np.diff(drawn, axis=1)
-        durations = _durations(drawn, period_s)
-        total = durations.sum(axis=1) + SETTLE_SAMPLES
-        good = (
-            (total <= n_samples)
-            & (total >= LEAST_IN_MOTION * n_samples)
-            & (durations.min(axis=1) >= cruise)
-            & (moves.min(axis=1) < 0)
-            & (moves.max(axis=1) > 0)
-        )
+        drawn = _candidates(rng, n_moves, SHORTEST_MOVE_SAMPLES * MAX_SPEED * period_s)
+        good = _fits(drawn, n_samples, period_s)
         if good.any():
             return drawn[np.argmax(good)]
     raise ConfigError(
         f"Drawing {n_moves} checkpoints for an episode of {seconds:g} s: none fit at {MAX_SPEED:.3g} rad/s; ask for seconds >= 2."
     )
+
+
+def _candidates(rng: np.random.Generator, n_moves: int, shortest: float) -> Array:
+    """Draw sequences of checkpoints, neighbours at least `shortest` apart, shape (n_candidates, n_moves + 1)."""
+    drawn = np.empty((_CANDIDATES, n_moves + 1))
+    drawn[:, 0] = rng.uniform(-REVOLUTION, REVOLUTION, _CANDIDATES)
+    for j in range(n_moves):
+        here = drawn[:, j]
+        below = np.maximum(0.0, here - shortest + REVOLUTION)
+        above = np.maximum(0.0, REVOLUTION - here - shortest)
+        place = rng.uniform(0.0, below + above)
+        drawn[:, j + 1] = np.where(place < below, place - REVOLUTION, here + shortest + place - below)
+    return drawn
+
+
+def _fits(drawn: Array, n_samples: int, period_s: float) -> npt.NDArray[np.bool_]:
+    """Tell which candidates fill the episode without overrunning it and hold full speed in both directions."""
+    total = _durations(drawn, period_s).sum(axis=1) + SETTLE_SAMPLES
+    moves = np.diff(drawn, axis=1) / (MAX_SPEED * period_s)
+    held = _RAMPS + LEAST_HOLD_SAMPLES
+    both = (moves.max(axis=1) >= held) & (moves.min(axis=1) <= -held)
+    return (total <= n_samples) & (total >= LEAST_IN_MOTION * n_samples) & both
 
 
 def _start_times(rng: np.random.Generator, checkpoints: Array, n_samples: int, period_s: float) -> Array:

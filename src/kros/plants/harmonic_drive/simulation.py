@@ -33,19 +33,13 @@ class Signals:
 
     Parameters
     ----------
-    position : ndarray, shape (n, n_samples), rad
-        Quantised by the encoder.
-    velocity : ndarray, shape (n, n_samples), rad/s
-        Filtered difference of the position.
-    current : ndarray, shape (n, n_samples), fraction of full scale
-        Without measurement noise.
+    states : ndarray, shape (n, 3, n_samples), rad, rad/s and fraction of full scale
+        Position as the encoder quantises it, velocity as filtered difference of it, current without measurement noise.
     load_torque : ndarray of float32, shape (n_loaded, n_samples), fraction of full-scale current
         Torque that the load takes from the flange, for the loaded trajectories, in their order.
     """
 
-    position: Array
-    velocity: Array
-    current: Array
+    states: Array
     load_torque: Array
 
 
@@ -67,8 +61,7 @@ def simulate(p: DriveParameters, loaded: Array, reference: Array, targets: tuple
     n, n_samples = len(p), targets[0].shape[1]
     n_loaded = int(np.count_nonzero(loaded))
     rows = np.cumsum(loaded > 0) - 1
-    position, velocity, current = (np.empty((n, n_samples)) for _ in range(3))
-    out = Signals(position, velocity, current, np.empty((n_loaded, n_samples), np.float32))
+    out = Signals(np.empty((n, RECORDED - 1, n_samples)), np.empty((n_loaded, n_samples), np.float32))
     for start in range(0, n, CHUNK_TRAJECTORIES):
         part = slice(start, start + CHUNK_TRAJECTORIES)
         _simulate_chunk(p.take(part), loaded[part], reference[part], targets, gains, out, part, rows[part])
@@ -95,8 +88,7 @@ def _simulate_chunk(
                 block[3, k] = physics.load_torque(load_inertia, total_inertia)
             physics.advance()
         length = stop - first
-        for signal, values in zip((out.position, out.velocity, out.current), block, strict=False):
-            signal[part, first:stop] = values[:length].T
+        out.states[part, :, first:stop] = block[:3, :length].transpose(2, 0, 1)
         out.load_torque[rows[is_loaded], first:stop] = (block[3, :length] / p.torque_constant).T[is_loaded]
 
 

@@ -1,0 +1,36 @@
+"""What every simulation returns: recordings, and what is true about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+from ..data.population import Population
+
+
+class HasTruth(Protocol):
+    """True parameters of a simulated population."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything but long signals, ready for JSON."""
+
+
+T = TypeVar("T", bound=HasTruth)
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedPopulation(Generic[T]):
+    """Recordings and what is true about them.
+
+    Parameters
+    ----------
+    population : Population
+        Ready for identification, as a reader yields it.
+    raw : Population
+        As recorded, before preparation; the same as `population` where a plant needs none.
+    truth : object with ``as_dict()``
+    """
+
+    population: Population
+    raw: Population
+    truth: T

@@ -1,28 +1,54 @@
-"""The examples in docstrings run, and the README stays short."""
+"""The examples in docstrings and documents run, the configurations in documents are valid, and the README stays short."""
 
 from __future__ import annotations
 
 import doctest
 import importlib
 import pkgutil
+import re
+import tomllib
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 import kros
+from kros.core import ConfigError
 
 ROOT = Path(__file__).parents[2]
+DOCUMENTS = sorted([*(ROOT / "docs").glob("*.md"), *ROOT.glob("*.md"), *(ROOT / "examples").rglob("*.md")])
 MODULES = sorted(m.name for m in pkgutil.walk_packages(kros.__path__, "kros."))
 
 
-def failures(module: ModuleType) -> list[str]:
-    """Examples of a module that do not give what they say."""
+def run_examples(tests: list[doctest.DocTest]) -> list[str]:
+    """Reports of examples that do not give what they say."""
     report: list[str] = []
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
-    for test in doctest.DocTestFinder(exclude_empty=True).find(module):
+    for test in tests:
         runner.run(test, out=report.append)
     return report
+
+
+def failures(module: ModuleType) -> list[str]:
+    """Examples in a module's docstrings that fail."""
+    return run_examples(doctest.DocTestFinder(exclude_empty=True).find(module))
+
+
+def blocks(text: str, language: str) -> list[str]:
+    """Fenced blocks of a document."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def check_configuration(text: str) -> None:
+    """Read a CSV mapping, or a study, as kros reads it."""
+    table = tomllib.loads(text)
+    if "files" in table:
+        from kros.data.readers.csv_mapping import load_mapping
+
+        _ = load_mapping(table).steps
+    else:
+        kros.study.validate_config({"data": {"source": "."}, **table}, ROOT)
+        kros.data.steps.parse_steps(table.get("data", {}).get("prepare", ()))
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -33,6 +59,25 @@ def test_examples_run(name: str) -> None:
 def test_a_wrong_example_is_found() -> None:
     module = ModuleType("wrong", ">>> 1 + 1\n3\n")
     assert "Expected:" in "".join(failures(module))
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_examples_of_documents_run(path: Path) -> None:
+    text = "\n".join(blocks(path.read_text(encoding="utf-8"), "python"))
+    assert run_examples([doctest.DocTestParser().get_doctest(text, {}, path.name, str(path), 0)]) == []
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_configurations_of_documents_are_valid(path: Path) -> None:
+    for block in blocks(path.read_text(encoding="utf-8"), "toml"):
+        check_configuration(block)
+
+
+def test_an_unknown_key_is_found() -> None:
+    with pytest.raises(ConfigError, match="sorce"):
+        check_configuration('[data]\nsorce = "here"\n')
+    with pytest.raises(ConfigError, match="chanel"):
+        check_configuration("files = '.*'\ntime = 't'\n[[chanel]]\n")
 
 
 def test_readme_is_short() -> None:

@@ -73,9 +73,13 @@ class CalibrateConfig(_Section):
 
 
 class IdentifyConfig(_Section):
-    """Regularisation; ``auto`` is the smallest coefficient that stabilises every model."""
+    """Regularisation; ``auto`` is `alpha_factor` times the smallest coefficient that stabilises every model.
+
+    At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the population is finite.
+    """
 
     alpha: float | Literal["auto"] = "auto"
+    alpha_factor: float = Field(4.0, ge=1)
     margin: float = Field(0.0, ge=0, lt=1)
 
     @field_validator("alpha")

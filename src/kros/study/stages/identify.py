@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
+from ...core.errors import IdentificationError
 from ...data.population import EpisodeKey, Population
 from ...identify import Factor, ModelSet, combine, edmd, lifted_factor, reduce_episode, residual_covariance, smallest_stabilising_alpha
 from ...lifting import Lifting
@@ -53,14 +54,30 @@ def identify_models(context: Context, condition: str, units: list[str], factor: 
     kinds = {name: context.lifting if name.startswith("koopman") else Lifting(context.lifting.states) for name in context.model_names}
     factors = {name: lifted_factor(factor, context.lifting, parameters, lifting) for name, lifting in kinds.items()}
     pooled = np.array([u in context.facts.pooled for u in units])
-    alpha = context.config.identify.alpha
+    config = context.config.identify
+    alpha = config.alpha
     if alpha == "auto":
         shared = [(factors[name].R[pooled if pooled.any() else slice(None)], kinds[name].n_lifted) for name in kinds]
-        alpha = smallest_stabilising_alpha(shared, context.config.identify.margin)
-        log.info("%s: alpha = %.4g is the smallest that stabilises every model", condition, alpha)
-    return [
+        edge = smallest_stabilising_alpha(shared, config.margin)
+        alpha = config.alpha_factor * edge
+        log.info("%s: alpha = %.4g, %g times the smallest that stabilises every model", condition, alpha, config.alpha_factor)
+    models = [
         fit(name, condition, kinds[name], context, units, factors[name], parameters if kinds[name].parameters else {}, float(alpha), pooled) for name in kinds
     ]
+    if condition == context.facts.identify_on:
+        for found in models:
+            require_stable(found, pooled)
+    return models
+
+
+def require_stable(models: ModelSet, pooled: npt.NDArray[np.bool_]) -> None:
+    """Refuse unstable models where they feed the synthesis."""
+    for unit, status, counts in zip(models.unit_ids, models.status, pooled, strict=True):
+        if counts and status != "ok":
+            raise IdentificationError(
+                f"Identifying {models.name} of unit {unit} ({models.condition}) with alpha = {models.alpha:g}: the model is {status}; "
+                "set identify.alpha = 'auto', or raise it."
+            )
 
 
 def fit(

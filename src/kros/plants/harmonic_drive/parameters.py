@@ -40,11 +40,11 @@ RIPPLE_DEVIATION = 0.15
 
 # Loose fasteners: factor on each parameter at severity s is exp(s * value).
 OUTLIER_LOG_FACTORS = {
-    "stiffness": -0.9,
-    "damping": -0.5,
-    "coulomb_torque": 0.4,
-    "breakaway_torque": 0.4,
-    "viscous_friction": 0.5,
+    "stiffness": -1.2,
+    "damping": -0.6,
+    "coulomb_torque": 0.3,
+    "breakaway_torque": 0.3,
+    "viscous_friction": 0.4,
     "ripple": 0.6,
 }
 

@@ -1,0 +1,246 @@
+"""The simulated drives against physics written down a second time, and calibration against known truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.signal import welch
+
+from kros.plants import HarmonicDrivePopulation
+from kros.plants.harmonic_drive import GAINS, Loop
+from kros.plants.harmonic_drive.control import VELOCITY_POLE
+from kros.plants.harmonic_drive.dynamics import Physics
+from kros.plants.harmonic_drive.linear import disturbance_response
+from kros.plants.harmonic_drive.parameters import draw_parameters
+from kros.plants.harmonic_drive.reference import MAX_SPEED
+from kros.plants.harmonic_drive.simulation import simulate
+
+PERIOD = 1e-3
+TURN = 20  # samples of a motor revolution at full speed
+SETTLE = 250  # samples
+
+
+@pytest.fixture(scope="module", params=["stiff", "soft"])
+def drives(request):
+    return HarmonicDrivePopulation(n_units=6, n_episodes=3, seconds=8.0, seed=21, loop=request.param, outlier=True).simulate()
+
+
+def settled_segments(episode):
+    """Yield (direction, samples) of constant full speed, without the transient, in whole motor revolutions."""
+    at_speed = np.flatnonzero(np.abs(episode[:, 4]) > (1 - 1e-7) * MAX_SPEED)
+    for segment in np.split(at_speed, np.flatnonzero(np.diff(at_speed) > 1) + 1):
+        inside = segment[SETTLE:]
+        inside = inside[: len(inside) // TURN * TURN]
+        if len(inside) >= 4 * TURN:
+            yield int(np.sign(episode[inside[0], 4])), inside
+
+
+def effect_by_direction(population, unit, condition):
+    """Complex amplitude A of e = Im(A exp(j 100 theta)) in each direction, by least squares."""
+    found = {1: [], -1: []}
+    for key in population.keys(unit, condition):
+        x = population.read(key)
+        for direction, samples in settled_segments(x):
+            theta, error = 100 * x[samples, 0], x[samples, 4] - x[samples, 1]
+            basis = np.stack([np.sin(theta), np.cos(theta), np.ones(len(theta)), np.linspace(-1, 1, len(theta))], axis=1)
+            sine, cosine = np.linalg.lstsq(basis, error, rcond=None)[0][:2]
+            found[direction].append(sine + 1j * cosine)
+    return {direction: np.mean(values) for direction, values in found.items()}
+
+
+def wrapped(angle, period):
+    return (angle + period / 2) % period - period / 2
+
+
+@pytest.mark.parametrize("condition", ["noload", "load"])
+def test_calibration_in_both_directions_recovers_phase_and_lag(drives, condition):
+    truth = drives.truth
+    response = truth.response(loaded=condition == "load")
+    for row, unit in enumerate(truth.unit_ids):
+        effect = effect_by_direction(drives.population, unit, condition)
+        forward, reverse = np.angle(effect[1]), np.angle(effect[-1])
+        # forward: phi + eta, reverse: phi - eta; half the sum is phi modulo pi
+        assert abs(wrapped((forward + reverse) / 2 - truth.phase_rad[row], np.pi)) < 0.01
+        assert abs(wrapped((forward - reverse) / 2 - np.angle(response[row]), np.pi)) < 0.01
+        for direction in (1, -1):
+            assert abs(effect[direction]) == pytest.approx(abs(response[row]) * truth.ripple[row], rel=0.02)
+        # and without the ambiguity: with the true lag each direction gives the phase itself
+        assert abs(wrapped(forward - np.angle(response[row]) - truth.phase_rad[row], 2 * np.pi)) < 0.02
+
+
+def test_the_wrong_sign_of_the_lag_would_be_noticed(drives):
+    truth = drives.truth
+    effect = effect_by_direction(drives.population, truth.unit_ids[1], "noload")
+    wrong = np.angle(effect[1]) + truth.lag_rad[1]
+    assert abs(wrapped(wrong - truth.phase_rad[1], 2 * np.pi)) > 1.0
+
+
+def test_lag_of_the_soft_loop_straddles_ninety_degrees_and_that_of_the_stiff_one_does_not():
+    p = draw_parameters(0, 200, 1.0)
+    soft, stiff = (np.degrees(np.angle(disturbance_response(p, GAINS[loop], False))) for loop in (Loop.SOFT, Loop.STIFF))
+    assert 0.3 < np.mean(soft < -90) < 0.7
+    assert np.all((stiff > -70) & (stiff < -30))
+
+
+@pytest.mark.parametrize("loop", list(Loop))
+@pytest.mark.parametrize("loaded", [False, True])
+def test_lag_agrees_with_continuous_frequency_response(loop, loaded):
+    """One loop at a time in the s-domain: plant by its impedances, sampling and hold by their delays, no aliasing."""
+    p, gains, omega = draw_parameters(5, 8, 1.0), GAINS[loop], 100 * MAX_SPEED
+    s, z = 1j * omega, np.exp(1j * omega * PERIOD)
+    link = p.flange_inertia + loaded * p.load_inertia
+    gear = p.damping + p.stiffness / s  # torque per twist velocity
+    seen = 1 / (1 / gear + 1 / (link * s))  # what the motor feels of gear and link
+    fade = (MAX_SPEED / p.stribeck_velocity) ** 2
+    slope = -2 * p.breakaway_torque * fade / (MAX_SPEED * (1 + fade) ** 2)
+    mobility = 1 / (p.motor_inertia * s + p.viscous_friction + slope + seen)  # velocity per motor torque
+    hold = (1 - np.exp(-s * PERIOD)) / (s * PERIOD)
+    estimate = (1 - VELOCITY_POLE) * (1 - 1 / z) / PERIOD / (1 - VELOCITY_POLE / z)
+    control = (gains.velocity + gains.integral * PERIOD / (z - 1)) * (gains.position + estimate)
+    loop_gain = p.torque_constant * mobility / s * hold / (1 + p.current_lag_s * s) * control
+    expected = estimate / s * p.torque_constant * mobility / (1 + loop_gain)
+    found = disturbance_response(p, gains, loaded)
+    np.testing.assert_allclose(np.angle(found / expected), 0, atol=0.02)
+    np.testing.assert_allclose(np.abs(found / expected), 1, atol=0.03)
+
+
+def right_hand_side(p, moment, link, u):
+    """The equations of motion of one drive, written down from the docstring, on [q, w, s, w_l, i]."""
+
+    def rhs(_, x):
+        q, w, s, wl, i = x
+        order = np.arange(1, p.ripple.shape[1] + 1)
+        ripple = np.sum(p.ripple[0] * np.sin(100 * order * q + p.phase_rad[0]))
+        sign = w / np.hypot(w, 0.02)
+        friction = (
+            sign * (p.coulomb_torque[0] + p.breakaway_torque[0] / (1 + (w / p.stribeck_velocity[0]) ** 2)) + p.viscous_friction[0] * w
+        )
+        gear = p.stiffness[0] * s + p.damping[0] * (w - wl)
+        dw = (p.torque_constant[0] * (i - ripple) - friction - gear) / p.motor_inertia[0]
+        dwl = (gear - moment * np.sin(q - s)) / link
+        return [w, dw, w - wl, dwl, (u - i) / p.current_lag_s[0]]
+
+    return rhs
+
+
+@pytest.mark.parametrize("loaded", [0.0, 1.0])
+def test_physics_agree_with_a_general_integrator(loaded):
+    p = draw_parameters(8, 1, 2.0)
+    physics = Physics(p, np.array([loaded]), np.array([0.7]))
+    link, moment = p.flange_inertia[0] + loaded * p.load_inertia[0], loaded * p.load_moment[0]
+    x = np.array([0.7, 0.0, physics.z[0, 0], 0.0, physics.z[3, 0]])
+    for k in range(300):
+        u = 0.45 * np.sign(np.sin(2 * np.pi * k / 220 + 0.1))
+        physics.z[4] = u
+        physics.advance()
+        rhs = right_hand_side(p, moment, link, u)
+        x = solve_ivp(rhs, (0, PERIOD), x, method="DOP853", rtol=1e-9, atol=1e-12).y[:, -1]
+        if k % 20 == 19:
+            assert physics.q[0] == pytest.approx(x[0], abs=2e-4)
+            assert physics.z[1, 0] == pytest.approx(x[1], abs=0.01)
+            assert physics.z[3, 0] == pytest.approx(x[4], abs=1e-9)
+
+
+def test_energy_is_kept_without_friction_and_drive():
+    p = draw_parameters(3, 4, 1.0)
+    zero = np.zeros(4)
+    p = replace(p, coulomb_torque=zero, breakaway_torque=zero, viscous_friction=zero, damping=zero, ripple=0 * p.ripple)
+    physics = Physics(p, np.ones(4), np.full(4, 0.5))
+    physics.z[0] += 1e-3  # twist the gear, and let go
+    physics.z[1] = 0.3
+    physics.z[3] = physics.z[4] = 0.0
+    link = p.flange_inertia + p.load_inertia
+
+    def energy():
+        s, w, wl = physics.z[:3]
+        kinetic = 0.5 * p.motor_inertia * w**2 + 0.5 * link * wl**2
+        return kinetic + 0.5 * p.stiffness * s**2 + p.load_moment * (1 - np.cos(physics.q - s))
+
+    start = energy()
+    for _ in range(1500):
+        physics.advance()
+        assert np.all(np.abs(energy() / start - 1) < 2e-3)
+
+
+@pytest.mark.parametrize("loop", list(Loop))
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_at_constant_speed_current_is_friction_and_the_position_error_vanishes(loop, direction):
+    p = draw_parameters(9, 5, 1.0)
+    speed = direction * 0.8 * MAX_SPEED
+    n = 6000
+    velocity = np.clip(np.arange(n) / 500.0, 0, 1) * speed
+    position = np.cumsum(velocity) * PERIOD
+    signals = simulate(p, np.zeros(5), np.zeros(5, int), (position[None], velocity[None]), GAINS[loop])
+    tail = slice(n - 2000, n)  # 80 motor revolutions
+    friction = p.friction_torque(np.full(5, speed)) / p.torque_constant
+    np.testing.assert_allclose(signals.states[:, 2, tail].mean(axis=1), friction, atol=2e-3)
+    np.testing.assert_allclose(signals.states[:, 0, tail].mean(axis=1), position[tail].mean(), atol=5e-6)
+    np.testing.assert_allclose(signals.states[:, 1, tail].mean(axis=1), speed, atol=1e-4)
+
+
+def test_at_rest_the_load_torque_is_gravity_and_the_current_holds_it(drives):
+    truth = drives.truth
+    for row, unit in enumerate(truth.unit_ids):
+        for key in drives.population.keys(unit, "load"):
+            start = drives.population.read(key)[0]
+            gravity = truth.parameters.load_moment[row] * np.sin(start[3]) / truth.parameters.torque_constant[row]
+            assert truth.load_torque(key)[0] == pytest.approx(gravity, abs=2e-3)  # the twist turns the load by less than 5 mrad
+            held = drives.raw.read(key)[:1000, 2].mean()
+            assert held == pytest.approx(truth.load_torque(key)[0] + truth.gearbox_current(unit, start[3]), abs=2e-3)
+
+
+def test_load_torque_follows_the_target_in_motion(drives):
+    """Away from the gear's resonance the load turns as commanded: inertia times acceleration, plus gravity."""
+    p, key = drives.truth.parameters, drives.population.keys("001003", "load")[0]
+    row = drives.truth.row("001003")
+    x = drives.population.read(key)
+    smooth = np.convolve(np.gradient(x[:, 4], PERIOD), np.ones(120) / 120, "same")
+    expected = (p.load_inertia[row] * smooth + p.load_moment[row] * np.sin(x[:, 3])) / p.torque_constant[row]
+    found = np.convolve(drives.truth.load_torque(key), np.ones(120) / 120, "same")
+    assert np.std(found - expected) < 0.15 * np.std(expected)
+
+
+def test_velocity_error_is_a_comb_dominated_by_the_fundamental(drives):
+    """Figure 4."""
+    x = drives.population.read(drives.population.keys("001002", "noload")[0])
+    _, samples = max(settled_segments(x), key=lambda found: len(found[1]))
+    samples = samples[: len(samples) // TURN * TURN]
+    error = x[samples, 4] - x[samples, 1]
+    turns = error.reshape(-1, TURN)
+    power = np.abs(np.fft.rfft(turns.mean(axis=0))) ** 2  # bin h: h times 50 Hz
+    assert power[1] > 100 * power[2] > 0
+    assert power[2] > power[4]
+    freqs, density = welch(error, 1 / PERIOD, nperseg=400)
+    assert freqs[np.argmax(density)] == pytest.approx(50, abs=2.6)
+
+
+def test_signals_have_the_sizes_of_the_paper(drives):
+    """Figures 5 and 13: ripple of a fraction of a percent to a few percent of the speed and some percent of the current."""
+    for key in drives.population.episodes:
+        x = drives.population.read(key)
+        assert np.abs(x[:, 1]).max() < 1.1 * MAX_SPEED
+        assert 0.25 < np.abs(x[:, 2]).max() < 1.02
+        assert np.abs(x[:, 3] - x[:, 0]).max() < 0.03
+    for unit in drives.truth.unit_ids[1:]:
+        for key in drives.population.keys(unit, "noload"):
+            x = drives.population.read(key)
+            for _, samples in settled_segments(x):
+                assert 0.003 < np.sqrt(2) * np.std(x[samples, 1]) / MAX_SPEED < 0.02
+                assert 0.01 < np.sqrt(2) * np.std(x[samples, 2]) < 0.12
+
+
+def test_the_outlier_shows_most_when_loaded():
+    """The response of the velocity error to the disturbance stands apart from all other units."""
+    simulated = HarmonicDrivePopulation(n_units=12, n_episodes=1, seconds=2.0, seed=6, outlier=True).simulate()
+    distance = {}
+    for loaded in (False, True):
+        response = simulated.truth.response(loaded=loaded)
+        others = response[1:]
+        distance[loaded] = abs(response[0] - others.mean()) / np.abs(others - others.mean()).std()
+    assert distance[True] > 5
+    assert distance[True] > distance[False]
+    effects = [abs(effect_by_direction(simulated.population, unit, "load")[1]) for unit in simulated.truth.unit_ids]
+    assert effects[0] > 1.1 * max(effects[1:])

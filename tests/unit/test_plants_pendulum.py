@@ -1,0 +1,57 @@
+"""Settings, shapes and seeds of the simulated pendulums."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError
+from kros.data import EpisodeKey
+from kros.plants import PLANTS, PendulumPopulation
+
+SMALL = PendulumPopulation(n_units=3, n_episodes=2, seconds=4.0, seed=4, outlier=True)
+KEY = EpisodeKey("002", "default", "1")
+
+
+def test_population_has_two_states_and_an_input():
+    population = SMALL.simulate().population
+    assert (population.states, population.inputs, population.measured) == (("position", "velocity"), ("torque",), ("position",))
+    assert population.unit_ids == ("000", "001", "002", "003")
+    assert population.unit("000").group == "outliers"
+    assert len(population.episodes) == 8
+    assert population.read(KEY).shape == (400, 3)
+    assert np.abs(population.read(KEY)[:, 0]).max() > 0.3
+
+
+def test_a_unit_is_the_same_whatever_else_is_simulated():
+    first, second = SMALL.simulate(), PendulumPopulation(n_units=2, n_episodes=5, seconds=4.0, seed=4).simulate()
+    np.testing.assert_allclose(first.population.read(KEY), second.population.read(KEY), atol=1e-12)
+    np.testing.assert_array_equal(first.population.read(KEY), SMALL.simulate().population.read(KEY))
+    assert np.abs(replace(SMALL, seed=5).simulate().population.read(KEY) - first.population.read(KEY)).max() > 0.1
+
+
+def test_truth_is_plain_json_and_the_outlier_is_stiff_jointed():
+    truth = json.loads(json.dumps(replace(SMALL, spread=0.0).simulate().truth.as_dict()))
+    good, bad = truth["units"]["001"], truth["units"]["000"]
+    assert good == {"gravity": 20.0, "damping": 0.8, "gain": 6.0}
+    assert bad["damping"] > 2 * good["damping"]
+
+
+def test_recordings_travel_between_processes():
+    population = SMALL.simulate().population
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(population)).read(KEY), population.read(KEY))
+
+
+@pytest.mark.parametrize("settings", [{"n_units": 0}, {"n_episodes": 0}, {"seconds": 0.5}, {"spread": -1.0}, {"seed": -1}])
+def test_settings_out_of_range_are_refused(settings):
+    with pytest.raises(ConfigError, match=next(iter(settings))):
+        PendulumPopulation(**settings)
+
+
+def test_plants_are_found_by_name():
+    assert PLANTS["pendulum"] is PendulumPopulation
+    assert set(PLANTS) == {"harmonic-drive", "pendulum"}

@@ -66,7 +66,7 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
         raise DataError(
             f"{title(key)}: at least {min_samples} samples are needed, found {len(values)}; leave the episode out or record longer."
         )
-    if not np.isfinite(values.sum()):
+    if not np.isfinite(values).all():
         _check_finite(values, key, channels)
     for column, channel in enumerate(channels):
         if channel.role is Role.STATE and is_constant(values[:, column]):

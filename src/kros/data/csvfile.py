@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,7 +71,7 @@ def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialec
     except (pa.ArrowInvalid, pa.ArrowKeyError) as error:
         if "Empty CSV" in str(error):
             return np.zeros((len(wanted), 0))
-        raise DataError(f"Reading {path}: {_explain(str(error), wanted)}; correct the file.") from error
+        raise DataError(f"Reading {path}: {_explain(str(error), names)}; correct the file.") from error
     except OSError as error:
         raise DataError(f"Reading {path}: {error}; check that the file exists and can be read.") from error
     values = np.empty((len(wanted), table.num_rows))
@@ -79,8 +80,6 @@ def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialec
     return values
 
 
-def _explain(message: str, wanted: Sequence[str]) -> str:
-    """Return Arrow's message, with the number of a column replaced by its name."""
-    for position, name in enumerate(dict.fromkeys(wanted)):
-        message = message.replace(f"In CSV column #{position}:", f"in column {name!r}:")
-    return message
+def _explain(message: str, names: Sequence[str]) -> str:
+    """Return Arrow's message, with the number of a column (from zero, in the file) replaced by its name."""
+    return re.sub(r"In CSV column #(\d+):", lambda match: f"in column {names[int(match[1])]!r}:", message)

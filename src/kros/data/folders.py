@@ -36,8 +36,18 @@ def whole_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
         filled = temporary / "new"
         filled.mkdir()
         yield filled
-        if out.exists():
-            out.rename(temporary / "old")
-        filled.rename(out)
+        _replace(out, filled, temporary / "old")
     finally:
         shutil.rmtree(temporary)
+
+
+def _replace(out: Path, filled: Path, aside: Path) -> None:
+    """Move a folder into place; what was there comes back when that fails."""
+    if out.exists():
+        out.rename(aside)
+    try:
+        filled.rename(out)
+    except OSError:
+        if aside.exists():
+            aside.rename(out)
+        raise

@@ -112,7 +112,7 @@ def check_even(recording: Recording, period_s: float, reference: EpisodeKey, tol
         raise DataError(
             f"{title(recording.key)}: uneven time, {count} of {len(steps)} steps differ from {own:g} s by more than "
             f"{tolerance:g} of it, the worst "
-            f'{steps[worst]:g} s at sample {worst}; declare [[data.prepare]] step = "resample", period_s = {own:g}, or fix the source.'
+            f'{steps[worst]:g} s at sample {worst}; declare [[data.prepare]] step = "resample", period_s = {own:.3g}, or fix the source.'
         )
     mean = float((time[-1] - time[0]) / len(steps))
     if abs(mean - period_s) > max(PERIOD_TOLERANCE, tolerance / len(steps)) * period_s:

@@ -8,6 +8,7 @@ Names of files are percent-encoded, so any id works. A study writes groups from 
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,10 +22,12 @@ import numpy.typing as npt
 
 from ..core.artifacts import save_artifact
 from ..core.errors import DataError
-from .checks import InputWatch, OnNan, check_structure, read_or_drop
+from .checks import InputWatch, OnNan, check_structure, parse_on_nan, read_or_drop
 from .folders import whole_folder
 from .population import EpisodeKey, Population
 from .readers.parquet import INDEX
+
+logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
 COMPRESSION = "none"
@@ -69,11 +72,12 @@ def write_group(population: Population, unit: str, condition: str, folder: Path 
     Returns
     -------
     GroupRecord
+        Without episodes, and no file, where every episode was dropped.
 
     Raises
     ------
     DataError
-        An episode that cannot be used, or none left.
+        An episode that cannot be used, an input that never moves, or no such unit and condition.
     """
     keys = population.keys(unit, condition)
     if not keys:
@@ -82,12 +86,10 @@ def write_group(population: Population, unit: str, condition: str, folder: Path 
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     watch = InputWatch(population.channels)
     try:
-        written = list(_write_episodes(population, keys, temporary, OnNan(on_nan), watch))
+        written = list(_write_episodes(population, keys, temporary, parse_on_nan(on_nan), watch))
         if not written:
-            raise DataError(
-                f"Unit {unit} ({condition}): no episode is left of {len(keys)} after dropping those with NaN; fix the "
-                "source or leave the unit out."
-            )
+            logger.warning("Unit %s (%s) is left out: no episode of %d is left after dropping those with NaN.", unit, condition, len(keys))
+            return GroupRecord(unit, condition, "", (), ())
         watch.check(unit, condition)
         temporary.replace(path)
     finally:
@@ -105,7 +107,7 @@ def write_index(population: Population, records: Iterable[GroupRecord], folder: 
     records : iterable of GroupRecord
     folder : Path
     """
-    groups = list(records)
+    groups = [g for g in records if g.episodes]
     written = {g.unit for g in groups}
     check_structure(population.channels, [EpisodeKey(g.unit, g.condition, e) for g in groups for e in g.episodes])
     content = {

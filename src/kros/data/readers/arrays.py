@@ -17,10 +17,15 @@ from ..recording import Recording, title
 
 @dataclass(frozen=True, eq=False)
 class ArrayRecordings:
-    """Episodes held in memory, columns already in the order of the channels."""
+    """Episodes held in memory, columns already in the order of the channels; the arrays are made read-only."""
 
     values: Mapping[EpisodeKey, npt.NDArray[np.float64]]
     times: Mapping[EpisodeKey, npt.NDArray[np.float64]] | None = None
+
+    def __post_init__(self) -> None:
+        """Protect the samples, which every reader of the population shares."""
+        for values in self.values.values():
+            values.flags.writeable = False
 
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode."""

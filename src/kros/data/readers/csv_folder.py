@@ -133,10 +133,13 @@ def _sample(source: Path) -> str:
 
 
 def _place(path: Path, fields: list[str], mapping: CsvMapping, unit: UnitMapping) -> FilePlace:
-    numbered = tuple(f"column {i}" for i in range(1, len(fields) + 1))
     wanted: list[Column | None] = [mapping.time] if mapping.time is not None else []
     wanted += [mapping.column(channel, unit) for channel in mapping.ordered]
-    return FilePlace(str(path), numbered, tuple(numbered[_position(path, fields, column)] for column in wanted))
+    names = [f"#{i}" for i in range(1, len(fields) + 1)]  # headers may repeat names that nobody wants
+    positions = [_position(path, fields, column) for column in wanted]
+    for position, column in zip(positions, wanted, strict=True):
+        names[position] = column if isinstance(column, str) else f"column {column}"
+    return FilePlace(str(path), tuple(names), tuple(names[position] for position in positions))
 
 
 def _position(path: Path, fields: list[str], column: Column | None) -> int:

@@ -1,0 +1,185 @@
+"""Arrays, long frames and pykoop's array."""
+
+import builtins
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kros.core.errors import DataError, MissingDependencyError
+from kros.data import Channel, EpisodeKey, Role, Unit, from_arrays, from_frame, from_pykoop, to_pykoop
+
+CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
+
+
+def values(seed: int, n: int = 12) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((n, 3))
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        ([[values(0), values(1)], [values(2)]], [("0", "default", "0"), ("0", "default", "1"), ("1", "default", "0")]),
+        ({"b": [values(0)], "a": [values(1)]}, [("a", "default", "0"), ("b", "default", "0")]),
+        ({"a": {"10": values(0), "9": values(1)}}, [("a", "default", "9"), ("a", "default", "10")]),
+        ({"a": {"hot": [values(0)], "cold": [values(1)]}}, [("a", "cold", "0"), ("a", "hot", "0")]),
+        ({"a": {"hot": {"x7": values(0)}}}, [("a", "hot", "x7")]),
+        ({EpisodeKey("a", "hot", "3"): values(0)}, [("a", "hot", "3")]),
+        ({7: [values(0)]}, [("7", "default", "0")]),
+    ],
+)
+def test_shapes_of_data(data: Any, expected: list[tuple[str, str, str]]) -> None:
+    assert from_arrays(data, CHANNELS, 0.1).episodes == tuple(EpisodeKey(*e) for e in expected)
+
+
+def test_pairs_lists_and_column_order() -> None:
+    whole = values(0)
+    mixed = (CHANNELS[2], CHANNELS[0], CHANNELS[1])
+    for population in (
+        from_arrays({"a": [(whole[:, :2], whole[:, 2:])]}, CHANNELS, 0.1),
+        from_arrays({"a": [(whole[:, :2], whole[:, 2])]}, CHANNELS, 0.1),
+        from_arrays({"a": [whole.tolist()]}, CHANNELS, 0.1),
+        from_arrays({"a": [whole[:, [2, 0, 1]]]}, mixed, 0.1),
+    ):
+        assert population.channels == CHANNELS
+        np.testing.assert_array_equal(population.read(EpisodeKey("a", "default", "0")), whole)
+
+
+def test_units_and_metadata() -> None:
+    facts = [Unit("b", "outliers", {"line": 2}), Unit("never recorded")]
+    population = from_arrays({"a": [values(0)], "b": [values(1)]}, CHANNELS, 0.1, units=facts, metadata={"plant": "p"})
+    assert [(u.id, u.group) for u in population.units] == [("a", ""), ("b", "outliers")]
+    assert population.metadata == {"plant": "p"}
+
+
+@pytest.mark.parametrize(
+    ("episode", "message"),
+    [
+        (values(0)[:, :2], r"Episode 0 of unit a \(default\): needs shape \(n_samples, 3\) .*found \(12, 2\)"),
+        (values(0).T, r"found \(3, 12\); transpose"),
+        (values(0)[:, 0], r"found \(12,\)"),
+        ([["one", "two", "three"]], "found something else"),
+        ((values(0)[:, :2], values(0)[:5, 2:]), "found something else"),
+    ],
+)
+def test_arrays_that_do_not_fit(episode: Any, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        from_arrays({"a": [episode]}, CHANNELS, 0.1)
+
+
+def test_period_above_zero_and_unknown_key() -> None:
+    with pytest.raises(DataError, match="sampling period above zero, found 0"):
+        from_arrays({"a": [values(0)]}, CHANNELS, 0)
+    with pytest.raises(DataError, match=r"Asked for episode 9 of unit a \(default\)"):
+        from_arrays({"a": [values(0)]}, CHANNELS, 0.1).read(EpisodeKey("a", "default", "9"))
+
+
+def frame(**changes: Any) -> Any:
+    pd = pytest.importorskip("pandas")
+    rows = []
+    for i, (unit, condition, episode) in enumerate([("a", "hot", 2), ("a", "hot", 10), ("b", "hot", 2)]):
+        rows.append(
+            pd.DataFrame(values(i), columns=["x", "v", "u"]).assign(unit=unit, condition=condition, episode=episode, t=np.arange(12) * 0.1)
+        )
+    return pd.concat(rows, ignore_index=True).assign(**changes)
+
+
+def test_frame() -> None:
+    population = from_frame(frame(), (CHANNELS[2], *CHANNELS[:2]), time="t")
+    assert population.channels == CHANNELS
+    assert population.sample_period_s == 0.1
+    assert [k.episode for k in population.episodes] == ["2", "10", "2"]
+    np.testing.assert_array_equal(population.read(EpisodeKey("a", "hot", "10")), values(1))
+
+
+def test_frame_with_defaults_and_renamed_columns() -> None:
+    one = frame().query("unit == 'b'").drop(columns=["condition", "episode"]).rename(columns={"unit": "serial"})
+    population = from_frame(one, CHANNELS, sample_period_s=0.5, unit="serial", units=[Unit("b", "outliers")])
+    assert population.episodes == (EpisodeKey("b", "default", "0"),)
+    assert population.unit("b").group == "outliers"
+
+
+def test_frame_refuses() -> None:
+    pd = pytest.importorskip("pandas")
+    with pytest.raises(DataError, match="column 'v' is missing"):
+        from_frame(frame().drop(columns="v"), CHANNELS, time="t")
+    with pytest.raises(DataError, match="one of time and sample_period_s"):
+        from_frame(frame(), CHANNELS)
+    with pytest.raises(DataError, match=r"column 'unit' should hold text or whole numbers, found 1\.5"):
+        from_frame(frame(unit=1.5), CHANNELS, time="t")
+    with pytest.raises(DataError, match=r"columns \['x', 'v', 'u'\] should hold numbers"):
+        from_frame(frame(x="wide"), CHANNELS, time="t")
+    with pytest.raises(DataError, match=r"rows of episode 0 of unit a \(hot\) are not together"):
+        from_frame(frame(episode=0, unit=["a"] * 6 + ["b"] * 6 + ["a"] * 24), CHANNELS, time="t")
+    disordered = np.arange(12)[[0, 1, 2, 3, 4, 6, 5, 7, 8, 9, 10, 11]] * 0.1
+    population = from_frame(frame(t=np.tile(disordered, 3)), CHANNELS, time="t")
+    with pytest.raises(DataError, match=r"time should increase, found 0\.6 s at sample 5 and 0\.5 s at sample 6"):
+        population.read(population.episodes[0])
+    with pytest.raises(DataError, match="found ndarray; use from_arrays"):
+        from_frame(values(0), CHANNELS, time="t")
+    with pytest.raises(DataError, match="population is empty"):
+        from_frame(pd.DataFrame(columns=["unit", "x", "v", "u"]), CHANNELS, sample_period_s=0.1)
+
+
+def test_frame_without_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = builtins.__import__
+
+    def refuse(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name == "pandas":
+            raise ImportError(name)
+        return original(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(MissingDependencyError, match="needs pandas"):
+        from_frame(None, CHANNELS, time="t")
+
+
+def koopman_array() -> np.ndarray:
+    return np.concatenate([np.column_stack([np.full(12, e), values(e)]) for e in (0, 3, 7)])
+
+
+def test_pykoop_both_ways() -> None:
+    X = koopman_array()
+    population = from_pykoop({"a": X, "b": X}, 1, 0.1)
+    assert (population.states, population.inputs, population.measured) == (("x0", "x1"), ("u0",), ("x0", "x1"))
+    assert [k.episode for k in population.keys("a")] == ["0", "3", "7"]
+    np.testing.assert_array_equal(population.read(EpisodeKey("b", "default", "7")), values(7))
+    back = to_pykoop(population, "a")
+    np.testing.assert_array_equal(back[:, 1:], X[:, 1:])
+    np.testing.assert_array_equal(back[:, 0], np.repeat([0, 1, 2], 12))
+    assert to_pykoop(population).shape == (72, 4)
+
+
+def test_pykoop_rows_of_an_episode_may_be_scattered() -> None:
+    X = koopman_array()
+    shuffled = X[np.argsort(np.tile(np.arange(12), 3), kind="stable")]  # sample by sample instead of episode by episode
+    np.testing.assert_array_equal(from_pykoop(shuffled, 1, 0.1).read(EpisodeKey("0", "default", "3")), values(3))
+
+
+def test_pykoop_without_episode_column() -> None:
+    population = from_pykoop(values(0), 1, 0.1, episode_feature=False, channels=CHANNELS, condition="hot")
+    np.testing.assert_array_equal(population.read(EpisodeKey("0", "hot", "0")), values(0))
+
+
+def test_pykoop_agrees_with_pykoop() -> None:
+    pykoop = pytest.importorskip("pykoop", exc_type=ImportError)
+    population = from_pykoop(koopman_array(), 1, 0.1)
+    episodes = pykoop.split_episodes(to_pykoop(population), episode_feature=True)
+    for key, (_, expected) in zip(population.episodes, episodes, strict=True):
+        np.testing.assert_array_equal(population.read(key), expected)
+
+
+def test_pykoop_refuses() -> None:
+    half = koopman_array()
+    half[4, 0] = 0.5
+    with pytest.raises(DataError, match=r"should number the episodes, found 0\.5 in row 4 of unit 0"):
+        from_pykoop(half, 1, 0.1)
+    for X, n_inputs in [(koopman_array(), 3), (koopman_array()[:, 0], 1), (koopman_array(), -1)]:
+        with pytest.raises(DataError, match="check n_inputs"):
+            from_pykoop(X, n_inputs, 0.1)
+    with pytest.raises(DataError, match="check n_inputs"):
+        from_pykoop({"a": koopman_array(), "b": koopman_array()[:, :3]}, 1, 0.1)
+    with pytest.raises(DataError, match="mapping is empty"):
+        from_pykoop({}, 1, 0.1)
+    with pytest.raises(DataError, match="no episode of unit 'z'"):
+        to_pykoop(from_pykoop(koopman_array(), 1, 0.1), "z")

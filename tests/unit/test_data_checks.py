@@ -1,0 +1,143 @@
+"""What makes an episode or a population unusable."""
+
+import logging
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError, DataError
+from kros.data import Channel, EpisodeKey, Population, Role, Unit, check_episode, check_population, from_arrays, scan_population
+from kros.data.checks import OnNan, parse_on_nan
+
+CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
+KEY = EpisodeKey("001011", "load", "7")
+
+
+def values(seed: int = 0, n: int = 20) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((n, 3))
+
+
+def population(episodes: Any = None, units: tuple[Unit, ...] = ()) -> Population:
+    return from_arrays(episodes or {"a": [values(0), values(1)], "b": [values(2), values(3)]}, CHANNELS, 0.1, units=units)
+
+
+def test_a_good_episode_passes() -> None:
+    check_episode(values(), KEY, CHANNELS)
+
+
+@pytest.mark.parametrize(
+    ("rows", "value", "found"),
+    [
+        (slice(12, 15), np.nan, "3 NaN at samples 12-14"),
+        (slice(12, 13), np.nan, "1 NaN at sample 12"),
+        (slice(0, 2), np.inf, "2 infinity at samples 0-1"),
+        (slice(3, 5), [np.nan, -np.inf], "2 NaN and infinity at samples 3-4"),
+    ],
+)
+def test_non_finite(rows: slice, value: Any, found: str) -> None:
+    bad = values()
+    bad[rows, 1] = value
+    match = rf"^Episode 7 of unit 001011 \(load\): channel 'v' has {found}; fix the source or set data\.on_nan = \"drop_episode\"\.$"
+    with pytest.raises(DataError, match=match):
+        check_episode(bad, KEY, CHANNELS)
+
+
+def test_infinities_of_both_signs_and_huge_values() -> None:
+    bad = values()
+    bad[3:5, 1] = [np.inf, -np.inf]
+    with pytest.raises(DataError, match="2 infinity at samples 3-4"):
+        check_episode(bad, KEY, CHANNELS)
+    check_episode(np.sign(values()) * 1e308, KEY, CHANNELS)
+
+
+def test_constant_state_is_refused_and_resting_input_is_not() -> None:
+    rest = values()
+    rest[:, 2] = 0.0
+    check_episode(rest, KEY, CHANNELS)
+    rest[:, 1] = 2.5
+    with pytest.raises(DataError, match=r"channel 'v' is a state and stays at 2\.5 in all 20 samples"):
+        check_episode(rest, KEY, CHANNELS)
+
+
+def test_short_and_misshapen() -> None:
+    check_episode(values(n=5), KEY, CHANNELS, min_samples=5)
+    with pytest.raises(DataError, match="at least 6 samples are needed, found 5"):
+        check_episode(values(n=5), KEY, CHANNELS, min_samples=6)
+    with pytest.raises(DataError, match=r"3 channels .* shape \(20, 2\)"):
+        check_episode(values()[:, :2], KEY, CHANNELS)
+
+
+def test_population_of_two_passes_and_one_does_not() -> None:
+    check_population(population())
+    one = population({"a": [values(0), values(1)]})
+    with pytest.raises(DataError, match=r"at least two units .* found 1 \(a\).*--until identify"):
+        check_population(one)
+    check_population(one, allow_single=True)
+
+
+def test_outliers_do_not_count() -> None:
+    with pytest.raises(DataError, match=r"found 1 \(a\)"):
+        check_population(population(units=(Unit("b", "outliers"),)))
+
+
+def test_nothing_measured() -> None:
+    with pytest.raises(DataError, match=r"No state of \['x', 'v'\] is measured"):
+        check_population(replace(population(), channels=(replace(CHANNELS[0], measured=False), *CHANNELS[1:])))
+
+
+def test_empty_and_duplicate() -> None:
+    with pytest.raises(DataError, match="population is empty"):
+        from_arrays({}, CHANNELS, 0.1)
+    good = population()
+    with pytest.raises(DataError, match="population is empty"):
+        check_population(replace(good, episodes=()))
+    with pytest.raises(DataError, match=r"Duplicate episodes: episode 0 of unit a \(default\) occurs 2 times"):
+        check_population(replace(good, episodes=(*good.episodes, good.episodes[0])))
+
+
+def test_channel_names_differ() -> None:
+    with pytest.raises(DataError, match=r"Channel names should differ, found \['x'\]"):
+        from_arrays({"a": [values()]}, (CHANNELS[0], CHANNELS[0], CHANNELS[2]), 0.1)
+
+
+def test_scan_refuses_an_input_that_never_moves() -> None:
+    resting = [values(i) for i in range(4)]
+    resting[0][:, 2] = 0.0
+    scan_population(population({"a": resting[:2], "b": resting[2:]}))
+    resting[1][:, 2] = 0.0
+    with pytest.raises(DataError, match=r"Unit a \(default\): input 'u' stays at 0 in all 2 episodes"):
+        scan_population(population({"a": resting[:2], "b": resting[2:]}))
+
+
+def test_scan_accepts_an_input_held_at_different_levels() -> None:
+    levels = [values(i) for i in range(2)]
+    for level, episode in enumerate(levels):
+        episode[:, 2] = level
+    scan_population(population({"a": levels}))
+
+
+def test_scan_drops_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    episodes = {"a": [values(0), values(1)], "b": [values(2)]}
+    episodes["a"][1][3, 0] = np.nan
+    episodes["b"][0][4, 1] = np.nan
+    bad = population(episodes)
+    with pytest.raises(DataError, match="channel 'x' has 1 NaN at sample 3"):
+        scan_population(bad)
+    with caplog.at_level(logging.WARNING):
+        kept = scan_population(bad, on_nan=OnNan.DROP_EPISODE)
+    assert kept.episodes == (EpisodeKey("a", "default", "0"),)
+    assert kept.unit_ids == ("a",)
+    assert [r.message.split(":")[1] for r in caplog.records] == [" Episode 1 of unit a (default)", " Episode 0 of unit b (default)"]
+
+
+def test_scan_knows_the_lifting() -> None:
+    with pytest.raises(DataError, match="at least 21 samples are needed, found 20"):
+        scan_population(population(), min_samples=21)
+
+
+def test_on_nan_by_name() -> None:
+    assert parse_on_nan("drop_episode") is OnNan.DROP_EPISODE
+    with pytest.raises(ConfigError, match=r"data\.on_nan should be one of \['error', 'drop_episode'\], found 'ignore'"):
+        parse_on_nan("ignore")

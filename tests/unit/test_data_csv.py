@@ -1,0 +1,226 @@
+"""The CSV reader and its mapping."""
+
+import gzip
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError, DataError
+from kros.data import EpisodeKey, Population, read_csv_folder
+
+N = 50
+CHANNEL: list[dict[str, Any]] = [
+    {"name": "u", "column": "volt", "role": "input", "unit": "V"},
+    {"name": "x", "column": "pos", "role": "state", "measured": True, "unit": "m", "scale": 1e-3},
+]
+MAPPING: dict[str, Any] = {"files": r"(?P<unit>[^/]+)/(?P<condition>\w+)_(?P<episode>\d+)\.csv", "time": "t", "channel": CHANNEL}
+
+
+def samples(seed: int) -> np.ndarray:
+    """Columns t, pos, volt."""
+    rng = np.random.default_rng(seed)
+    return np.column_stack([np.arange(N) * 0.01, rng.standard_normal((N, 2))])
+
+
+def write(path: Path, values: np.ndarray, header: str | None = "t,pos,volt", delimiter: str = ",", end: str = "\n") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = end.join(([header] if header else []) + [delimiter.join(repr(float(v)) for v in row) for row in values]) + end
+    path.write_bytes(gzip.compress(text.encode()) if path.suffix == ".gz" else text.encode())
+
+
+def mapping(**changes: Any) -> dict[str, Any]:
+    return {**MAPPING, **changes}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for seed, name in enumerate(["a/cold_1.csv", "a/cold_2.csv", "b/cold_1.csv", "b/cold_10.csv", "b/cold_2.csv", "b/warm_1.csv"]):
+        write(tmp_path / name, samples(seed))
+    (tmp_path / "notes.csv.bak").write_text("nothing")
+    return tmp_path
+
+
+def test_values_keys_and_channels(folder: Path) -> None:
+    population = read_csv_folder(folder, MAPPING)
+    assert [str(k) for k in population.keys("b")] == [
+        f"episode {e} of unit b ({c})" for c, e in [("cold", 1), ("cold", 2), ("cold", 10), ("warm", 1)]
+    ]
+    assert (population.states, population.inputs, population.measured) == (("x",), ("u",), ("x",))
+    assert population.sample_period_s == 0.01
+    values = population.read(EpisodeKey("a", "cold", "2"))
+    np.testing.assert_allclose(values, samples(1)[:, 1:] * [1e-3, 1], rtol=1e-15)
+
+
+def test_mapping_from_a_toml_file(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "mapping.toml"
+    path.write_text(
+        "files = '(?P<unit>[^/]+)/(?P<condition>\\w+)_(?P<episode>\\d+)\\.csv'\ntime = 't'\n"
+        "[[channel]]\nname = 'u'\ncolumn = 'volt'\nrole = 'input'\nunit = 'V'\n"
+        "[[channel]]\nname = 'x'\ncolumn = 'pos'\nrole = 'state'\nmeasured = true\nunit = 'm'\nscale = 1e-3\n"
+    )
+    key = EpisodeKey("a", "cold", "2")
+    np.testing.assert_array_equal(read_csv_folder(folder, path).read(key), read_csv_folder(folder, MAPPING).read(key))
+    assert read_csv_folder(folder, str(path)).channels == read_csv_folder(folder, MAPPING).channels
+
+
+def test_missing_groups_get_defaults(tmp_path: Path) -> None:
+    write(tmp_path / "only.csv", samples(0))
+    assert read_csv_folder(tmp_path, mapping(files="only")).episodes == (EpisodeKey("unit", "default", "0"),)
+
+
+def test_exclude_and_group(folder: Path) -> None:
+    population = read_csv_folder(folder, mapping(exclude="_10|warm"))
+    assert [(k.unit, k.episode) for k in population.episodes] == [("a", "1"), ("a", "2"), ("b", "1"), ("b", "2")]
+    write(folder / "outliers" / "c_1.csv", samples(9))
+    grouped = read_csv_folder(folder, mapping(files=r"(?P<group>outliers)?/?(?P<unit>[abc])[/_]\w*?(?P<episode>\d+)\.csv", exclude="warm"))
+    assert [(u.id, u.group) for u in grouped.units] == [("a", ""), ("b", ""), ("c", "outliers")]
+
+
+def test_several_units_in_one_file(tmp_path: Path) -> None:
+    values = np.column_stack([samples(0), samples(1)[:, 1:]])
+    write(tmp_path / "rig_1.csv.gz", values, "t,pos1,volt1,pos2,volt2")
+    units = [{"suffix": f"/joint{j}", "columns": {"x": f"pos{j}", "u": f"volt{j}"}} for j in (1, 2)]
+    channel = [{k: v for k, v in c.items() if k not in ("column", "scale")} for c in CHANNEL]
+    population = read_csv_folder(tmp_path, mapping(files=r"(?P<unit>\w+)_(?P<episode>\d)", channel=channel, unit=units))
+    assert population.unit_ids == ("rig/joint1", "rig/joint2")
+    np.testing.assert_allclose(population.read(EpisodeKey("rig/joint2", "default", "1")), values[:, 3:], rtol=1e-15)
+
+
+def test_spaces_and_quotes_around_names_and_cells(tmp_path: Path) -> None:
+    (tmp_path / "a_1.csv").write_text('t, "pos", volt\r\n0.00, 1.5, -2e0\r\n0.01, 2.5, 3\r\n0.02, 4.5, 3\r\n')
+    values = read_csv_folder(tmp_path, mapping(files=r"(?P<unit>a)_(?P<episode>\d)")).read(EpisodeKey("a", "default", "1"))
+    np.testing.assert_allclose(values, [[1.5e-3, -2], [2.5e-3, 3], [4.5e-3, 3]])
+
+
+def test_tab_separated_without_header(tmp_path: Path) -> None:
+    values = samples(0)
+    values[:, 0] *= 1000
+    write(tmp_path / "a_1.tsv", values, None, "\t", "\r\n")
+    channel = [{**CHANNEL[0], "column": 3}, {**CHANNEL[1], "column": 2}]
+    table = mapping(files=r"(?P<unit>a)_(?P<episode>\d)", channel=channel, time=1, time_scale=1e-3, header=False, delimiter="\t")
+    population = read_csv_folder(tmp_path, table)
+    assert population.sample_period_s == 0.01
+    np.testing.assert_allclose(population.read(population.episodes[0]), values[:, 1:] * [1e-3, 1], rtol=1e-15)
+    table["channel"] = [{**CHANNEL[0], "column": 4}, channel[1]]
+    with pytest.raises(DataError, match=r"a_1\.tsv: column 4 is asked for, found 3 columns"):
+        read_csv_folder(tmp_path, table)
+
+
+def test_period_in_place_of_time(folder: Path) -> None:
+    table = mapping(sample_period_s=0.5)
+    del table["time"]
+    assert read_csv_folder(folder, table).sample_period_s == 0.5
+
+
+def test_mapping_with_preparation_and_metadata(folder: Path) -> None:
+    population = read_csv_folder(folder, mapping(prepare=[{"step": "trim", "start": 10}], metadata={"gear_ratio": 50}))
+    assert population.read(population.episodes[0]).shape == (40, 2)
+    assert population.metadata["gear_ratio"] == 50
+
+
+def read_first(folder: Path, unit: str = "a") -> Population:
+    population = read_csv_folder(folder, MAPPING)
+    population.read(EpisodeKey(unit, "cold", "1"))
+    return population
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("t,position,volt", r"cold_1\.csv: column 'pos' is missing, found \['t', 'position', 'volt'\]"),
+        ("t,pos,v", "column 'volt' is missing"),
+        ("t,pos,pos", "column 'pos' occurs 2 times"),
+        ("time,pos,volt", "column 't' is missing"),
+    ],
+)
+def test_columns_that_are_missing_or_double(folder: Path, header: str, message: str) -> None:
+    write(folder / "b" / "cold_1.csv", samples(0), header)
+    with pytest.raises(DataError, match=message):
+        read_csv_folder(folder, MAPPING)
+
+
+def test_columns_nobody_asked_for_are_left_alone(folder: Path) -> None:
+    write(folder / "b" / "cold_1.csv", np.column_stack([samples(0), samples(1)]), "t,pos,volt,a,b,c")
+    np.testing.assert_allclose(read_csv_folder(folder, MAPPING).read(EpisodeKey("b", "cold", "1"))[:, 1], samples(0)[:, 2])
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("0.5,1,2,3", r"cold_1\.csv: .*Expected 3 columns, got 4"),
+        ("0.5,1", r"cold_1\.csv: .*Expected 3 columns, got 2"),
+        ("0.5,1,off", r"cold_1\.csv: in column 'volt'.*'off'"),
+        ("0.5,,1", r"Episode 1 of unit a \(cold\): channel 'x' has 1 NaN at sample 50"),
+        ("0.5,1,inf", "channel 'u' has 1 infinity at sample 50"),
+        ("0.505,1,1", r"uneven time, 1 of 50 steps .* 0\.015 s at sample 49"),
+    ],
+)
+def test_bad_rows(folder: Path, row: str, message: str) -> None:
+    path = folder / "a" / "cold_1.csv"
+    path.write_text(path.read_text() + row + "\n")
+    with pytest.raises(DataError, match=message):
+        read_first(folder)
+
+
+def test_text_among_columns_nobody_asked_for(folder: Path) -> None:
+    path = folder / "a" / "cold_1.csv"
+    path.write_text("note,volt,t,note,pos\nfine,1,0,,4\n,2,0.01,good,5\n,3,0.02,x,7\n")
+    np.testing.assert_allclose(read_csv_folder(folder, MAPPING).read(EpisodeKey("a", "cold", "1")), [[4e-3, 1], [5e-3, 2], [7e-3, 3]])
+    path.write_text("note,volt,t,note,pos\nfine,1,0,,4\n,2,0.01,good,5\n,3,0.02,x,seven\n")
+    with pytest.raises(DataError, match=r"cold_1\.csv: in column 'pos'.*'seven'"):
+        read_first(folder)
+
+
+def test_duplicates_and_no_match(folder: Path) -> None:
+    with pytest.raises(DataError, match=r"Duplicate episodes: episode 1 of unit b \(default\)"):
+        read_csv_folder(folder, mapping(files=r"(?P<unit>[^/]+)/\w+_(?P<episode>\d+)\.csv"))
+    with pytest.raises(DataError, match=r"no file matches files = 'run\\\\d' of 6 files such as 'a/cold_1\.csv'"):
+        read_csv_folder(folder, mapping(files=r"run\d"))
+    (folder / "empty").mkdir()
+    with pytest.raises(DataError, match=r"no file matches.*there is no file that ends in \.csv"):
+        read_csv_folder(folder / "empty", MAPPING)
+
+
+def test_another_rate(folder: Path) -> None:
+    write(folder / "b" / "cold_1.csv", samples(0) * [2, 1, 1])
+    with pytest.raises(DataError, match=r"0\.01 s in episode 1 of unit a \(cold\) and 0\.02 s in episode 1 of unit b \(cold\)"):
+        read_first(folder, "b")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"file": "x"}, "unknown key 'file'; known keys are files, channel, time"),
+        ({"channel": [{"name": "x", "role": "state", "column": "pos", "measurd": True}]}, r"channel\[0\]: unknown key 'measurd'"),
+        ({"channel": [{"name": "x", "role": "output", "column": "pos"}]}, r"role: should be one of \['state', 'input'\], found 'output'"),
+        ({"channel": [{"name": "x", "role": "state"}]}, "channel 'x' has no column"),
+        ({"channel": []}, r"there is no \[\[channel\]\]"),
+        ({"files": "("}, r"files = '\(' is not a regular expression"),
+        ({"files": "(?P<run>a)"}, "names the group 'run'; known groups are unit, condition, episode, group"),
+        ({"time": None}, "one of time and sample_period_s"),
+        ({"sample_period_s": 0.1}, "one of time and sample_period_s"),
+        ({"time": 0}, "numbered from 1, found 0"),
+        ({"header": False}, "leaves columns without names, found 't'"),
+        ({"delimiter": "::"}, "one character"),
+        ({"unit": [{"suffix": "1", "columns": {"z": "pos"}}]}, r"gives a column for 'z'; the channels are \['u', 'x'\]"),
+        ({"prepare": [{"step": "trim", "begin": 1}]}, "unknown key 'begin'"),
+    ],
+)
+def test_mapping_refuses(folder: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        read_csv_folder(folder, mapping(**changes))
+
+
+def test_mapping_file_refuses(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_csv_folder(tmp_path, tmp_path / "mapping.toml")
+    (tmp_path / "mapping.toml").write_text("files = ")
+    with pytest.raises(ConfigError, match="not valid TOML"):
+        read_csv_folder(tmp_path, tmp_path / "mapping.toml")
+
+
+def test_states_alone_without_a_role_state_are_refused(folder: Path) -> None:
+    with pytest.raises(DataError, match="at least one channel with role 'state'"):
+        read_csv_folder(folder, mapping(channel=[CHANNEL[0]]))

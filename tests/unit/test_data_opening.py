@@ -1,0 +1,116 @@
+"""Opening a folder by the name of a reader."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError, DataError
+from kros.data import Channel, Role, detect_reader, from_arrays, open_population, read_parquet, write_parquet, write_raw
+from kros.data.readers.motor_drive_raw import CHANNELS, STEPS
+
+MAPPING: dict[str, Any] = {
+    "files": r"(?P<unit>\w)_(?P<episode>\d)\.csv",
+    "time": "t",
+    "channel": [{"name": "x", "column": "x", "role": "state", "measured": True}],
+}
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One folder for each reader, one empty, one with nothing of use."""
+    root = tmp_path_factory.mktemp("sources")
+    rng = np.random.default_rng(0)
+    drives = {u: {"load": [rng.standard_normal((1050, 5)) for _ in range(2)]} for u in ("000001", "000002")}
+    channels = CHANNELS
+    for step in STEPS:
+        channels = step.channels_after(channels)
+    write_raw(from_arrays(drives, channels, 1e-3), root / "motor-drive-raw")
+    write_parquet(
+        from_arrays({u: [rng.standard_normal((9, 1))] for u in "ab"}, (Channel("x", Role.STATE, measured=True),), 0.1), root / "parquet"
+    )
+    (root / "csv").mkdir()
+    for unit in "ab":
+        lines = ["t,x", *(f"{0.1 * k:.1f},{rng.standard_normal()}" for k in range(9))]
+        (root / "csv" / f"{unit}_1.csv").write_text("\n".join(lines))
+    (root / "empty").mkdir()
+    (root / "other").mkdir()
+    (root / "other" / "photo.jpg").write_text("")
+    return root
+
+
+@pytest.mark.parametrize("name", ["motor-drive-raw", "parquet", "csv"])
+def test_the_fitting_reader_is_found_and_used(folders: Path, name: str) -> None:
+    mapping = MAPPING if name == "csv" else None
+    assert detect_reader(folders / name) == name
+    named = open_population(name, folders / name, mapping=mapping)
+    found = open_population(None, folders / name, mapping=mapping)
+    assert len(named.unit_ids) == 2
+    assert found.episodes == named.episodes
+    assert named.read(named.episodes[0]).shape[1] == len(named.channels)
+
+
+@pytest.mark.parametrize("name", ["empty", "other", "missing"])
+def test_nothing_fits(folders: Path, name: str) -> None:
+    assert detect_reader(folders / name) is None
+
+
+@pytest.mark.parametrize(
+    ("reader", "folder", "found"),
+    [
+        ("parquet", "motor-drive-raw", "holds a folder 'population' or 'outliers', so it looks like motor-drive-raw"),
+        ("motor-drive-raw", "parquet", r"holds population\.json, so it looks like parquet"),
+        ("parquet", "csv", "holds CSV files, so it looks like csv"),
+        ("motor-drive-raw", "csv", 'set data.reader = "csv"'),
+    ],
+)
+def test_wrong_reader(folders: Path, reader: str, folder: str, found: str) -> None:
+    with pytest.raises(DataError, match=rf"{folder} as {reader}: .*{found}"):
+        open_population(reader, folders / folder)
+
+
+@pytest.mark.parametrize("reader", ["motor-drive-raw", "parquet", "csv", None])
+def test_missing_empty_and_useless_folders(folders: Path, reader: str | None) -> None:
+    mapping = MAPPING if reader == "csv" else None
+    with pytest.raises(DataError, match=r"missing: there is no such folder; check data\.source"):
+        open_population(reader, folders / "missing", mapping=mapping)
+    with pytest.raises(DataError, match="empty: the folder is empty"):
+        open_population(reader, folders / "empty", mapping=mapping)
+    with pytest.raises(DataError, match=r"this is a file"):
+        open_population(reader, folders / "other" / "photo.jpg", mapping=mapping)
+    with pytest.raises(DataError, match="no reader fits" if reader != "csv" else "no file matches"):
+        open_population(reader, folders / "other", mapping=mapping)
+
+
+def test_unknown_reader_and_options(folders: Path) -> None:
+    with pytest.raises(ConfigError, match="one of motor-drive-raw, parquet, csv, found 'hdf5'"):
+        open_population("hdf5", folders / "csv")
+    with pytest.raises(ConfigError, match="needs a mapping of columns"):
+        open_population("csv", folders / "csv")
+    with pytest.raises(ConfigError, match="a CSV mapping is given"):
+        open_population("parquet", folders / "parquet", mapping=MAPPING)
+    with pytest.raises(ConfigError, match=r"data\.on_nan"):
+        open_population("parquet", folders / "parquet", on_nan="")
+    with pytest.raises(ConfigError, match=r"data\.prepare\[0\] \(step 'trim'\): unknown key"):
+        open_population("parquet", folders / "parquet", prepare=[{"step": "trim", "from": 3}])
+
+
+@pytest.mark.parametrize("name", ["motor-drive-raw", "parquet", "csv"])
+def test_declared_steps_come_after_the_readers_own(folders: Path, name: str) -> None:
+    mapping = MAPPING if name == "csv" else None
+    whole = open_population(name, folders / name, mapping=mapping)
+    trimmed = open_population(name, folders / name, mapping=mapping, prepare=[{"step": "trim", "start": 2}])
+    np.testing.assert_array_equal(trimmed.read(whole.episodes[0]), whole.read(whole.episodes[0])[2:])
+
+
+def test_dropping_episodes_at_opening(folders: Path, tmp_path: Path) -> None:
+    for path in (folders / "csv").iterdir():
+        (tmp_path / path.name).write_text(path.read_text())
+    (tmp_path / "a_2.csv").write_text("t,x\n0,1\n0.1,\n0.2,3\n")
+    assert len(open_population("csv", tmp_path, mapping=MAPPING).episodes) == 3
+    assert len(open_population("csv", tmp_path, mapping=MAPPING, on_nan="drop_episode").episodes) == 2
+
+
+def test_paths_may_be_text(folders: Path) -> None:
+    assert open_population("parquet", str(folders / "parquet")).episodes == read_parquet(str(folders / "parquet")).episodes

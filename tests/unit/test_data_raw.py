@@ -1,0 +1,264 @@
+"""The paper's raw layout, against files written line by line here."""
+
+import math
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kros.core.errors import DataError
+from kros.data import EpisodeKey, Unit, from_arrays, read_motor_drive_raw, write_raw
+from kros.data.readers.motor_drive_raw import CHANNELS, STEPS
+
+HEADER = "t,theta,omega,tau,theta_ref,omega_ref"
+N = 1100
+DEG = math.pi / 180 / 100
+
+
+def truth(seed: int, n: int = N) -> np.ndarray:
+    """Motor-side samples: time, position, velocity, torque, target position, target velocity, targets beside their measurements."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(n) * 1e-3
+    moving = np.where(np.arange(n) >= 1000, time - 1.0, 0.0)
+    target = 36000 * moving**2
+    columns = [
+        time,
+        target - 12.5 + 0.01 * rng.standard_normal(n),
+        72000 * moving + rng.standard_normal(n),
+        rng.standard_normal(n),
+        target,
+        72000 * moving,
+    ]
+    return np.column_stack(columns)
+
+
+def write_file(path: Path, samples: np.ndarray, header: str = HEADER) -> Path:
+    """Write one raw file as the bench does: targets one row late."""
+    rows = samples.copy()
+    rows[1:, 4:] = samples[:-1, 4:]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [header, *(",".join(repr(float(v)) for v in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def folder(root: Path, serial: str, load: str = "noload", group: str = "population", stamp: str = "20220915T122400") -> Path:
+    return root / "batch_b" / group / f"{stamp}_{serial}_{load}"
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    """Two units and an outlier, two conditions, episodes 0 and 1."""
+    for i, (serial, group) in enumerate([("001011", "population"), ("000002", "population"), ("000000", "outliers")]):
+        for load in ("noload", "load"):
+            for episode in (0, 1):
+                write_file(folder(tmp_path, serial, load, group) / f"cycle_{episode:03d}.csv", truth(10 * i + episode))
+    return tmp_path
+
+
+def test_reads_values_units_and_facts(raw: Path) -> None:
+    population = read_motor_drive_raw(raw)
+    assert population.sample_period_s == 0.001
+    assert [(u.id, u.group) for u in population.units] == [("000000", "outliers"), ("000002", "population"), ("001011", "population")]
+    assert population.conditions == ("load", "noload")
+    assert population.states == ("position", "velocity", "current")
+    assert population.inputs == ("target_position", "target_velocity")
+    assert population.measured == ("position",)
+    assert [c.unit for c in population.channels] == ["rad", "rad/s", "", "rad", "rad/s"]
+    assert dict(population.metadata) == {"plant": "harmonic-drive", "gear_ratio": 100}
+
+    samples = truth(1)[:-1]  # the last target is not recorded
+    offset = np.mean(samples[500:1000, 4] - samples[500:1000, 1])
+    expected = [(samples[:, 1] + offset) * DEG, samples[:, 2] * DEG, samples[:, 3] / 100, samples[:, 4] * DEG, samples[:, 5] * DEG]
+    values = population.read(EpisodeKey("001011", "noload", "1"))
+    np.testing.assert_allclose(values, np.column_stack(expected)[1000:], rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("inner", [".", "batch_b"])
+def test_source_may_hold_batch_b_or_population(raw: Path, inner: str) -> None:
+    assert len(read_motor_drive_raw(raw / inner).episodes) == 12
+
+
+def test_opening_reads_no_samples_but_the_first_episode(raw: Path) -> None:
+    path = folder(raw, "001011") / "cycle_001.csv"
+    path.write_text(HEADER + "\nbroken\n")
+    population = read_motor_drive_raw(raw)
+    with pytest.raises(DataError, match=r"cycle_001\.csv"):
+        population.read(EpisodeKey("001011", "noload", "1"))
+
+
+def test_two_time_stamps_add_up_unless_an_episode_is_in_both(raw: Path) -> None:
+    again = folder(raw, "001011", stamp="20230101T000000")
+    write_file(again / "cycle_002.csv", truth(5))
+    assert [k.episode for k in read_motor_drive_raw(raw).keys("001011", "noload")] == ["0", "1", "2"]
+    write_file(again / "cycle_001.csv", truth(6))
+    with pytest.raises(DataError, match=r"Duplicate episodes: episode 1 of unit 001011 \(noload\).*remove or renumber"):
+        read_motor_drive_raw(raw)
+
+
+@pytest.mark.parametrize(("columns", "problem"), [(5, "missing"), (7, "extra")])
+def test_wrong_number_of_columns_in_the_header(raw: Path, columns: int, problem: str) -> None:
+    header = ",".join("abcdefg"[:columns])
+    write_file(folder(raw, "000002") / "cycle_001.csv", truth(0), header)
+    with pytest.raises(DataError, match=rf"cycle_001\.csv: 6 columns are needed .*found {columns}.*{problem}"):
+        read_motor_drive_raw(raw)
+
+
+def test_wrong_number_of_columns_in_a_row(raw: Path) -> None:
+    path = folder(raw, "000002") / "cycle_001.csv"
+    path.write_text(path.read_text() + "1.1,0,0\n")
+    with pytest.raises(DataError, match=r"cycle_001\.csv: .*Expected 6 columns, got 3"):
+        read_motor_drive_raw(raw).read(EpisodeKey("000002", "noload", "1"))
+
+
+def test_text_in_a_cell_names_the_column(raw: Path) -> None:
+    path = folder(raw, "000002") / "cycle_001.csv"
+    path.write_text(path.read_text() + "1.1,0,stop,0,0,0\n")
+    with pytest.raises(DataError, match=r"cycle_001\.csv: in column 'velocity'.*stop"):
+        read_motor_drive_raw(raw).read(EpisodeKey("000002", "noload", "1"))
+
+
+def test_missing_header_line(raw: Path) -> None:
+    path = folder(raw, "000002") / "cycle_001.csv"
+    path.write_text("\n".join(path.read_text().splitlines()[1:]))
+    with pytest.raises(DataError, match="one header line is needed"):
+        read_motor_drive_raw(raw)
+
+
+def test_empty_file(raw: Path) -> None:
+    (folder(raw, "000002") / "cycle_001.csv").write_text("")
+    with pytest.raises(DataError, match=r"cycle_001\.csv: the file is empty"):
+        read_motor_drive_raw(raw)
+
+
+def test_header_alone_is_too_short(raw: Path) -> None:
+    (folder(raw, "000002") / "cycle_001.csv").write_text(HEADER + "\n")
+    with pytest.raises(DataError, match=r"Episode 1 of unit 000002 \(noload\).*leaves nothing of 0"):
+        read_motor_drive_raw(raw).read(EpisodeKey("000002", "noload", "1"))
+
+
+def test_not_a_number(raw: Path) -> None:
+    samples = truth(3)
+    samples[1012:1015, 2] = np.nan
+    write_file(folder(raw, "001011") / "cycle_001.csv", samples)
+    match = r"^Episode 1 of unit 001011 \(noload\): channel 'velocity' has 3 NaN at samples 12-14; fix the source or set data\.on_nan = "
+    with pytest.raises(DataError, match=match):
+        read_motor_drive_raw(raw).read(EpisodeKey("001011", "noload", "1"))
+
+
+def test_uneven_time(raw: Path) -> None:
+    samples = truth(3)
+    samples[700:, 0] += 0.0005
+    write_file(folder(raw, "001011") / "cycle_001.csv", samples)
+    with pytest.raises(DataError, match=r"uneven time, 1 of 1099 steps .* 0\.0015 s at sample 699; declare .*resample"):
+        read_motor_drive_raw(raw).read(EpisodeKey("001011", "noload", "1"))
+
+
+def test_two_sampling_periods(raw: Path) -> None:
+    samples = truth(3)
+    samples[:, 0] *= 2
+    write_file(folder(raw, "001011") / "cycle_001.csv", samples)
+    match = r"Two sampling periods: 0\.001 s in episode 0 of unit 000000 \(load\) and 0\.002 s in episode 1 of unit 001011 \(noload\)"
+    with pytest.raises(DataError, match=match):
+        read_motor_drive_raw(raw).read(EpisodeKey("001011", "noload", "1"))
+
+
+def test_constant_state(raw: Path) -> None:
+    samples = truth(3)
+    samples[:, 3] = 0.5
+    write_file(folder(raw, "001011") / "cycle_001.csv", samples)
+    with pytest.raises(DataError, match=r"'current' is a state and stays at 0\.005 in all 99 samples"):
+        read_motor_drive_raw(raw).read(EpisodeKey("001011", "noload", "1"))
+
+
+def test_too_short_for_the_offset_or_the_rest(raw: Path) -> None:
+    write_file(folder(raw, "001011") / "cycle_000.csv", truth(3, 900))
+    write_file(folder(raw, "001011") / "cycle_001.csv", truth(3, 1001))
+    population = read_motor_drive_raw(raw)
+    with pytest.raises(DataError, match="calibrated over samples 500-999, the episode has 899"):
+        population.read(EpisodeKey("001011", "noload", "0"))
+    with pytest.raises(DataError, match="leaves nothing of 1000 samples"):
+        population.read(EpisodeKey("001011", "noload", "1"))
+
+
+def test_names_that_do_not_fit(raw: Path) -> None:
+    odd = write_file(folder(raw, "001011") / "cycle_x1.csv", truth(3))
+    with pytest.raises(DataError, match="should number the episode, found '_x1'"):
+        read_motor_drive_raw(raw)
+    odd.unlink()
+    (raw / "batch_b" / "population" / "notes").mkdir()
+    with pytest.raises(DataError, match="notes should be named"):
+        read_motor_drive_raw(raw)
+
+
+def test_one_unit_in_two_groups(raw: Path) -> None:
+    write_file(folder(raw, "001011", group="outliers") / "cycle_005.csv", truth(3))
+    with pytest.raises(DataError, match="Unit 001011 is in both groups 'population' and 'outliers'"):
+        read_motor_drive_raw(raw)
+
+
+def test_no_layout_and_no_files(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="found no folder 'population' or 'outliers'"):
+        read_motor_drive_raw(tmp_path)
+    folder(tmp_path, "000001").mkdir(parents=True)
+    with pytest.raises(DataError, match=r"1 folders of units and no \.csv"):
+        read_motor_drive_raw(tmp_path)
+
+
+def simulated(seed: int = 0) -> np.ndarray:
+    """An episode in the reader's channels and units, before preparation."""
+    return truth(seed)[:, 1:] * [DEG, DEG, 0.01, DEG, DEG]
+
+
+def prepared_channels() -> tuple:
+    channels = CHANNELS
+    for step in STEPS:
+        channels = step.channels_after(channels)
+    return channels
+
+
+def test_write_raw_is_the_inverse_of_the_reader(tmp_path: Path) -> None:
+    episodes = {
+        EpisodeKey(u, c, e): simulated(i)
+        for i, (u, c, e) in enumerate([("000007", "load", "0"), ("000007", "load", "19"), ("123456", "noload", "3")])
+    }
+    population = from_arrays(episodes, prepared_channels(), 1e-3, units=[Unit("123456", "outliers")])
+    write_raw(population, tmp_path / "raw")
+    names = sorted(p.name for p in (tmp_path / "raw" / "batch_b").iterdir())
+    back = read_motor_drive_raw(tmp_path / "raw")
+    assert names == ["outliers", "population"]
+    assert back.episodes == population.episodes
+    assert [u.group for u in back.units] == ["population", "outliers"]
+    for key, values in episodes.items():
+        offset = np.mean(values[500:1000, 3] - values[500:1000, 0])
+        expected = values[1000:-1] + np.array([offset, 0, 0, 0, 0])
+        worst = np.abs(back.read(key) - expected).max(axis=0)
+        # half a digit in the file: 1e-6 deg, 1e-5 deg/s, 1e-4 %, on the motor side
+        assert np.all(worst <= np.array([1.1e-6, 0.51e-5, 0, 0.51e-6, 0.51e-5]) * DEG + [0, 0, 0.51e-6, 0, 0])
+
+
+def test_write_raw_is_reproducible(tmp_path: Path) -> None:
+    population = from_arrays({EpisodeKey("000007", "load", "0"): simulated()}, prepared_channels(), 1e-3)
+    for name in ("a", "b"):
+        write_raw(population, tmp_path / name)
+    (first,), (second,) = (sorted((tmp_path / name).rglob("*.csv")) for name in ("a", "b"))
+    assert first.relative_to(tmp_path / "a") == second.relative_to(tmp_path / "b")
+    assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.parametrize("key", [EpisodeKey("7", "load", "0"), EpisodeKey("000007", "hot", "0"), EpisodeKey("000007", "load", "a")])
+def test_write_raw_refuses_other_names(tmp_path: Path, key: EpisodeKey) -> None:
+    population = from_arrays({key: simulated()}, prepared_channels(), 1e-3)
+    with pytest.raises(DataError, match="needs a unit of six digits"):
+        write_raw(population, tmp_path / "raw")
+    assert not (tmp_path / "raw").exists()
+
+
+def test_population_travels_to_another_process_and_stays_small(raw: Path) -> None:
+    population = read_motor_drive_raw(raw)
+    one = population.select(units=["001011"], conditions=["load"])
+    assert len(pickle.dumps(one)) < len(pickle.dumps(population))
+    assert set(one.source.recordings.files) == set(one.episodes)
+    copy = pickle.loads(pickle.dumps(one))
+    np.testing.assert_array_equal(copy.read(copy.episodes[0]), population.read(copy.episodes[0]))

@@ -1,0 +1,200 @@
+"""The native format: exact, lazy, whole or not at all."""
+
+import json
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from kros.core.errors import ConfigError, DataError
+from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, read_parquet, write_group, write_index, write_parquet
+
+CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("y/z", Role.STATE), Channel("u", Role.INPUT, "V"))
+
+
+def values(seed: int, n: int = 30) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((n, 3))
+
+
+def population(units: tuple[str, ...] = ("a", "b"), **changes: Any) -> Population:
+    episodes = {
+        EpisodeKey(u, c, str(e)): values(100 * i + 10 * j + e, 20 + e)
+        for i, u in enumerate(units)
+        for j, c in enumerate(("cold", "warm"))
+        for e in range(3)
+    }
+    facts = [Unit(units[0], "outliers", {"built": "2022-09-15", "mass": 1.5})]
+    return from_arrays({**episodes, **changes}, CHANNELS, 0.01, units=facts, metadata={"plant": "test", "gear_ratio": 100})
+
+
+def assert_same(found: Population, expected: Population) -> None:
+    assert found.channels == expected.channels
+    assert found.sample_period_s == expected.sample_period_s
+    assert found.units == expected.units
+    assert found.episodes == expected.episodes
+    assert found.metadata == expected.metadata
+    for key in expected.episodes:
+        np.testing.assert_array_equal(found.read(key), expected.read(key))
+
+
+def test_round_trip_is_exact(tmp_path: Path) -> None:
+    write_parquet(population(), tmp_path / "out")
+    assert_same(read_parquet(tmp_path / "out"), population())
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]
+
+
+def test_files_as_documented(tmp_path: Path) -> None:
+    write_parquet(population(), tmp_path / "out")
+    names = sorted(p.name for p in (tmp_path / "out").iterdir())
+    assert names == ["a@cold.parquet", "a@warm.parquet", "b@cold.parquet", "b@warm.parquet", "population.json"]
+    with pq.ParquetFile(tmp_path / "out" / "b@warm.parquet") as file:
+        assert file.schema_arrow.names == ["unit", "condition", "episode", "k", "x", "y/z", "u"]
+        assert [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)] == [20, 21, 22]
+        row = file.read_row_group(2).slice(3, 1).to_pylist()[0]
+    assert (row["unit"], row["condition"], row["episode"], row["k"]) == ("b", "warm", "2", 3)
+    content = json.loads((tmp_path / "out" / "population.json").read_text())
+    assert (content["schema"], content["kind"]) == (1, "population")
+    assert content["groups"][0] == {
+        "unit": "a",
+        "condition": "cold",
+        "file": "a@cold.parquet",
+        "episodes": ["0", "1", "2"],
+        "samples": [20, 21, 22],
+    }
+
+
+def test_any_id_works(tmp_path: Path) -> None:
+    odd = ("000123456789012345678901", "../etc", "a@b", "a%40b", "Größe 5 / links", "x.parquet", "", "a b")
+    write_parquet(population(odd), tmp_path / "out")
+    assert_same(read_parquet(tmp_path / "out"), population(odd))
+    assert len(list((tmp_path / "out").iterdir())) == 2 * len(odd) + 1
+
+
+def test_same_bytes_for_any_number_of_workers(tmp_path: Path) -> None:
+    for workers in (1, 3):
+        write_parquet(population(), tmp_path / str(workers), workers=workers)
+    for path in (tmp_path / "1").iterdir():
+        assert path.read_bytes() == (tmp_path / "3" / path.name).read_bytes()
+
+
+def test_groups_written_by_other_processes(tmp_path: Path) -> None:
+    write_parquet(population(), tmp_path / "expected")
+    folder = tmp_path / "out"
+    folder.mkdir()
+    groups = [(unit, condition) for unit, condition, _ in population().groups()]
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        tasks = [pool.submit(write_group, population().select([u], [c]), u, c, folder) for u, c in groups]
+        write_index(population(), [task.result() for task in tasks], folder)
+    assert_same(read_parquet(folder), population())
+    for path in folder.iterdir():
+        assert path.read_bytes() == (tmp_path / "expected" / path.name).read_bytes()
+
+
+def test_progress_counts_groups(tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    write_parquet(population(), tmp_path / "out", lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def broken() -> Population:
+    bad = population()
+    samples = values(7)
+    samples[4, 1] = np.nan
+    bad.source.recordings.values[EpisodeKey("b", "warm", "1")] = samples  # type: ignore[attr-defined]
+    return bad
+
+
+def test_a_failed_conversion_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"Episode 1 of unit b \(warm\): channel 'y/z' has 1 NaN at sample 4"):
+        write_parquet(broken(), tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_group_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="NaN"):
+        write_group(broken(), "b", "warm", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_dropping_episodes_while_writing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_parquet(broken(), tmp_path / "out", on_nan="drop_episode")
+    assert [k.episode for k in read_parquet(tmp_path / "out").keys("b", "warm")] == ["0", "2"]
+    assert "Episode 1 of unit b (warm)" in caplog.text
+    with pytest.raises(ConfigError, match=r"data\.on_nan should be one of"):
+        write_parquet(broken(), tmp_path / "other", on_nan="skip")
+
+
+def test_dropping_all_episodes_of_a_unit(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    samples = {"a": [values(0)], "b": [values(1)]}
+    samples["b"][0][0, 0] = np.inf
+    write_parquet(from_arrays(samples, CHANNELS, 0.01), tmp_path / "out", on_nan="drop_episode")
+    assert read_parquet(tmp_path / "out").unit_ids == ("a",)
+    assert "Unit b (default) is left out" in caplog.text
+    with pytest.raises(DataError, match="population is empty"):
+        write_parquet(from_arrays({"b": samples["b"]}, CHANNELS, 0.01), tmp_path / "none", on_nan="drop_episode")
+    assert not (tmp_path / "none").exists()
+
+
+def test_resting_input(tmp_path: Path) -> None:
+    samples = values(0)
+    samples[:, 2] = 3.0
+    with pytest.raises(DataError, match=r"Unit a \(default\): input 'u' stays at 3 in all 1 episodes"):
+        write_parquet(from_arrays({"a": [samples]}, CHANNELS, 0.01), tmp_path / "out")
+
+
+def test_existing_folders_are_kept_unless_told(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    write_parquet(population(), out)
+    (out / "mine.txt").write_text("keep")
+    with pytest.raises(DataError, match="exists and is not empty"):
+        write_parquet(population(("c",)), out)
+    assert (out / "mine.txt").exists()
+    with pytest.raises(DataError, match="NaN"):
+        write_parquet(broken(), out, overwrite=True)
+    assert_same(read_parquet(out), population())
+    write_parquet(population(("c",)), out, overwrite=True)
+    assert read_parquet(out).unit_ids == ("c",)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="exists and is not empty"):
+        write_parquet(population(), tmp_path / "file", overwrite=True)
+
+
+def test_channel_named_like_a_key_column(tmp_path: Path) -> None:
+    channels = (Channel("k", Role.STATE), *CHANNELS[1:])
+    with pytest.raises(DataError, match=r"channels \['k'\] have the name of a key column"):
+        write_parquet(from_arrays({"a": [values(0)]}, channels, 0.01), tmp_path / "out")
+
+
+def test_unknown_group(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"unit z \(cold\); the population has no episode"):
+        write_group(population(), "z", "cold", tmp_path)
+
+
+def test_damaged_folders(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(DataError, match="there is no file"):
+        read_parquet(out)
+    write_parquet(population(), out)
+    index = out / "population.json"
+    good = index.read_text()
+    index.write_text(good.replace('"schema": 1', '"schema": 99'))
+    with pytest.raises(DataError, match="schema and kind should be"):
+        read_parquet(out)
+    index.write_text(good.replace('"role": "input"', '"role": "output"'))
+    with pytest.raises(DataError, match="not as kros writes it"):
+        read_parquet(out)
+    index.write_text(good.replace("   20,", "   25,"))
+    with pytest.raises(DataError, match="25 samples are expected, found 20"):
+        read_parquet(out).read(EpisodeKey("a", "cold", "0"))
+    index.write_text(good)
+    (out / "b@warm.parquet").write_bytes((out / "b@warm.parquet").read_bytes()[:200])
+    with pytest.raises(DataError, match=r"b@warm\.parquet"):
+        read_parquet(out).read(EpisodeKey("b", "warm", "0"))
+    (out / "b@warm.parquet").unlink()
+    with pytest.raises(DataError, match=r"1 files are missing, the first b@warm\.parquet"):
+        read_parquet(out)

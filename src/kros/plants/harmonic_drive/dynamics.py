@@ -21,20 +21,13 @@ import numpy as np
 import numpy.typing as npt
 
 from .control import SAMPLE_PERIOD_S
-from .parameters import GEAR_RATIO, DriveParameters
+from .parameters import GEAR_RATIO, SMOOTHING_VELOCITY, DriveParameters
 
 Array = npt.NDArray[Any]
 
 SUBSTEPS = 2
 SUBSTEP_S = SAMPLE_PERIOD_S / SUBSTEPS
-SMOOTHING_VELOCITY = 0.02  # rad/s: width of the sign function of friction
 TWIST, W, WL, CURRENT, COMMAND, FM, FL = range(7)
-
-
-def smooth_friction(p: DriveParameters, w: Array) -> Array:
-    """Coulomb and Stribeck friction with a smooth sign function, N m."""
-    fade = 1.0 + (w / p.stribeck_velocity) ** 2
-    return w / np.sqrt(w * w + SMOOTHING_VELOCITY**2) * (p.coulomb_torque + p.breakaway_torque / fade)
 
 
 def transition(p: DriveParameters, loaded: Array) -> Array:
@@ -80,7 +73,8 @@ class Physics:
             self.z[TWIST] = self.moment * np.sin(self.q - self.z[TWIST]) / p.stiffness
         self.z[CURRENT] = self.z[COMMAND] = p.stiffness * self.z[TWIST] / p.torque_constant + p.gearbox_current(self.q)
         self._inverse_stribeck = 1.0 / p.stribeck_velocity
-        self._new, self._a, self._b = np.empty((5, n)), np.empty(n), np.empty(n)
+        self._new = np.empty((5, n))
+        self._a, self._b, self._c = np.empty(n), np.empty(n), np.empty(n)
         self._angle, self._power = np.empty(n, complex), np.empty(n, complex)
 
     def advance(self) -> None:
@@ -96,32 +90,39 @@ class Physics:
             np.add(self.q, self._new[4], out=self.q)
 
     def _motor_torque(self, q: Array) -> None:
-        """z[FM] = -K_t i_d(q) - F(w), with i_d the imaginary part of sum_h a_h exp(j phi_h) exp(j h r q) by Horner's rule."""
-        p, z, b = self.p, self.z, self._b
+        """z[FM] = -K_t i_d(q) - F(w)."""
+        f = self.z[FM]
+        np.multiply(self._disturbance(q), self.p.torque_constant, out=f)
+        np.add(f, self._friction(), out=f)
+        np.negative(f, out=f)
+
+    def _disturbance(self, q: Array) -> Array:
+        """(34): i_d is the imaginary part of sum_h a_h exp(j phi_h) exp(j h r q), by Horner's rule."""
         e, acc = self._angle, self._power
-        np.multiply(q, GEAR_RATIO, out=b)
-        np.cos(b, out=e.real)
-        np.sin(b, out=e.imag)
+        np.multiply(q, GEAR_RATIO, out=self._b)
+        np.cos(self._b, out=e.real)
+        np.sin(self._b, out=e.imag)
         np.copyto(acc, self.ripple[-1])
         for coefficient in self.ripple[-2::-1]:
             np.multiply(acc, e, out=acc)
             np.add(acc, coefficient, out=acc)
         np.multiply(acc, e, out=acc)
-        f = z[FM]
-        np.multiply(acc.imag, p.torque_constant, out=f)
-        np.multiply(z[W], self._inverse_stribeck, out=b)
-        np.multiply(b, b, out=b)
-        np.add(b, 1.0, out=b)
-        np.divide(p.breakaway_torque, b, out=b)
-        np.add(b, p.coulomb_torque, out=b)
-        np.multiply(b, z[W], out=b)
-        t = self._new[0]
-        np.multiply(z[W], z[W], out=t)
-        np.add(t, SMOOTHING_VELOCITY**2, out=t)
-        np.sqrt(t, out=t)
-        np.divide(b, t, out=b)
-        np.add(f, b, out=f)
-        np.negative(f, out=f)
+        return acc.imag
+
+    def _friction(self) -> Array:
+        """F(w), as `DriveParameters.dry_friction` but in place."""
+        w, fade, width = self.z[W], self._b, self._c
+        np.multiply(w, self._inverse_stribeck, out=fade)
+        np.multiply(fade, fade, out=fade)
+        np.add(fade, 1.0, out=fade)
+        np.divide(self.p.breakaway_torque, fade, out=fade)
+        np.add(fade, self.p.coulomb_torque, out=fade)
+        np.multiply(fade, w, out=fade)
+        np.multiply(w, w, out=width)
+        np.add(width, SMOOTHING_VELOCITY**2, out=width)
+        np.sqrt(width, out=width)
+        np.divide(fade, width, out=fade)
+        return fade
 
     def _gravity(self, q: Array) -> None:
         """z[FL] = -m g l sin(q - s)."""

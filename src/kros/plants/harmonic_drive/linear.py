@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .control import SAMPLE_PERIOD_S, VELOCITY_POLE, Gains
-from .dynamics import SUBSTEP_S, SUBSTEPS, smooth_friction, transition
+from .dynamics import SUBSTEP_S, SUBSTEPS, transition
 from .parameters import GEAR_RATIO, DriveParameters
 from .reference import MAX_SPEED
 
@@ -66,7 +66,7 @@ def _substep(p: DriveParameters, loaded: bool, speed: float) -> tuple[Array, Arr
     Phi[:, 4, 4] = 1.0
     Gu, Gm = M[:, :, 4], M[:, :, 5]
     h = 1e-4
-    slope = (smooth_friction(p, np.full(n, speed + h)) - smooth_friction(p, np.full(n, speed - h))) / (2 * h)
+    slope = (p.dry_friction(np.full(n, speed + h)) - p.dry_friction(np.full(n, speed - h))) / (2 * h)
     Phi[:, :, 1] -= Gm * slope[:, None]
     return Phi, Gu, Gm
 

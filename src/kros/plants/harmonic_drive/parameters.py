@@ -17,6 +17,7 @@ Array = npt.NDArray[np.float64]
 
 GEAR_RATIO = 100
 HARMONICS = 8
+SMOOTHING_VELOCITY = 0.02  # rad/s: width of the sign function of friction
 UNIT_STREAM, OUTLIER_STREAM = 1, 2  # first word of the spawn key
 
 # name: (nominal value, relative deviation at spread 1)
@@ -104,11 +105,15 @@ class DriveParameters:
         """Return the parameters of some units, or of the same unit several times."""
         return DriveParameters(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
-    def friction_torque(self, velocity: Array) -> Array:
-        """Steady friction torque of each unit at its own velocity, shape (n_units,), N m."""
-        from .dynamics import smooth_friction
+    def dry_friction(self, velocity: Array) -> Array:
+        """Coulomb and Stribeck friction of each unit at its own velocity, with a smooth sign function, shape (n_units,), N m."""
+        fade = 1.0 + (velocity / self.stribeck_velocity) ** 2
+        sign = velocity / np.sqrt(velocity**2 + SMOOTHING_VELOCITY**2)
+        return sign * (self.coulomb_torque + self.breakaway_torque / fade)
 
-        return smooth_friction(self, np.asarray(velocity, float)) + self.viscous_friction * velocity
+    def friction_torque(self, velocity: Array) -> Array:
+        """Dry and viscous friction of each unit at its own velocity, shape (n_units,), N m."""
+        return self.dry_friction(velocity) + self.viscous_friction * velocity
 
     def gearbox_current(self, position: Array) -> Array:
         """Disturbance (34) of each unit at its own output angle, shape (n_units,), fraction of full scale."""

@@ -77,6 +77,7 @@ def _simulate_chunk(
     total_inertia = p.flange_inertia + loaded * p.load_inertia
     load_inertia = loaded * p.load_inertia
     is_loaded = loaded > 0
+    any_loaded = bool(is_loaded.any())
     block = np.empty((RECORDED, BLOCK_SAMPLES, n))
     for first in range(0, n_samples, BLOCK_SAMPLES):
         stop = min(first + BLOCK_SAMPLES, n_samples)
@@ -84,12 +85,13 @@ def _simulate_chunk(
         for k in range(stop - first):
             drive.sample(rp[k], rv[k])
             block[0, k], block[1, k], block[2, k] = drive.p, drive.v, physics.z[CURRENT]
-            if is_loaded.any():
+            if any_loaded:
                 block[3, k] = physics.load_torque(load_inertia, total_inertia)
             physics.advance()
         length = stop - first
         out.states[part, :, first:stop] = block[:3, :length].transpose(2, 0, 1)
-        out.load_torque[rows[is_loaded], first:stop] = (block[3, :length] / p.torque_constant).T[is_loaded]
+        if any_loaded:
+            out.load_torque[rows[is_loaded], first:stop] = (block[3, :length] / p.torque_constant).T[is_loaded]
 
 
 class _Controller:
@@ -105,19 +107,12 @@ class _Controller:
 
     def sample(self, rp: Array, rv: Array) -> None:
         """Measure, and set the command for the coming sampling period."""
+        self._measure()
         g, error, raw, u = self.gains, self._error, self._raw, self.physics.z[COMMAND]
-        np.multiply(self.physics.q, 1.0 / COUNT_RAD, out=error)
-        np.rint(error, out=error)
-        np.multiply(error, COUNT_RAD, out=error)
-        np.subtract(error, self.p, out=raw)
-        np.multiply(raw, (1.0 - VELOCITY_POLE) / SAMPLE_PERIOD_S, out=raw)
-        np.multiply(self.v, VELOCITY_POLE, out=self.v)
-        np.add(self.v, raw, out=self.v)
-        np.copyto(self.p, error)
         np.subtract(rp, self.p, out=error)
         np.multiply(error, g.position, out=error)
         np.add(error, rv, out=error)
-        np.subtract(error, self.v, out=error)
+        np.subtract(error, self.v, out=error)  # Kp (rp - p) + rv - v
         np.multiply(error, g.velocity, out=raw)
         np.add(raw, self._integral, out=raw)
         np.clip(raw, -1.0, 1.0, out=u)
@@ -126,3 +121,15 @@ class _Controller:
         np.subtract(u, raw, out=raw)
         np.multiply(raw, g.antiwindup, out=raw)
         np.add(self._integral, raw, out=self._integral)
+
+    def _measure(self) -> None:
+        """Quantise the position; v becomes a v + (1 - a) (p - last p) / T."""
+        new, step = self._error, self._raw
+        np.multiply(self.physics.q, 1.0 / COUNT_RAD, out=new)
+        np.rint(new, out=new)
+        np.multiply(new, COUNT_RAD, out=new)
+        np.subtract(new, self.p, out=step)
+        np.multiply(step, (1.0 - VELOCITY_POLE) / SAMPLE_PERIOD_S, out=step)
+        np.multiply(self.v, VELOCITY_POLE, out=self.v)
+        np.add(self.v, step, out=self.v)
+        np.copyto(self.p, new)

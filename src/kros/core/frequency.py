@@ -1,0 +1,102 @@
+"""Frequency grids and the variable in which magnitudes of discrete systems are rational.
+
+Symbols
+-------
+theta : 2 pi f dt, angle on the unit circle, rad
+tau : tan^2(theta / 2), zero at DC and infinite at Nyquist; equals -w^2 on the unit circle for w = (z - 1) / (z + 1)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from .errors import ConfigError
+
+Array = npt.NDArray[np.float64]
+
+
+def nyquist_hz(sample_period_s: float) -> float:
+    """Return half the sampling frequency, Hz."""
+    if not sample_period_s > 0:
+        raise ConfigError(
+            f"Nyquist frequency: the sampling period should be positive, found {sample_period_s} s; only discrete systems have one."
+        )
+    return 0.5 / sample_period_s
+
+
+def log_grid(sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0) -> Array:
+    """Return logarithmically spaced frequencies that end at Nyquist, the Nyquist frequency included.
+
+    Parameters
+    ----------
+    sample_period_s : float, s
+    n_freqs : int
+        Number of frequencies, at least two.
+    decades : float
+        Width of the band below Nyquist.
+
+    Returns
+    -------
+    ndarray, shape (n_freqs,), Hz
+    """
+    if n_freqs < 2 or not decades > 0:
+        raise ConfigError(
+            f"Frequency grid: needs at least two frequencies over a positive number of decades, found {n_freqs} over {decades}."
+        )
+    top = nyquist_hz(sample_period_s)
+    grid = np.geomspace(top * 10.0**-decades, top, n_freqs)
+    grid[-1] = top
+    return grid
+
+
+def check_grid(freqs_hz: npt.ArrayLike, sample_period_s: float) -> Array:
+    """Return the frequencies as an array, or say why they are no grid.
+
+    Raises
+    ------
+    ConfigError
+        When they are not finite, not increasing, negative, or above Nyquist.
+    """
+    freqs = np.atleast_1d(np.asarray(freqs_hz, dtype=float))
+    top = nyquist_hz(sample_period_s)
+    if freqs.ndim != 1 or freqs.size == 0 or not np.isfinite(freqs).all():
+        raise ConfigError(
+            f"Frequency grid: needs a list of finite frequencies in Hz, found shape {freqs.shape} with {np.isnan(freqs).sum()} NaN."
+        )
+    if np.any(np.diff(freqs) <= 0) or freqs[0] < 0:
+        raise ConfigError(
+            f"Frequency grid: frequencies should increase from zero or above, found {freqs[:5]} ... {freqs[-1]} Hz; sort them and drop doubles."
+        )
+    if freqs[-1] > top * (1 + 1e-12):
+        raise ConfigError(
+            f"Frequency grid: {freqs[-1]} Hz is above the Nyquist frequency {top} Hz of the sampling period {sample_period_s} s; end the grid there."
+        )
+    return freqs
+
+
+def dense_grid(freqs_hz: Array, sample_period_s: float, factor: int = 10) -> Array:
+    """Return `factor` times as many frequencies, between and at the given ones, with DC and Nyquist added.
+
+    Returns
+    -------
+    ndarray, shape (at least factor * (n_freqs - 1) + 1,), Hz
+    """
+    inside = freqs_hz[freqs_hz > 0]
+    steps = np.arange(factor) / factor
+    between = (inside[:-1, None] * (inside[1:] / inside[:-1])[:, None] ** steps).ravel()
+    return np.unique(np.concatenate([[0.0], between, freqs_hz, [nyquist_hz(sample_period_s)]]))
+
+
+def bilinear_squared(freqs_hz: npt.ArrayLike, sample_period_s: float) -> Array:
+    """Return tau = tan^2(theta / 2); infinity at Nyquist, and full relative precision near DC.
+
+    Parameters
+    ----------
+    freqs_hz : array_like, Hz
+    sample_period_s : float, s
+    """
+    freqs = np.asarray(freqs_hz, dtype=float)
+    half = np.pi * freqs * sample_period_s
+    at_top = np.abs(freqs * sample_period_s - 0.5) <= 1e-12
+    return np.where(at_top, np.inf, np.tan(np.where(at_top, 0.0, half)) ** 2)

@@ -1,0 +1,247 @@
+r"""The six uncertainty forms of section II-A.4: residual from two plants, perturbed plant from a residual.
+
+======================  =====================================  =========================  ==========================================
+form                    perturbed plant                        residual                   exact when
+======================  =====================================  =========================  ==========================================
+additive                Gp = G + E                             Gp - G                     always
+input_multiplicative    Gp = G (1 + E)                         G^+ (Gp - G)               range(Gp - G) in range(G)
+output_multiplicative   Gp = (1 + E) G                         (Gp - G) G^+               rows(Gp - G) in rows(G)
+inverse_additive        Gp = G (1 - E G)^-1                    Gp^+ (Gp - G) G^+          range(G) in range(Gp), rows(Gp) in rows(G)
+inverse_input_...       Gp = G (1 - E)^-1                      Gp^+ (Gp - G)              range(G) in range(Gp)
+inverse_output_...      Gp = (1 - E)^-1 G                      (Gp - G) Gp^+              rows(G) in rows(Gp)
+======================  =====================================  =========================  ==========================================
+
+The inverse forms also need the inverted matrix to be regular. Elsewhere the residual is the least-squares fit, and what it leaves out is
+the misfit. `paper=True` gives the published pipeline's variants of the multiplicative forms, `G^+ Gp - 1`, `Gp G^+ - 1`, `1 - Gp^+ G` and
+`1 - G Gp^+`: with more outputs than inputs the output ones contain the identity on the complement of the range, whatever the plants.
+
+Plants here are already in scaled coordinates. Nothing in this module chooses, fits or stores.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError, DimensionError
+from .small import entries_first, entries_last, multiply
+
+Array = npt.NDArray[Any]
+
+MAX_CONDITION = 1e12  # beyond this an inverse form cannot rebuild the plant
+
+
+class Form(str, Enum):
+    """Where the perturbation acts."""
+
+    ADDITIVE = "additive"
+    INPUT_MULTIPLICATIVE = "input_multiplicative"
+    OUTPUT_MULTIPLICATIVE = "output_multiplicative"
+    INVERSE_ADDITIVE = "inverse_additive"
+    INVERSE_INPUT_MULTIPLICATIVE = "inverse_input_multiplicative"
+    INVERSE_OUTPUT_MULTIPLICATIVE = "inverse_output_multiplicative"
+
+    @property
+    def dual(self) -> Form:
+        """The form of the transposed plants: input and output sides change places."""
+        return _DUAL[self]
+
+
+_DUAL = {
+    Form.ADDITIVE: Form.ADDITIVE,
+    Form.INPUT_MULTIPLICATIVE: Form.OUTPUT_MULTIPLICATIVE,
+    Form.OUTPUT_MULTIPLICATIVE: Form.INPUT_MULTIPLICATIVE,
+    Form.INVERSE_ADDITIVE: Form.INVERSE_ADDITIVE,
+    Form.INVERSE_INPUT_MULTIPLICATIVE: Form.INVERSE_OUTPUT_MULTIPLICATIVE,
+    Form.INVERSE_OUTPUT_MULTIPLICATIVE: Form.INVERSE_INPUT_MULTIPLICATIVE,
+}
+
+
+def as_form(form: Form | str) -> Form:
+    """Return the form of a name.
+
+    Raises
+    ------
+    ConfigError
+        When there is no form of that name.
+    """
+    try:
+        return Form(form)
+    except ValueError as error:
+        raise ConfigError(f"Uncertainty form {form!r} is unknown; choose one of {', '.join(f.value for f in Form)}.") from error
+
+
+def residual_shape(form: Form | str, n_outputs: int, n_inputs: int) -> tuple[int, int]:
+    """Return the rows and columns of a form's residual for a plant with `n_outputs` and `n_inputs`."""
+    p, m = n_outputs, n_inputs
+    return {
+        Form.ADDITIVE: (p, m),
+        Form.INPUT_MULTIPLICATIVE: (m, m),
+        Form.OUTPUT_MULTIPLICATIVE: (p, p),
+        Form.INVERSE_ADDITIVE: (m, p),
+        Form.INVERSE_INPUT_MULTIPLICATIVE: (m, m),
+        Form.INVERSE_OUTPUT_MULTIPLICATIVE: (p, p),
+    }[as_form(form)]
+
+
+def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike, *, paper: bool = False) -> Array:
+    """Return the residual E between a nominal and perturbed plants.
+
+    Parameters
+    ----------
+    form : Form or str
+    nominal, perturbed : array_like, shape (..., p, m), complex
+        Leading axes broadcast.
+    paper : bool
+        The published pipeline's variant of the multiplicative forms.
+
+    Returns
+    -------
+    ndarray, shape (..., p', m')
+        See `residual_shape`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import residual
+    >>> residual("input_multiplicative", np.diag([1.0, 2.0]), np.diag([1.5, 2.0]))
+    array([[0.5, 0. ],
+           [0. , 0. ]])
+    """
+    form = as_form(form)
+    G, Gp = _plants(nominal, perturbed)
+    if form is Form.ADDITIVE:
+        return Gp - G
+    first, second = entries_first(G), entries_first(Gp)
+    if paper and form is not Form.INVERSE_ADDITIVE:
+        return entries_last(_paper_residual(form, G, Gp, first, second))
+    difference = second - first
+    if form is Form.INPUT_MULTIPLICATIVE:
+        E = multiply(_pinv(G), difference)
+    elif form is Form.OUTPUT_MULTIPLICATIVE:
+        E = multiply(difference, _pinv(G))
+    elif form is Form.INVERSE_ADDITIVE:
+        E = multiply(multiply(_pinv(Gp), difference), _pinv(G))
+    elif form is Form.INVERSE_INPUT_MULTIPLICATIVE:
+        E = multiply(_pinv(Gp), difference)
+    else:
+        E = multiply(difference, _pinv(Gp))
+    return entries_last(E)
+
+
+def rebuild(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) -> Array:
+    """Return the perturbed plants that a nominal and residuals stand for.
+
+    Parameters
+    ----------
+    form : Form or str
+    nominal : array_like, shape (..., p, m)
+    E : array_like, shape (..., p', m')
+
+    Returns
+    -------
+    ndarray, shape (..., p, m)
+        NaN where an inverse form's matrix is singular.
+    """
+    form, G, E = as_form(form), np.asarray(nominal), np.asarray(E)
+    if form is Form.ADDITIVE:
+        return G + E
+    if form is Form.INPUT_MULTIPLICATIVE:
+        return G + G @ E
+    if form is Form.OUTPUT_MULTIPLICATIVE:
+        return G + E @ G
+    inverse = _inverse(inverted_matrix(form, G, E))
+    return inverse @ G if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else G @ inverse
+
+
+def inverted_matrix(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) -> Array:
+    """Return what an inverse form inverts: `1 - E G` or `1 - E`, shape (..., q, q)."""
+    form, G, E = as_form(form), np.asarray(nominal), np.asarray(E)
+    product = E @ G if form is Form.INVERSE_ADDITIVE else E
+    return np.eye(product.shape[-1]) - product
+
+
+def existence(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike, *, rtol: float = 1e-9) -> Array:
+    """Tell where a residual of this form rebuilds the perturbed plant exactly.
+
+    Parameters
+    ----------
+    form : Form or str
+    nominal, perturbed : array_like, shape (..., p, m)
+    rtol : float
+        What may stick out of a range or row space, relative to the matrix tested.
+
+    Returns
+    -------
+    ndarray of bool, shape (...)
+    """
+    form = as_form(form)
+    G, Gp = _plants(nominal, perturbed)
+    if form is Form.ADDITIVE:
+        return np.ones(np.broadcast_shapes(G.shape, Gp.shape)[:-2], bool)
+    if form is Form.INPUT_MULTIPLICATIVE:
+        return _in_range(Gp - G, G, rtol)
+    if form is Form.OUTPUT_MULTIPLICATIVE:
+        return _in_range(_turn(Gp - G), _turn(G), rtol)
+    if form is Form.INVERSE_ADDITIVE:
+        inside = _in_range(G, Gp, rtol) & _in_range(_turn(Gp), _turn(G), rtol)
+    elif form is Form.INVERSE_INPUT_MULTIPLICATIVE:
+        inside = _in_range(G, Gp, rtol)
+    else:
+        inside = _in_range(_turn(G), _turn(Gp), rtol)
+    matrix = inverted_matrix(form, G, residual(form, G, Gp))
+    return inside & (np.linalg.cond(matrix) < MAX_CONDITION)
+
+
+def _plants(nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> tuple[Array, Array]:
+    G, Gp = np.asarray(nominal), np.asarray(perturbed)
+    if G.ndim < 2 or Gp.ndim < 2 or G.shape[-2:] != Gp.shape[-2:]:
+        raise DimensionError(
+            f"Residual: both plants need the shape (..., outputs, inputs), found {G.shape} and {Gp.shape}; bring them to the same channels."
+        )
+    axes = max(G.ndim, Gp.ndim)
+    return G.reshape((1,) * (axes - G.ndim) + G.shape), Gp.reshape((1,) * (axes - Gp.ndim) + Gp.shape)
+
+
+def _paper_residual(form: Form, G: Array, Gp: Array, first: Array, second: Array) -> Array:
+    """The published pipeline's multiplicative residuals, entries first."""
+    p, m = G.shape[-2:]
+    q = m if form in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE) else p
+    if form is Form.INPUT_MULTIPLICATIVE:
+        product, sign = multiply(_pinv(G), second), 1
+    elif form is Form.OUTPUT_MULTIPLICATIVE:
+        product, sign = multiply(second, _pinv(G)), 1
+    elif form is Form.INVERSE_INPUT_MULTIPLICATIVE:
+        product, sign = multiply(_pinv(Gp), first), -1
+    else:
+        product, sign = multiply(first, _pinv(Gp)), -1
+    eye = np.eye(q).reshape((q, q) + (1,) * (product.ndim - 2))
+    return sign * (product - eye)
+
+
+def _pinv(plants: Array) -> Array:
+    """Pseudo-inverses with the entries first."""
+    return entries_first(np.linalg.pinv(plants))
+
+
+def _inverse(matrices: Array) -> Array:
+    """Inverses, NaN where a matrix is singular."""
+    try:
+        return np.linalg.inv(matrices)
+    except np.linalg.LinAlgError:
+        regular = np.linalg.cond(matrices) < 1 / np.finfo(float).eps
+        safe = np.where(regular[..., None, None], matrices, np.eye(matrices.shape[-1]))
+        return np.where(regular[..., None, None], np.linalg.inv(safe), np.nan)
+
+
+def _turn(matrices: Array) -> Array:
+    return np.conj(np.swapaxes(matrices, -1, -2))
+
+
+def _in_range(inner: Array, outer: Array, rtol: float) -> Array:
+    """Tell where range(inner) lies in range(outer)."""
+    out = inner - outer @ (np.linalg.pinv(outer) @ inner)
+    return np.linalg.norm(out, axis=(-2, -1)) <= rtol * np.linalg.norm(inner, axis=(-2, -1))

@@ -1,0 +1,88 @@
+"""Products and largest singular values of many small matrices, on long vectors.
+
+NumPy multiplies stacks of 2 x 2 matrices one by one. Here the matrix axes come first, `(row, column, ...)`, and every entry is a long vector
+over units and frequencies: a product of small matrices is a few dozen vector operations.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+
+_UNROLL = 6  # beyond this inner size BLAS wins
+
+
+def entries_first(matrices: Array) -> Array:
+    """Move the matrix axes to the front: (..., p, m) to (p, m, ...), contiguous."""
+    return np.ascontiguousarray(np.moveaxis(matrices, (-2, -1), (0, 1)))
+
+
+def entries_last(matrices: Array) -> Array:
+    """Move the matrix axes to the back: (p, m, ...) to (..., p, m)."""
+    return np.moveaxis(matrices, (0, 1), (-2, -1))
+
+
+def multiply(left: Array, right: Array) -> Array:
+    """Multiply entries-first matrices: (p, r, ...) times (r, m, ...), broadcast over the rest."""
+    p, r, m = left.shape[0], left.shape[1], right.shape[1]
+    rest = np.broadcast_shapes(left.shape[2:], right.shape[2:])
+    out = np.empty((p, m, *rest), np.result_type(left, right))
+    if r > _UNROLL:
+        out[...] = entries_first(entries_last(left) @ entries_last(right))
+        return out
+    scratch = np.empty(rest, out.dtype)
+    for i in range(p):
+        for j in range(m):
+            np.multiply(left[i, 0], right[0, j], out=out[i, j])
+            for k in range(1, r):
+                out[i, j] += np.multiply(left[i, k], right[k, j], out=scratch)
+    return out
+
+
+def adjoint(matrices: Array) -> Array:
+    """Return the conjugate transposes of entries-first matrices."""
+    return np.conj(np.swapaxes(matrices, 0, 1))
+
+
+def squared(values: Array) -> Array:
+    """Return the squared modulus."""
+    return values.real**2 + values.imag**2 if np.iscomplexobj(values) else values**2
+
+
+def sigma_max_first(matrices: Array) -> Array:
+    """Return the largest singular value of entries-first matrices (p, m, ...), shape (...).
+
+    With `min(p, m) <= 2` from the closed form of the 2 x 2 Gram matrix, whose discriminant is a sum of squares: nothing cancels.
+    """
+    p, m = matrices.shape[:2]
+    if min(p, m) > 2:
+        return np.linalg.norm(entries_last(matrices), 2, axis=(-2, -1))
+    return np.sqrt(sigma_max_squared(matrices))
+
+
+def sigma_max_squared(matrices: Array) -> Array:
+    """Return the squared largest singular value for `min(p, m) <= 2`."""
+    columns = matrices if matrices.shape[1] <= matrices.shape[0] else np.swapaxes(matrices, 0, 1)
+    first = squared(columns[:, 0]).sum(axis=0)
+    if columns.shape[1] == 1:
+        return first
+    second = squared(columns[:, 1]).sum(axis=0)
+    cross = np.conj(columns[0, 0]) * columns[0, 1]
+    for i in range(1, columns.shape[0]):
+        cross += np.conj(columns[i, 0]) * columns[i, 1]
+    half = (first - second) / 2
+    return (first + second) / 2 + np.sqrt(half**2 + squared(cross))
+
+
+def lower_factor(pseudo_inverse: Array) -> Array:
+    """Return square `L` with `P P^H = L L^H` for entries-first P of shape (r, s, ...), r <= s.
+
+    `sigma_max(D P) = sigma_max(D L)`: the wide factor shrinks to a triangle, once per unit instead of once per pair. From QR, not from
+    Cholesky of the product: no squared condition number.
+    """
+    R = np.linalg.qr(np.conj(np.swapaxes(entries_last(pseudo_inverse), -1, -2)), mode="r")
+    return entries_first(np.conj(np.swapaxes(R, -1, -2)))

@@ -74,7 +74,7 @@ def by_csv(folder: Path) -> Population:
     for key, values in ALIGNED.items():
         columns = [f"time [ms],{','.join(NAMES)}", *(f"{k},{','.join(repr(float(1e3 * v)) for v in row)}" for k, row in enumerate(values))]
         (folder / f"{key.unit}-{key.condition}-{key.episode}.csv").write_text("\n".join(columns))
-    return open_population("csv", folder, mapping=MAPPING, prepare=PREPARATION)
+    return open_population("csv", folder, csv=MAPPING, prepare=PREPARATION)
 
 
 def by_arrays(folder: Path) -> Population:

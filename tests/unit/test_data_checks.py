@@ -126,10 +126,20 @@ def test_scan_drops_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
     with pytest.raises(DataError, match="channel 'x' has 1 NaN at sample 3"):
         scan_population(bad)
     with caplog.at_level(logging.WARNING):
-        kept = scan_population(bad, on_nan=OnNan.DROP_EPISODE)
+        kept = scan_population(bad, on_nan="drop_episode")
     assert kept.episodes == (EpisodeKey("a", "default", "0"),)
     assert kept.unit_ids == ("a",)
     assert [r.message.split(":")[1] for r in caplog.records] == [" Episode 1 of unit a (default)", " Episode 0 of unit b (default)"]
+
+
+def test_scan_takes_the_policy_by_name() -> None:
+    samples = values(0)
+    samples[3, 0] = np.nan
+    for policy in ("error", OnNan.ERROR):
+        with pytest.raises(DataError, match="1 NaN at sample 3"):
+            scan_population(population({"a": [samples]}), on_nan=policy)
+    with pytest.raises(ConfigError, match=r"data\.on_nan should be"):
+        scan_population(population(), on_nan="ignore")
 
 
 def test_scan_knows_the_lifting() -> None:

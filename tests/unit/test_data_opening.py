@@ -44,8 +44,8 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_fitting_reader_is_found_and_used(folders: Path, name: str) -> None:
     mapping = MAPPING if name == "csv" else None
     assert detect_reader(folders / name) == name
-    named = open_population(name, folders / name, mapping=mapping)
-    found = open_population(None, folders / name, mapping=mapping)
+    named = open_population(name, folders / name, csv=mapping)
+    found = open_population(None, folders / name, csv=mapping)
     assert len(named.unit_ids) == 2
     assert found.episodes == named.episodes
     assert named.read(named.episodes[0]).shape[1] == len(named.channels)
@@ -74,13 +74,13 @@ def test_wrong_reader(folders: Path, reader: str, folder: str, found: str) -> No
 def test_missing_empty_and_useless_folders(folders: Path, reader: str | None) -> None:
     mapping = MAPPING if reader == "csv" else None
     with pytest.raises(DataError, match=r"missing: there is no such folder; check data\.source"):
-        open_population(reader, folders / "missing", mapping=mapping)
+        open_population(reader, folders / "missing", csv=mapping)
     with pytest.raises(DataError, match="empty: the folder is empty"):
-        open_population(reader, folders / "empty", mapping=mapping)
+        open_population(reader, folders / "empty", csv=mapping)
     with pytest.raises(DataError, match=r"this is a file"):
-        open_population(reader, folders / "other" / "photo.jpg", mapping=mapping)
+        open_population(reader, folders / "other" / "photo.jpg", csv=mapping)
     with pytest.raises(DataError, match="no reader fits" if reader != "csv" else "no file matches"):
-        open_population(reader, folders / "other", mapping=mapping)
+        open_population(reader, folders / "other", csv=mapping)
 
 
 def test_unknown_reader_and_options(folders: Path) -> None:
@@ -89,7 +89,7 @@ def test_unknown_reader_and_options(folders: Path) -> None:
     with pytest.raises(ConfigError, match="needs a mapping of columns"):
         open_population("csv", folders / "csv")
     with pytest.raises(ConfigError, match="a CSV mapping is given"):
-        open_population("parquet", folders / "parquet", mapping=MAPPING)
+        open_population("parquet", folders / "parquet", csv=MAPPING)
     with pytest.raises(ConfigError, match=r"data\.on_nan"):
         open_population("parquet", folders / "parquet", on_nan="")
     with pytest.raises(ConfigError, match=r"data\.prepare\[0\] \(step 'trim'\): unknown key"):
@@ -99,8 +99,8 @@ def test_unknown_reader_and_options(folders: Path) -> None:
 @pytest.mark.parametrize("name", ["motor-drive-raw", "parquet", "csv"])
 def test_declared_steps_come_after_the_readers_own(folders: Path, name: str) -> None:
     mapping = MAPPING if name == "csv" else None
-    whole = open_population(name, folders / name, mapping=mapping)
-    trimmed = open_population(name, folders / name, mapping=mapping, prepare=[{"step": "trim", "start": 2}])
+    whole = open_population(name, folders / name, csv=mapping)
+    trimmed = open_population(name, folders / name, csv=mapping, prepare=[{"step": "trim", "start": 2}])
     np.testing.assert_array_equal(trimmed.read(whole.episodes[0]), whole.read(whole.episodes[0])[2:])
 
 
@@ -108,8 +108,8 @@ def test_dropping_episodes_at_opening(folders: Path, tmp_path: Path) -> None:
     for path in (folders / "csv").iterdir():
         (tmp_path / path.name).write_text(path.read_text())
     (tmp_path / "a_2.csv").write_text("t,x\n0,1\n0.1,\n0.2,3\n")
-    assert len(open_population("csv", tmp_path, mapping=MAPPING).episodes) == 3
-    assert len(open_population("csv", tmp_path, mapping=MAPPING, on_nan="drop_episode").episodes) == 2
+    assert len(open_population("csv", tmp_path, csv=MAPPING).episodes) == 3
+    assert len(open_population("csv", tmp_path, csv=MAPPING, on_nan="drop_episode").episodes) == 2
 
 
 def test_paths_may_be_text(folders: Path) -> None:

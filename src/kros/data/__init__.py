@@ -5,16 +5,21 @@ folder or arrays ── reader ── Population ── prepare ── check ─
 
 from . import steps
 from .checks import check_episode, check_population, scan_population
-from .opening import READERS, detect_reader, open_population
 from .population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Role, Split, Unit, split_episodes
 from .prepare import prepare
-from .readers.arrays import from_arrays
-from .readers.csv_folder import read_csv_folder
-from .readers.csv_mapping import CsvMapping
-from .readers.frame import from_frame
-from .readers.motor_drive_raw import read_motor_drive_raw
-from .readers.parquet import read_parquet
-from .readers.pykoop_array import from_pykoop, to_pykoop
+from .readers import (
+    READERS,
+    CsvMapping,
+    detect_reader,
+    from_arrays,
+    from_frame,
+    from_pykoop,
+    open_population,
+    read_csv_folder,
+    read_motor_drive_raw,
+    read_parquet,
+    to_pykoop,
+)
 from .write_raw import write_raw
 from .writers import GroupRecord, write_group, write_index, write_parquet
 

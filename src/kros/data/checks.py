@@ -31,7 +31,7 @@ class NonFiniteError(DataError):
     """An episode holds NaN or infinity."""
 
 
-def parse_on_nan(value: str) -> OnNan:
+def parse_on_nan(value: OnNan | str) -> OnNan:
     """Return the policy named by `data.on_nan`."""
     try:
         return OnNan(value)
@@ -167,14 +167,14 @@ def check_population(population: Population, allow_single: bool = False) -> None
             )
 
 
-def scan_population(population: Population, min_samples: int = MIN_SAMPLES, on_nan: OnNan = OnNan.ERROR) -> Population:
+def scan_population(population: Population, min_samples: int = MIN_SAMPLES, on_nan: OnNan | str = OnNan.ERROR) -> Population:
     """Read every episode once and check it.
 
     Parameters
     ----------
     population : Population
     min_samples : int
-    on_nan : OnNan
+    on_nan : OnNan or str
         With ``drop_episode``, episodes with NaN or infinity are left out and logged.
 
     Returns
@@ -186,11 +186,12 @@ def scan_population(population: Population, min_samples: int = MIN_SAMPLES, on_n
     ------
     DataError
     """
+    policy = parse_on_nan(on_nan)
     kept: list[EpisodeKey] = []
     for unit, condition, keys in population.groups():
         watch = InputWatch(population.channels)
         for key in keys:
-            values = read_or_drop(population, key, on_nan)
+            values = read_or_drop(population, key, policy)
             if values is not None:
                 check_episode(values, key, population.channels, min_samples)
                 watch.add(values)

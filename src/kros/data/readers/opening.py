@@ -6,14 +6,14 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import ConfigError, DataError
-from .checks import OnNan, parse_on_nan, scan_population
-from .population import Population
-from .readers.csv_folder import csv_files, read_csv_folder
-from .readers.csv_mapping import CsvMapping
-from .readers.motor_drive_raw import find_root, read_motor_drive_raw
-from .readers.parquet import INDEX, read_parquet
-from .steps import Step, parse_steps
+from ...core.errors import ConfigError, DataError
+from ..checks import OnNan, parse_on_nan, scan_population
+from ..population import Population
+from ..steps import Step, parse_steps
+from .csv_folder import csv_files, read_csv_folder
+from .csv_mapping import CsvMapping
+from .motor_drive_raw import find_root, read_motor_drive_raw
+from .parquet import INDEX, read_parquet
 
 READERS = ("motor-drive-raw", "parquet", "csv")
 LOOKS = {
@@ -42,7 +42,7 @@ def open_population(
     reader: str | None,
     source: Path | str,
     *,
-    mapping: CsvMapping | Mapping[str, Any] | Path | str | None = None,
+    csv: CsvMapping | Mapping[str, Any] | Path | str | None = None,
     prepare: Iterable[Step | Mapping[str, Any]] = (),
     on_nan: str = "error",
 ) -> Population:
@@ -53,8 +53,8 @@ def open_population(
     reader : str, optional
         ``motor-drive-raw``, ``parquet`` or ``csv``; None: the one that fits.
     source : Path
-    mapping : CsvMapping, mapping or Path, optional
-        For ``csv``: a TOML file or the table ``[data.csv]``.
+    csv : CsvMapping, mapping or Path, optional
+        Mapping for the reader ``csv``: a TOML file or the table ``[data.csv]``.
     prepare : iterable of Step or mapping
         Further steps, as in ``[[data.prepare]]``.
     on_nan : {"error", "drop_episode"}
@@ -75,12 +75,12 @@ def open_population(
     steps, policy = parse_steps(prepare), parse_on_nan(on_nan)
     if reader is not None and reader not in READERS:
         raise ConfigError(f"data.reader should be one of {', '.join(READERS)}, found {reader!r}; correct it.")
-    chosen = _fitting(reader, Path(source), mapping is not None)
+    chosen = _fitting(reader, Path(source), csv is not None)
     if chosen == "csv":
-        if mapping is None:
+        if csv is None:
             raise ConfigError(f"Reading {source} as csv needs a mapping of columns; give --mapping FILE or the table [data.csv].")
-        population = read_csv_folder(source, mapping, steps)
-    elif mapping is not None:
+        population = read_csv_folder(source, csv, steps)
+    elif csv is not None:
         raise ConfigError(
             f"Reading {source} as {chosen}: a CSV mapping is given, which only the reader 'csv' uses; remove it or set "
             'data.reader = "csv".'

@@ -17,7 +17,12 @@ import typer
 
 from .core.errors import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
 
-app = typer.Typer(name="kros", help="From recordings of a batch of machines to one robust observer for all of them.", no_args_is_help=True, add_completion=False)
+app = typer.Typer(
+    name="kros",
+    help="From recordings of a batch of machines to one robust observer for all of them.",
+    no_args_is_help=True,
+    add_completion=False,
+)
 export_app = typer.Typer(help="Hand the deployed observer over.", no_args_is_help=True)
 
 FAILED, BAD_INPUT, NOT_MET = 1, 2, 3
@@ -165,7 +170,9 @@ def check(
         typer.echo(json.dumps(scores, indent=1, ensure_ascii=False))
     else:
         for row in scores:
-            typer.echo(f"{row['unit']}  {row['condition']}  score {row['score']:.2f} (threshold {row['threshold']:.2f})  {'OUTLIER' if row['outlier'] else 'ok'}")
+            typer.echo(
+                f"{row['unit']}  {row['condition']}  score {row['score']:.2f} (threshold {row['threshold']:.2f})  {'OUTLIER' if row['outlier'] else 'ok'}"
+            )
     if any(row["outlier"] for row in scores):
         raise typer.Exit(NOT_MET)
 

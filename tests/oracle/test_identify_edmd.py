@@ -94,7 +94,9 @@ def test_residual_covariance_equals_the_residuals():
     matrices = edmd(factor.R, 3, 2.0)
     theta = LIFTING.lift(x, {"phase": np.full(len(x), 0.7)})
     residual = theta[1:] - theta[:-1] @ matrices.A[0].T - u[:-1] @ matrices.B[0].T
-    np.testing.assert_allclose(residual_covariance(factor.R, 3, matrices, factor.n_samples)[0], residual.T @ residual / len(residual), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        residual_covariance(factor.R, 3, matrices, factor.n_samples)[0], residual.T @ residual / len(residual), rtol=1e-9, atol=1e-12
+    )
 
 
 def test_smallest_alpha_is_the_edge_of_stability():

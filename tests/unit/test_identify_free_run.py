@@ -69,7 +69,13 @@ def test_models_survive_the_disk(tmp_path):
     again = ModelSet.load(tmp_path)
     for name in ("A", "B", "residual_covariance", "output_scale", "input_scale"):
         np.testing.assert_array_equal(getattr(again, name), getattr(population, name))
-    assert (again.lifting, again.channels, again.unit_ids, again.alpha, again.status) == (LIFTING, population.channels, population.unit_ids, 90.0, population.status)
+    assert (again.lifting, again.channels, again.unit_ids, again.alpha, again.status) == (
+        LIFTING,
+        population.channels,
+        population.unit_ids,
+        90.0,
+        population.status,
+    )
     np.testing.assert_array_equal(again.parameters["phase"], population.parameters["phase"])
     assert again.measured == (0,)
     response = again.systems().frequency_response([1.0, 10.0])

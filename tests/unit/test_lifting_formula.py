@@ -87,7 +87,8 @@ def test_c_expression_computes_the_same(tmp_path):
     if compiler is None:
         pytest.skip("no C compiler on this machine")
     formula = Formula("sin(100*position + phase)*velocity**3 - abs(position)/3", NAMES)
-    source = f'#include <math.h>\n#include <stdio.h>\nint main(void){{double position=0.7,velocity=-1.3,phase=2.1;printf("%.17g",{formula.c_expression()});return 0;}}'
+    body = f'double position=0.7,velocity=-1.3,phase=2.1;printf("%.17g",{formula.c_expression()});return 0;'
+    source = f"#include <math.h>\n#include <stdio.h>\nint main(void){{{body}}}"
     (tmp_path / "f.c").write_text(source)
     subprocess.run([compiler, str(tmp_path / "f.c"), "-o", str(tmp_path / "f"), "-lm"], check=True)
     printed = float(subprocess.run([str(tmp_path / "f")], check=True, capture_output=True, text=True).stdout)
@@ -96,7 +97,9 @@ def test_c_expression_computes_the_same(tmp_path):
 
 
 def test_separation_rebuilds_the_lifting_for_any_phase():
-    lifting = Lifting(("position", "velocity"), ("sin(100*position + phase)", "2*cos(position - 3*phase)*velocity", "velocity**2"), ("phase",))
+    lifting = Lifting(
+        ("position", "velocity"), ("sin(100*position + phase)", "2*cos(position - 3*phase)*velocity", "velocity**2"), ("phase",)
+    )
     x = np.random.default_rng(2).normal(size=(30, 2))
     phase = np.random.default_rng(3).uniform(0, 2 * np.pi, 30)
     separation = lifting.separation

@@ -17,7 +17,13 @@ def observer(injection=Injection.STATE, order=2, seed=0):
     rng = np.random.default_rng(seed)
     A, B = 0.3 * rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
     width = 4 if injection is Injection.STATE else 2
-    K = StateSpace(0.3 * rng.normal(size=(order, order)), rng.normal(size=(order, 1)), rng.normal(size=(width, order)), 0.1 * rng.normal(size=(width, 1)), 0.001)
+    K = StateSpace(
+        0.3 * rng.normal(size=(order, order)),
+        rng.normal(size=(order, 1)),
+        rng.normal(size=(width, order)),
+        0.1 * rng.normal(size=(width, 1)),
+        0.001,
+    )
     return Observer("koopman/test", LIFTING, A, B, (0,), ("a", "b"), K, injection, 0.001, {"phase": 0.3})
 
 
@@ -66,7 +72,14 @@ def test_the_file_holds_everything(tmp_path, injection, order):
     o.save(tmp_path / "o.json")
     again = Observer.load(tmp_path / "o.json")
     np.testing.assert_array_equal(again.one_step, o.one_step)
-    assert (again.name, again.lifting, again.measured, again.inputs, again.parameters, again.injection) == (o.name, LIFTING, (0,), ("a", "b"), {"phase": 0.3}, injection)
+    assert (again.name, again.lifting, again.measured, again.inputs, again.parameters, again.injection) == (
+        o.name,
+        LIFTING,
+        (0,),
+        ("a", "b"),
+        {"phase": 0.3},
+        injection,
+    )
 
 
 def test_other_files_are_refused(tmp_path):
@@ -100,7 +113,8 @@ def test_candidates_sweep_at_least_six_decades():
     levels, gains = zip(*kalman_candidates(A, np.array([[1.0, 0.0]]), np.array([2.0, 5.0]), np.array([[1e-6]]), 0.01), strict=True)
     assert np.log10(levels[-1] / levels[0]) >= 6
     sizes = [abs(float(s.controller.D[0, 0])) for s in gains]
-    assert sizes[0] < 1e-2 and sizes[-1] > 0.8
+    assert sizes[0] < 1e-2
+    assert sizes[-1] > 0.8
     assert all(np.diff(sizes) > -1e-9)
 
 

@@ -111,6 +111,8 @@ def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np
     content = read_json(folder / f"{kind}.json")
     found = (content.get("schema"), content.get("kind")) if isinstance(content, dict) else None
     if found != (SCHEMA, kind):
-        raise DataError(f"Loading {kind} from {folder}: schema and kind should be {(SCHEMA, kind)}, found {found}; write it again with this version of kros.")
+        raise DataError(
+            f"Loading {kind} from {folder}: schema and kind should be {(SCHEMA, kind)}, found {found}; write it again with this version of kros."
+        )
     arrays = read_arrays(folder / "arrays.npz") if (folder / "arrays.npz").exists() else {}
     return content, arrays

@@ -54,7 +54,9 @@ class StateSpace:
         for name, shape in expected.items():
             if getattr(self, name).shape[-2:] != shape:
                 found = {key: getattr(self, key).shape for key in "ABCD"}
-                raise DimensionError(f"State space: {name} should end in shape {shape}, found {found}; transpose or pad the offending matrix.")
+                raise DimensionError(
+                    f"State space: {name} should end in shape {shape}, found {found}; transpose or pad the offending matrix."
+                )
         if self.dt < 0:
             raise DimensionError(f"State space: sampling period {self.dt} s is negative; use 0 for continuous time.")
 
@@ -113,7 +115,7 @@ class StateSpace:
         eye = np.eye(self.n_states)
         shifted = self.A - eye if self.dt > 0 else self.A
         resolvent = zeta[:, None, None] * eye - shifted[..., None, :, :]
-        states = np.linalg.solve(resolvent, np.broadcast_to(self.B[..., None, :, :] + 0j, resolvent.shape[:-1] + (self.n_inputs,)))
+        states = np.linalg.solve(resolvent, np.broadcast_to(self.B[..., None, :, :] + 0j, (*resolvent.shape[:-1], self.n_inputs)))
         return self.C[..., None, :, :] @ states + self.D[..., None, :, :]
 
     def __matmul__(self, other: StateSpace) -> StateSpace:

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import IdentificationError
+from ..core.linalg import qr_triangle
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -66,7 +67,7 @@ def edmd(R: Array, n_lifted: int, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices
     ridge = np.sqrt(alpha)[..., None, None] * np.eye(p)
     top = np.broadcast_to(R[..., :p, :], (*batch, p, R.shape[-1]))
     bottom = np.concatenate([np.broadcast_to(ridge, (*batch, p, p)), np.zeros((*batch, p, n_lifted))], axis=-1)
-    triangle = np.linalg.qr(np.concatenate([top, bottom], axis=-2), mode="r")
+    triangle = qr_triangle(np.concatenate([top, bottom], axis=-2))
     R11, R12 = triangle[..., :p, :p], triangle[..., :p, p:]
     pivots = np.abs(np.diagonal(R11, axis1=-2, axis2=-1)) / np.maximum(np.linalg.norm(R11, axis=-2), np.finfo(float).tiny)
     if np.any(pivots < p * np.finfo(float).eps):
@@ -110,11 +111,15 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
         radii = [edmd(R[None], n, alphas[:, None]).spectral_radius().max(axis=-1) for R, n in factors]
         return np.max(radii, axis=0)
 
-    top = 2 + np.ceil(np.log10(max(float(np.linalg.norm(R[..., : -n or None, : -n or None], axis=(-2, -1)).max()) ** 2 for R, n in factors)))
+    top = 2 + np.ceil(
+        np.log10(max(float(np.linalg.norm(R[..., : -n or None, : -n or None], axis=(-2, -1)).max()) ** 2 for R, n in factors))
+    )
     grid = 10.0 ** np.arange(top, top - 2 - _DECADES_BELOW, -1 / _PER_DECADE)
     stable = radius(grid) < 1 - margin
     if not stable[0]:
-        raise IdentificationError(f"EDMD: models stay unstable up to alpha = {grid[0]:.1e} with a stability margin of {margin}; lower identify.margin.")
+        raise IdentificationError(
+            f"EDMD: models stay unstable up to alpha = {grid[0]:.1e} with a stability margin of {margin}; lower identify.margin."
+        )
     if stable.all():
         return 0.0 if _stable_without(factors, margin) else float(grid[-1])
     first_unstable = int(np.argmin(stable))

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ..core.linalg import qr_triangle
 from ..lifting import Lifting
 
 Array = npt.NDArray[np.float64]
@@ -66,8 +67,8 @@ def triangular(rows: Array) -> Array:
     n_blocks, width = len(rows) // _BLOCK_ROWS, rows.shape[1]
     if n_blocks > 1:
         head = rows[: n_blocks * _BLOCK_ROWS].reshape(n_blocks, _BLOCK_ROWS, width)
-        rows = np.concatenate([np.linalg.qr(head, mode="r").reshape(-1, width), rows[n_blocks * _BLOCK_ROWS :]])
-    R = np.linalg.qr(rows, mode="r")
+        rows = np.concatenate([qr_triangle(head).reshape(-1, width), rows[n_blocks * _BLOCK_ROWS :]])
+    R = qr_triangle(rows)
     return np.concatenate([R, np.zeros((width - len(R), width))]) if len(R) < width else R
 
 
@@ -75,7 +76,7 @@ def combine(factors: Factor) -> Factor:
     """Combine a batch of factors over its last batch axis, shape (..., episode, n, n) to (..., n, n)."""
     *batch, episodes, width, _ = factors.R.shape
     stacked = factors.R.reshape(*batch, episodes * width, width)
-    return Factor(np.linalg.qr(stacked, mode="r"), factors.peak.max(axis=-2), factors.n_samples.sum(axis=-1))
+    return Factor(qr_triangle(stacked), factors.peak.max(axis=-2), factors.n_samples.sum(axis=-1))
 
 
 def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array], model: Lifting) -> Factor:
@@ -104,9 +105,7 @@ def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array]
     change[..., : n + b, : model.n_lifted] = theta
     change[..., n + b : n + b + n_inputs, model.n_lifted : width] = np.eye(n_inputs)
     change[..., n + b + n_inputs :, width:] = theta
-    peak = np.concatenate(
-        [factor.peak[..., :n], np.ones((*batch, model.n_lifted - n)), factor.peak[..., n + b :]], axis=-1
-    )
+    peak = np.concatenate([factor.peak[..., :n], np.ones((*batch, model.n_lifted - n)), factor.peak[..., n + b :]], axis=-1)
     if model.functions:
         peak[..., n : model.n_lifted] = np.einsum("...ij,...j->...i", np.abs(M), factor.peak[..., n : n + b])
-    return Factor(np.linalg.qr(factor.R @ change, mode="r"), peak, factor.n_samples)
+    return Factor(qr_triangle(factor.R @ change), peak, factor.n_samples)

@@ -36,7 +36,9 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.
     batch, n_samples, m = u.shape
     n, n_lifted = lifting.n_states, lifting.n_lifted
     if x0.shape != (batch, n) or A.shape[-1] != n_lifted or B.shape[-1] != m:
-        raise DimensionError(f"Free run: inputs {u.shape}, first states {x0.shape}, A {A.shape} and B {B.shape} do not fit a lifting of {n} states to {n_lifted}.")
+        raise DimensionError(
+            f"Free run: inputs {u.shape}, first states {x0.shape}, A {A.shape} and B {B.shape} do not fit a lifting of {n} states to {n_lifted}."
+        )
     step = np.ascontiguousarray(np.swapaxes(np.concatenate([A, B], axis=-1)[..., :n, :], -1, -2))  # (.., n_lifted + m, n)
     psi = np.empty((batch, n_lifted + m))
     states = np.empty((n_samples, batch, n))

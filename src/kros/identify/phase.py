@@ -196,5 +196,7 @@ def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec
     lag = float(np.angle(doubled)) / 2
     lag = lag - np.pi if lag >= 0 else lag
     if np.abs(doubled) < _LOW_CONCENTRATION:
-        log.warning("phase calibration: lags differ so much between units (resultant %.2f) that some may be on the wrong branch", np.abs(doubled))
+        log.warning(
+            "phase calibration: lags differ so much between units (resultant %.2f) that some may be on the wrong branch", np.abs(doubled)
+        )
     return PhaseCalibration(spec, lag, {name: unit.on_branch_of(lag) for name, unit in units.items()})

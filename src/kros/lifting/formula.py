@@ -23,7 +23,18 @@ Evaluator = Callable[[Values], Any]
 
 _BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv, ast.Pow: operator.pow}
 _UNARY: dict[type, Callable[[Any], Any]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
-_FUNCTIONS = {"sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt, "tanh": np.tanh, "Abs": np.abs, "sign": np.sign, "atan": np.arctan}
+_FUNCTIONS = {
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "exp": np.exp,
+    "log": np.log,
+    "sqrt": np.sqrt,
+    "tanh": np.tanh,
+    "Abs": np.abs,
+    "sign": np.sign,
+    "atan": np.arctan,
+}
 _SPELLINGS = {"abs": "Abs"}
 _MAX_LENGTH = 2000
 _MAX_EXPONENT = 64
@@ -125,7 +136,9 @@ def _convert(node: ast.AST, text: str, names: tuple[str, ...]) -> Any:
         if function in _FUNCTIONS:
             return getattr(sp, function)(_convert(node.args[0], text, names))
         raise ConfigError(f"Formula {text!r}: unknown function {node.func.id!r}; known are {', '.join(sorted(_FUNCTIONS))}.")
-    raise ConfigError(f"Formula {text!r}: {ast.unparse(node)!r} is not allowed; use numbers, names, + - * / ** and functions of one argument.")
+    raise ConfigError(
+        f"Formula {text!r}: {ast.unparse(node)!r} is not allowed; use numbers, names, + - * / ** and functions of one argument."
+    )
 
 
 def compile_expression(expression: Any) -> Evaluator:
@@ -150,7 +163,9 @@ def compile_expression(expression: Any) -> Evaluator:
         return lambda values: np.power(base(values), exponent(values))
     function = _FUNCTIONS.get(type(expression).__name__)
     if function is None:
-        raise ConfigError(f"Formula node {expression!r}: no numerical evaluation is known; write the formula with {', '.join(sorted(_FUNCTIONS))}.")
+        raise ConfigError(
+            f"Formula node {expression!r}: no numerical evaluation is known; write the formula with {', '.join(sorted(_FUNCTIONS))}."
+        )
     (child,) = children
     return lambda values: function(child(values))
 

@@ -49,12 +49,16 @@ class Lifting:
     def __post_init__(self) -> None:
         clash = set(self.states) & set(self.parameters)
         if clash or len(set(self.states)) != len(self.states):
-            raise ConfigError(f"Lifting: names of states and parameters must differ, found states {self.states} and parameters {self.parameters}; rename {clash}.")
+            raise ConfigError(
+                f"Lifting: names of states and parameters must differ, found states {self.states} and parameters {self.parameters}; rename {clash}."
+            )
         if len(set(self.functions)) != len(self.functions):
             raise ConfigError(f"Lifting: functions {list(self.functions)} repeat one of them; every lifted function must be listed once.")
         for formula in self.formulas:
             if not formula.used & set(self.states):
-                raise ConfigError(f"Lifting: {formula.text!r} depends on no state ({', '.join(self.states)}); a constant cannot be lifted, remove it.")
+                raise ConfigError(
+                    f"Lifting: {formula.text!r} depends on no state ({', '.join(self.states)}); a constant cannot be lifted, remove it."
+                )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Rebuild from the texts in a worker process: compiled formulas do not travel."""
@@ -96,7 +100,7 @@ class Lifting:
         x = np.asarray(x, dtype=float)
         if x.shape[-1] != self.n_states:
             raise DimensionError(f"Lifting: expected {self.n_states} states {self.states} on the last axis, found shape {x.shape}.")
-        lifted = np.empty(x.shape[:-1] + (self.n_lifted,))
+        lifted = np.empty((*x.shape[:-1], self.n_lifted))
         lifted[..., : self.n_states] = x
         self.lift_into(lifted, parameters)
         return lifted
@@ -114,7 +118,7 @@ class Lifting:
     def jacobian(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the derivative of the lifted states, shape (..., n + p, n)."""
         x = np.asarray(x, dtype=float)
-        jacobian = np.zeros(x.shape[:-1] + (self.n_lifted, self.n_states))
+        jacobian = np.zeros((*x.shape[:-1], self.n_lifted, self.n_states))
         jacobian[..., range(self.n_states), range(self.n_states)] = 1.0
         values = self._values(x, parameters)
         for i, row in enumerate(self._derivatives):
@@ -165,7 +169,9 @@ class Separation:
             for term in sp.Add.make_args(sp.expand(_split_angles(formula.expression, set(parameters)), trig=False)):
                 coefficient, function = term.as_independent(*(s for s in term.free_symbols if s not in parameters), as_Add=False)
                 if function.free_symbols & set(parameters):
-                    raise ConfigError(f"Lifting function {formula.text!r}: parameters {lifting.parameters} must enter as factors or as phases of sin and cos; rewrite it.")
+                    raise ConfigError(
+                        f"Lifting function {formula.text!r}: parameters {lifting.parameters} must enter as factors or as phases of sin and cos; rewrite it."
+                    )
                 if function not in basis:
                     basis.append(function)
                 row.append((basis.index(function), coefficient))
@@ -180,7 +186,7 @@ class Separation:
         """Return the parameter-free functions at states (..., n), shape (..., n_basis)."""
         values = {name: x[..., i] for i, name in enumerate(self.lifting.states)}
         columns = [np.broadcast_to(evaluator(values), x.shape[:-1]) for evaluator in self._evaluators]
-        return np.stack(columns, axis=-1) if columns else np.zeros(x.shape[:-1] + (0,))
+        return np.stack(columns, axis=-1) if columns else np.zeros((*x.shape[:-1], 0))
 
     def matrix(self, parameters: Parameters) -> Array:
         """Return M(q) for parameter values of any common shape, shape (..., p, n_basis)."""
@@ -198,7 +204,8 @@ def _split_angles(expression: Any, parameters: set[Any]) -> Any:
     import sympy as sp
 
     def split(argument: Any) -> tuple[Any, Any]:
-        own, data = [], []
+        own: list[Any] = []
+        data: list[Any] = []
         for term in sp.Add.make_args(argument):
             (own if term.free_symbols and term.free_symbols <= parameters else data).append(term)
         return sp.Add(*data), sp.Add(*own)

@@ -11,8 +11,8 @@ from ..synthesis import kalman
 from ..synthesis.result import Synthesis
 
 Array = npt.NDArray[np.float64]
-_SWEEP_DECADES = (-10, 4)
-_PER_DECADE = 2
+_SWEEP_DECADES = (-6, 10)
+_PER_DECADE = 1
 
 
 def noise_covariances(residual_covariance: Array, resolution: Array) -> tuple[Array, Array]:
@@ -33,7 +33,7 @@ def noise_covariances(residual_covariance: Array, resolution: Array) -> tuple[Ar
 
 
 def kalman_candidates(A: Array, C: Array, scale: Array, R: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:
-    """Sweep white process noise of equal relative size in every state over fourteen decades.
+    """Sweep white process noise of equal relative size in every state over sixteen decades.
 
     Parameters
     ----------

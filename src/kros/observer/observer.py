@@ -70,7 +70,9 @@ class Observer:
             )
 
     @classmethod
-    def open_loop(cls, name: str, lifting: Lifting, A: Array, B: Array, measured: tuple[int, ...], inputs: tuple[str, ...], sample_period_s: float) -> Observer:
+    def open_loop(
+        cls, name: str, lifting: Lifting, A: Array, B: Array, measured: tuple[int, ...], inputs: tuple[str, ...], sample_period_s: float
+    ) -> Observer:
         """Return the nominal model without any correction."""
         controller = gain(np.zeros((len(A), len(measured))), sample_period_s)
         return cls(name, lifting, A, B, measured, inputs, controller, Injection.STATE, sample_period_s)
@@ -126,10 +128,23 @@ class Observer:
         width = m if injection is Injection.INPUT else n
         raw = {key: np.asarray(value, dtype=float) for key, value in content["controller"].items()}
         order = raw["A"].shape[0]
-        controller = StateSpace(raw["A"].reshape(order, order), raw["B"].reshape(order, q), raw["C"].reshape(width, order), raw["D"].reshape(width, q), dt)
+        controller = StateSpace(
+            raw["A"].reshape(order, order), raw["B"].reshape(order, q), raw["C"].reshape(width, order), raw["D"].reshape(width, q), dt
+        )
         model = {key: np.asarray(value, dtype=float) for key, value in content["model"].items()}
         defaults = {k: v for k, v in content["parameters"].items() if v is not None}
-        return cls(content["name"], lifting, model["A"], model["B"], tuple(content["measured"]), tuple(content["inputs"]), controller, injection, dt, defaults)
+        return cls(
+            content["name"],
+            lifting,
+            model["A"],
+            model["B"],
+            tuple(content["measured"]),
+            tuple(content["inputs"]),
+            controller,
+            injection,
+            dt,
+            defaults,
+        )
 
 
 class RunningObserver:
@@ -157,7 +172,9 @@ class RunningObserver:
 
     def reset(self, y: npt.ArrayLike) -> None:
         """Start again at a measurement, shape (q,)."""
-        self._state = np.concatenate([self.observer.initial(np.atleast_1d(np.asarray(y, dtype=float))), np.zeros(self.observer.controller.n_states)])
+        self._state = np.concatenate(
+            [self.observer.initial(np.atleast_1d(np.asarray(y, dtype=float))), np.zeros(self.observer.controller.n_states)]
+        )
 
     def step(self, y: npt.ArrayLike, u: npt.ArrayLike) -> Array:
         """Take the measurement and input at k, return the estimate for k + 1.

@@ -30,7 +30,9 @@ def run_observer(observer: Observer, y: Array, u: Array, parameters: Mapping[str
         Row k is the estimate of the state at k from data up to k - 1; row 0 is the start.
     """
     if y.ndim != 3 or u.ndim != 3 or y.shape[:2] != u.shape[:2]:
-        raise DimensionError(f"Running observer {observer.name}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch).")
+        raise DimensionError(
+            f"Running observer {observer.name}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch)."
+        )
     lifting, n_samples, batch = observer.lifting, *y.shape[:2]
     n, n_lifted, order, m = lifting.n_states, lifting.n_lifted, observer.controller.n_states, u.shape[2]
     values = {**observer.parameters, **(parameters or {})}

@@ -107,6 +107,7 @@ class SynthesisConfig(_Section):
 
     methods: tuple[Literal["mixed", "worst_case_h2"], ...] = ("mixed", "worst_case_h2")
     injection: Literal["state", "input"] = "state"
+    input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
     noise: dict[str, float] = Field(default_factory=dict, description="standard deviation of the measurement noise per measured channel")
     penalty: float = Field(1e-3, gt=0)
     time_limit_s: float = Field(60.0, gt=0)

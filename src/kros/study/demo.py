@@ -12,8 +12,8 @@ from ..data import write_parquet, write_raw
 from .config import validate_config
 from .context import Progress
 from .pipeline import RunResult, run_study
+from .presets import HARMONIC_DRIVE
 
-PLANTS = ("harmonic-drive",)
 FORMATS = ("parquet", "raw")
 _MARK = "demo.json"
 
@@ -28,16 +28,24 @@ def simulate_to(
     dict
         The truth that was written.
     """
-    from ..plants import HarmonicDrivePopulation
+    from ..plants import PLANTS
 
-    for name, value, allowed in (("--plant", plant, PLANTS), ("--format", format_, FORMATS), ("--loop", loop, ("stiff", "soft"))):
+    for name, value, allowed in (("--plant", plant, tuple(PLANTS)), ("--format", format_, FORMATS), ("--loop", loop, ("stiff", "soft"))):
         if value not in allowed:
             raise ConfigError(f"{name} {value!r}: choose one of {', '.join(allowed)}.")
+    if format_ == "raw" and plant != HARMONIC_DRIVE:
+        raise ConfigError(f"--format raw: is the layout of motor drives; write {plant} as parquet.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"Output {out}: exists and is not an empty folder; name a new one.")
-    simulated = HarmonicDrivePopulation(
-        n_units=units, n_episodes=episodes, seconds=seconds, seed=seed, spread=spread, loop=loop, outlier=outlier
-    ).simulate()
+    settings: dict[str, Any] = {
+        "n_units": units,
+        "n_episodes": episodes,
+        "seconds": seconds,
+        "seed": seed,
+        "spread": spread,
+        "outlier": outlier,
+    }
+    simulated = PLANTS[plant](**settings, **({"loop": loop} if plant == HARMONIC_DRIVE else {})).simulate()
     if out.exists():
         out.rmdir()
     if format_ == "raw":

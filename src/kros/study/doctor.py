@@ -21,7 +21,9 @@ _OPTIONAL = {
 
 def diagnose() -> list[str]:
     """Return lines for people."""
-    lines = [f"kros {_version('kros') or 'not installed as a package'}   Python {platform.python_version()} on {platform.platform(terse=True)}"]
+    lines = [
+        f"kros {_version('kros') or 'not installed as a package'}   Python {platform.python_version()} on {platform.platform(terse=True)}"
+    ]
     lines += [f"  {name:<16} {_version(name) or 'MISSING: install kros again'}" for name in _REQUIRED]
     lines.append("optional")
     lines += [f"  {name:<16} {_version(name) or 'not installed'}   {purpose}" for name, purpose in _OPTIONAL.items()]

@@ -43,7 +43,9 @@ def check_channels(population: Population, observer: Observer) -> None:
     if expected != found:
         raise DataError(f"Channels: the run has states and inputs {expected}, the recordings {found}; read them the same way.")
     if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=1e-6):
-        raise DataError(f"Sampling period: the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} s; declare a resample step.")
+        raise DataError(
+            f"Sampling period: the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} s; declare a resample step."
+        )
 
 
 def load_calibration(store: Store) -> PhaseCalibration | None:

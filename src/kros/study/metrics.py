@@ -66,7 +66,11 @@ def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
 
 
 def _models(context: Context) -> dict[str, Any]:
-    return {name: {"order": m.lifting.n_lifted, "spectral_radius_max": _pooled_radius(context, name)} for name in context.model_names for m in [context.models(name)]}
+    return {
+        name: {"order": m.lifting.n_lifted, "spectral_radius_max": _pooled_radius(context, name)}
+        for name in context.model_names
+        for m in [context.models(name)]
+    }
 
 
 def _pooled_radius(context: Context, name: str) -> float:
@@ -88,7 +92,12 @@ def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
         "form": model.form,
         "peak_db": model.peak_db,
         "misfit_max": model.misfit_max,
-        "weight": {"structure": "diagonal", "orders": weight.orders, "cover_max": model.cover_max, "overbound_db_max": model.overbound_db_max},
+        "weight": {
+            "structure": "diagonal",
+            "orders": weight.orders,
+            "cover_max": model.cover_max,
+            "overbound_db_max": model.overbound_db_max,
+        },
     }
     return entry
 

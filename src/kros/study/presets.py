@@ -16,7 +16,9 @@ def resolve_lifting(config: StudyConfig, population: Population) -> Lifting:
     """Return the lifting that the study declares, or the plant's own (35)."""
     declared = config.lifting
     if declared.functions is not None:
-        parameters = declared.parameters if declared.parameters is not None else ((PHASE,) if any(PHASE in f for f in declared.functions) else ())
+        parameters = (
+            declared.parameters if declared.parameters is not None else ((PHASE,) if any(PHASE in f for f in declared.functions) else ())
+        )
         return Lifting(population.states, declared.functions, parameters)
     if population.metadata.get("plant") == HARMONIC_DRIVE:
         return Lifting(population.states, (f"sin({_ratio(config, population):g}*position + {PHASE})",), (PHASE,))
@@ -28,7 +30,9 @@ def resolve_phase(config: StudyConfig, population: Population, lifting: Lifting)
     if not lifting.parameters:
         return None
     if lifting.parameters != (PHASE,):
-        raise ConfigError(f"Lifting parameters {lifting.parameters}: only {PHASE!r} can be calibrated; write other constants into the formulas.")
+        raise ConfigError(
+            f"Lifting parameters {lifting.parameters}: only {PHASE!r} can be calibrated; write other constants into the formulas."
+        )
     declared = {k: v for k, v in config.calibrate.model_dump().items() if v is not None}
     if "ratio" not in declared:
         declared["ratio"] = _ratio(config, population)
@@ -36,7 +40,9 @@ def resolve_phase(config: StudyConfig, population: Population, lifting: Lifting)
     known = population.states + population.inputs
     for name in (spec.angle, spec.reference, spec.measured):
         if name not in known:
-            raise ConfigError(f"Calibration: there is no channel {name!r} in {', '.join(known)}; set calibrate.angle, .reference and .measured.")
+            raise ConfigError(
+                f"Calibration: there is no channel {name!r} in {', '.join(known)}; set calibrate.angle, .reference and .measured."
+            )
     return spec
 
 

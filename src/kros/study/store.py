@@ -56,7 +56,9 @@ class Store:
     def finish(self, stage: Stage, key: str, seconds: float, files: list[Path]) -> None:
         """Record a finished stage."""
         digests = {str(f.relative_to(self.folder)): fingerprint(f) for f in sorted(files)}
-        write_json(self.path("stages", f"{stage.value}.json"), {"schema": 1, "stage": stage, "key": key, "seconds": seconds, "files": digests})
+        write_json(
+            self.path("stages", f"{stage.value}.json"), {"schema": 1, "stage": stage, "key": key, "seconds": seconds, "files": digests}
+        )
 
     def output_key(self, stage: Stage) -> str:
         """Return a hash of everything a finished stage wrote."""

@@ -31,14 +31,20 @@ class Outcome:
     shown: list[Array]
 
 
-def evaluate_observer(observer: Observer, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]) -> Outcome:
+def evaluate_observer(
+    observer: Observer, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
+) -> Outcome:
     """Run an observer on test episodes."""
     batch = EpisodeBatch.read(population, keys)
-    estimate = run_observer(observer, batch.states[..., list(observer.measured)], batch.inputs, batch.parameters(units) if observer.lifting.parameters else None)
+    estimate = run_observer(
+        observer, batch.states[..., list(observer.measured)], batch.inputs, batch.parameters(units) if observer.lifting.parameters else None
+    )
     return _outcome(estimate, batch, population.sample_period_s, shown)
 
 
-def evaluate_model(models: ModelSet, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]) -> Outcome:
+def evaluate_model(
+    models: ModelSet, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
+) -> Outcome:
     """Run every unit's own model freely from the true first state."""
     batch = EpisodeBatch.read(population, keys)
     rows = [models.index(k.unit) for k in keys]
@@ -59,7 +65,9 @@ def run(context: Context) -> list[Path]:
     """Evaluate and save errors, spectra and the trajectories that are shown."""
     facts, population = context.facts, context.population
     calibration = calibrate.load(context)
-    units: UnitParameters = {u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in _usable(context)}
+    units: UnitParameters = {
+        u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in _usable(context)
+    }
     keys = tuple(k for k in facts.test if k.unit in units)
     on = tuple(k for k in keys if k.condition == facts.identify_on)
     roles = unit_roles(context)
@@ -77,11 +85,22 @@ def run(context: Context) -> list[Path]:
     rows = []
     for name, outcome in zip(observers, outcomes, strict=False):
         rows += error_rows(name, outcome.summary, keys, roles, population.states, band)
-    free = {name: free_run_percent(o.summary, on, facts.pooled, population.states) for name, o in zip(models, outcomes[len(observers) :], strict=True)}
+    free = {
+        name: free_run_percent(o.summary, on, facts.pooled, population.states)
+        for name, o in zip(models, outcomes[len(observers) :], strict=True)
+    }
     folder = context.store.path("evaluation")
-    content = {"rows": rows, "free_run": free, "band_hz": band, "roles": roles, "shown": [[k.unit, k.condition, k.episode] for k in (keys[i] for i in shown)]}
+    content = {
+        "rows": rows,
+        "free_run": free,
+        "band_hz": band,
+        "roles": roles,
+        "shown": [[k.unit, k.condition, k.episode] for k in (keys[i] for i in shown)],
+    }
     content |= {"observers": list(observers), "models": list(models), "states": population.states}
-    save_artifact(folder, "evaluation", content, _arrays(population, keys, on, shown, shown_on, roles, list(observers), list(models), outcomes))
+    save_artifact(
+        folder, "evaluation", content, _arrays(population, keys, on, shown, shown_on, roles, list(observers), list(models), outcomes)
+    )
     return [folder / "evaluation.json", folder / "arrays.npz"]
 
 
@@ -117,7 +136,12 @@ def showcase(context: Context, keys: tuple[EpisodeKey, ...], roles: dict[str, st
 
 
 def error_rows(
-    name: str, summary: ErrorSummary, keys: tuple[EpisodeKey, ...], roles: dict[str, str], channels: tuple[str, ...], band: tuple[float, float] | None
+    name: str,
+    summary: ErrorSummary,
+    keys: tuple[EpisodeKey, ...],
+    roles: dict[str, str],
+    channels: tuple[str, ...],
+    band: tuple[float, float] | None,
 ) -> list[dict[str, Any]]:
     """Return a row for every unit, condition and channel: the mean over the unit's test episodes."""
     power = None if band is None else summary.band_power(band)
@@ -131,9 +155,13 @@ def error_rows(
     return rows
 
 
-def free_run_percent(summary: ErrorSummary, keys: tuple[EpisodeKey, ...], pooled: tuple[str, ...], channels: tuple[str, ...]) -> dict[str, dict[str, float]]:
+def free_run_percent(
+    summary: ErrorSummary, keys: tuple[EpisodeKey, ...], pooled: tuple[str, ...], channels: tuple[str, ...]
+) -> dict[str, dict[str, float]]:
     """Return median and worst free-run error over the pooled units, channel by channel."""
-    per_unit = np.array([summary.percent[[i for i, k in enumerate(keys) if k.unit == u]].mean(axis=0) for u in pooled if any(k.unit == u for k in keys)])
+    per_unit = np.array(
+        [summary.percent[[i for i, k in enumerate(keys) if k.unit == u]].mean(axis=0) for u in pooled if any(k.unit == u for k in keys)]
+    )
     return {c: {"median": float(np.median(per_unit[:, j])), "worst": float(per_unit[:, j].max())} for j, c in enumerate(channels)}
 
 

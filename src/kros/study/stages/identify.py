@@ -62,7 +62,8 @@ def identify_models(context: Context, condition: str, units: list[str], factor: 
         alpha = config.alpha_factor * edge
         log.info("%s: alpha = %.4g, %g times the smallest that stabilises every model", condition, alpha, config.alpha_factor)
     models = [
-        fit(name, condition, kinds[name], context, units, factors[name], parameters if kinds[name].parameters else {}, float(alpha), pooled) for name in kinds
+        fit(name, condition, kinds[name], context, units, factors[name], parameters if kinds[name].parameters else {}, float(alpha), pooled)
+        for name in kinds
     ]
     if condition == context.facts.identify_on:
         for found in models:
@@ -121,7 +122,12 @@ def _save_factors(context: Context, condition: str, units: list[str], episodes: 
     folder = context.store.path("factors", quote(condition, safe=""))
     keys = [[k.unit, k.episode] for u in units for k in context.facts.keys("train", u, condition)]
     arrays = {name: np.concatenate([getattr(f, name) for f in episodes]) for name in ("R", "peak", "n_samples")}
-    content = {"condition": condition, "states": context.lifting.states, "functions": context.lifting.functions, "inputs": context.population.inputs}
+    content = {
+        "condition": condition,
+        "states": context.lifting.states,
+        "functions": context.lifting.functions,
+        "inputs": context.population.inputs,
+    }
     save_artifact(folder, "factors", {**content, "rows": keys}, arrays)
     return [folder / "factors.json", folder / "arrays.npz"]
 

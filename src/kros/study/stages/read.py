@@ -10,7 +10,17 @@ import numpy.typing as npt
 
 from ...core.artifacts import save_artifact
 from ...core.errors import DataError
-from ...data import EpisodeKey, Population, check_population, open_population, read_parquet, scan_population, split_episodes, write_group, write_index
+from ...data import (
+    EpisodeKey,
+    Population,
+    check_population,
+    open_population,
+    read_parquet,
+    scan_population,
+    split_episodes,
+    write_group,
+    write_index,
+)
 from ...data.population import DEFAULT_CONDITION
 from ...data.writers import GroupRecord
 from ..config import StudyConfig
@@ -121,5 +131,7 @@ def _identify_on(config: StudyConfig, population: Population) -> str:
     if wanted is None:
         return "noload" if "noload" in population.conditions else (population.conditions[0] if population.conditions else DEFAULT_CONDITION)
     if wanted not in population.conditions:
-        raise DataError(f"data.identify_on = {wanted!r}: the recordings have the conditions {', '.join(population.conditions)}; name one of them.")
+        raise DataError(
+            f"data.identify_on = {wanted!r}: the recordings have the conditions {', '.join(population.conditions)}; name one of them."
+        )
     return wanted

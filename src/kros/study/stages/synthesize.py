@@ -1,10 +1,9 @@
-"""Stage: synthesise robust observers and the baselines they are compared with."""
+"""Stage: synthesise robust observers and the baselines they are compared with, and certify every one for the same set."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,62 +12,35 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import SynthesisError
-from ...core.lti import StateSpace, gain
-from ...data.population import EpisodeKey, Population
-from ...evaluate import EpisodeBatch, summarise
 from ...identify import ModelSet
-from ...observer import Observer, kalman_candidates, noise_covariances, run_observer
-from ...synthesis import Injection, ObserverProblem, Synthesis, kalman, mixed, worst_case_h2
+from ...observer import Observer
+from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...synthesis.certificate import certify
 from ...uncertainty import UncertainModel
 from ..context import Context
+from ..makers import Product, Task, produce
+from ..tuning import TUNING_UNITS, TuningSet
 from . import calibrate
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-_TUNING_UNITS = 12
-_TUNING_S = 10.0
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """Everything a worker needs for one observer."""
-
-    name: str
-    method: str
-    models: ModelSet
-    unit: str
-    problem: ObserverProblem | None
-    options: dict[str, Any]
-
-    @property
-    def nominal(self) -> StateSpace:
-        """The nominal unit's model."""
-        return self.models.systems([self.unit])[0]
-
-
-@dataclass(frozen=True, eq=False)
-class Product:
-    """One observer, or the reason why there is none."""
-
-    name: str
-    synthesis: Synthesis | None
-    facts: dict[str, Any]
+PREFERRED = ("worst_case_h2", "mixed", "kalman_tuned", "kalman_white", "open_loop")
 
 
 def run(context: Context) -> list[Path]:
-    """Synthesise everything, certify everything that can be, save observers."""
-    tasks = [task for name in context.model_names for task in _tasks(context, name)]
-    work = [partial(_produce, task) for task in tasks]
-    products = list(context.map("synthesize", _call, work))
-    files = []
+    """Make all observers, certify them, save them."""
+    tasks = [task for name in context.model_names for task in tasks_of(context, name)]
+    products = list(context.map("synthesize", produce, tasks))
+    files, facts = [], {}
     for task, product in zip(tasks, products, strict=True):
+        facts[task.name] = dict(product.facts)
         if product.synthesis is not None:
-            files += _save(context, task, product)
+            facts[task.name] |= certificate(task, product.synthesis, certified_problem(task, tasks, products))
+            files += save(context, task, product.synthesis)
     made = [p.name for p in products if p.synthesis is not None]
     deployed = choose_deployed(context.config.observer.deployed, made)
     folder = context.store.path("observers")
-    save_artifact(folder, "observers", {"names": made, "deployed": deployed, "facts": {p.name: p.facts for p in products}})
+    save_artifact(folder, "observers", {"names": made, "deployed": deployed, "facts": facts})
     Observer.load(folder / f"{deployed}.json").save(folder / "deployed.json")
     return [*files, folder / "observers.json", folder / "deployed.json"]
 
@@ -79,32 +51,28 @@ def choose_deployed(wanted: str | None, made: list[str]) -> str:
         if wanted not in made:
             raise SynthesisError(f"observer.deployed = {wanted!r}: there is no such observer, only {', '.join(made)}; name one of them.")
         return wanted
-    for method in ("worst_case_h2", "mixed", "kalman_tuned", "kalman_white", "open_loop"):
+    for method in PREFERRED:
         for name in made:
             if name.endswith(f"/{method}"):
                 return name
     raise SynthesisError("No observer could be made; see the reasons above.")
 
 
-def _call(task: Any) -> Product:
-    product: Product = task()
-    return product
-
-
-def _tasks(context: Context, name: str) -> list[Task]:
-    models = context.models(name)
-    choice, _ = load_artifact(context.store.path("uncertainty"), "choice")
-    unit = choice["nominal"]
+def tasks_of(context: Context, name: str) -> list[Task]:
+    """Return a task for every observer of one kind of model."""
+    models, config = context.models(name), context.config
+    unit = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
     folder = context.store.path("uncertainty", name)
-    problem = observer_problem(context, models, unit, UncertainModel.load(folder)) if folder.exists() else None
-    config = context.config
-    options: dict[str, Any] = {"time_limit_s": config.synthesis.time_limit_s, "max_order": config.uncertainty.max_order}
-    options |= {"noise": measurement_noise(context, models), "tuning": _tuning(context, models)}
+    noise = measurement_noise(context, models)
+    problem = observer_problem(models, unit, UncertainModel.load(folder), noise, context) if folder.exists() else None
     methods = config.observer.baselines + (config.synthesis.methods if problem is not None else ())
-    return [Task(f"{name}/{method}", method, models, unit, problem, options) for method in methods]
+    ordered = [m for m in ("open_loop", "kalman_white", "kalman_tuned", "mixed", "worst_case_h2") if m in methods]
+    settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
+    settings["max_order"] = config.uncertainty.max_order
+    return [Task(f"{name}/{method}", method, models, unit, problem, noise, tuning_set(context, models), **settings) for method in ordered]
 
 
-def observer_problem(context: Context, models: ModelSet, unit: str, uncertain: UncertainModel) -> ObserverProblem:
+def observer_problem(models: ModelSet, unit: str, uncertain: UncertainModel, noise: Array, context: Context) -> ObserverProblem:
     """Return the synthesis problem of one kind of model."""
     remainder = uncertain.remainder
     return ObserverProblem(
@@ -114,7 +82,7 @@ def observer_problem(context: Context, models: ModelSet, unit: str, uncertain: U
         W_R=uncertain.weight.right,
         input_scale=models.input_scale,
         output_scale=models.output_scale,
-        noise=measurement_noise(context, models),
+        noise=noise,
         n_original=models.lifting.n_states,
         correction_penalty=context.config.synthesis.penalty,
         remainder_left=remainder.left if remainder is not None else None,
@@ -130,97 +98,33 @@ def measurement_noise(context: Context, models: ModelSet) -> Array:
     return np.array([declared.get(n, context.facts.resolution[n] / np.sqrt(12)) for n in names])
 
 
-def _tuning(context: Context, models: ModelSet) -> tuple[Population, tuple[EpisodeKey, ...], dict[str, dict[str, float]]]:
-    """Return the training episodes that baselines are tuned on: one of each of the first units."""
-    facts = context.facts
-    units = [u for u in facts.pooled if u in models.unit_ids][:_TUNING_UNITS]
-    calibration = calibrate.load(context)
+def tuning_set(context: Context, models: ModelSet) -> TuningSet:
+    """Return the training episodes that observers are tuned on: the first of each of the first units."""
+    facts, calibration = context.facts, calibrate.load(context)
+    units = [u for u in facts.pooled if u in models.unit_ids][:TUNING_UNITS]
     keys = tuple(facts.keys("train", u, facts.identify_on)[0] for u in units)
-    parameters: dict[str, dict[str, float]] = {u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in units}
-    return context.population.select(units), keys, parameters
+    parameters: dict[str, dict[str, float]] = {
+        u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in units
+    }
+    return TuningSet(context.population.select(units), keys, parameters)
 
 
-def _produce(task: Task) -> Product:
-    """Make one observer; a failure is a product too, with its reason."""
-    try:
-        synthesis, facts = _METHODS[task.method](task)
-    except SynthesisError as error:
-        log.warning("%s: %s", task.name, error)
-        return Product(task.name, None, {"status": "failed", "reason": str(error)})
-    return Product(task.name, synthesis, {**facts, **certificate(task, synthesis)})
+def certified_problem(task: Task, tasks: list[Task], products: list[Product]) -> ObserverProblem | None:
+    """Return the set that all observers of a kind of model are certified for: that of its worst-case synthesis, where there is one."""
+    for other, product in zip(tasks, products, strict=True):
+        if other.models.name == task.models.name and other.method == "worst_case_h2" and product.synthesis is not None:
+            return product.problem
+    return task.problem
 
 
-def _static(task: Task, injection: Injection = Injection.STATE) -> Synthesis:
-    from ...synthesis.result import Status
-
-    n, q = task.models.lifting.n_lifted, len(task.models.measured)
-    return Synthesis("open_loop", gain(np.zeros((n, q)), task.models.sample_period_s), Status.OPTIMAL, injection)
-
-
-def _open_loop(task: Task) -> tuple[Synthesis, dict[str, Any]]:
-    return _static(task), {}
-
-
-def _kalman_white(task: Task) -> tuple[Synthesis, dict[str, Any]]:
-    models = task.models
-    Q, R = noise_covariances(models.residual_covariance, task.options["noise"] * np.sqrt(12))
-    return kalman(models.A[models.index(task.unit)], _measures(models), Q, R, models.sample_period_s), {}
-
-
-def _kalman_tuned(task: Task) -> tuple[Synthesis, dict[str, Any]]:
-    """Sweep the process noise; the smallest mean error of the unmeasured states on training episodes wins."""
-    models = task.models
-    population, keys, units = task.options["tuning"]
-    batch = EpisodeBatch.read(population, keys, round(_TUNING_S / models.sample_period_s))
-    hidden = [i for i in range(models.lifting.n_states) if i not in models.measured] or list(models.measured)
-    R = np.diag(task.options["noise"] ** 2)
-    best: tuple[float, float, Synthesis] | None = None
-    for level, synthesis in kalman_candidates(models.A[models.index(task.unit)], _measures(models), models.output_scale, R, models.sample_period_s):
-        observer = make_observer(task, synthesis)
-        values = batch.parameters(units) if models.lifting.parameters else None
-        estimate = run_observer(observer, batch.states[..., list(models.measured)], batch.inputs, values)
-        error = float(np.mean(summarise(estimate, batch.states, batch.lengths, models.sample_period_s).percent[:, hidden]))
-        if np.isfinite(error) and (best is None or error < best[0]):
-            best = (error, level, synthesis)
-    if best is None:
-        raise SynthesisError("Tuned Kalman filter: every candidate diverges on the training episodes.")
-    return best[2], {"process_noise_level": best[1], "training_error_percent": best[0]}
-
-
-def _mixed(task: Task) -> tuple[Synthesis, dict[str, Any]]:
-    assert task.problem is not None
-    problem = replace(task.problem, injection=Injection.INPUT)
-    synthesis = mixed(problem.mixed_plant(), time_limit_s=task.options["time_limit_s"])
-    return replace(synthesis, controller=problem.to_physical(synthesis.controller), injection=Injection.INPUT), {}
-
-
-def _worst_case_h2(task: Task) -> tuple[Synthesis, dict[str, Any]]:
-    assert task.problem is not None
-    return worst_case_h2(task.problem, max_order=task.options["max_order"]), {}
-
-
-_METHODS = {
-    "open_loop": _open_loop,
-    "kalman_white": _kalman_white,
-    "kalman_tuned": _kalman_tuned,
-    "mixed": _mixed,
-    "worst_case_h2": _worst_case_h2,
-}
-
-
-def _measures(models: ModelSet) -> Array:
-    return np.eye(models.lifting.n_lifted)[list(models.measured)]
-
-
-def certificate(task: Task, synthesis: Synthesis) -> dict[str, Any]:
+def certificate(task: Task, synthesis: Synthesis, problem: ObserverProblem | None) -> dict[str, Any]:
     """Recompute what can be said about an observer, however it was made."""
     facts: dict[str, Any] = {"order": synthesis.controller.n_states, "spectral_radius_max": None, "worst_case_h2": None}
-    if task.problem is None:
+    if problem is None:
         return facts
-    problem = replace(task.problem, injection=synthesis.injection)
-    loop = problem.error_system(synthesis.controller)
-    units = max(float(np.max(task.models.spectral_radius()[[task.models.index(u)]])) for u in task.models.unit_ids)
-    facts["spectral_radius_max"] = max(float(loop.spectral_radius()), units)
+    problem = replace(problem, injection=synthesis.injection)
+    loop = float(problem.error_system(synthesis.controller).spectral_radius())
+    facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
     try:
         facts["worst_case_h2"] = certify(problem, synthesis.controller)[0]
     except SynthesisError as error:
@@ -229,28 +133,10 @@ def certificate(task: Task, synthesis: Synthesis) -> dict[str, Any]:
     return facts
 
 
-def make_observer(task: Task, synthesis: Synthesis) -> Observer:
-    """Return the observer as it runs."""
-    models = task.models
-    row = models.index(task.unit)
-    return Observer(
-        name=task.name,
-        lifting=models.lifting,
-        A=models.A[row],
-        B=models.B[row],
-        measured=models.measured,
-        inputs=models.inputs,
-        controller=synthesis.controller,
-        injection=synthesis.injection,
-        sample_period_s=models.sample_period_s,
-        parameters={name: float(values[row]) for name, values in models.parameters.items()},
-    )
-
-
-def _save(context: Context, task: Task, product: Product) -> list[Path]:
-    assert product.synthesis is not None
+def save(context: Context, task: Task, synthesis: Synthesis) -> list[Path]:
+    """Write the observer and its synthesis."""
     path = context.store.path("observers", f"{task.name}.json")
-    make_observer(task, product.synthesis).save(path)
+    task.observer(synthesis).save(path)
     folder = context.store.path("synthesis", task.name)
-    product.synthesis.save(folder)
+    synthesis.save(folder)
     return [path, folder / "synthesis.json", folder / "arrays.npz"]

@@ -1,0 +1,99 @@
+"""Scores of new units against a finished study."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.artifacts import plain
+from ..core.errors import ConfigError, DataError
+from ..data import Population, check_population, split_episodes
+from ..data.population import EpisodeKey
+from ..identify import Factor, ModelSet, combine, edmd, lifted_factor
+from ..observer import Observer
+from ..uncertainty import OutlierModel
+from .estimate import check_channels, load_calibration, open_data, unit_parameters
+from .executors import Executor, open_executor
+from .pipeline import load_run
+from .stages.identify import reduce_episodes
+from .store import Store
+
+
+def check_units(run: Path, data: Path, workers: int | None = None) -> list[dict[str, Any]]:
+    """Identify the units of some recordings as the study did, and score each against the study's population.
+
+    Returns
+    -------
+    list of dict
+        ``unit, condition, score, threshold, outlier, frequency_hz`` and more, one row a unit and condition that the study knows.
+    """
+    config, store = load_run(run)
+    folders = sorted(p.parent for p in store.path("outliers").glob("*/outliers.json"))
+    if not folders:
+        raise ConfigError(f"Run {run}: has no outlier scores to compare with; run the study until quantify, with at least three units.")
+    population = open_data(config, data)
+    check_population(population, allow_single=True)
+    deployed = store.path("observers", "deployed.json")
+    if deployed.exists():
+        check_channels(population, Observer.load(deployed))
+    rows: list[dict[str, Any]] = []
+    with open_executor(workers) as executor:
+        for folder in folders:
+            models = ModelSet.load(store.path("models", folder.name))
+            if models.condition in population.conditions:
+                rows += score_condition(store, population, models, OutlierModel.load(folder), executor)
+    if not rows:
+        raise DataError(
+            f"Checking {data}: the recordings have the conditions {', '.join(population.conditions)}, and the run knows none of them."
+        )
+    return [plain(row) for row in sorted(rows, key=lambda r: (r["condition"], r["unit"]))]
+
+
+def score_condition(
+    store: Store, population: Population, models: ModelSet, outliers: OutlierModel, executor: Executor
+) -> list[dict[str, Any]]:
+    """Score all units that were recorded in one condition."""
+    keys = training_keys(population)
+    units = [u for u in population.unit_ids if keys.get((u, models.condition))]
+    parameters = (
+        unit_parameters(population.select(units), load_calibration(store), _identify_on(store))
+        if models.lifting.parameters
+        else {u: {} for u in units}
+    )
+    lifting = models.lifting
+    tasks = [(population.select([u], [models.condition]), keys[u, models.condition], lifting) for u in units]
+    reduced = [combine(f) for f in executor.map(reduce_episodes, tasks)]
+    factor = Factor(*(np.stack([getattr(f, name) for f in reduced]) for name in ("R", "peak", "n_samples")))
+    values = {name: np.array([parameters[u][name] for u in units]) for name in lifting.parameters}
+    matrices = edmd(lifted_factor(factor, lifting, values, lifting).R, lifting.n_lifted, models.alpha or 0.0)
+    fresh = ModelSet(
+        **{
+            **models.__dict__,
+            "unit_ids": tuple(units),
+            "A": matrices.A,
+            "B": matrices.B,
+            "parameters": values,
+            "status": ("ok",) * len(units),
+        }
+    )
+    from .stages.quantify import scaled_responses
+
+    responses = scaled_responses(fresh, units, outliers.freqs_hz)
+    return [{"condition": models.condition, **row} for row in outliers.score(responses, units)]
+
+
+def training_keys(population: Population) -> dict[tuple[str, str], tuple[EpisodeKey, ...]]:
+    """Return the episodes that a unit is identified on: its training part, or its only episode."""
+    groups = {(u, c): keys for u, c, keys in population.groups()}
+    single = {group: keys for group, keys in groups.items() if len(keys) < 2}
+    several = [group for group in groups if group not in single]
+    chosen = Population(**{**population.__dict__, "episodes": tuple(k for group in several for k in groups[group])})
+    return single | {group: split.train for group, split in split_episodes(chosen).items()}
+
+
+def _identify_on(store: Store) -> str:
+    from .context import Facts
+
+    return Facts.load(store.path("population")).identify_on

@@ -1,0 +1,49 @@
+"""One small demo run for all end-to-end tests, and the command line as people call it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+
+@pytest.fixture(scope="session")
+def kros() -> Callable[..., Result]:
+    """Call the command line; returns exit code, standard output and standard error."""
+    from kros.cli import app
+
+    def call(*arguments: Any) -> Result:
+        return CliRunner().invoke(app, [str(a) for a in arguments])
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def demo(kros, tmp_path_factory) -> Path:
+    """A finished demo: five units and an outlier, two conditions, four short episodes."""
+    out = tmp_path_factory.mktemp("demo") / "run"
+    result = kros("demo", "--out", out, "--units", 5, "--episodes", 4, "--seconds", 12, "--workers", 1)
+    assert result.exit_code == 0, result.output
+    return out
+
+
+@pytest.fixture(scope="session")
+def metrics(demo) -> dict[str, Any]:
+    """The demo's machine-readable result."""
+    return json.loads((demo / "metrics.json").read_text())
+
+
+@pytest.fixture
+def study(demo, tmp_path) -> Callable[..., Path]:
+    """Write a study file on the demo's recordings, with more TOML behind it."""
+
+    def write(extra: str = "", source: Path | None = None, reader: str = "parquet") -> Path:
+        path = tmp_path / "study.toml"
+        path.write_text(f'[data]\nsource = "{source or demo / "simulated"}"\nreader = "{reader}"\n{extra}\n')
+        return path
+
+    return write

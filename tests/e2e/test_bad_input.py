@@ -1,0 +1,158 @@
+"""Bad input: exit code 2 (or 1 where the data are at fault only after computing), one clear message, no half-written run folder."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kros.data import Channel, Role, from_arrays, write_parquet
+
+
+@pytest.fixture
+def raw(kros, tmp_path) -> Path:
+    """A small recording in the paper's raw layout."""
+    out = tmp_path / "raw"
+    result = kros("simulate", out, "--units", 2, "--episodes", 3, "--seconds", 5, "--format", "raw")
+    assert result.exit_code == 0, result.output
+    return out
+
+
+def refused(kros, study, tmp_path, *words, code=2, options=()):
+    out = tmp_path / "out"
+    result = kros("run", study, "--out", out, "--workers", 1, *options)
+    assert result.exit_code == code, result.output
+    messages = [line for line in result.stderr.splitlines() if line.startswith("kros: ")]
+    assert len(messages) == 1, result.stderr
+    for word in words:
+        assert word in messages[0]
+    assert code == 1 or not out.exists()
+    assert "Traceback" not in result.stderr
+
+
+def first_csv(raw: Path) -> Path:
+    return sorted(raw.rglob("*.csv"))[0]
+
+
+def edit(path: Path, change) -> None:
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(change(lines)) + "\n")
+
+
+def test_missing_folder(kros, study, tmp_path):
+    refused(kros, study(source=tmp_path / "nowhere"), tmp_path, "nowhere")
+
+
+def test_missing_study(kros, tmp_path):
+    refused(kros, tmp_path / "no.toml", tmp_path, "no.toml")
+
+
+def test_empty_folder(kros, study, tmp_path):
+    (tmp_path / "empty").mkdir()
+    refused(kros, study(source=tmp_path / "empty"), tmp_path, "empty")
+
+
+def test_wrong_reader(kros, study, tmp_path):
+    refused(kros, study(reader="motor-drive-raw"), tmp_path, "parquet")
+
+
+def test_unknown_reader(kros, study, tmp_path):
+    refused(kros, study(reader="excel"), tmp_path, "excel")
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        ("[identify]\nalfa = 90", ("identify.alfa", "unknown key")),
+        ("[identify]\nalpha = -1", ("identify.alpha", "-1")),
+        ("[uncertainty]\nform = 'upside_down'", ("uncertainty.form", "upside_down")),
+        ("[nonsense]\na = 1", ("nonsense", "unknown key")),
+        ("[lifting]\nfunctions = ['sin(positoin)']", ("positoin", "position")),
+        ("[lifting]\nfunctions = ['__import__(\"os\").abort()']", ("not allowed",)),
+        ("[calibrate]\nangle = 'theta'", ("theta", "position")),
+        ("[split]\ntest = ['000', '001', '002', '003']", ("split.test",)),
+        ("[data.csv]\nfiles = 1\n[data.x]", ("data.x",)),
+        ("not toml", ("TOML",)),
+    ],
+)
+def test_bad_studies(kros, study, tmp_path, extra, words):
+    refused(kros, study(extra), tmp_path, *words)
+
+
+def test_unknown_condition(kros, study, tmp_path):
+    path = study()
+    refused(kros, path, tmp_path, "hot", "noload", options=("--set", "data.identify_on=hot"))
+
+
+def test_bad_override_and_stage(kros, study, tmp_path):
+    path = study()
+    refused(kros, path, tmp_path, "KEY=VALUE", options=("--set", "identify.alpha"))
+    refused(kros, path, tmp_path, "--until", "quantify", options=("--until", "lunch"))
+
+
+@pytest.mark.parametrize(("columns", "word"), [(slice(0, 5), "column"), (slice(0, 7), "column")])
+def test_missing_or_extra_column(kros, study, tmp_path, raw, columns, word):
+    edit(first_csv(raw), lambda lines: [",".join([*line.split(","), "0"][columns]) for line in lines])
+    refused(kros, study(source=raw, reader="motor-drive-raw"), tmp_path, word)
+
+
+def test_nan_is_located(kros, study, tmp_path, raw):
+    def change(lines):
+        row = lines[1501].split(",")
+        return [*lines[:1501], ",".join([row[0], row[1], "nan", *row[3:]]), *lines[1502:]]
+
+    edit(first_csv(raw), change)
+    refused(kros, study(source=raw, reader="motor-drive-raw"), tmp_path, "velocity", "NaN", "001001")
+
+
+def test_uneven_time(kros, study, tmp_path, raw):
+    edit(first_csv(raw), lambda lines: lines[:2000] + lines[2010:])
+    refused(kros, study(source=raw, reader="motor-drive-raw"), tmp_path, "001001")
+
+
+def test_two_sampling_periods(kros, study, tmp_path, raw):
+    edit(first_csv(raw), lambda lines: [lines[0], *(",".join([f"{2 * float(x.split(',')[0]):.6f}", *x.split(",")[1:]]) for x in lines[1:])])
+    refused(kros, study(source=raw, reader="motor-drive-raw"), tmp_path, "0.002", "0.001")
+
+
+def test_one_unit_only(kros, study, tmp_path, raw):
+    folders = sorted((raw / "batch_b" / "population").iterdir())
+    for folder in folders:
+        if "001002" in folder.name:
+            shutil.rmtree(folder)
+    path = study(source=raw, reader="motor-drive-raw")
+    refused(kros, path, tmp_path, "001001")
+    result = kros("run", path, "--out", tmp_path / "one", "--until", "identify", "--workers", 1)
+    assert result.exit_code == 0, result.output
+
+
+def test_an_existing_folder_of_something_else_is_left_alone(kros, study, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "thesis.txt").write_text("mine")
+    result = kros("run", study(), "--out", out)
+    assert result.exit_code == 2
+    assert [p.name for p in out.iterdir()] == ["thesis.txt"]
+    assert kros("demo", "--out", out).exit_code == 2
+    assert kros("simulate", out).exit_code == 2
+    assert [p.name for p in out.iterdir()] == ["thesis.txt"]
+
+
+def test_a_model_that_no_regularisation_was_allowed_to_stabilise(kros, study, tmp_path):
+    refused(kros, study(), tmp_path, "spectral radius", "alpha", code=1, options=("--set", "identify.alpha=1e-9"))
+
+
+def test_no_measured_channel(kros, study, tmp_path):
+    rng = np.random.default_rng(0)
+    channels = [Channel("x", Role.STATE), Channel("u", Role.INPUT)]
+    data = {unit: {"default": [rng.normal(size=(200, 2)) for _ in range(3)]} for unit in "abc"}
+    write_parquet(from_arrays(data, channels, 0.01), tmp_path / "blind")
+    refused(kros, study(source=tmp_path / "blind"), tmp_path, "measured")
+
+
+@pytest.mark.parametrize("command", ["check", "estimate", "report", "figures"])
+def test_commands_on_something_that_is_not_a_run(kros, tmp_path, command):
+    arguments = {"check": [tmp_path], "estimate": [tmp_path, tmp_path / "x.parquet"], "report": [], "figures": [tmp_path / "f"]}[command]
+    result = kros(command, tmp_path, *arguments)
+    assert result.exit_code == 2
+    assert "study.json" in result.stderr

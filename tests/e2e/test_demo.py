@@ -1,0 +1,135 @@
+"""The demo: every stage does its work, and metrics.json keeps its contract."""
+
+import json
+import re
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from kros.identify import ModelSet
+
+STAGES = ["read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report"]
+FORMS = {
+    "additive",
+    "input_multiplicative",
+    "output_multiplicative",
+    "inverse_additive",
+    "inverse_input_multiplicative",
+    "inverse_output_multiplicative",
+}
+CHANNELS = {"position", "velocity", "current"}
+
+
+def test_metrics_keep_the_contract(metrics):
+    assert metrics["schema"] == 1
+    study = metrics["study"]
+    assert (study["units"], study["conditions"], study["identify_on"], study["sample_period_s"]) == (5, ["load", "noload"], "noload", 0.001)
+    assert study["alpha"] > 0
+    assert study["deployed"] == "koopman_edmd/worst_case_h2"
+    assert list(metrics["timing_s"]) == [*STAGES, "total"]
+    assert {u["unit"]: u["group"] for u in metrics["units"]}["000000"] == "outliers"
+    assert all(u["status"] == "ok" and 0.9 < u["concentration"] <= 1 for u in metrics["units"] if u["group"] != "outliers")
+    assert set(metrics["models"]) == {"koopman_edmd", "linear_edmd"}
+    for name, model in metrics["models"].items():
+        assert model["order"] == {"koopman_edmd": 4, "linear_edmd": 3}[name]
+        assert model["spectral_radius_max"] < 1
+        assert set(model["freerun_error_percent"]) == CHANNELS
+        assert all(0 < e["median"] <= e["worst"] < 60 for e in model["freerun_error_percent"].values())
+    for uncertain in metrics["uncertainty"].values():
+        assert set(uncertain["peak_db"]) == FORMS
+        assert uncertain["weight"]["cover_max"] <= 1
+        assert uncertain["weight"]["overbound_db_max"] <= 3
+        assert [len(orders) for orders in uncertain["weight"]["orders"]] == [2, 2]
+    for name in ("koopman_edmd/worst_case_h2", "linear_edmd/worst_case_h2"):
+        observer = metrics["observers"][name]
+        assert 0 < observer["lower_bound"] <= observer["worst_case_h2"]
+        assert observer["spectral_radius_max"] < 1
+    assert len(metrics["outliers"]) == 12
+
+
+def test_every_unit_is_evaluated_in_every_condition_with_every_observer(metrics):
+    rows = {(r["observer"], r["unit"], r["condition"], r["channel"]) for r in metrics["evaluation"]}
+    made = [name for name, o in metrics["observers"].items() if o.get("status") != "failed"]
+    assert len(rows) == len(metrics["evaluation"]) == len(made) * 6 * 2 * 3
+    assert {r["role"] for r in metrics["evaluation"]} == {"nominal", "off_nominal", "outlier"}
+    assert all(r["gearbox_band_power"] >= 0 for r in metrics["evaluation"] if r["error_percent"] is not None)
+
+
+def test_the_models_on_disk_are_what_the_design_promises(demo, metrics):
+    for name, order in (("koopman_edmd", 4), ("linear_edmd", 3)):
+        content = json.loads((demo / "models" / name / "model.json").read_text())
+        with np.load(demo / "models" / name / "arrays.npz", allow_pickle=False) as arrays:
+            assert arrays["A"].shape == (6, order, order)
+            assert arrays["B"].shape == (6, order, 2)
+        assert len(content["unit_ids"]) == 6
+        assert content["alpha"] == metrics["study"]["alpha"]
+    koopman = ModelSet.load(demo / "models" / "koopman_edmd")
+    truth = json.loads((demo / "simulated" / "truth.json").read_text())["units"]
+    found = np.array([koopman.parameters["phase"][koopman.index(u)] for u in truth])
+    true = np.array([truth[u]["phases"][0] for u in truth])
+    error = np.angle(np.exp(2j * (found - true))) / 2
+    np.testing.assert_allclose(error, 0, atol=0.05)
+    branch = np.sign(np.cos(found - true))
+    assert abs(branch.sum()) == len(branch)
+
+
+def test_the_report_stands_alone(demo):
+    page = (demo / "report.html").read_text()
+    assert not re.search(r"<script[^>]+src=|<link[^>]+href=\"http|<img[^>]+src=\"(?!data:)", page)
+    assert "koopman_edmd/worst_case_h2" in page
+    assert "000000" in page
+
+
+def test_a_second_run_changes_nothing_and_skips_everything(kros, demo, metrics):
+    before = {p: p.stat().st_mtime_ns for p in demo.rglob("*") if p.is_file() and p.name not in ("metrics.json", "study.json")}
+    study = demo.parent / "again.toml"
+    study.write_text(f'name = "demo"\n[data]\nsource = "{demo / "simulated"}"\nreader = "parquet"\n')
+    result = kros("run", study, "--out", demo, "--workers", 1)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.count("unchanged") == len(STAGES)
+    assert {p: p.stat().st_mtime_ns for p in before} == before
+    again = json.loads((demo / "metrics.json").read_text())
+    assert {k: v for k, v in again.items() if k != "timing_s"} == {k: v for k, v in metrics.items() if k != "timing_s"}
+
+
+def test_estimates_are_written_one_row_group_an_episode(kros, demo, tmp_path, metrics):
+    out = tmp_path / "estimates.parquet"
+    result = kros("estimate", demo, demo / "simulated", out)
+    assert result.exit_code == 0, result.output
+    file = pq.ParquetFile(out)
+    assert file.num_row_groups == 6 * 2 * 4
+    table = file.read()
+    assert table.column_names == ["unit", "condition", "episode", "k", "position_hat", "velocity_hat", "current_hat"]
+    rows = table.to_pandas() if hasattr(table, "to_pandas") else None
+    one = rows[(rows.unit == "001002") & (rows.condition == "noload") & (rows.episode == "003")]
+    from kros.data import EpisodeKey, read_parquet
+
+    truth = read_parquet(demo / "simulated").read(EpisodeKey("001002", "noload", "003"))
+    error = 100 * np.sqrt(np.mean((one["velocity_hat"].to_numpy() - truth[:, 1]) ** 2)) / np.abs(truth[:, 1]).max()
+    expected = [
+        r["error_percent"]
+        for r in metrics["evaluation"]
+        if (r["observer"], r["unit"], r["condition"], r["channel"]) == (metrics["study"]["deployed"], "001002", "noload", "velocity")
+    ]
+    assert error == pytest.approx(expected[0], rel=1e-9)
+    assert kros("estimate", demo, demo / "simulated", out).exit_code == 2
+
+
+def test_new_units_are_scored(kros, demo, tmp_path):
+    fresh = tmp_path / "new"
+    assert kros("simulate", fresh, "--units", 2, "--episodes", 4, "--seconds", 12, "--seed", 77, "--outlier").exit_code == 0
+    result = kros("check", demo, fresh, "--json", "--workers", 1)
+    scores = json.loads(result.stdout)
+    assert {(r["unit"], r["condition"]) for r in scores} == {(u, c) for u in ("000000", "001001", "001002") for c in ("noload", "load")}
+    loaded = {r["unit"]: r["score"] for r in scores if r["condition"] == "load"}
+    assert max(loaded, key=loaded.get) == "000000"
+    assert result.exit_code == (3 if any(r["outlier"] for r in scores) else 0)
+
+
+def test_the_report_can_be_written_again_from_the_run_folder_alone(kros, demo, tmp_path):
+    page = (demo / "report.html").read_bytes()
+    assert kros("report", demo).exit_code == 0
+    assert len((demo / "report.html").read_bytes()) == pytest.approx(len(page), rel=0.02)
+    assert kros("figures", demo, tmp_path / "figures").exit_code == 0
+    assert len(list((tmp_path / "figures").glob("*.png"))) >= 8

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .generalized_plant import GeneralizedPlant
     from .h2_optimal import h2
     from .constant_gain import kalman, luenberger
-    from .mixed_lmi import mixed
+    from .mixed_optimal import mixed
     from .observer_problem import ObserverProblem
     from .result import Injection, Status, Synthesis
     from .worst_case import worst_case_h2
@@ -28,7 +28,7 @@ _HOME = {
     "h2": "h2_optimal",
     "kalman": "constant_gain",
     "luenberger": "constant_gain",
-    "mixed": "mixed_lmi",
+    "mixed": "mixed_optimal",
     "worst_case_h2": "worst_case",
 }
 

@@ -216,10 +216,12 @@ class ObserverProblem:
             )
         return penalise(shape_inputs(plant, block_diagonal(filters)), self.correction_penalty)
 
-    def mixed_plant(self) -> GeneralizedPlant:
+    def mixed_plant(self, noise_floor: float = 1e-3) -> GeneralizedPlant:
         """Reduced, regularised, scaled form of (37)-(39): w1 = (inputs, n), w2 = output of Delta, z1 = (W_p e, penalty), z2 = input of Delta.
 
-        Minimal in the error: the copies of the plant drop out. The remainder has no place in this form and is left to the certificate.
+        Minimal in the error: the copies of the plant drop out. The remainder has no place in this form and is left to the certificate. With
+        the noise of a good encoder the covariances span twelve decades, more than conic solvers can handle; `noise_floor` is the least noise
+        here, as a fraction of the measured channel's range.
         """
         A, B, C, W_p = self.scaled
         L, R, U = self.W_L, self.W_R @ self.input_weight, self.W_R @ self.W_L
@@ -240,6 +242,7 @@ class ObserverProblem:
         to_d = np.zeros((m, k))  # d = W_L w2: the states of W_L are the last ones
         to_d[:, k - L.n_states :] = L.C
         n_u = J.shape[1]
+        sigma = np.maximum(1.0, noise_floor * (np.abs(self.C) @ self.output_scale) / self.noise)
         B1 = np.block([[np.zeros((n, m + q)), B @ L.D], [z2.B[:, :m], np.zeros((k, q)), z2.B[:, m:]]])
         return GeneralizedPlant(
             np.block([[A, B @ to_d], [np.zeros((k, n)), z2.A]]),
@@ -249,7 +252,7 @@ class ObserverProblem:
             np.hstack([C, np.zeros((q, k))]),
             np.block([[np.zeros((p + n_u, m + q + m))], [z2.D[:, :m], np.zeros((m, q)), z2.D[:, m:]]]),
             np.vstack([np.zeros((p, n_u)), self.correction_penalty * np.eye(n_u), np.zeros((m, n_u))]),
-            np.hstack([np.zeros((q, m)), np.eye(q), np.zeros((q, m))]),
+            np.hstack([np.zeros((q, m)), np.diag(sigma), np.zeros((q, m))]),
             np.zeros((q, n_u)),
             L.dt,
             n_w1=m + q,

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
+from .arrow import fill
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialec
     import pyarrow as pa
     from pyarrow import csv
 
-    read = csv.ReadOptions(use_threads=False, skip_rows=int(dialect.header), column_names=list(names), block_size=1 << 24)
+    read = csv.ReadOptions(use_threads=False, skip_rows=int(dialect.header), column_names=list(names), block_size=1 << 22)
     parse = csv.ParseOptions(delimiter=dialect.delimiter)
     convert = csv.ConvertOptions(column_types={name: pa.float64() for name in wanted}, include_columns=list(dict.fromkeys(wanted)))
     try:
@@ -76,7 +77,7 @@ def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialec
         raise DataError(f"Reading {path}: {error}; check that the file exists and can be read.") from error
     values = np.empty((len(wanted), table.num_rows))
     for row, name in enumerate(wanted):
-        values[row] = table.column(name).to_numpy()
+        fill(values[row], table.column(name))
     return values
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
+from .arrow import from_numpy
 from .folders import whole_folder
 from .population import OUTLIERS, EpisodeKey, Population
 from .readers.motor_drive_raw import CHANNELS, MOTOR_DEG_TO_RAD, PERCENT, TARGET_LAG
@@ -103,7 +104,7 @@ def raw_csv(values: npt.NDArray[np.float64], sample_period_s: float) -> bytes:
     recorded[:TARGET_LAG, 3:] = values[0, 3:]
     recorded /= np.array([MOTOR_DEG_TO_RAD, MOTOR_DEG_TO_RAD, PERCENT, MOTOR_DEG_TO_RAD, MOTOR_DEG_TO_RAD])
     columns = [np.arange(len(values)) * sample_period_s, *recorded.T]
-    rounded = [pa.array(np.round(column, decimals) + 0.0) for column, decimals in zip(columns, DECIMALS, strict=True)]
+    rounded = [from_numpy(np.round(column, decimals) + 0.0) for column, decimals in zip(columns, DECIMALS, strict=True)]
     buffer = io.BytesIO(HEADER)
     buffer.seek(len(HEADER))
     csv.write_csv(

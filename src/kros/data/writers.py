@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from ..core.artifacts import save_artifact
 from ..core.errors import DataError
+from .arrow import from_numpy, repeated
 from .checks import InputWatch, OnNan, check_structure, parse_on_nan, read_or_drop
 from .folders import whole_folder
 from .population import EpisodeKey, Population
@@ -30,7 +31,8 @@ from .readers.parquet import INDEX
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
-COMPRESSION = "none"
+# Signals of sensors as bytes of equal weight side by side, then LZ4: 57 % of the size for 0.03 s more per 91 MB. zstd saves 2 % more for twice that.
+COMPRESSION, SIGNALS, COUNTER = "lz4", "BYTE_STREAM_SPLIT", "DELTA_BINARY_PACKED"
 
 
 @dataclass(frozen=True)
@@ -170,8 +172,9 @@ def _write_episodes(
 
     names = [c.name for c in population.channels]
     schema = _schema(names)
+    encoding = {"k": COUNTER, **dict.fromkeys(names, SIGNALS)}
     options: dict[str, Any] = {"compression": COMPRESSION, "use_dictionary": list(KEYS), "write_statistics": False}
-    with parquet.ParquetWriter(path, schema, column_encoding={"k": "DELTA_BINARY_PACKED"}, **options) as writer:
+    with parquet.ParquetWriter(path, schema, column_encoding=encoding, **options) as writer:
         for key in keys:
             values = read_or_drop(population, key, on_nan)
             if values is not None:
@@ -196,7 +199,6 @@ def _schema(names: Sequence[str]) -> Any:
 def _table(key: EpisodeKey, values: npt.NDArray[np.float64], schema: Any) -> Any:
     import pyarrow as pa
 
-    zeros = pa.array(np.zeros(len(values), np.int32))
-    keys = [pa.DictionaryArray.from_arrays(zeros, pa.array([text])) for text in (key.unit, key.condition, key.episode)]
-    columns = [pa.array(np.ascontiguousarray(column)) for column in values.T]
-    return pa.Table.from_arrays([*keys, pa.array(np.arange(len(values))), *columns], schema=schema)
+    keys = [repeated(text, len(values)) for text in (key.unit, key.condition, key.episode)]
+    columns = [from_numpy(np.ascontiguousarray(column)) for column in values.T]
+    return pa.Table.from_arrays([*keys, from_numpy(np.arange(len(values), dtype=np.int64)), *columns], schema=schema)

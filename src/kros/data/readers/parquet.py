@@ -11,6 +11,7 @@ import numpy as np
 
 from ...core.artifacts import load_artifact
 from ...core.errors import DataError
+from ..arrow import fill
 from ..population import Channel, EpisodeKey, Population, Role, Unit
 from ..prepare import Recorded, assemble
 from ..recording import Recording
@@ -39,7 +40,7 @@ class ParquetRecordings:
                 table = file.read_row_group(group, columns=list(self.columns), use_threads=False)
             values = np.empty((table.num_rows, len(self.columns)))
             for column, channel in enumerate(self.columns):
-                values[:, column] = table.column(channel).to_numpy()
+                fill(values[:, column], table.column(channel))
         except (OSError, pa.ArrowInvalid, KeyError, IndexError) as error:
             raise DataError(f"Reading {key} from {path}: {error}; convert the recordings again.") from error
         if len(values) != samples:

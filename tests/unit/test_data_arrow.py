@@ -1,0 +1,56 @@
+"""NumPy to Arrow and back, against pyarrow's own conversion."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from kros.data.arrow import fill, from_numpy, repeated
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.int64, np.int32])
+@pytest.mark.parametrize("n", [0, 1, 9])
+def test_numbers(dtype: type, n: int) -> None:
+    values = np.arange(2 * n, dtype=dtype)[::2]
+    assert from_numpy(values).equals(pa.array(values))
+
+
+@pytest.mark.parametrize("text", ["", "001011", "Größe"])
+def test_repeated_text(text: str) -> None:
+    array = repeated(text, 3)
+    array.validate(full=True)
+    assert array.to_pylist() == [text] * 3
+
+
+def test_fill_with_nulls_slices_and_chunks() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        chunks = []
+        for n in rng.integers(0, 40, size=3):
+            listed = [None if rng.random() < 0.3 else float(v) for v in rng.standard_normal(n)]
+            start = int(rng.integers(0, n + 1))
+            chunks.append(pa.array(listed, pa.float64()).slice(start))
+        column = pa.chunked_array(chunks, pa.float64())
+        out = np.full((len(column), 2), 7.0)
+        fill(out[:, 1], column)
+        np.testing.assert_array_equal(out[:, 1], column.to_numpy())
+        assert np.all(out[:, 0] == 7.0)
+
+
+def test_reading_and_writing_leave_pandas_alone(tmp_path: Path) -> None:
+    """Workers start without the half second that pandas costs."""
+    (tmp_path / "csv").mkdir()
+    (tmp_path / "csv" / "a.csv").write_text("t,x\n0,1\n0.1,2\n0.2,4\n")
+    code = """
+import sys
+from kros.data import open_population, read_parquet, write_parquet
+table = {"files": "a", "time": "t", "channel": [{"name": "x", "column": "x", "role": "state"}]}
+write_parquet(open_population("csv", sys.argv[1] + "/csv", csv=table), sys.argv[1] + "/out")
+population = read_parquet(sys.argv[1] + "/out")
+assert population.read(population.episodes[0]).ravel().tolist() == [1, 2, 4]
+assert "pandas" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, timeout=60)

@@ -23,8 +23,6 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
 )
-export_app = typer.Typer(help="Hand the deployed observer over.", no_args_is_help=True)
-
 FAILED, BAD_INPUT, NOT_MET = 1, 2, 3
 
 Quiet = Annotated[bool, typer.Option("--json", help="Print metrics.json and nothing else on standard output.")]
@@ -47,6 +45,12 @@ def _exit_codes() -> Iterator[None]:
 def _fail(error: KrosError, code: int) -> None:
     typer.echo(f"kros: {error}", err=True)
     raise typer.Exit(code)
+
+
+def _count(workers: int | None) -> int:
+    from .study.executors import available_cores
+
+    return available_cores() if workers is None else workers
 
 
 def _say(text: str, quiet: bool = False) -> None:
@@ -75,7 +79,7 @@ def demo(
     from .study.progress import make_progress
 
     with _exit_codes(), make_progress(quiet) as progress:
-        result = run_demo(out, units, episodes, seconds, seed, workers, progress)
+        result = run_demo(out, units, episodes, seconds, seed, _count(workers), progress)
     _finish(result, quiet)
 
 
@@ -113,7 +117,7 @@ def convert(
     from .study.progress import make_progress
 
     with _exit_codes(), make_progress(False) as progress:
-        population = convert_recordings(source, out, reader, mapping, workers, progress)
+        population = convert_recordings(source, out, reader, mapping, _count(workers), progress)
     _say(f"{len(population.episodes)} episodes of {len(population.units)} units in {out}")
 
 
@@ -136,7 +140,7 @@ def run(
             raise ConfigError(f"--until {until!r}: stages are {', '.join(s.value for s in Stage)}.")
         config = load_config(study, set_ or ())
         folder = out if out is not None else study.parent / "runs" / study.stem
-        result = run_study(config, folder, Stage(until), workers, scheduler, progress)
+        result = run_study(config, folder, Stage(until), _count(workers), scheduler, progress)
     _finish(result, quiet)
 
 
@@ -165,7 +169,7 @@ def check(
     from .study.check import check_units
 
     with _exit_codes():
-        scores = check_units(run_folder, data, workers)
+        scores = check_units(run_folder, data, _count(workers))
     if quiet:
         typer.echo(json.dumps(scores, indent=1, ensure_ascii=False))
     else:

@@ -21,7 +21,7 @@ from .stages.identify import reduce_episodes
 from .store import Store
 
 
-def check_units(run: Path, data: Path, workers: int | None = None) -> list[dict[str, Any]]:
+def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]:
     """Identify the units of some recordings as the study did, and score each against the study's population.
 
     Returns

@@ -32,7 +32,7 @@ def write_one(task: Task) -> GroupRecord:
 
 
 def convert_recordings(
-    source: Path, out: Path, reader: str | None, mapping: Path | None, workers: int | None, progress: Progress
+    source: Path, out: Path, reader: str | None, mapping: Path | None, workers: int, progress: Progress
 ) -> Population:
     """Convert recordings; the output folder appears whole or not at all."""
     csv = read_mapping(mapping) if mapping is not None else None

@@ -57,7 +57,7 @@ def simulate_to(
     return truth
 
 
-def run_demo(out: Path, units: int, episodes: int, seconds: float, seed: int, workers: int | None, progress: Progress) -> RunResult:
+def run_demo(out: Path, units: int, episodes: int, seconds: float, seed: int, workers: int, progress: Progress) -> RunResult:
     """Simulate a population with one badly assembled drive and run the study on it, all below one folder.
 
     Raises

@@ -53,13 +53,13 @@ class DaskExecutor:
 
 
 @contextmanager
-def open_executor(workers: int | None = None, scheduler: str | None = None) -> Iterator[Executor]:
+def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
     """Open the executor that fits: Dask for a scheduler's address, processes for more than one worker.
 
     Parameters
     ----------
-    workers : int, optional
-        Number of processes; as many as there are cores by default.
+    workers : int
+        Number of processes.
     scheduler : str, optional
         Address of a Dask scheduler.
     """
@@ -71,10 +71,9 @@ def open_executor(workers: int | None = None, scheduler: str | None = None) -> I
         with Client(scheduler) as client:
             yield DaskExecutor(client)
         return
-    count = workers if workers is not None else available_cores()
-    if count < 1:
-        raise ConfigError(f"--workers {count}: at least 1 is needed.")
-    if count == 1:
+    if workers < 1:
+        raise ConfigError(f"--workers {workers}: at least 1 is needed.")
+    if workers == 1:
         yield SerialExecutor()
         return
     import multiprocessing
@@ -83,7 +82,7 @@ def open_executor(workers: int | None = None, scheduler: str | None = None) -> I
     saved = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
     try:
-        with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
             yield ProcessExecutor(pool)
     finally:
         for name, value in saved.items():

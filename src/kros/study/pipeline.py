@@ -55,7 +55,7 @@ def run_study(
     config: StudyConfig,
     out: Path,
     until: Stage = Stage.REPORT,
-    workers: int | None = None,
+    workers: int = 1,
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
@@ -68,8 +68,8 @@ def run_study(
         Run folder; a stage that finds its own earlier result there is skipped.
     until : Stage
         Last stage to run.
-    workers : int, optional
-        Processes for maps over units; as many as there are cores by default.
+    workers : int
+        Processes for maps over units. More than one needs the usual ``if __name__ == "__main__":`` guard in a script.
     scheduler : str, optional
         Address of a Dask scheduler, instead of processes.
 

@@ -39,6 +39,17 @@ def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
 
 
+def unknown_names(text: str) -> list[str]:
+    """Dotted names of kros in a document that stand for nothing."""
+    missing = []
+    for name in sorted(set(re.findall(r"`(kros(?:\.\w+)+)", text))):
+        try:
+            pkgutil.resolve_name(name)
+        except (ImportError, AttributeError):
+            missing.append(name)
+    return missing
+
+
 def check_configuration(text: str) -> None:
     """Read a CSV mapping, or a study, as kros reads it."""
     table = tomllib.loads(text)
@@ -71,6 +82,15 @@ def test_examples_of_documents_run(path: Path) -> None:
 def test_configurations_of_documents_are_valid(path: Path) -> None:
     for block in blocks(path.read_text(encoding="utf-8"), "toml"):
         check_configuration(block)
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_names_in_documents_exist(path: Path) -> None:
+    assert unknown_names(path.read_text(encoding="utf-8")) == []
+
+
+def test_unknown_names_are_found() -> None:
+    assert unknown_names("`kros.core.h2_norm`, `kros.core.h3_norm` and `kros.cores`") == ["kros.core.h3_norm", "kros.cores"]
 
 
 def test_an_unknown_key_is_found() -> None:

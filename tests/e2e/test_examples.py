@@ -1,0 +1,42 @@
+"""The examples run on measured recordings, where KROS_DATA names them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def run_example(name, recordings, out):
+    command = [sys.executable, EXAMPLES / name / "run.py", "--out", out, "--workers", "1"]
+    done = subprocess.run(command, env={**os.environ, "KROS_DATA": str(recordings)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads((out / "metrics.json").read_text())
+
+
+def test_double_pendulum(recordings, tmp_path):
+    metrics = run_example("double_pendulum", recordings, tmp_path / "run")
+    assert metrics["study"]["units"] == 6
+    assert metrics["study"]["sample_period_s"] == 0.0025
+    assert {u["status"] for u in metrics["units"]} == {"ok"}
+    assert {r["channel"] for r in metrics["evaluation"]} == {"position", "velocity", "torque"}
+    assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
+
+
+def test_quanser_qube(recordings, tmp_path):
+    metrics = run_example("quanser_qube", recordings, tmp_path / "run")
+    assert metrics["study"]["units"] == 1
+    assert metrics["models"]["koopman_edmd"]["order"] == 6
+    assert "evaluation" not in metrics
+
+
+@pytest.mark.parametrize("name", ["double_pendulum", "quanser_qube"])
+def test_without_recordings_it_says_what_to_do(name):
+    environment = {k: v for k, v in os.environ.items() if k != "KROS_DATA"}
+    done = subprocess.run([sys.executable, EXAMPLES / name / "run.py"], env=environment, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "Set KROS_DATA" in done.stderr

@@ -27,3 +27,4 @@ autodoc_default_options = {"members": True}
 
 # The one-line docstring of a property may begin "Gain: ..."; what has a space in it is no class.
 nitpick_ignore_regex = [("py:class", ".* .*")]
+nitpick_ignore = [("py:exc", "NonFiniteError")]  # internal; users catch DataError, which it is

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -73,6 +73,7 @@ class EpisodeKey:
         return f"episode {self.episode} of unit {self.unit} ({self.condition})"
 
 
+@lru_cache(maxsize=1 << 16)
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that orders ``2`` before ``10``."""
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", text) if part)
@@ -140,13 +141,12 @@ class Population:
     @property
     def conditions(self) -> tuple[str, ...]:
         """Conditions, in natural order."""
-        return tuple(sorted({e.condition for e in self.episodes}, key=natural_key))
+        return tuple(sorted({condition for _, condition in self._positions}, key=natural_key))
 
     def unit(self, unit_id: str) -> Unit:
         """Return one unit's facts."""
-        for unit in self.units:
-            if unit.id == unit_id:
-                return unit
+        if unit_id in self._unit_positions:
+            return self.units[self._unit_positions[unit_id]]
         raise DataError(
             f"Asked for unit {unit_id!r}; the population has {', '.join(self.unit_ids[:10])}{' ...' if len(self.units) > 10 else ''}."
         )
@@ -154,7 +154,7 @@ class Population:
     def keys(self, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
         """Return the episodes of a unit, a condition or both."""
         if unit is not None and condition is not None:
-            return self._grouped.get((unit, condition), ())
+            return tuple(self.episodes[i] for i in self._positions.get((unit, condition), ()))
         return tuple(e for e in self.episodes if unit in (None, e.unit) and condition in (None, e.condition))
 
     def read(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
@@ -169,24 +169,29 @@ class Population:
 
     def select(self, units: Iterable[str] | None = None, conditions: Iterable[str] | None = None) -> Population:
         """Return the population restricted to some units or conditions; nothing is read."""
-        wanted = set(self.unit_ids if units is None else units)
-        allowed = set(self.conditions if conditions is None else conditions)
-        episodes = tuple(e for e in self.episodes if e.unit in wanted and e.condition in allowed)
-        return replace(
-            self, units=tuple(u for u in self.units if u.id in wanted), episodes=episodes, source=restrict(self.source, episodes)
-        )
+        wanted = tuple(dict.fromkeys(self.unit_ids if units is None else units))
+        allowed = tuple(dict.fromkeys(self.conditions if conditions is None else conditions))
+        positions = sorted(i for u in wanted for c in allowed for i in self._positions.get((u, c), ()))
+        kept = sorted(self._unit_positions[u] for u in wanted if u in self._unit_positions)
+        episodes = tuple(self.episodes[i] for i in positions)
+        return replace(self, units=tuple(self.units[i] for i in kept), episodes=episodes, source=restrict(self.source, episodes))
 
     def groups(self) -> Iterator[tuple[str, str, tuple[EpisodeKey, ...]]]:
         """Iterate over (unit, condition, episodes)."""
-        for (unit, condition), keys in self._grouped.items():
-            yield unit, condition, keys
+        for (unit, condition), positions in self._positions.items():
+            yield unit, condition, tuple(self.episodes[i] for i in positions)
 
     @cached_property
-    def _grouped(self) -> dict[tuple[str, str], tuple[EpisodeKey, ...]]:
-        found: dict[tuple[str, str], list[EpisodeKey]] = {}
-        for key in self.episodes:
-            found.setdefault((key.unit, key.condition), []).append(key)
-        return {group: tuple(keys) for group, keys in found.items()}
+    def _positions(self) -> dict[tuple[str, str], list[int]]:
+        """Where the episodes of each unit and condition stand: asking for one group does not walk through a million episodes."""
+        found: dict[tuple[str, str], list[int]] = {}
+        for i, key in enumerate(self.episodes):
+            found.setdefault((key.unit, key.condition), []).append(i)
+        return found
+
+    @cached_property
+    def _unit_positions(self) -> dict[str, int]:
+        return {unit.id: i for i, unit in enumerate(self.units)}
 
 
 def split_episodes(population: Population, test: Iterable[str] | None = None) -> dict[tuple[str, str], Split]:

@@ -88,6 +88,26 @@ def test_several_units_in_one_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(population.read(EpisodeKey("rig/joint2", "default", "1")), values[:, 3:], rtol=1e-15)
 
 
+def test_columns_of_a_unit_may_stand_beside_its_suffix(tmp_path: Path) -> None:
+    values = np.column_stack([samples(0), samples(1)[:, 1:]])
+    write(tmp_path / "rig_1.csv", values, "t,pos1,volt1,pos2,volt2")
+    channel = [{k: v for k, v in c.items() if k != "column"} for c in CHANNEL]
+    units = [{"suffix": "/1", "x": "pos1", "u": "volt1"}, {"suffix": "/2", "x": "pos2", "columns": {"u": "volt2"}}]
+    population = read_csv_folder(tmp_path, mapping(files="(?P<unit>rig)", channel=channel, unit=units))
+    np.testing.assert_allclose(population.read(EpisodeKey("rig/2", "default", "0"))[:, 1], values[:, 4])
+    units[0]["z"] = "pos2"
+    with pytest.raises(ConfigError, match=r"unit\[0\]: unknown key 'z'; known keys are suffix, columns"):
+        read_csv_folder(tmp_path, mapping(files="(?P<unit>rig)", channel=channel, unit=units))
+
+
+def test_decimal_comma_skipped_lines_and_quoted_names(tmp_path: Path) -> None:
+    text = '\ufeffBench 4\n;;\n"t";"pos; raw";"volt"\n0,00;1,5;-2e0\n0,01;2,5;3\n0,02;4,5;3\n'
+    (tmp_path / "a_1.csv").write_text(text, encoding="utf-8")
+    channel = [CHANNEL[0], {**CHANNEL[1], "column": "pos; raw"}]
+    population = read_csv_folder(tmp_path, mapping(files="a_1", channel=channel, delimiter=";", decimal=",", skip=2))
+    np.testing.assert_allclose(population.read(population.episodes[0]), [[1.5e-3, -2], [2.5e-3, 3], [4.5e-3, 3]])
+
+
 def test_spaces_and_quotes_around_names_and_cells(tmp_path: Path) -> None:
     (tmp_path / "a_1.csv").write_text('t, "pos", volt\r\n0.00, 1.5, -2e0\r\n0.01, 2.5, 3\r\n0.02, 4.5, 3\r\n')
     values = read_csv_folder(tmp_path, mapping(files=r"(?P<unit>a)_(?P<episode>\d)")).read(EpisodeKey("a", "default", "1"))
@@ -203,7 +223,9 @@ def test_another_rate(folder: Path) -> None:
         ({"sample_period_s": 0.1}, "one of time and sample_period_s"),
         ({"time": 0}, "numbered from 1, found 0"),
         ({"header": False}, "leaves columns without names, found 't'"),
-        ({"delimiter": "::"}, "one character"),
+        ({"delimiter": "::"}, "two different characters, found delimiter = '::'"),
+        ({"decimal": ","}, "two different characters"),
+        ({"skip": -1}, "skip should be zero or more lines, found -1"),
         ({"unit": [{"suffix": "1", "columns": {"z": "pos"}}]}, r"gives a column for 'z'; the channels are \['u', 'x'\]"),
         ({"prepare": [{"step": "trim", "begin": 1}]}, "unknown key 'begin'"),
     ],

@@ -1,5 +1,6 @@
 """Names, selections and the split."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,14 @@ def test_keys_select_and_groups_agree() -> None:
     np.testing.assert_array_equal(part.read(part.episodes[0]), whole.read(part.episodes[0]))
     with pytest.raises(DataError):
         part.read(EpisodeKey("b", "hot", "0"))
+
+
+def test_order_of_episodes_survives_selection() -> None:
+    whole = population({("a", "hot"): 2, ("b", "hot"): 2})
+    mixed = replace(whole, episodes=tuple(whole.episodes[i] for i in (2, 0, 3, 1)))
+    assert mixed.select(units=["b", "a", "b"]).episodes == mixed.episodes
+    assert mixed.select(units=iter(["a"])).episodes == (whole.episodes[0], whole.episodes[1])
+    assert mixed.select(units=["b", "a"]).unit_ids == ("a", "b")
 
 
 def test_states_and_inputs_apart() -> None:

@@ -147,6 +147,21 @@ def test_not_a_number(raw: Path) -> None:
         read_motor_drive_raw(raw).read(EpisodeKey("001011", "noload", "1"))
 
 
+def test_not_a_number_where_the_offset_is_calibrated(raw: Path) -> None:
+    samples = truth(3)
+    samples[612:614, 1] = np.nan
+    write_file(folder(raw, "001011") / "cycle_001.csv", samples)
+    with pytest.raises(DataError, match="channel 'position' has 2 NaN at samples 612-613"):
+        read_motor_drive_raw(raw).read(EpisodeKey("001011", "noload", "1"))
+
+
+def test_not_a_number_in_what_is_dropped_does_no_harm(raw: Path) -> None:
+    samples = truth(3)
+    samples[100:200, 1:] = np.nan
+    write_file(folder(raw, "001011") / "cycle_001.csv", samples)
+    assert np.isfinite(read_motor_drive_raw(raw).read(EpisodeKey("001011", "noload", "1"))).all()
+
+
 def test_uneven_time(raw: Path) -> None:
     samples = truth(3)
     samples[700:, 0] += 0.0005
@@ -180,6 +195,11 @@ def test_too_short_for_the_offset_or_the_rest(raw: Path) -> None:
         population.read(EpisodeKey("001011", "noload", "0"))
     with pytest.raises(DataError, match="leaves nothing of 1000 samples"):
         population.read(EpisodeKey("001011", "noload", "1"))
+
+
+def test_unknown_episode(raw: Path) -> None:
+    with pytest.raises(DataError, match=r"Asked for episode 9 of unit 001011 \(load\); this source has 12 other episodes"):
+        read_motor_drive_raw(raw).read(EpisodeKey("001011", "load", "9"))
 
 
 def test_names_that_do_not_fit(raw: Path) -> None:

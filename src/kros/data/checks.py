@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from enum import Enum
 
@@ -67,7 +67,7 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
             f"{title(key)}: at least {min_samples} samples are needed, found {len(values)}; leave the episode out or record longer."
         )
     if not np.isfinite(values).all():
-        _check_finite(values, key, channels)
+        check_finite(values, key, channels)
     for column, channel in enumerate(channels):
         if channel.role is Role.STATE and is_constant(values[:, column]):
             raise DataError(
@@ -81,14 +81,32 @@ def is_constant(column: npt.NDArray[np.float64]) -> bool:
     return bool(column[0] == column[len(column) // 2] and np.all(column == column[0]))
 
 
-def _check_finite(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel]) -> None:
-    for column, channel in enumerate(channels):
+def check_finite(
+    values: npt.NDArray[np.float64],
+    key: EpisodeKey,
+    channels: Sequence[Channel],
+    first: int = 0,
+    columns: Iterable[int] | None = None,
+) -> None:
+    """Raise NonFiniteError where a channel holds NaN or infinity.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n_samples, n_channels)
+    key : EpisodeKey
+    channels : sequence of Channel
+    first : int
+        Number of the first sample, for the message.
+    columns : iterable of int, optional
+        Columns to look at; default all.
+    """
+    for column in range(len(channels)) if columns is None else columns:
         bad = np.flatnonzero(~np.isfinite(values[:, column]))
         if bad.size:
             kinds = " and ".join(sorted({"NaN" if np.isnan(v) else "infinity" for v in values[bad, column]}))
-            where = f"sample {bad[0]}" if bad.size == 1 else f"samples {bad[0]}-{bad[-1]}"
+            where = f"sample {first + bad[0]}" if bad.size == 1 else f"samples {first + bad[0]}-{first + bad[-1]}"
             raise NonFiniteError(
-                f"{title(key)}: channel {channel.name!r} has {bad.size} {kinds} at {where}; fix the source or set "
+                f"{title(key)}: channel {channels[column].name!r} has {bad.size} {kinds} at {where}; fix the source or set "
                 'data.on_nan = "drop_episode".'
             )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import gzip
 import re
 from collections.abc import Sequence
@@ -17,26 +18,30 @@ from .arrow import fill
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a file is written: delimiter, and whether its first line names the columns."""
+    """How a file is written: delimiter, whether a line names the columns, lines to skip before it, and the decimal point."""
 
     delimiter: str = ","
     header: bool = True
+    skip: int = 0
+    decimal: str = "."
 
 
 COMMA = Dialect()
 
 
 def first_fields(path: Path, dialect: Dialect = COMMA) -> list[str]:
-    """Return the fields of the first line, without surrounding space and quotes."""
+    """Return the fields of the first line after those skipped, without surrounding space and quotes."""
     opener = gzip.open if path.suffix == ".gz" else open
     try:
         with opener(path, "rb") as file:
+            for _ in range(dialect.skip):
+                file.readline()
             line = file.readline().decode("utf-8-sig").rstrip("\r\n")
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"Reading {path}: cannot read its first line ({error}); check the file.") from error
     if not line.strip():
         raise DataError(f"Reading {path}: the file is empty or starts with an empty line; remove it or restore it.")
-    return [part.strip().strip('"') for part in line.split(dialect.delimiter)]
+    return [part.strip() for part in next(csv.reader([line], delimiter=dialect.delimiter, skipinitialspace=True))]
 
 
 def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect = COMMA) -> npt.NDArray[np.float64]:
@@ -62,13 +67,14 @@ def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialec
         A missing file, a row with more or fewer columns, or a cell that is not a number.
     """
     import pyarrow as pa
-    from pyarrow import csv
+    from pyarrow import csv as arrow
 
-    read = csv.ReadOptions(use_threads=False, skip_rows=int(dialect.header), column_names=list(names), block_size=1 << 22)
-    parse = csv.ParseOptions(delimiter=dialect.delimiter)
-    convert = csv.ConvertOptions(column_types={name: pa.float64() for name in wanted}, include_columns=list(dict.fromkeys(wanted)))
+    read = arrow.ReadOptions(use_threads=False, skip_rows=dialect.skip + dialect.header, column_names=list(names), block_size=1 << 22)
+    parse = arrow.ParseOptions(delimiter=dialect.delimiter)
+    numbers = {name: pa.float64() for name in wanted}
+    convert = arrow.ConvertOptions(column_types=numbers, include_columns=list(numbers), decimal_point=dialect.decimal)
     try:
-        table = csv.read_csv(path, read, parse, convert)
+        table = arrow.read_csv(path, read, parse, convert)
     except (pa.ArrowInvalid, pa.ArrowKeyError) as error:
         if "Empty CSV" in str(error):
             return np.zeros((len(wanted), 0))

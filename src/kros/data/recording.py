@@ -5,8 +5,9 @@ reader ── Recording ── steps ── Recording ── checks ── sampl
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +40,15 @@ class Recording:
 
 
 RecordingSource = Callable[[EpisodeKey], Recording]
+Place = TypeVar("Place")
+
+
+def look_up(places: Mapping[EpisodeKey, Place], key: EpisodeKey) -> Place:
+    """Return where an episode is, or say that this source does not have it."""
+    try:
+        return places[key]
+    except KeyError as error:
+        raise DataError(f"Asked for {key}; this source has {len(places)} other episodes; take keys from population.episodes.") from error
 
 
 def title(key: EpisodeKey) -> str:

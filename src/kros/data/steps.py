@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..core.errors import ConfigError, DataError
+from .checks import check_finite
 from .population import Channel
 from .recording import Recording, title
 from .resampling import Differentiate, Resample
@@ -102,6 +103,7 @@ class Offset(Step):
                 f"{len(recording.values)}; leave the episode out."
             )
         window = recording.values[self.start : self.stop]
+        check_finite(window, recording.key, channels, first=self.start, columns=(column, reference))
         values = recording.values.copy()
         values[:, column] += np.mean(window[:, reference] - window[:, column])
         return replace(recording, values=values)

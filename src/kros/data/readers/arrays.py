@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ...core.errors import DataError
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit
 from ..prepare import Recorded, assemble
-from ..recording import Recording, title
+from ..recording import Recording, look_up, title
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +29,7 @@ class ArrayRecordings:
 
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode."""
-        try:
-            return Recording(key, self.values[key], None if self.times is None else self.times[key])
-        except KeyError as error:
-            raise DataError(f"Asked for {key}; these arrays hold {len(self.values)} other episodes.") from error
+        return Recording(key, look_up(self.values, key), None if self.times is None else self.times[key])
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> ArrayRecordings:
         """Return the same for fewer episodes, cheaper to send to another process."""

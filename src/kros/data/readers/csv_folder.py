@@ -15,7 +15,7 @@ from ...core.errors import DataError
 from ..csvfile import Dialect, first_fields, read_columns
 from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Unit
 from ..prepare import Recorded, assemble
-from ..recording import Recording
+from ..recording import Recording, look_up
 from ..steps import Step
 from .csv_mapping import Column, CsvMapping, UnitMapping, load_mapping
 
@@ -43,7 +43,7 @@ class CsvRecordings:
 
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode as recorded."""
-        place = self.places[key]
+        place = look_up(self.places, key)
         columns = read_columns(Path(place.path), place.names, place.wanted, self.dialect)
         if self.time_scale is None:
             return Recording(key, np.ascontiguousarray(columns.T))
@@ -78,7 +78,7 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
         No file matches, a column is missing, or two files are the same episode.
     """
     chosen, source = load_mapping(mapping), Path(source)
-    dialect = Dialect(chosen.delimiter, chosen.header)
+    dialect = Dialect(chosen.delimiter, chosen.header, chosen.skip, chosen.decimal)
     places: dict[EpisodeKey, FilePlace] = {}
     groups: dict[str, str] = {}
     for path, match in _matches(source, chosen):

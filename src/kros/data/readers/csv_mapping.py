@@ -85,6 +85,10 @@ class CsvMapping:
     delimiter : str
     header : bool
         False where the first line holds numbers already; columns are then given by number.
+    skip : int
+        Lines before the header, or before the first line of numbers.
+    decimal : str
+        Decimal point, for example ``","`` in files of some countries.
     prepare : tuple of mapping
         Preparation steps of this mapping.
     metadata : mapping
@@ -101,6 +105,8 @@ class CsvMapping:
     exclude: str | None = None
     delimiter: str = ","
     header: bool = True
+    skip: int = 0
+    decimal: str = "."
     prepare: tuple[Mapping[str, Any], ...] = ()
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
@@ -111,8 +117,11 @@ class CsvMapping:
                 f"CSV mapping: give one of time and sample_period_s, found time = {self.time!r}, sample_period_s = "
                 f"{self.sample_period_s!r}."
             )
-        if len(self.delimiter) != 1:
-            raise ConfigError(f"CSV mapping: delimiter should be one character, found {self.delimiter!r}; correct it.")
+        if len(self.delimiter) != 1 or len(self.decimal) != 1 or self.delimiter == self.decimal:
+            found = f"delimiter = {self.delimiter!r}, decimal = {self.decimal!r}"
+            raise ConfigError(f"CSV mapping: delimiter and decimal should be two different characters, found {found}; correct them.")
+        if self.skip < 0:
+            raise ConfigError(f"CSV mapping: skip should be zero or more lines, found {self.skip}; correct it.")
         if not self.channel:
             raise ConfigError("CSV mapping: there is no [[channel]]; declare each channel with name, column and role.")
         self._check_pattern("files")
@@ -185,10 +194,25 @@ def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMap
     if isinstance(mapping, CsvMapping):
         return mapping
     if isinstance(mapping, Mapping):
-        return build(CsvMapping, mapping, "CSV mapping")
+        return build(CsvMapping, _with_columns(mapping), "CSV mapping")
     try:
-        return build(CsvMapping, tomllib.loads(Path(mapping).read_text(encoding="utf-8")), f"CSV mapping {mapping}")
+        return build(CsvMapping, _with_columns(tomllib.loads(Path(mapping).read_text(encoding="utf-8"))), f"CSV mapping {mapping}")
     except OSError as error:
         raise ConfigError(f"CSV mapping {mapping}: cannot be read ({error}); give the path of a TOML file.") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"CSV mapping {mapping}: not valid TOML ({error}); correct it.") from error
+
+
+def _with_columns(table: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the table with columns that a ``[[unit]]`` gives beside its suffix (``position = "pos1"``) under `columns`."""
+    channels, units = table.get("channel"), table.get("unit")
+    if not isinstance(channels, (list, tuple)) or not isinstance(units, (list, tuple)):
+        return table
+    names = {c.get("name") for c in channels if isinstance(c, Mapping)}
+    return {**table, "unit": [_unit_table(u, names - {"suffix", "columns"}) if isinstance(u, Mapping) else u for u in units]}
+
+
+def _unit_table(unit: Mapping[str, Any], names: set[Any]) -> dict[str, Any]:
+    beside = {key: value for key, value in unit.items() if key in names}
+    rest = {key: value for key, value in unit.items() if key not in names}
+    return rest if not beside else {**rest, "columns": {**rest.get("columns", {}), **beside}}

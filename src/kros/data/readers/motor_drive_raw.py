@@ -21,7 +21,7 @@ from ...core.errors import DataError
 from ..csvfile import first_fields, read_columns
 from ..population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
 from ..prepare import Recorded, assemble
-from ..recording import Recording
+from ..recording import Recording, look_up
 from ..steps import Offset, Scale, Shift, Step, Trim
 
 GEAR_RATIO = 100
@@ -58,7 +58,7 @@ class RawRecordings:
 
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode as recorded."""
-        columns = read_columns(Path(self.files[key]), COLUMNS, COLUMNS)
+        columns = read_columns(Path(look_up(self.files, key)), COLUMNS, COLUMNS)
         return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0])
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> RawRecordings:

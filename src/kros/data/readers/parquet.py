@@ -14,7 +14,7 @@ from ...core.errors import DataError
 from ..arrow import fill
 from ..population import Channel, EpisodeKey, Population, Role, Unit
 from ..prepare import Recorded, assemble
-from ..recording import Recording
+from ..recording import Recording, look_up
 from ..steps import Step
 
 INDEX = "population"  # kind of the artifact, hence population.json
@@ -33,7 +33,7 @@ class ParquetRecordings:
         import pyarrow as pa
         from pyarrow import parquet
 
-        name, group, samples = self.places[key]
+        name, group, samples = look_up(self.places, key)
         path = Path(self.folder) / name
         try:
             with parquet.ParquetFile(path, memory_map=True) as file:

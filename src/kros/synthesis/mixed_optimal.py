@@ -54,7 +54,7 @@ def mixed(
     *,
     gamma: float = 1.0,
     scalings: Sequence[float] = (1.0,),
-    max_states: int = 10,
+    max_states: int = 8,
     time_limit_s: float = 60.0,
     noise_floor: float = 1e-3,
 ) -> Synthesis:
@@ -70,8 +70,9 @@ def mixed(
     scalings : sequence of float
         Scalings of the second channel to try; the best verified result is kept. Leave it at 1 for observer problems.
     max_states : int
-        Stable plants with more states are reduced to this number by balanced truncation for the inequalities only (their cost grows with the
-        sixth power of the states); the controller is verified on the full plant.
+        Stable plants are reduced to this number by balanced truncation for the inequalities only (their cost grows with the sixth power of
+        the states, and states of no consequence make them ill-conditioned); where every solver fails, to two fewer. The controller is
+        verified on the full plant.
     time_limit_s : float
         For each call of a solver.
     noise_floor : float
@@ -106,9 +107,14 @@ def mixed(
             f"Mixed synthesis: gamma = {gamma}, scalings = {tuple(scalings)}, time_limit_s = {time_limit_s}, max_states = {max_states} should all be positive."
         )
     start = time.perf_counter()
-    small, notes = _reduced(plant, max_states)
     reasons: list[str] = []
-    found = [v for a in scalings for v in [_best_for(plant, small, gamma, a, time_limit_s, reasons)] if v is not None]
+    notes: list[str] = []
+    found: list[_Verified] = []
+    for limit in (max_states, max(max_states - 2, 1)):
+        small, notes = _reduced(plant, limit)
+        found = [v for a in scalings for v in [_best_for(plant, small, gamma, a, time_limit_s, reasons)] if v is not None]
+        if found or small is plant:
+            break
     if not found:
         raise SynthesisError("Mixed synthesis: no controller survived; " + "; ".join(reasons) + ". Raise gamma, max_states, noise or the time limit.")
     best = min(found, key=lambda v: v.h2)
@@ -118,12 +124,13 @@ def mixed(
 def _reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant, list[str]]:
     """Plant for the inequalities, and what was done to it."""
     n = plant.sizes[0]
-    if n <= max_states:
-        return plant, []
     if not plant.open_loop().is_stable():
-        return plant, [f"The plant is unstable and was not reduced: {n} states in the inequalities."]
+        return plant, [f"The plant is unstable and was not reduced: {n} states in the inequalities."] if n > max_states else []
     small, tail = truncate(plant, max_states)
-    return small, [f"Inequalities on {max_states} of {n} states (discarded Hankel singular values sum to {tail:.2g} of the largest); verified on all."]
+    kept = small.sizes[0]
+    if kept == n:
+        return plant, []
+    return small, [f"Inequalities on {kept} of {n} states (discarded Hankel singular values sum to {tail:.2g} of the largest); verified on all."]
 
 
 def _best_for(

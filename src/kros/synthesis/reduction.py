@@ -14,6 +14,8 @@ import numpy as np
 from ..core.norms import gramian
 from .generalized_plant import GeneralizedPlant
 
+_NEGLIGIBLE = 1e-10
+
 
 def truncate(plant: GeneralizedPlant, n_states: int) -> tuple[GeneralizedPlant, float]:
     """Balanced truncation of a stable plant from (w, u) to (z, y).
@@ -23,6 +25,7 @@ def truncate(plant: GeneralizedPlant, n_states: int) -> tuple[GeneralizedPlant, 
     plant : GeneralizedPlant
         Stable; every signal should have a size near one, since all count alike.
     n_states : int
+        At most; states whose Hankel singular value is negligible go in any case.
 
     Returns
     -------
@@ -34,7 +37,7 @@ def truncate(plant: GeneralizedPlant, n_states: int) -> tuple[GeneralizedPlant, 
     R = _root(gramian(plant.A, B, plant.dt))
     S = _root(gramian(plant.A.T, C.T, plant.dt)).T
     U, h, Vh = np.linalg.svd(S @ R)
-    k = min(n_states, int(np.sum(h > 1e-14 * h[0])))
+    k = min(n_states, int(np.sum(h > _NEGLIGIBLE * h[0])))
     left = (U[:, :k] / np.sqrt(h[:k])).T @ S
     right = R @ Vh[:k].T / np.sqrt(h[:k])
     small = replace(

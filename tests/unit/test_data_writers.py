@@ -1,6 +1,7 @@
 """The native format: exact, lazy, whole or not at all."""
 
 import json
+import string
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -9,9 +10,12 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from kros.core.errors import ConfigError, DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, read_parquet, write_group, write_index, write_parquet
+from kros.data.writers import group_file
 
 CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("y/z", Role.STATE), Channel("u", Role.INPUT, "V"))
 
@@ -68,10 +72,33 @@ def test_files_as_documented(tmp_path: Path) -> None:
 
 
 def test_any_id_works(tmp_path: Path) -> None:
-    odd = ("000123456789012345678901", "../etc", "a@b", "a%40b", "Größe 5 / links", "x.parquet", "", "a b")
+    odd = (
+        "000123456789012345678901",
+        "../etc",
+        "a@b",
+        "a%40b",
+        "Größe 5 / links",
+        "x.parquet",
+        "",
+        "a b",
+        "x" * 300,
+        "x" * 299 + "y",
+        "ß" * 80,
+    )
     write_parquet(population(odd), tmp_path / "out")
     assert_same(read_parquet(tmp_path / "out"), population(odd))
     assert len(list((tmp_path / "out").iterdir())) == 2 * len(odd) + 1
+
+
+@example(("a@b", "c"), ("a", "b@c"))
+@example(("a" * 300, ""), ("a" * 300 + "b", ""))
+@given(st.tuples(st.text(max_size=300), st.text(max_size=300)), st.tuples(st.text(max_size=300), st.text(max_size=300)))
+def test_file_names_differ_and_are_portable(one: tuple[str, str], other: tuple[str, str]) -> None:
+    names = [group_file(*ids) for ids in (one, other)]
+    assert (names[0] == names[1]) == (one == other)
+    for name in names:
+        assert len(name) <= 208
+        assert set(name) <= set(string.ascii_letters + string.digits + "%@._-~")
 
 
 def test_same_bytes_for_any_number_of_workers(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -31,6 +32,8 @@ from .readers.parquet import INDEX
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
+KEYS = ("unit", "condition", "episode")
+LONGEST_NAME = 200  # file systems allow 255 bytes, and a temporary name is longer
 # Signals of sensors as bytes of equal weight side by side, then LZ4: 57 % of the size for 0.03 s more per 91 MB. zstd saves 2 % more for twice that.
 COMPRESSION, SIGNALS, COUNTER = "lz4", "BYTE_STREAM_SPLIT", "DELTA_BINARY_PACKED"
 
@@ -57,7 +60,10 @@ class GroupRecord:
 
 def group_file(unit: str, condition: str) -> str:
     """Return the name of the file of one unit and condition; different ids never share a name."""
-    return f"{quote(unit, safe='')}@{quote(condition, safe='')}.parquet"
+    name = f"{quote(unit, safe='')}@{quote(condition, safe='')}"
+    if len(name) > LONGEST_NAME:
+        name = f"{name[: LONGEST_NAME - 65]}~{sha256(name.encode()).hexdigest()}"
+    return f"{name}.parquet"
 
 
 def write_group(population: Population, unit: str, condition: str, folder: Path | str, on_nan: str = "error") -> GroupRecord:
@@ -181,9 +187,6 @@ def _write_episodes(
                 watch.add(values)
                 writer.write_table(_table(key, values, schema), row_group_size=len(values))
                 yield key.episode, len(values)
-
-
-KEYS = ("unit", "condition", "episode")
 
 
 def _schema(names: Sequence[str]) -> Any:

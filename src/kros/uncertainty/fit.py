@@ -30,7 +30,8 @@ _FLOOR = 1e-8  # magnitudes below this fraction of the largest count as this fra
 _POINTS = 150  # of the grid in the first programs
 _ROUNDS = 6
 _TOP = 10.0  # tau beyond which (80 % of Nyquist) no knots are placed
-_EXCHANGE = 10**0.001 - 1  # 0.01 dB of squared magnitude
+_EXCHANGE = 10**0.002 - 1  # 0.02 dB of squared magnitude
+_GAIN = 0.9  # a further order that brings the overbound in dB to this share needs no other start
 
 
 class Side(str, Enum):
@@ -244,11 +245,14 @@ def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None) ->
     cuts = np.zeros(0)
     phi, best = basis(tau, knots), None
     start = None if lower is None else basis(tau, lower.rational.knots) @ lower.rational.denominator
+    enough = 1 + _EXCHANGE if lower is None else max(lower.ratio**_GAIN, 1 + _EXCHANGE)
     for _ in range(_ROUNDS):
         starts = [targets[chosen] ** -0.5] if best is None else []  # n and d share the slope
         if start is not None:
             starts.append(start[chosen])
-        rational = Grid.build(tau[chosen], targets[chosen], knots, cuts).best(starts)
+        if best is None:
+            starts.append(np.ones(len(chosen)))
+        rational = Grid.build(tau[chosen], targets[chosen], knots, cuts).best(starts, enough)
         if rational is None:
             return best
         n, d = phi @ rational.numerator, phi @ rational.denominator

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
-from .small import entries_first, entries_last, multiply
+from .small import entries_first, entries_last, multiply, pseudo_inverse_first
 
 Array = npt.NDArray[Any]
 
@@ -120,15 +120,15 @@ def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike,
         return entries_last(_paper_residual(form, G, Gp, first, second))
     difference = second - first
     if form is Form.INPUT_MULTIPLICATIVE:
-        E = multiply(_pinv(G), difference)
+        E = multiply(pseudo_inverse_first(G), difference)
     elif form is Form.OUTPUT_MULTIPLICATIVE:
-        E = multiply(difference, _pinv(G))
+        E = multiply(difference, pseudo_inverse_first(G))
     elif form is Form.INVERSE_ADDITIVE:
-        E = multiply(multiply(_pinv(Gp), difference), _pinv(G))
+        E = multiply(multiply(pseudo_inverse_first(Gp), difference), pseudo_inverse_first(G))
     elif form is Form.INVERSE_INPUT_MULTIPLICATIVE:
-        E = multiply(_pinv(Gp), difference)
+        E = multiply(pseudo_inverse_first(Gp), difference)
     else:
-        E = multiply(difference, _pinv(Gp))
+        E = multiply(difference, pseudo_inverse_first(Gp))
     return entries_last(E)
 
 
@@ -211,20 +211,15 @@ def _paper_residual(form: Form, G: Array, Gp: Array, first: Array, second: Array
     p, m = G.shape[-2:]
     q = m if form in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE) else p
     if form is Form.INPUT_MULTIPLICATIVE:
-        product, sign = multiply(_pinv(G), second), 1
+        product, sign = multiply(pseudo_inverse_first(G), second), 1
     elif form is Form.OUTPUT_MULTIPLICATIVE:
-        product, sign = multiply(second, _pinv(G)), 1
+        product, sign = multiply(second, pseudo_inverse_first(G)), 1
     elif form is Form.INVERSE_INPUT_MULTIPLICATIVE:
-        product, sign = multiply(_pinv(Gp), first), -1
+        product, sign = multiply(pseudo_inverse_first(Gp), first), -1
     else:
-        product, sign = multiply(first, _pinv(Gp)), -1
+        product, sign = multiply(first, pseudo_inverse_first(Gp)), -1
     eye = np.eye(q).reshape((q, q) + (1,) * (product.ndim - 2))
     return sign * (product - eye)
-
-
-def _pinv(plants: Array) -> Array:
-    """Pseudo-inverses with the entries first."""
-    return entries_first(np.linalg.pinv(plants))
 
 
 def _inverse(matrices: Array) -> Array:

@@ -28,8 +28,8 @@ _LOG = logging.getLogger(__name__)
 _EDGE = 1e-4  # how far n and d may fall between the ends of the grid and DC or Nyquist
 _STARTS = 10
 _STEPS = 12
-_EXACT_DB = 1e-5
-_STALLED_DB = 1e-3
+_EXACT_DB = 1e-4
+_STALLED_DB = 5e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +61,15 @@ class Grid:
         nearest = np.concatenate([[0], np.searchsorted(tau, cuts).clip(0, len(tau) - 1), [len(tau) - 1]])
         return cls(targets, knots, phi, basis(np.concatenate([[0.0], cuts, [np.inf]]), knots), phi[nearest], nearest)
 
-    def best(self, starts: Sequence[Array]) -> RationalMagnitude | None:
-        """Return the best bound reached from several first denominators, shape (n_points,) each."""
+    def best(self, starts: Sequence[Array], enough: float) -> RationalMagnitude | None:
+        """Return the best bound from several first denominators, shape (n_points,) each, or the first whose ratio is below `enough`."""
         found: RationalMagnitude | None = None
         ratio = np.inf
         for start in starts:
             rational, reached = self._iterate(start)
             if rational is not None and reached < ratio:
                 found, ratio = rational, reached
-            if ratio < 10 ** (_STALLED_DB / 10):
+            if ratio < enough:
                 break
         return found
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from .forms import MAX_CONDITION, Form, as_form, inverted_matrix, rebuild, residual
-from .small import entries_first, lower_factor, multiply, sigma_max_first
+from .small import entries_first, lower_factor, multiply, pseudo_inverse_first, sigma_max_first
 
 Array = npt.NDArray[Any]
 
@@ -77,8 +77,7 @@ def all_bounds(responses: Array, forms: Iterable[Form | str] = tuple(Form)) -> d
     columns = entries_first(G)  # (p, m, unit, frequency)
     inverses = lower = None
     if any(form is not Form.ADDITIVE for form in wanted):
-        pinv = np.linalg.pinv(G)
-        inverses = entries_first(pinv)
+        inverses = pseudo_inverse_first(G)
         lower = lower_factor(inverses)
     step = max(1, _CHUNK // max(1, len(G) // 2))
     for start in range(0, G.shape[1], step):

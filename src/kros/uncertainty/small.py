@@ -14,6 +14,7 @@ import numpy.typing as npt
 Array = npt.NDArray[Any]
 
 _UNROLL = 6  # beyond this inner size BLAS wins
+_RANK = 1e-12  # columns closer to parallel than this are left to the SVD, which decides about the rank
 
 
 def entries_first(matrices: Array) -> Array:
@@ -86,3 +87,30 @@ def lower_factor(pseudo_inverse: Array) -> Array:
     """
     R = np.linalg.qr(np.conj(np.swapaxes(entries_last(pseudo_inverse), -1, -2)), mode="r")
     return entries_first(np.conj(np.swapaxes(R, -1, -2)))
+
+
+def pseudo_inverse_first(matrices: Array) -> Array:
+    """Return pseudo-inverses, entries first, of matrices (..., p, m).
+
+    With `min(p, m) = 2` by orthogonalising twice (as accurate as QR); other sizes, and matrices without full rank, go through the SVD.
+    """
+    if min(matrices.shape[-2:]) != 2:
+        return entries_first(np.linalg.pinv(matrices))
+    if matrices.shape[-2] < matrices.shape[-1]:
+        return np.ascontiguousarray(np.swapaxes(pseudo_inverse_first(np.swapaxes(matrices, -1, -2)), 0, 1))
+    columns = entries_first(matrices)
+    g1, g2 = columns[:, 0], columns[:, 1]
+    r11, size = np.sqrt(squared(g1).sum(axis=0)), np.sqrt(squared(g2).sum(axis=0))
+    with np.errstate(all="ignore"):
+        q1 = g1 / r11
+        r12 = (np.conj(q1) * g2).sum(axis=0)
+        v = g2 - q1 * r12
+        again = (np.conj(q1) * v).sum(axis=0)
+        v = v - q1 * again
+        r22 = np.sqrt(squared(v).sum(axis=0))
+        second = np.conj(v) / r22**2
+        out = np.stack([(np.conj(q1) - (r12 + again) * second) / r11, second])
+        weak = ~((r22 > _RANK * size) & (r11 > _RANK * size))
+    if weak.any():
+        out[:, :, weak] = entries_first(np.linalg.pinv(np.moveaxis(columns[:, :, weak], -1, 0)))
+    return out

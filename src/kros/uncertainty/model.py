@@ -1,0 +1,203 @@
+r"""The uncertainty stage: models of all units in, an `UncertainModel` out.
+
+Outputs and inputs are divided by the population's ranges first: with `S_y = diag(output_scale)`, `S_u = diag(input_scale)` every response is
+`S_y^-1 G S_u`. Residuals, covers and weights live in these coordinates. In physical units an output-side residual is `S_y E S_y^-1`, an
+input-side one `S_u E S_u^-1`, an additive one `S_y E S_u^-1`, an inverse additive one `S_u E S_y^-1`: the weights act on scaled signals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.artifacts import load_artifact, save_artifact
+from ..core.lti import StateSpace
+from .cover import Cover, Structure
+from .forms import Form
+from .weights import Weight
+
+Array = npt.NDArray[Any]
+
+
+
+@dataclass(frozen=True, eq=False)
+class UncertainModel:
+    """A nominal model and a bound on how the units of the population differ from it.
+
+    Parameters
+    ----------
+    form : Form
+    unit_ids : tuple of str
+        Units that the weights cover.
+    nominal : int
+        Row of the nominal unit; -1 when the nominal is a model of its own (for example a pooled one).
+    nominal_id : str
+    nominal_system : StateSpace
+        In physical units.
+    freqs_hz : ndarray, shape (frequency,), Hz
+    output_scale : ndarray, shape (p,)
+    input_scale : ndarray, shape (m,)
+    bounds : dict of Form to ndarray, shape (frequency,)
+        Largest residual over the other units, for the best nominal of each form (for the chosen form: the nominal used).
+    nominals : dict of Form to str
+        Unit behind each of these bounds.
+    cover : Cover
+        Optimal cover of the residuals, frequency by frequency.
+    weight : Weight
+    misfit : ndarray, shape (unit, frequency)
+        What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular (condition above 1e12).
+    remainder : Weight or None
+        Additive weights for `Gp - rebuilt(G, E)`, when the misfit exceeds 1 % anywhere.
+    remainder_cover : Cover or None
+    """
+
+    form: Form
+    unit_ids: tuple[str, ...]
+    nominal: int
+    nominal_id: str
+    nominal_system: StateSpace
+    freqs_hz: Array
+    output_scale: Array
+    input_scale: Array
+    bounds: dict[Form, Array]
+    nominals: dict[Form, str]
+    cover: Cover
+    weight: Weight
+    misfit: Array
+    remainder: Weight | None = None
+    remainder_cover: Cover | None = None
+
+    @property
+    def sample_period_s(self) -> float:
+        """Sampling period, s."""
+        return self.nominal_system.dt
+
+    @property
+    def peak_db(self) -> dict[Form, float]:
+        """Peak of the bound of each form, dB; minus infinity where all units are alike."""
+        with np.errstate(divide="ignore"):
+            return {form: float(20 * np.log10(bound.max())) for form, bound in self.bounds.items()}
+
+    @property
+    def misfit_max(self) -> float:
+        """Largest misfit where it is known; NaN where it is known nowhere."""
+        known = self.misfit[np.isfinite(self.misfit)]
+        return float(known.max()) if known.size else float("nan")
+
+    @property
+    def cover_max(self) -> float:
+        """Largest `sigma_max(W_L^-1 E_k W_R^-1)` on the dense grid; at most one."""
+        return self.weight.cover_max
+
+    @property
+    def overbound_db_max(self) -> float:
+        """Largest distance of the weight from the optimal cover, dB."""
+        return self.weight.overbound_db_max
+
+    def scaled_nominal(self) -> StateSpace:
+        """Return the nominal between scaled inputs and outputs, on which the weights act."""
+        return scale_system(self.nominal_system, self.output_scale, self.input_scale)
+
+    def save(self, folder: Path) -> None:
+        """Write ``arrays.npz`` and ``uncertain_model.json``."""
+        arrays: dict[str, Array] = {
+            "freqs_hz": self.freqs_hz,
+            "output_scale": self.output_scale,
+            "input_scale": self.input_scale,
+            "misfit": self.misfit,
+            **{f"bound_{form.value}": bound for form, bound in self.bounds.items()},
+            **_pack_system("nominal", self.nominal_system),
+            **_pack_weight("weight", self.weight, self.cover),
+        }
+        content: dict[str, Any] = {
+            "form": self.form,
+            "unit_ids": self.unit_ids,
+            "nominal": self.nominal,
+            "nominal_id": self.nominal_id,
+            "sample_period_s": self.sample_period_s,
+            "nominals": {form.value: unit for form, unit in self.nominals.items()},
+            "peak_db": {form.value: peak for form, peak in self.peak_db.items()},
+            "misfit_max": self.misfit_max,
+            "misfit_unknown": int(np.isnan(self.misfit).sum()),
+            "weight": _facts(self.weight),
+            "remainder": None,
+        }
+        if self.remainder is not None and self.remainder_cover is not None:
+            arrays |= _pack_weight("remainder", self.remainder, self.remainder_cover)
+            content["remainder"] = _facts(self.remainder)
+        save_artifact(Path(folder), "uncertain_model", content, arrays)
+
+    @classmethod
+    def load(cls, folder: Path) -> UncertainModel:
+        """Read what `save` wrote."""
+        content, arrays = load_artifact(Path(folder), "uncertain_model")
+        dt = content["sample_period_s"]
+        weight, cover = _unpack_weight("weight", content["weight"], arrays, dt)
+        remainder, remainder_cover = (
+            _unpack_weight("remainder", content["remainder"], arrays, dt) if content["remainder"] is not None else (None, None)
+        )
+        return cls(
+            form=Form(content["form"]),
+            unit_ids=tuple(content["unit_ids"]),
+            nominal=content["nominal"],
+            nominal_id=content["nominal_id"],
+            nominal_system=_unpack_system("nominal", arrays, dt),
+            freqs_hz=arrays["freqs_hz"],
+            output_scale=arrays["output_scale"],
+            input_scale=arrays["input_scale"],
+            bounds={Form(name): arrays[f"bound_{name}"] for name in content["nominals"]},
+            nominals={Form(name): unit for name, unit in content["nominals"].items()},
+            cover=cover,
+            weight=weight,
+            misfit=arrays["misfit"],
+            remainder=remainder,
+            remainder_cover=remainder_cover,
+        )
+
+
+def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:
+    """Return `S_y^-1 G S_u`."""
+    rows = 1.0 / output_scale[:, None]
+    return StateSpace(system.A, system.B * input_scale, system.C * rows, system.D * rows * input_scale, system.dt)
+
+
+def _facts(weight: Weight) -> dict[str, Any]:
+    return {
+        "structure": weight.structure,
+        "orders": [weight.left_orders, weight.right_orders],
+        "cover_max": weight.cover_max,
+        "overbound_db_max": weight.overbound_db_max,
+        "within_tolerance": weight.within_tolerance,
+    }
+
+
+def _pack_system(name: str, system: StateSpace) -> dict[str, Array]:
+    return {f"{name}_{x}": getattr(system, x) for x in "ABCD"}
+
+
+def _unpack_system(name: str, arrays: dict[str, Array], dt: float) -> StateSpace:
+    A, B, C, D = (arrays[f"{name}_{x}"] for x in "ABCD")
+    return StateSpace(A, B, C, D, dt)
+
+
+def _pack_weight(name: str, weight: Weight, cover: Cover) -> dict[str, Array]:
+    left, right = _pack_system(f"{name}_left", weight.left), _pack_system(f"{name}_right", weight.right)
+    return {**left, **right, f"{name}_cover_left": cover.left, f"{name}_cover_right": cover.right}
+
+
+def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> tuple[Weight, Cover]:
+    weight = Weight(
+        left=_unpack_system(f"{name}_left", arrays, dt),
+        right=_unpack_system(f"{name}_right", arrays, dt),
+        left_orders=tuple(facts["orders"][0]),
+        right_orders=tuple(facts["orders"][1]),
+        structure=Structure(facts["structure"]),
+        cover_max=facts["cover_max"],
+        overbound_db_max=facts["overbound_db_max"],
+        within_tolerance=facts["within_tolerance"],
+    )
+    return weight, Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])

@@ -1,0 +1,81 @@
+"""What a page is made of: sections with paragraphs, tables and figures. The template turns it into HTML, text is escaped there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table.
+
+    Parameters
+    ----------
+    text : str
+    strong : bool
+        Best of its column, or worth seeing.
+    note : str
+        Shown smaller, behind the text.
+    bar : float or None
+        Share of the cell's width that is shaded, 0 to 1.
+    """
+
+    text: str
+    strong: bool = False
+    note: str = ""
+    bar: float | None = None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; the first column names the rows.
+
+    Parameters
+    ----------
+    head : sequence of str
+    rows : sequence of sequence of Cell
+    caption : str
+    groups : sequence of (str, int)
+        Titles over several columns each, the first column included; none by default.
+    folded : bool
+        Whether the reader opens it.
+    emphasised : sequence of int
+        Rows that are set off.
+    """
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    caption: str = ""
+    groups: Sequence[tuple[str, int]] = ()
+    folded: bool = False
+    emphasised: Sequence[int] = ()
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of the report; figures are named and come after the tables.
+
+    Parameters
+    ----------
+    key : str
+        Anchor.
+    title : str
+    paragraphs : sequence of str
+    tables : sequence of Table
+    figures : sequence of str
+    folded : sequence of (str, str)
+        Titles and preformatted texts that the reader opens.
+    """
+
+    key: str
+    title: str
+    paragraphs: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    figures: Sequence[str] = ()
+    folded: Sequence[tuple[str, str]] = field(default=())
+
+
+def text_cells(*texts: str) -> list[Cell]:
+    """Return plain cells."""
+    return [Cell(t) for t in texts]

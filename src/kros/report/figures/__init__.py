@@ -1,0 +1,67 @@
+"""Figures, one file a figure, in the order of the paper's argument."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module
+
+from ..run_folder import NotShownError, RunFolder
+from ..theme import style
+from .drawing import Drawing
+
+log = logging.getLogger(__name__)
+
+FIGURES = (
+    "signals",
+    "tracking_spectrum",
+    "phase",
+    "bode",
+    "free_run",
+    "free_run_spectra",
+    "forms",
+    "weights",
+    "synthesis_bode",
+    "certificates",
+    "errors_chart",
+    "observers_in_time",
+    "observer_spectra",
+    "loaded",
+    "outlier_scores",
+    "outlier_residuals",
+)
+
+__all__ = ["FIGURES", "Drawing", "Result", "draw_all"]
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A figure that was drawn, or the reason why it was left out.
+
+    Parameters
+    ----------
+    name : str
+        Also the name of its file.
+    title : str
+    drawing : Drawing or None
+    reason : str
+        Why there is none; empty where there is one.
+    """
+
+    name: str
+    title: str
+    drawing: Drawing | None
+    reason: str = ""
+
+
+def draw_all(run: RunFolder) -> Iterator[Result]:
+    """Draw all figures of a run, one at a time; one that lacks an artifact comes with the reason instead."""
+    for module_name in FIGURES:
+        module = import_module(f".{module_name}", __name__)
+        with style():
+            try:
+                yield Result(module.NAME, module.TITLE, module.draw(run))
+            except NotShownError as absent:
+                log.info("figure %s: left out, %s", module.NAME, absent)
+                yield Result(module.NAME, module.TITLE, None, str(absent))

@@ -1,0 +1,111 @@
+"""Bounds of the residuals of all six uncertainty forms, linear beside Koopman (the paper's Figure 7).
+
+Needs: uncertain models; models, for the paper's variants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...identify import ModelSet
+from ...uncertainty import Form, UncertainModel, bounds
+from ..canvas import decibel, end_labels, frequency_axis, grid, thin_log
+from ..names import best_models, form_label, model_label
+from ..run_folder import RunFolder
+from ..theme import Tone
+from .drawing import Drawing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+NAME, TITLE = "forms", "Six uncertainty forms"
+Array = npt.NDArray[Any]
+_PAPER_POINTS = 60
+_FLOOR_DB = 80.0
+FORM_TONES = {
+    Form.ADDITIVE: Tone.INK,
+    Form.INPUT_MULTIPLICATIVE: Tone.SKY,
+    Form.OUTPUT_MULTIPLICATIVE: Tone.GOLD,
+    Form.INVERSE_ADDITIVE: Tone.GREY,
+    Form.INVERSE_INPUT_MULTIPLICATIVE: Tone.BLUE,
+    Form.INVERSE_OUTPUT_MULTIPLICATIVE: Tone.ORANGE,
+}
+_PAPER_FORMS = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)  # the input ones agree with ours for tall plants
+
+
+def draw(run: RunFolder) -> Drawing:
+    """Draw one panel a model."""
+    chosen = {n: run.uncertain[n] for n in best_models(run.uncertain)}
+    variants = {n: paper_bounds(model, run.models[n]) for n, model in chosen.items() if n in run.models}
+    first = next(iter(chosen.values()))
+    text = (
+        "Largest singular value of the residuals over all units, for the nominal unit that suits each form best; signals over "
+        "their ranges. Thick: the form in use, "
+        f"{form_label(first.form.value)}."
+    )
+    text += " Dashed: the paper's variants of both output forms, 0 dB and more everywhere whatever the units do." if variants else ""
+    return Drawing(forms_figure(chosen, variants), text)
+
+
+def paper_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tuple[Array, Array]]:
+    """Return frequencies and bounds of the published pipeline's output forms, on a few frequencies."""
+    every = max(1, len(model.freqs_hz) // _PAPER_POINTS)
+    freqs = model.freqs_hz[::every]
+    response = models.systems(model.unit_ids).frequency_response(freqs) * models.input_scale / models.output_scale[:, None]
+    found = {}
+    for form in _PAPER_FORMS:
+        nominal = model.nominals.get(form)
+        row = model.unit_ids.index(nominal) if nominal in model.unit_ids else 0
+        found[form] = (freqs, bounds(form, response, paper=True, nominals=[row])[0])
+    return found
+
+
+def forms_figure(models: Mapping[str, UncertainModel], variants: Mapping[str, Mapping[Form, tuple[Array, Array]]] | None = None) -> Figure:
+    """Draw the bounds of six forms, a panel a model.
+
+    Parameters
+    ----------
+    models : mapping of name to UncertainModel
+    variants : mapping of name to mapping of Form to (frequencies, bounds), optional
+        Drawn dashed.
+    """
+    figure, axes = grid(1, len(models), 3.3, legend_rows=0, sharey=True)
+    for panel, (name, model) in zip(axes[0], models.items(), strict=True):
+        _panel(panel, model, (variants or {}).get(name, {}))
+        panel.set_title(model_label(name))
+    axes[0, 0].set_ylabel("largest residual (dB)")
+    for panel, model in zip(axes[0], models.values(), strict=True):
+        ends = [(float(decibel(bound)[-1]), form_label(form.value), FORM_TONES[form].light) for form, bound in model.bounds.items()]
+        if panel is axes[0, -1]:
+            end_labels(panel, ends, spacing=0.06)
+    return figure
+
+
+def _panel(axes: Axes, model: UncertainModel, variants: Mapping[Form, tuple[Array, Array]]) -> None:
+    for form, bound in model.bounds.items():
+        freqs, line = thin_log(model.freqs_hz, bound)
+        used = form is model.form
+        axes.plot(freqs, decibel(line), color=FORM_TONES[form].light, lw=2.4 if used else 1.2, zorder=3 if used else 2)
+    for form, (freqs, bound) in variants.items():
+        axes.plot(freqs, decibel(bound), "--", color=FORM_TONES[form].light, lw=1.0)
+    if variants:
+        level = max(float(decibel(bound)[0]) for _, bound in variants.values())
+        axes.annotate(
+            "output forms as in the paper",
+            (0, level),
+            xycoords=("axes fraction", "data"),
+            xytext=(5, 3),
+            textcoords="offset points",
+            size=7.5,
+        )
+    axes.axhline(0, color=Tone.SOFT.light, lw=0.7)
+    frequency_axis(axes, model.freqs_hz)
+    lines = [decibel(b) for b in model.bounds.values()]
+    finite = np.concatenate([line[np.isfinite(line)] for line in lines])
+    if finite.size:
+        axes.set_ylim(max(finite.min(), finite.max() - _FLOOR_DB) - 3, max(finite.max(), 3.0) + 5)

@@ -1,0 +1,51 @@
+"""Free-running predictions of the linear and the Koopman model against the truth, with a zoom (the paper's Figure 5).
+
+Needs: the evaluation's kept episodes with models.
+"""
+
+from __future__ import annotations
+
+from ..canvas import grid, legend
+from ..names import best_models, is_koopman, model_label, model_look, number
+from ..run_folder import NotShownError, RunFolder
+from .drawing import Drawing
+from .trajectories import TRUTH, clip_to, draw_lines, hide_times, label_rows, shade, states, steady_window
+
+NAME, TITLE = "free_run", "Predictions of the models"
+_ZOOM_S = 0.3
+
+
+def draw(run: RunFolder) -> Drawing:
+    """Draw one held-out episode of the nominal unit."""
+    shown = run.shown[0]
+    chosen = best_models(shown.models)
+    if not chosen:
+        raise NotShownError("no model was run freely on the episode that is shown")
+    channels = states(run)[:6]
+    figure, axes = grid(len(channels), 2, 1.25, width_ratios=(1.5, 1))
+    window = steady_window(run, shown, _ZOOM_S)
+    for i, (full, zoom) in enumerate(axes):
+        lines = [("recorded", shown.states[:, i], TRUTH)] + [(model_label(n), shown.models[n][:, i], model_look(n)) for n in chosen]
+        draw_lines(full, shown.time_s, lines, width=0.9)
+        draw_lines(zoom, shown.time_s, lines, window, width=1.3)
+        clip_to(full, shown.states[:, i])
+        clip_to(zoom, shown.states[window, i], 1.5)
+        shade(full, shown.time_s, window)
+    label_rows(axes[:, 0], channels)
+    hide_times(axes[:-1].ravel())
+    axes[0, 0].set_title(f"unit {shown.key.unit}, episode {shown.key.episode}")
+    axes[0, 1].set_title(f"{_ZOOM_S:g} s at constant speed" if run.calibrated else f"{_ZOOM_S:g} s of it")
+    for panel in axes[-1]:
+        panel.set_xlabel("time (s)")
+    legend(figure, axes[0, 0])
+    return Drawing(figure, _caption(run, chosen))
+
+
+def _caption(run: RunFolder, chosen: list[str]) -> str:
+    text = "The whole held-out episode from the true first state and the recorded inputs alone, no measurement fed back. "
+    lifted = [n for n in chosen if is_koopman(n)]
+    if lifted and len(chosen) == 2 and run.calibrated:
+        text += "The linear model follows the average; the Koopman model carries the gearbox oscillation as well. "
+    free = run.evaluation["free_run"]
+    parts = [f"{model_label(n)} " + ", ".join(f"{c} {number(v['median'])} %" for c, v in free[n].items()) for n in chosen if n in free]
+    return text + (f"Median error over units: {'; '.join(parts)}." if parts else "")

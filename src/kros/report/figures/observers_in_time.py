@@ -1,0 +1,59 @@
+"""Estimates of the main observers for the nominal and the worst off-nominal unit (the paper's Figure 11).
+
+Needs: the evaluation's kept episodes with observers.
+"""
+
+from __future__ import annotations
+
+from ..canvas import grid, legend
+from ..names import main_observers, observer_label, observer_look
+from ..run_folder import NotShownError, RunFolder
+from .drawing import Drawing
+from .trajectories import TRUTH, clip_to, draw_lines, hide_times, label_rows, shade, states, steady_window
+
+NAME, TITLE = "observers_in_time", "Estimates"
+_ZOOM_S = 0.3
+
+
+def draw(run: RunFolder) -> Drawing:
+    """Draw full episodes on the left and a zoom at constant speed on the right, nominal above worst off-nominal."""
+    shown = [s for s in run.shown if s.key.condition == run.identify_on][:2]
+    if not shown or not shown[0].observers:
+        raise NotShownError("no observer was run on the episodes that are shown")
+    names = main_observers(list(shown[0].observers), run.deployed)
+    all_states = states(run)
+    rows = [i for i, c in enumerate(all_states) if not c.measured][:3] or list(range(min(3, len(all_states))))
+    channels = [all_states[i] for i in rows]
+    figure, axes = grid(len(rows) * len(shown), 2, 1.25, legend_rows=2, width_ratios=(1.3, 1))
+    for block, episode in enumerate(shown):
+        window = steady_window(run, episode, _ZOOM_S)
+        panels = axes[block * len(rows) : (block + 1) * len(rows)]
+        for i, (full, zoom) in zip(rows, panels, strict=True):
+            lines = [("recorded", episode.states[:, i], TRUTH)] + [
+                (observer_label(n), episode.observers[n][:, i], observer_look(n)) for n in names
+            ]
+            draw_lines(full, episode.time_s, lines, width=0.9)
+            draw_lines(zoom, episode.time_s, lines, window, width=1.4)
+            clip_to(full, episode.states[:, i], 0.15)
+            clip_to(zoom, episode.states[window, i], 1.0)
+            shade(full, episode.time_s, window)
+        label_rows(panels[:, 0], channels)
+        hide_times(panels[:-1].ravel())
+        role = "nominal" if block == 0 else "worst off-nominal"
+        panels[0, 0].set_title(f"{role}: unit {episode.key.unit}, episode {episode.key.episode}")
+        panels[0, 1].set_title(f"{_ZOOM_S:g} s of it")
+    for panel in axes[-1]:
+        panel.set_xlabel("time (s)")
+    figure.align_ylabels(axes[:, 0])
+    legend(figure, axes[0, 0], columns=3)
+    return Drawing(figure, _caption(run, names))
+
+
+def _caption(run: RunFolder, names: list[str]) -> str:
+    measured = " and ".join(c.name for c in states(run) if c.measured)
+    text = f"Estimates from {measured} alone, as recorded, of states that are not measured. "
+    if run.calibrated:
+        text += "The Koopman observer follows the gearbox oscillation in velocity and current; its linear twin gives the average. "
+    return (
+        text + "The start shows how fast an observer finds the true state: all begin at the first measurement with everything else at zero."
+    )

@@ -1,0 +1,96 @@
+"""Residual of the most conspicuous unit against those of all the others, entry by entry (the paper's Figure 15).
+
+Needs: outlier scores, models in the condition of the highest score, the choice of the nominal unit.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.frequency import log_grid
+from ...identify import ModelSet
+from ...uncertainty import Form, residual
+from ..canvas import decibel, frequency_axis, grid, legend
+from ..names import condition_label, form_label
+from ..run_folder import NotShownError, RunFolder
+from ..theme import Tone
+from .drawing import Drawing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+NAME, TITLE = "outlier_residuals", "Residuals of the most conspicuous unit"
+Array = npt.NDArray[Any]
+_POINTS = 120
+_INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
+
+
+def draw(run: RunFolder) -> Drawing:
+    """Draw one panel an entry of the residual, in the condition where the unit scores highest."""
+    rows = [r for r in run.outlier_rows if r["score"] is not None]
+    if not rows:
+        raise NotShownError("outlier scores need at least three units in a condition")
+    top = max(rows, key=lambda r: (bool(r["outlier"]), float(r["score"])))
+    models = run.condition_models(next(iter(run.models)), top["condition"])
+    form = next(iter(run.uncertain.values())).form
+    others = [u for u in models.unit_ids if u != top["unit"] and not _flagged(rows, u, top["condition"])]
+    nominal = str(run.choice["nominal"])
+    nominal = nominal if nominal in others else others[0]
+    freqs = log_grid(models.sample_period_s, _POINTS, decades=5)
+    E = _residuals(models, form, nominal, [*others, top["unit"]], freqs)
+    names = models.inputs if form in _INPUT_SIDE else tuple(str(i + 1) for i in range(max(E.shape[-2:])))
+    figure, axes = grid(E.shape[-2], E.shape[-1], 1.7, sharex=True, sharey=True)
+    for i, row in enumerate(axes):
+        for j, panel in enumerate(row):
+            _panel(panel, freqs, decibel(E[..., i, j]), top["unit"])
+            panel.set_title(f"{_short(names[j])} → {_short(names[i])}")
+    for panel in axes[-1]:
+        frequency_axis(panel, freqs)
+    for panel in axes[:, 0]:
+        panel.set_ylabel("residual (dB)")
+    low, high = _limits(decibel(E))
+    axes[0, 0].set_ylim(low, high)
+    legend(figure, axes[0, 0])
+    return Drawing(figure, _caption(top, form, nominal))
+
+
+def _flagged(rows: list[dict[str, Any]], unit: str, condition: str) -> bool:
+    return any(r["outlier"] for r in rows if (r["unit"], r["condition"]) == (unit, condition))
+
+
+def _residuals(models: ModelSet, form: Form, nominal: str, units: list[str], freqs: Array) -> Array:
+    """Residuals of units against the nominal one in scaled signals, shape (unit, frequency, p', m')."""
+    response = models.systems([nominal, *units]).frequency_response(freqs) * models.input_scale / models.output_scale[:, None]
+    return residual(form, response[0], response[1:])
+
+
+def _panel(axes: Axes, freqs: Array, lines: Array, unit: str) -> None:
+    from matplotlib.collections import LineCollection
+
+    with np.errstate(invalid="ignore"):
+        top = np.nanmax(np.where(np.isfinite(lines[:-1]), lines[:-1], -400.0), axis=0)
+    paths = [np.column_stack([freqs, line]) for line in lines[:-1] if np.isfinite(line).all()]
+    axes.add_collection(LineCollection(paths, colors=Tone.BLUE.light, linewidths=0.6, alpha=0.3, label=f"{len(lines) - 1} others"))
+    axes.plot(freqs, top, color=Tone.BLUE.light, lw=1.3, label="largest of the others")
+    axes.plot(freqs, lines[-1], color=Tone.ALARM.light, lw=1.6, label=f"unit {unit}")
+
+
+def _limits(lines: Array) -> tuple[float, float]:
+    finite = lines[np.isfinite(lines)]
+    high = float(finite.max())
+    return max(float(np.percentile(finite, 1)), high - 80.0) - 3.0, high + 3.0
+
+
+def _short(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _caption(top: dict[str, Any], form: Form, nominal: str) -> str:
+    state = "flagged" if top["outlier"] else "not flagged, but the highest score"
+    return (
+        f"Entries of the {form_label(form.value)} residual against unit {nominal}, {condition_label(top['condition'])}. "
+        f"Unit {top['unit']} ({state}) beside all others: a unit is conspicuous where it leaves their envelope."
+    )

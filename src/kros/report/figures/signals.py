@@ -1,0 +1,64 @@
+"""Recorded signals of one held-out episode in every condition, with the velocity error at constant speed.
+
+Needs: the evaluation's kept episodes.
+"""
+
+from __future__ import annotations
+
+from ..canvas import grid, legend
+from ..names import Look, axis_label, condition_label
+from ..run_folder import RunFolder, Shown
+from ..theme import Tone
+from .drawing import Drawing
+from .trajectories import clip_to, draw_lines, hide_times, label_rows, reference_columns, shade, states, steady_window
+
+NAME, TITLE = "signals", "Recorded signals"
+_RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light)
+_ZOOM_S = 0.4
+
+
+def draw(run: RunFolder) -> Drawing:
+    """Draw one episode of the nominal unit in at most two conditions, side by side."""
+    shown = _one_each(run)
+    channels, references = states(run)[:5], reference_columns(run)
+    zoomed = "velocity" if "velocity" in references else next(iter(references), None)
+    figure, axes = grid(len(channels) + (zoomed is not None), len(shown), 1.15, sharey="row")
+    for column, episode in zip(axes.T, shown, strict=True):
+        window = steady_window(run, episode, _ZOOM_S)
+        for i, channel in enumerate(channels):
+            lines = [("recorded", episode.states[:, i], _RECORDED)]
+            if channel.name in references:
+                lines.append(("reference", episode.inputs[:, references[channel.name]], _REFERENCE))
+            draw_lines(column[i], episode.time_s, lines, width=1.0)
+            if zoomed is not None:
+                shade(column[i], episode.time_s, window)
+        column[0].set_title(f"{condition_label(episode.key.condition)}: unit {episode.key.unit}, episode {episode.key.episode}")
+        column[len(channels) - 1].set_xlabel("time (s)")
+        hide_times(column[: len(channels) - 1])
+        if zoomed is not None:
+            i = [c.name for c in channels].index(zoomed)
+            error = episode.inputs[:, references[zoomed]] - episode.states[:, i]
+            draw_lines(column[-1], episode.time_s, [("error", error, Look(Tone.BLUE.light))], window)
+            column[-1].set_xlabel("time (s), shaded window above")
+    label_rows(axes[: len(channels), 0], channels)
+    if zoomed is not None:
+        unit = next(c.unit for c in channels if c.name == zoomed)
+        axes[-1, 0].set_ylabel(axis_label(f"{zoomed} error", unit).replace(" (", "\n("))
+    clip_to(axes[0, 0], shown[0].states[:, 0])
+    figure.align_ylabels(axes[:, 0])
+    legend(figure, axes[0, 0])
+    return Drawing(figure, _caption(run, zoomed, len(shown)))
+
+
+def _one_each(run: RunFolder) -> list[Shown]:
+    nominal = run.shown[0].key.unit
+    return [s for s in run.shown if s.key.unit == nominal][:2]
+
+
+def _caption(run: RunFolder, zoomed: str | None, columns: int) -> str:
+    text = "A held-out episode as recorded"
+    text += ", in both conditions of the same unit." if columns == 2 else "."
+    if zoomed is not None:
+        text += f" Bottom: reference minus recorded {zoomed} at constant speed"
+        text += ", where the gearbox shows as a steady oscillation that no linear model can produce." if run.calibrated else "."
+    return text

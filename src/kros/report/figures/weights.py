@@ -1,0 +1,109 @@
+"""Fitted weights over the optimal cover, left and right, and their product against 0 dB (the paper's Figure 8).
+
+Needs: uncertain models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...uncertainty import Form, UncertainModel
+from ..canvas import decibel, end_labels, frequency_axis, grid, thin_log
+from ..names import best_models, model_label, number
+from ..run_folder import RunFolder
+from ..theme import Tone
+from .drawing import Drawing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+NAME, TITLE = "weights", "Weights over the optimal cover"
+Array = npt.NDArray[Any]
+_TONES = (Tone.BLUE, Tone.ORANGE, Tone.GREEN, Tone.PURPLE, Tone.GOLD, Tone.SKY, Tone.GREY, Tone.INK)
+_INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
+
+
+def draw(run: RunFolder) -> Drawing:
+    """Draw one row a model."""
+    chosen = {n: run.uncertain[n] for n in best_models(run.uncertain)}
+    names = {n: _entry_names(model, run, n) for n, model in chosen.items()}
+    parts = [f"{model_label(n)} at most {number(model.overbound_db_max)} dB above the cover" for n, model in chosen.items()]
+    text = (
+        "Each residual is bounded by W_left · Δ · W_right with ‖Δ‖ ≤ 1. Lines: weights as used; shaded: the smallest cover that "
+        "any diagonal weights could give, frequency "
+        f"by frequency; {'; '.join(parts)}. Right column: product of both weights; below 0 dB the uncertain set holds no ill-posed unit."
+    )
+    return Drawing(weights_figure(chosen, names), text)
+
+
+def _entry_names(model: UncertainModel, run: RunFolder, name: str) -> Sequence[str] | None:
+    models = run.models.get(name)
+    return None if models is None or model.form not in _INPUT_SIDE else models.inputs
+
+
+def weights_figure(models: Mapping[str, UncertainModel], names: Mapping[str, Sequence[str] | None] | None = None) -> Figure:
+    """Draw left and right weights and their product, a row a model.
+
+    Parameters
+    ----------
+    models : mapping of name to UncertainModel
+    names : mapping of name to sequence of str, optional
+        Signals behind the entries; numbers where unknown.
+    """
+    square = all(m.weight.left.n_outputs == m.weight.right.n_outputs for m in models.values())
+    figure, axes = grid(len(models), 2 + square, 2.0, legend_rows=0, sharex=True)
+    for row, (name, model) in zip(axes, models.items(), strict=True):
+        _draw_row(row, model, (names or {}).get(name))
+        row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
+    for panel, title in zip(axes[0], ("left weight", "right weight", "product"), strict=False):
+        panel.set_title(title)
+    for panel in axes[-1]:
+        panel.set_xlabel("frequency (Hz)")
+    return figure
+
+
+def _draw_row(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] | None) -> None:
+    fitted = model.weight.magnitudes(model.freqs_hz)
+    for panel, magnitudes, cover in ((row[0], fitted.left, model.cover.left), (row[1], fitted.right, model.cover.right)):
+        _draw_entries(panel, model.freqs_hz, magnitudes, cover, names)
+    if len(row) > 2:
+        _draw_product(row[2], model.freqs_hz, fitted.left * fitted.right, model.cover.left * model.cover.right)
+
+
+def _draw_entries(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: Sequence[str] | None) -> None:
+    ends = []
+    frequency_axis(axes, freqs_hz, "")
+    for i, tone in zip(range(magnitudes.shape[1]), _TONES, strict=False):
+        freqs, line = thin_log(freqs_hz, magnitudes[:, i])
+        _, below = thin_log(freqs_hz, cover[:, i])
+        axes.plot(freqs, decibel(below), color=tone.light, lw=3.2, alpha=0.3, solid_capstyle="butt")
+        axes.plot(freqs, decibel(line), color=tone.light, lw=1.2)
+        ends.append((float(decibel(line)[0]), (names[i] if names else str(i + 1)).replace("_", " "), tone.light))
+    if np.allclose(magnitudes, 1.0):
+        axes.set_ylim(-20, 10)
+    _start_labels(axes, ends)
+
+
+def _start_labels(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
+    """Label lines inside the axes, upper left, in the order of their levels at low frequency."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.13 * (high - low) * len(ends))
+    for place, (_, text, colour) in enumerate(sorted(ends, reverse=True)):
+        axes.annotate(
+            text, (0, 1), xycoords="axes fraction", xytext=(5, -9 * place - 1), textcoords="offset points", va="top", color=colour, size=7.5
+        )
+
+
+def _draw_product(axes: Axes, freqs_hz: Array, product: Array, cover: Array) -> None:
+    frequency_axis(axes, freqs_hz, "")
+    freqs, line = thin_log(freqs_hz, product.max(axis=1))
+    _, below = thin_log(freqs_hz, cover.max(axis=1))
+    axes.plot(freqs, decibel(below), color=Tone.INK.light, lw=3.2, alpha=0.25, solid_capstyle="butt")
+    axes.plot(freqs, decibel(line), color=Tone.INK.light, lw=1.2)
+    axes.axhline(0, color=Tone.ALARM.light, lw=0.9, ls="--")
+    end_labels(axes, [(0.0, "0 dB", Tone.ALARM.light)])

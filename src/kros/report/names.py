@@ -1,0 +1,152 @@
+"""What models, observers, forms and channels are called and coloured: the same in every figure, table and sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import floor, isfinite, log10
+
+from .theme import Tone
+
+_METHODS = {
+    "open_loop": "open loop",
+    "kalman_white": "white-noise Kalman",
+    "kalman_tuned": "tuned Kalman",
+    "luenberger": "Luenberger",
+    "ekf": "extended Kalman",
+    "mixed": "mixed H2-H∞",
+    "h2": "H2",
+    "hinf": "H∞",
+    "worst_case_h2": "worst-case H2",
+    "worst_case_hinf": "worst-case H∞",
+    "residual_h2": "residual-shaped H2",
+    "filtered_difference": "filtered difference",
+    "learned": "learned",
+}
+_METHOD_TONES = {
+    "open_loop": Tone.GREY,
+    "kalman_white": Tone.GOLD,
+    "kalman_tuned": Tone.PURPLE,
+    "luenberger": Tone.GOLD,
+    "ekf": Tone.PURPLE,
+    "filtered_difference": Tone.GOLD,
+    "learned": Tone.GREEN,
+}
+BASELINES = ("open_loop", "kalman_white", "kalman_tuned", "luenberger", "ekf", "filtered_difference", "learned")
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_UNITS = {"1": "fraction", "": ""}
+
+
+@dataclass(frozen=True)
+class Look:
+    """Colour and line style of a curve; `weight` multiplies its width."""
+
+    colour: str
+    style: str = "-"
+    weight: float = 1.0
+    opacity: float = 1.0
+
+
+def is_koopman(name: str) -> bool:
+    """Tell whether a model, or the model of an observer, is a lifted one."""
+    return name.startswith("koopman")
+
+
+def split_observer(name: str) -> tuple[str, str]:
+    """Return model and method of an observer; the model is empty for those that stand alone."""
+    model, _, method = name.rpartition("/")
+    return model, method
+
+
+def model_label(name: str) -> str:
+    """Return what a model is called, for example ``Koopman (EDMD)``."""
+    family, _, kind = name.partition("_")
+    label = {"koopman": "Koopman", "linear": "linear"}.get(family, family)
+    return f"{label} ({'EDMD' if kind == 'edmd' else kind.replace('_', ' ')})" if kind else label
+
+
+def observer_label(name: str) -> str:
+    """Return what an observer is called, for example ``Koopman (EDMD), worst-case H2``."""
+    model, method = split_observer(name)
+    text = _METHODS.get(method, method.replace("_", " "))
+    return f"{model_label(model)}, {text}" if model else text
+
+
+def method_label(name: str) -> str:
+    """Return what an observer's method is called."""
+    method = split_observer(name)[1]
+    return _METHODS.get(method, method.replace("_", " "))
+
+
+def model_look(name: str) -> Look:
+    """Return how a model's curves look: Koopman blue, linear orange, the paper's recipe dashed where kros's own is there too."""
+    return Look((Tone.BLUE if is_koopman(name) else Tone.ORANGE).light)
+
+
+def observer_look(name: str) -> Look:
+    """Return how an observer's curves look: hue by kind, linear ones orange, a linear baseline dashed."""
+    model, method = split_observer(name)
+    if method in _METHOD_TONES:
+        return Look(_METHOD_TONES[method].light, "-" if is_koopman(model) or not model else "--")
+    if is_koopman(model):
+        return Look({"mixed": Tone.GREEN, "h2": Tone.SKY, "hinf": Tone.SKY}.get(method, Tone.BLUE).light)
+    return Look(Tone.ORANGE.light, "-" if method != "mixed" else "--")
+
+
+def form_label(form: str) -> str:
+    """Return what an uncertainty form is called."""
+    return form.replace("_", " ")
+
+
+def best_models(names: Iterable[str]) -> list[str]:
+    """Return one linear and one Koopman model to compare: kros's own where there are any, else the paper's recipe."""
+    known = list(names)
+    chosen = [next((n for n in (family, f"{family}_edmd") if n in known), None) for family in ("linear", "koopman")]
+    return [n for n in chosen if n is not None] or known[:2]
+
+
+def main_observers(names: Sequence[str], deployed: str | None) -> list[str]:
+    """Return the few observers that figures compare: the deployed one, its linear twin, the tuned Kalman filter, the open loop.
+
+    Parameters
+    ----------
+    names : sequence of str
+    deployed : str or None
+        Observer that is handed over; the first robust one where it is unknown.
+    """
+    known = list(names)
+    robust = [n for n in known if split_observer(n)[1] not in BASELINES]
+    first = deployed if deployed in known else (robust or known or [""])[0]
+    model, method = split_observer(first)
+    other = model.replace("koopman", "linear") if is_koopman(model) else model.replace("linear", "koopman")
+    wanted = [f"{other}/{method}", f"{model}/open_loop", f"{model}/kalman_tuned", first]
+    return [n for n in dict.fromkeys(wanted) if n in known]
+
+
+def axis_label(channel: str, unit: str) -> str:
+    """Return a channel's name with its unit of measure, for an axis."""
+    readable = _UNITS.get(unit, unit)
+    name = channel.replace("_", " ")
+    return f"{name} ({readable})" if readable else name
+
+
+def condition_label(condition: str) -> str:
+    """Return what a condition is called."""
+    return {"noload": "no load", "load": "loaded"}.get(condition, condition)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number for people, by default with three significant digits; what is unknown is a dash."""
+    if value is None or not isfinite(value):
+        return "–"
+    size = abs(value)
+    if size >= 10 ** (digits + 2) or 0 < size < 1e-4:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return minus(f"{mantissa}·10{str(int(exponent)).translate(RAISED)}")
+    decimals = max(digits - 1 - floor(log10(size)), 0) if size else 0
+    return minus(f"{value:.{decimals}f}")
+
+
+def minus(text: str) -> str:
+    """Return a number's text with a proper minus sign."""
+    return text.replace("-", "−")

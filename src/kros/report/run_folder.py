@@ -1,0 +1,227 @@
+"""A run folder as the report sees it: every artifact by name, read when first asked for.
+
+What a run does not have raises `NotShownError` with a sentence that the report prints in place of a figure or table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.artifacts import load_artifact, read_arrays, read_json
+from ..data.population import Channel, EpisodeKey, Population
+from ..identify import ModelSet, PhaseCalibration
+from ..observer import Observer
+from ..synthesis.result import Synthesis
+
+if TYPE_CHECKING:
+    from ..uncertainty import UncertainModel
+
+Array = npt.NDArray[Any]
+
+
+class NotShownError(Exception):
+    """Something cannot be shown because the run does not have it; the message is a sentence for the reader."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """One held-out episode with what every observer and model made of it.
+
+    Parameters
+    ----------
+    key : EpisodeKey
+    time_s : ndarray, shape (n_samples,)
+    states : ndarray, shape (n_samples, n)
+    inputs : ndarray, shape (n_samples, m)
+    observers : mapping of str to ndarray, shape (n_samples, n)
+    models : mapping of str to ndarray, shape (n_samples, n)
+    """
+
+    key: EpisodeKey
+    time_s: Array
+    states: Array
+    inputs: Array
+    observers: Mapping[str, Array]
+    models: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A finished, or half finished, run."""
+
+    folder: Path
+
+    @cached_property
+    def study(self) -> dict[str, Any]:
+        """The resolved study."""
+        content: dict[str, Any] = read_json(self.folder / "study.json")
+        return content
+
+    @cached_property
+    def facts(self) -> dict[str, Any]:
+        """What the read stage found."""
+        self._require(self.folder / "population" / "facts.json", "the recordings have not been read yet")
+        return load_artifact(self.folder / "population", "facts")[0]
+
+    @property
+    def identify_on(self) -> str:
+        """Condition that feeds models and synthesis."""
+        return str(self.facts["identify_on"])
+
+    @cached_property
+    def population(self) -> Population:
+        """The recordings, where they are still in place."""
+        from ..data import read_parquet
+
+        recordings = Path(self.facts["recordings"])
+        folder = recordings if recordings.is_absolute() else self.folder / recordings
+        self._require(folder / "population.json", "the recordings are not in their place any more")
+        return read_parquet(folder)
+
+    @cached_property
+    def channels(self) -> tuple[Channel, ...]:
+        """Channels with their units of measure."""
+        models = self.folder / "models"
+        return next(iter(self.models.values())).channels if models.is_dir() and any(models.iterdir()) else self.population.channels
+
+    @property
+    def sample_period_s(self) -> float:
+        """Sampling period, s."""
+        models = self.folder / "models"
+        return next(iter(self.models.values())).sample_period_s if models.is_dir() else self.population.sample_period_s
+
+    @cached_property
+    def calibration(self) -> PhaseCalibration:
+        """The phase calibration."""
+        self._require(
+            self.folder / "calibration" / "calibration.json", "the lifting of this study has no phase, or it has not been calibrated yet"
+        )
+        return PhaseCalibration.load(self.folder / "calibration")
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the study has a phase calibration, hence a disturbance that is fixed to an angle."""
+        return (self.folder / "calibration" / "calibration.json").exists()
+
+    @cached_property
+    def models(self) -> dict[str, ModelSet]:
+        """Models of the condition that was identified on."""
+        found = {
+            f.name: ModelSet.load(f)
+            for f in self._folders("models", "model.json", "no models have been identified yet")
+            if "@" not in f.name
+        }
+        return dict(sorted(found.items(), key=lambda item: (not item[0].startswith("koopman"), item[0])))
+
+    def condition_models(self, name: str, condition: str) -> ModelSet:
+        """Return the models of one kind in a condition."""
+        if condition == self.identify_on:
+            return self.models[name]
+        folder = self.folder / "models" / f"{name}@{quote(condition, safe='')}"
+        self._require(folder / "model.json", f"no models have been identified in condition {condition!r}")
+        return ModelSet.load(folder)
+
+    @cached_property
+    def uncertain(self) -> dict[str, UncertainModel]:
+        """Uncertain models of the condition that was identified on."""
+        from ..uncertainty import UncertainModel
+
+        folders = self._folders("uncertainty", "*.json", "the uncertainty has not been quantified yet")
+        return {f.name: UncertainModel.load(f) for f in folders if "@" not in f.name}
+
+    @cached_property
+    def choice(self) -> dict[str, Any]:
+        """Which unit is nominal and which is worst off nominal."""
+        self._require(self.folder / "uncertainty" / "choice.json", "the uncertainty has not been quantified yet")
+        return load_artifact(self.folder / "uncertainty", "choice")[0]
+
+    @cached_property
+    def outlier_rows(self) -> list[dict[str, Any]]:
+        """Scores of all units in all conditions."""
+        self._require(self.folder / "outliers" / "scores.json", "no outlier scores have been computed yet")
+        rows: list[dict[str, Any]] = read_json(self.folder / "outliers" / "scores.json")["rows"]
+        return rows
+
+    @cached_property
+    def syntheses(self) -> dict[str, Synthesis]:
+        """Syntheses by ``model/method``."""
+        folders = self._folders("synthesis", "*/synthesis.json", "no observer has been synthesized yet")
+        methods = sorted(m for f in folders for m in f.iterdir() if (m / "synthesis.json").exists())
+        return {f"{m.parent.name}/{m.name}": Synthesis.load(m) for m in methods}
+
+    @cached_property
+    def observer_names(self) -> list[str]:
+        """Names of the observers, in the order of the study."""
+        return list(self.observers_record["names"])
+
+    @cached_property
+    def observers_record(self) -> dict[str, Any]:
+        """What the synthesis stage says about its observers."""
+        self._require(self.folder / "observers" / "observers.json", "no observer has been made yet")
+        return load_artifact(self.folder / "observers", "observers")[0]
+
+    def observer(self, name: str) -> Observer:
+        """Load an observer."""
+        return Observer.load(self.folder / "observers" / f"{name}.json")
+
+    @property
+    def deployed(self) -> str | None:
+        """Name of the observer that is handed over, where there is one."""
+        try:
+            name = self.observers_record.get("deployed")
+        except NotShownError:
+            return None
+        return None if name is None else str(name)
+
+    @cached_property
+    def evaluation(self) -> dict[str, Any]:
+        """Errors of all observers and models."""
+        self._require(self.folder / "evaluation" / "evaluation.json", "the observers have not been evaluated yet")
+        content: dict[str, Any] = read_json(self.folder / "evaluation" / "evaluation.json")
+        return content
+
+    @cached_property
+    def arrays(self) -> dict[str, Array]:
+        """Trajectories and spectra of the evaluation."""
+        self._require(self.folder / "evaluation" / "arrays.npz", "the observers have not been evaluated yet")
+        return dict(read_arrays(self.folder / "evaluation" / "arrays.npz"))
+
+    @cached_property
+    def shown(self) -> list[Shown]:
+        """Episodes that the evaluation kept: nominal, worst off-nominal, and the nominal unit in every other condition."""
+        keys = [EpisodeKey(*row) for row in self.evaluation["shown"]]
+        return [self._shown(number, key) for number, key in enumerate(keys)]
+
+    def _shown(self, number: int, key: EpisodeKey) -> Shown:
+        start = f"shown{number}/"
+        part = {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
+        states = part["states"]
+        observers = {k.removeprefix("observer/"): v for k, v in part.items() if k.startswith("observer/")}
+        models = {k.removeprefix("model/"): v for k, v in part.items() if k.startswith("model/")}
+        return Shown(key, np.arange(len(states)) * self.sample_period_s, states, part["inputs"], observers, models)
+
+    def show(self, unit: str, condition: str) -> Shown:
+        """Return the kept episode of a unit in a condition."""
+        for shown in self.shown:
+            if (shown.key.unit, shown.key.condition) == (unit, condition):
+                return shown
+        raise NotShownError(f"there is no held-out episode of unit {unit} ({condition})")
+
+    def _folders(self, name: str, pattern: str, reason: str) -> list[Path]:
+        folder = self.folder / name
+        found = sorted(f for f in folder.iterdir() if f.is_dir() and any(f.glob(pattern))) if folder.is_dir() else []
+        if not found:
+            raise NotShownError(reason)
+        return found
+
+    def _require(self, path: Path, reason: str) -> None:
+        if not path.exists():
+            raise NotShownError(reason)

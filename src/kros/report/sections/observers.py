@@ -1,0 +1,63 @@
+"""Errors of the observers where they were designed for: the result table, and what they do in time and frequency."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..content import Cell, Section, Table
+from ..error_table import ErrorCell, ErrorTable, error_table
+from ..names import condition_label, number, observer_label
+from ..run_folder import RunFolder
+
+
+def result(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
+    """Return the tables of all observers and channels, with the chart."""
+    tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
+    if not tables:
+        return None
+    deployed = metrics["study"].get("deployed")
+    text = (
+        "RMS error in percent of the signal's range on held-out episodes that nothing was fitted to. Off nominal: mean over the "
+        "units other than the nominal one, and the "
+        "worst of them. Best of each column in bold; the observer that is handed over is set off."
+    )
+    return Section("results", "Results", [text], [errors(t, deployed) for t in tables], ["errors"])
+
+
+def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
+    """Return the figures of estimates and their spectra."""
+    if not metrics.get("evaluation"):
+        return None
+    text = (
+        "The observers as they run: at every step the estimate is cut back to the original states and lifted anew with the unit's "
+        "own parameters. An estimate for the next "
+        "sample uses data up to this one."
+    )
+    return Section("observers", "Observers at work", [text], [], ["observers_in_time", "observer_spectra"])
+
+
+def errors(table: ErrorTable, deployed: str | None) -> Table:
+    """Return one condition's errors as a table."""
+    rows = []
+    for observer in table.observers:
+        cells = [Cell(observer_label(observer))]
+        for channel in table.channels:
+            cells += _cells(table, channel, table.cells[observer].get(channel))
+        rows.append(cells)
+    head = ["observer", *(["nominal", "mean", "worst"] * len(table.channels))]
+    groups = [("", 1), *((c.replace("_", " ") + ("" if c in table.ranked else ": the load's torque"), 3) for c in table.channels)]
+    emphasised = [i for i, o in enumerate(table.observers) if o == deployed]
+    caption = f"Errors in percent, {condition_label(table.condition)}."
+    if len(table.ranked) < len(table.channels):
+        caption += " The current's error under load is the load's torque itself: reported, not ranked."
+    return Table(head, rows, caption, groups, emphasised=emphasised)
+
+
+def _cells(table: ErrorTable, channel: str, cell: ErrorCell | None) -> list[Cell]:
+    if cell is None:
+        return [Cell("–")] * 3
+    if cell.mean is None:
+        return [Cell(number(cell.nominal)), Cell("diverged", note=f"{cell.diverged} units"), Cell("–")]
+    values = {what: getattr(cell, what) for what in ("nominal", "mean", "worst")}
+    return [Cell(number(v), strong=v is not None and v == table.best(channel, w)) for w, v in values.items()]

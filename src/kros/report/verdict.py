@@ -1,0 +1,115 @@
+"""The first paragraph: what was recorded, what is handed over, how well it works, who is flagged. Plain words, numbers from the metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from .error_table import ErrorTable, error_table
+from .names import condition_label, number, observer_label, split_observer
+from .sections.outliers import flagged_text
+
+
+def verdict(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[str]:
+    """Return the sentences of the verdict.
+
+    Parameters
+    ----------
+    metrics : mapping
+        As in ``metrics.json``; any part may be absent.
+    measured : tuple of str
+        Channels that are available at run time; their errors are left to the table.
+    """
+    return [*_recorded(metrics), *_handed_over(metrics, measured), *_certificate(metrics), *_flagged(metrics)]
+
+
+def _recorded(metrics: Mapping[str, Any]) -> list[str]:
+    study = metrics["study"]
+    conditions = " and ".join(condition_label(c) for c in study["conditions"])
+    units = f"{study['units']} unit" + ("s" if study["units"] != 1 else "")
+    return [f"{units} of one batch were recorded ({conditions})."]
+
+
+def _handed_over(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str]:
+    name = metrics["study"].get("deployed")
+    if name is None:
+        return ["The run stopped before an observer was made."]
+    sentences = [f"The observer that is handed over is “{observer_label(name)}”."]
+    tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
+    if not tables or name not in tables[0].cells:
+        return [*sentences, "It has not been evaluated."]
+    table = tables[0]
+    hidden = [c for c in table.channels if c not in measured] or list(table.channels)
+    source = f"From {' and '.join(measured)} alone it" if measured else "It"
+    known = [c for c in hidden if table.cells[name][c].mean is not None]
+    if not known:
+        return [*sentences, "Its estimates diverge on held-out episodes: do not use it."]
+    parts = [_channel(table, name, c) for c in known]
+    sentences.append(f"{source} estimates {_join(parts)} on held-out episodes of the other units, in the mean.")
+    for method, label in (("open_loop", "Open loop, the nominal model alone,"), ("kalman_tuned", "The tuned Kalman filter")):
+        sentences += _comparison(table, name, method, label, known)
+    return sentences
+
+
+def _channel(table: ErrorTable, name: str, channel: str) -> str:
+    cell = table.cells[name][channel]
+    worst = f" ({number(cell.worst)} % on the worst unit, {cell.worst_unit})" if cell.worst is not None else ""
+    return f"{channel.replace('_', ' ')} to {number(cell.mean)} % of its range{worst}"
+
+
+def _comparison(table: ErrorTable, name: str, method: str, label: str, channels: list[str]) -> list[str]:
+    model = split_observer(name)[0]
+    other = (
+        f"{model}/{method}"
+        if f"{model}/{method}" in table.cells
+        else next((o for o in table.observers if split_observer(o)[1] == method), None)
+    )
+    if other is None or other == name:
+        return []
+    parts = []
+    for channel in channels:
+        own, theirs = table.cells[name][channel].mean, table.cells[other][channel].mean
+        parts.append(f"{channel.replace('_', ' ')} " + ("diverges" if theirs is None else f"{number(theirs)} %{_ratio(own, theirs)}"))
+    return [f"{label} gives {_join(parts)}."]
+
+
+def _ratio(own: float | None, theirs: float) -> str:
+    if not own:
+        return ""
+    ratio = theirs / own
+    if 0.99 < ratio < 1.01:
+        return " (the same)"
+    return (
+        f" ({number(ratio)} times as much)"
+        if ratio >= 2
+        else (f" ({100 * (ratio - 1):.0f} % more)" if ratio > 1 else f" ({100 * (1 - ratio):.0f} % less)")
+    )
+
+
+def _certificate(metrics: Mapping[str, Any]) -> list[str]:
+    entry = metrics.get("observers", {}).get(metrics["study"].get("deployed") or "", {})
+    sentences = []
+    if entry.get("worst_case_h2") is not None:
+        gap = entry.get("gap_percent")
+        near = f", at most {number(gap)} % above what any correction of this kind can reach" if gap is not None else ""
+        sentences.append(f"Its error is certified for every unit inside the uncertain set{near}.")
+    if entry.get("relift_certified") is not None:
+        sentences.append(
+            "A second certificate covers it as it runs, lifted anew at every step."
+            if entry["relift_certified"]
+            else "No certificate could be found for it as it runs, lifted anew at every step."
+        )
+    return sentences
+
+
+def _flagged(metrics: Mapping[str, Any]) -> list[str]:
+    if "outliers" not in metrics:
+        return []
+    flagged = [r for r in metrics["outliers"] if r["outlier"]]
+    if not flagged:
+        return ["No unit is flagged as an outlier."] if metrics["outliers"] else ["There are too few units to look for outliers."]
+    return [f"Flagged as not belonging to the batch: {flagged_text(flagged)}."]
+
+
+def _join(parts: list[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

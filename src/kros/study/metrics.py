@@ -88,13 +88,13 @@ def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
     """Return the metrics of one uncertain model."""
     weight = model.weight
     entry: dict[str, Any] = {
-        "nominal": model.unit_ids[model.nominal],
+        "nominal": model.nominal_id,
         "form": model.form,
         "peak_db": model.peak_db,
         "misfit_max": model.misfit_max,
         "weight": {
-            "structure": "diagonal",
-            "orders": weight.orders,
+            "structure": weight.structure,
+            "orders": [weight.left_orders, weight.right_orders],
             "cover_max": model.cover_max,
             "overbound_db_max": model.overbound_db_max,
         },

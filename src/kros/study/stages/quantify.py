@@ -11,12 +11,15 @@ import numpy.typing as npt
 
 from ...core.artifacts import save_artifact, write_json
 from ...core.errors import IdentificationError
+from ...core.frequency import log_grid
+from ...core.norms import hinf_norm
 from ...identify import ModelSet
 from ...uncertainty import OutlierModel, UncertainModel, quantify, residual, sigma_max
 from ..config import UncertaintyConfig
 from ..context import Context
 
 log = logging.getLogger(__name__)
+_LARGEST_PRODUCT = 0.7  # of |W_R W_L|: an amplification by 3.3
 Array = npt.NDArray[Any]
 
 
@@ -36,7 +39,7 @@ def run(context: Context) -> list[Path]:
         models = context.models(name)
         uncertain = quantify_models(models, units, context.config.uncertainty, nominal)
         first = first or (models, uncertain)
-        nominal = uncertain.unit_ids[uncertain.nominal]  # all kinds of models share the nominal unit of the first one, as in the paper
+        nominal = uncertain.nominal_id  # all kinds of models share the nominal unit of the first one, as in the paper
         uncertain.save(folder / name)
         files += sorted((folder / name).iterdir())
     assert first is not None
@@ -45,20 +48,36 @@ def run(context: Context) -> list[Path]:
 
 
 def quantify_models(models: ModelSet, units: list[str], config: UncertaintyConfig, nominal: str | None) -> UncertainModel:
-    """Quantify one kind of model over the pooled units."""
+    """Quantify one kind of model over the pooled units.
+
+    Diagonal weights are tighter than scalar ones channel by channel, but their product can be larger. Inverse forms pay for the product by
+    ``1 / (1 - |W_R W_L|)``, so where it comes near one the scalar weights are taken instead.
+    """
     if nominal is not None and nominal not in units:
         raise IdentificationError(f"uncertainty.nominal = {nominal!r}: is not among the units {', '.join(units)}; name one of them.")
-    return quantify(
-        models.systems(units),
-        config.form,
-        unit_ids=units,
-        output_scale=models.output_scale,
-        input_scale=models.input_scale,
-        nominal=None if nominal is None else units.index(nominal),
-        max_order=config.max_order,
-        tolerance_db=config.tolerance_db,
-        n_freqs=config.n_freqs,
-    )
+
+    def attempt(structure: str) -> UncertainModel:
+        return quantify(
+            models.systems(units),
+            config.form,
+            log_grid(models.sample_period_s, config.n_freqs),
+            unit_ids=units,
+            output_scale=models.output_scale,
+            input_scale=models.input_scale,
+            nominal=nominal,
+            structure=structure,
+            max_order=config.max_order,
+            tolerance_db=config.tolerance_db,
+        )
+
+    if config.structure != "auto":
+        return attempt(config.structure)
+    diagonal = attempt("diagonal")
+    inverse = config.form.startswith("inverse") and config.form != "inverse_additive"
+    if not inverse or hinf_norm(diagonal.weight.right @ diagonal.weight.left) < _LARGEST_PRODUCT:
+        return diagonal
+    log.info("%s: diagonal weights come close to an ill-posed set, scalar ones are taken", models.name)
+    return attempt("scalar")
 
 
 def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:
@@ -104,6 +123,4 @@ def score_units(context: Context) -> tuple[list[Path], set[str]]:
 
 def scaled_responses_on_grid(models: ModelSet, config: UncertaintyConfig) -> Array:
     """Return scaled responses on the default grid."""
-    from ...core.frequency import default_grid
-
-    return scaled_responses(models, list(models.unit_ids), default_grid(models.sample_period_s, config.n_freqs))
+    return scaled_responses(models, list(models.unit_ids), log_grid(models.sample_period_s, config.n_freqs))

@@ -246,3 +246,42 @@ def test_mapping_file_refuses(tmp_path: Path) -> None:
 def test_states_alone_without_a_role_state_are_refused(folder: Path) -> None:
     with pytest.raises(DataError, match="at least one channel with role 'state'"):
         read_csv_folder(folder, mapping(channel=[CHANNEL[0]]))
+
+
+def test_files_that_cannot_be_read(folder: Path) -> None:
+    population = read_csv_folder(folder, MAPPING)
+    (folder / "b" / "cold_1.csv").unlink()
+    with pytest.raises(DataError, match=r"b/cold_1\.csv: .*check that the file exists"):
+        population.read(EpisodeKey("b", "cold", "1"))
+    (folder / "b" / "cold_1.csv").write_bytes("t,pos,Größe\n".encode("latin-1"))
+    with pytest.raises(DataError, match=r"b/cold_1\.csv: cannot read its first line"):
+        read_csv_folder(folder, MAPPING)
+
+
+def test_header_alone(folder: Path) -> None:
+    write(folder / "b" / "cold_1.csv", samples(0)[:0])
+    with pytest.raises(DataError, match=r"Episode 1 of unit b \(cold\): at least 3 samples are needed, found 0"):
+        read_first(folder, "b")
+    write(folder / "a" / "cold_1.csv", samples(0)[:1])
+    with pytest.raises(DataError, match=r"Episode 1 of unit a \(cold\): the sampling period needs at least two samples with time, found 1"):
+        read_csv_folder(folder, MAPPING)
+
+
+def test_time_that_stands_still(folder: Path) -> None:
+    write(folder / "a" / "cold_1.csv", samples(0) * [0, 1, 1])
+    with pytest.raises(DataError, match="the median time step is 0 s; name the column that holds time"):
+        read_csv_folder(folder, MAPPING)
+
+
+def test_one_unit_in_two_groups(tmp_path: Path) -> None:
+    for name in ("good/a_1.csv", "outliers/a_2.csv"):
+        write(tmp_path / name, samples(0))
+    with pytest.raises(DataError, match="Unit a is in both groups 'good' and 'outliers'"):
+        read_csv_folder(tmp_path, mapping(files=r"(?P<group>\w+)/(?P<unit>a)_(?P<episode>\d)"))
+
+
+def test_restricted_to_one_unit(folder: Path) -> None:
+    population = read_csv_folder(folder, MAPPING)
+    one = population.select(units=["a"])
+    assert len(one.source.recordings.places) == 2  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(one.read(one.episodes[0]), population.read(one.episodes[0]))

@@ -1,6 +1,7 @@
 """Names, selections and the split."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kros.core.errors import DataError
-from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, split_episodes
+from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, prepare, split_episodes, steps, write_parquet
 from kros.data.population import natural_key
+from kros.data.prepare import Recorded, assemble
+from kros.data.recording import Recording
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("u", Role.INPUT))
 
@@ -75,3 +78,37 @@ def test_split_by_name_and_its_refusals() -> None:
         split_episodes(whole, ["0", "1", "2", "3"])
     with pytest.raises(DataError, match=r"unit a \(hot\) into training and test needs at least two, found 1"):
         split_episodes(population({("a", "hot"): 1}))
+
+
+@dataclass(frozen=True)
+class Counter:
+    """A source of another package, which knows nothing of preparation."""
+
+    start: float
+
+    def __call__(self, key: EpisodeKey) -> np.ndarray:
+        return self.start + np.arange(20.0).reshape(10, 2)
+
+
+def test_any_source_can_be_prepared() -> None:
+    keys = (EpisodeKey("a", "hot", "0"), EpisodeKey("b", "hot", "0"))
+    plain = Population(CHANNELS, 0.1, (Unit("a"), Unit("b")), keys, Counter(5.0))
+    assert prepare(plain, []) is plain
+    trimmed = prepare(plain, [steps.Trim(start=4)]).select(units=["b"])
+    np.testing.assert_array_equal(trimmed.read(keys[1]), plain.read(keys[1])[4:])
+
+
+def test_order_of_what_is_given_does_not_matter(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    episodes = {EpisodeKey(u, c, str(e)): rng.standard_normal((9, 2)) for u in "ab" for c in ("hot", "cold") for e in (1, 2, 10)}
+    shuffled = [list(episodes.items())[i] for i in rng.permutation(len(episodes))]
+    for name, given_ in (("one", episodes), ("two", dict(shuffled))):
+        write_parquet(from_arrays(given_, CHANNELS, 0.1), tmp_path / name)
+    for path in (tmp_path / "one").iterdir():
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
+
+
+def test_inputs_before_states_are_refused_where_columns_are_fixed() -> None:
+    recorded = Recorded(CHANNELS[::-1], [Unit("a")], [EpisodeKey("a", "hot", "0")], lambda key: Recording(key, np.ones((5, 2))), 0.1)
+    with pytest.raises(DataError, match="Channels should list states before inputs"):
+        assemble(recorded)

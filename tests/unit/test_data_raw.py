@@ -275,6 +275,22 @@ def test_write_raw_refuses_other_names(tmp_path: Path, key: EpisodeKey) -> None:
     assert not (tmp_path / "raw").exists()
 
 
+def test_write_raw_refuses_other_channels_and_tells_its_progress(tmp_path: Path) -> None:
+    population = from_arrays({EpisodeKey("000007", c, "0"): simulated() for c in ("load", "noload")}, prepared_channels(), 1e-3)
+    seen: list[tuple[int, int]] = []
+    write_raw(population, tmp_path / "raw", lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 2), (2, 2)]
+    with pytest.raises(DataError, match="needs the channels"):
+        write_raw(from_arrays({"000007": [np.ones((9, 1))]}, prepared_channels()[:1], 1e-3), tmp_path / "other")
+
+
+def test_other_files_are_left_alone(raw: Path) -> None:
+    for name in ("notes.txt", ".cycle_007.csv", "cycle_008.csv.part"):
+        (folder(raw, "001011") / name).write_text("nothing")
+    (raw / "batch_b" / "population" / ".trash").mkdir()
+    assert len(read_motor_drive_raw(raw).episodes) == 12
+
+
 def test_population_travels_to_another_process_and_stays_small(raw: Path) -> None:
     population = read_motor_drive_raw(raw)
     one = population.select(units=["001011"], conditions=["load"])

@@ -112,6 +112,13 @@ def test_lowpass_gain_against_theory() -> None:
         np.testing.assert_allclose(out, gain * signal[500:-500, 0], atol=6e-3)
 
 
+def test_lowpass_leaves_alone_what_it_cannot_filter() -> None:
+    values = np.arange(6.0)[:, None]
+    np.testing.assert_array_equal(lowpass(values, 0.5), values)
+    np.testing.assert_array_equal(lowpass(values[:1], 0.1), values[:1])
+    np.testing.assert_allclose(lowpass(values, 0.01), values, atol=1e-12)  # a filter longer than the episode keeps a line
+
+
 def frame_population(time: np.ndarray) -> Population:
     pd = pytest.importorskip("pandas")
     rng = np.random.default_rng(0)
@@ -185,6 +192,8 @@ def test_steps_from_toml() -> None:
     [
         ({"step": "smooth"}, r"data\.prepare\[0\]: step should be one of .*'trim'.*found 'smooth'"),
         ({"start": 3}, "found None"),
+        ("trim", "found None"),
+        ({"step": "scale", "channels": ["x", 3], "factor": 2}, r"channels\[1\]: should be text, found 3"),
         ({"step": "trim", "begin": 3}, r"\(step 'trim'\): unknown key 'begin'; known keys are start, stop, tail"),
         ({"step": "trim", "start": 1.5}, r"start: should be a whole number, found 1\.5"),
         ({"step": "trim", "start": True}, "start: should be a whole number, found True"),

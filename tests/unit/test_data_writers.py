@@ -191,6 +191,24 @@ def test_existing_folders_are_kept_unless_told(tmp_path: Path) -> None:
         write_parquet(population(), tmp_path / "file", overwrite=True)
 
 
+def test_what_was_there_comes_back_when_the_move_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    write_parquet(population(), out)
+    original = Path.rename
+
+    def full_disk(self: Path, target: Path) -> Path:
+        if self.name == "new":
+            raise OSError("no space left")
+        return original(self, target)
+
+    monkeypatch.setattr(Path, "rename", full_disk)
+    with pytest.raises(OSError, match="no space left"):
+        write_parquet(population(("c",)), out, overwrite=True)
+    monkeypatch.undo()
+    assert_same(read_parquet(out), population())
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
 def test_channel_named_like_a_key_column(tmp_path: Path) -> None:
     channels = (Channel("k", Role.STATE), *CHANNELS[1:])
     with pytest.raises(DataError, match=r"channels \['k'\] have the name of a key column"):

@@ -179,6 +179,26 @@ def test_two_sampling_periods(raw: Path) -> None:
         read_motor_drive_raw(raw).read(EpisodeKey("001011", "noload", "1"))
 
 
+@pytest.mark.parametrize("per_second", [1e3, 1e6])
+def test_time_in_milliseconds_or_microseconds(raw: Path, per_second: float) -> None:
+    expected = read_motor_drive_raw(raw)
+    values = [expected.read(key) for key in expected.episodes]
+    for path in raw.rglob("*.csv"):
+        samples = np.loadtxt(path, delimiter=",", skiprows=1)
+        samples[:-1, 4:] = samples[1:, 4:]  # write_file makes them late again
+        write_file(path, samples * [per_second, 1, 1, 1, 1, 1])
+    found = read_motor_drive_raw(raw)
+    assert found.sample_period_s == 0.001
+    for key, value in zip(expected.episodes, values, strict=True):
+        np.testing.assert_allclose(found.read(key), value, rtol=1e-12, atol=1e-15)
+
+
+def test_another_rate_is_taken_as_it_is_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_file(folder(tmp_path, "001011") / "cycle_000.csv", truth(0) * [2, 1, 1, 1, 1, 1])
+    assert read_motor_drive_raw(tmp_path).sample_period_s == 0.002
+    assert "sampled at 1 kHz, found steps of 0.002" in caplog.text
+
+
 def test_constant_state(raw: Path) -> None:
     samples = truth(3)
     samples[:, 3] = 0.5

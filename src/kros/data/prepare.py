@@ -86,6 +86,11 @@ class Recorded:
     tolerance: float = TIME_TOLERANCE
 
 
+def episode_order(key: EpisodeKey) -> tuple[Any, ...]:
+    """Sort key of episodes: natural order of unit, condition and episode, and no ties."""
+    return natural_key(key.unit), key.unit, natural_key(key.condition), key.condition, natural_key(key.episode), key.episode
+
+
 def assemble(recorded: Recorded, steps: Iterable[Step] = ()) -> Population:
     """Make the population: natural order, one sampling period, steps declared, names checked.
 
@@ -102,9 +107,7 @@ def assemble(recorded: Recorded, steps: Iterable[Step] = ()) -> Population:
         raise DataError(
             f"Channels should list states before inputs, found {[(c.name, c.role.value) for c in recorded.channels]}; reorder them."
         )
-    episodes = tuple(
-        sorted(recorded.episodes, key=lambda k: (natural_key(k.unit), k.unit, natural_key(k.condition), natural_key(k.episode), k.episode))
-    )
+    episodes = tuple(sorted(recorded.episodes, key=episode_order))
     with_episodes = {key.unit for key in episodes}
     units = tuple(sorted((u for u in recorded.units if u.id in with_episodes), key=lambda u: (natural_key(u.id), u.id)))
     first = episodes[0]

@@ -83,7 +83,7 @@ def from_arrays(
         raise DataError(f"A population needs a sampling period above zero, found {sample_period_s} s; give it in seconds.")
     order = sorted(range(len(channels)), key=lambda i: channels[i].role is Role.INPUT)
     pairs = list(_episodes(data))
-    values = {key: _samples(key, episode, channels)[:, order] for key, episode in pairs}
+    values = {key: np.ascontiguousarray(_samples(key, episode, channels)[:, order]) for key, episode in pairs}
     facts = {unit.id: unit for unit in units}
     names = dict.fromkeys(key.unit for key, _ in pairs)
     found = [facts.get(name, Unit(name)) for name in names]

@@ -2,12 +2,13 @@
 
     raw/batch_b/{population,outliers}/<YYYYmmddTHHMMSS>_<serial>_<load|noload>/*_<episode>.csv
 
-Columns, by position after one header line: time (s), position (deg), velocity (deg/s), torque (% of full scale), target position (deg),
+Columns, by position after one header line: time (s, also ms or us), position (deg), velocity (deg/s), torque (% of full scale), target position (deg),
 target velocity (deg/s), all on the motor side of a gear of ratio 100. `STEPS` declares the preparation.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import re
@@ -20,11 +21,14 @@ import numpy as np
 from ...core.errors import DataError
 from ..csvfile import first_fields, read_columns
 from ..population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
-from ..prepare import Recorded, assemble
-from ..recording import Recording, look_up
+from ..prepare import Recorded, assemble, episode_order
+from ..recording import Recording, estimate_period, look_up
 from ..steps import Offset, Scale, Shift, Step, Trim
 
+logger = logging.getLogger(__name__)
+
 GEAR_RATIO = 100
+PERIOD_S = 1e-3
 REST_SAMPLES = 1000
 TARGET_LAG = 1
 GROUPS = ("population", OUTLIERS)
@@ -55,15 +59,16 @@ class RawRecordings:
     """Reads one raw file at a time."""
 
     files: Mapping[EpisodeKey, str]
+    time_scale: float = 1.0
 
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode as recorded."""
         columns = read_columns(Path(look_up(self.files, key)), COLUMNS, COLUMNS)
-        return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0])
+        return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0] * self.time_scale)
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> RawRecordings:
         """Return the same for fewer episodes, cheaper to send to another process."""
-        return RawRecordings({key: self.files[key] for key in keys})
+        return RawRecordings({key: self.files[key] for key in keys}, self.time_scale)
 
 
 def find_root(source: Path) -> Path | None:
@@ -117,7 +122,20 @@ def read_motor_drive_raw(source: Path | str, prepare: Iterable[Step] = ()) -> Po
     units = [Unit(unit, group) for unit, group in groups.items()]
     if not files:
         raise DataError(f"Reading {source} as motor-drive-raw: found {len(groups)} folders of units and no .csv in them; check the path.")
-    return assemble(Recorded(CHANNELS, units, list(files), RawRecordings(files), metadata=METADATA), (*STEPS, *prepare))
+    recordings = RawRecordings(files, _time_scale(RawRecordings(files)(min(files, key=episode_order))))
+    return assemble(Recorded(CHANNELS, units, list(files), recordings, metadata=METADATA), (*STEPS, *prepare))
+
+
+def _time_scale(first: Recording) -> float:
+    """Return the factor from the column of time to seconds: the layout is sampled at 1 kHz, so steps of 1 are ms and of 1000 are us."""
+    period = estimate_period(first)
+    for scale in (1.0, 1e-3, 1e-6):
+        if math.isclose(period * scale, PERIOD_S, rel_tol=0.01):
+            return scale
+    logger.warning(
+        "The raw layout is sampled at 1 kHz, found steps of %g in %s; rest and offset are counted in samples.", period, first.key
+    )
+    return 1.0
 
 
 def _folders(root: Path) -> Iterator[tuple[str, Path, re.Match[str]]]:

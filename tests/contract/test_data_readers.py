@@ -22,12 +22,13 @@ from kros.data import (
     write_parquet,
     write_raw,
 )
+from kros.plants.harmonic_drive import HarmonicDrivePopulation
 
 PERIOD = 1e-3
 CHANNELS = (
     Channel("position", Role.STATE, "rad", measured=True),
     Channel("velocity", Role.STATE, "rad/s"),
-    Channel("current", Role.STATE, ""),
+    Channel("current", Role.STATE, "1"),
     Channel("target_position", Role.INPUT, "rad"),
     Channel("target_velocity", Role.INPUT, "rad/s"),
 )
@@ -150,3 +151,16 @@ def test_conversion_to_parquet_is_exact(read: Callable[[Path], Population], tmp_
     assert converted.metadata == population.metadata
     for key in KEYS:
         np.testing.assert_array_equal(converted.read(key), population.read(key))
+
+
+def test_simulated_drives_come_back_from_the_raw_layout(tmp_path: Path) -> None:
+    """The simulator prepares its population by its own code; the reader has to arrive at the same."""
+    simulated = HarmonicDrivePopulation(n_units=2, n_episodes=2, seconds=3.0, outlier=True).simulate()
+    write_raw(simulated.raw, tmp_path / "raw")
+    read = open_population("motor-drive-raw", tmp_path / "raw")
+    expected = simulated.population
+    assert (read.channels, read.units, read.episodes) == (expected.channels, expected.units, expected.episodes)
+    assert (read.sample_period_s, dict(read.metadata)) == (expected.sample_period_s, dict(expected.metadata))
+    for key in expected.episodes:
+        worst = np.abs(read.read(key) - expected.read(key)).max(axis=0)
+        assert np.all(worst < [1e-9, 1e-9, 1e-6, 1e-9, 1e-9])

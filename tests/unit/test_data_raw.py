@@ -65,7 +65,7 @@ def test_reads_values_units_and_facts(raw: Path) -> None:
     assert population.states == ("position", "velocity", "current")
     assert population.inputs == ("target_position", "target_velocity")
     assert population.measured == ("position",)
-    assert [c.unit for c in population.channels] == ["rad", "rad/s", "", "rad", "rad/s"]
+    assert [c.unit for c in population.channels] == ["rad", "rad/s", "1", "rad", "rad/s"]
     assert dict(population.metadata) == {"plant": "harmonic-drive", "gear_ratio": 100}
 
     samples = truth(1)[:-1]  # the last target is not recorded

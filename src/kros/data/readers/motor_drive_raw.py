@@ -46,7 +46,7 @@ PERCENT = 0.01
 STEPS: tuple[Step, ...] = (
     Scale(("position", "target_position"), MOTOR_DEG_TO_RAD, "rad"),
     Scale(("velocity", "target_velocity"), MOTOR_DEG_TO_RAD, "rad/s"),
-    Scale(("current",), PERCENT, ""),
+    Scale(("current",), PERCENT, "1"),
     Shift(("target_position", "target_velocity"), TARGET_LAG),
     Offset("position", "target_position", 500, 1000),
     Trim(start=REST_SAMPLES),

@@ -81,22 +81,29 @@ class Ball:
         """Diagonal of the spectrum of an element that is (locally) worst for T, shape (f, m).
 
         The squared error is convex in Theta, so its linearisation is a minorant, and moving to the maximiser of the linearisation, the
-        polar factor of the gradient, never decreases it.
+        polar factor of the gradient, never decreases it. Where T hardly tells elements apart the first start wins, which fits smoothly.
         """
         P = T @ self.left
         _, _, Vh_p = np.linalg.svd(P)
         U_q, _, _ = np.linalg.svd(self.right)
-        best, best_value = None, None
-        for theta in (_hermitian(Vh_p) @ _hermitian(U_q), _polar(_hermitian(P) @ (T @ self.center) @ _hermitian(self.right))):
+        best: Array | None = None
+        best_value: Array | None = None
+        starts = (
+            _polar(_hermitian(self.left) @ self.center @ _hermitian(self.right)),  # aligned with the centre
+            _polar(_hermitian(P) @ (T @ self.center) @ _hermitian(self.right)),  # aligned with the centre, as T sees it
+            _hermitian(Vh_p) @ _hermitian(U_q),  # worst without the centre
+        )
+        for theta in starts:
             for _ in range(iterations):
                 error = T @ self.center + P @ theta @ self.right
                 theta = _polar(_hermitian(P) @ error @ _hermitian(self.right))
             element = self.center + self.left @ theta @ self.right
             value = np.linalg.norm(T @ element, axis=(-2, -1))
-            if best is None:
+            if best is None or best_value is None:
                 best, best_value = element, value
             else:
-                best = np.where((value > best_value)[..., None, None], element, best)
+                best = np.where((value > best_value * (1 + 1e-6))[..., None, None], element, best)
+                best_value = np.maximum(value, best_value)
         assert best is not None
         return np.sum(np.abs(best) ** 2, axis=-1)
 

@@ -26,7 +26,7 @@ from .balance import Balanced, balance
 from .certificate import certify
 from .generalized_plant import GeneralizedPlant
 from .h2_optimal import absorb_feedthrough, h2, stability_margin
-from .mixed_lmi import MixedInequalities, Solution, ladder
+from .mixed_lmi import Attempt, MixedInequalities, Solution, ladder
 from .observer_problem import ObserverProblem
 from .reduction import truncate
 from .result import Injection, Status, Synthesis
@@ -57,6 +57,7 @@ def mixed(
     max_states: int = 8,
     time_limit_s: float = 60.0,
     noise_floor: float = 1e-3,
+    penalty_floor: float = 3e-2,
 ) -> Synthesis:
     """Return a controller with a small H2 norm in channel 1 and an H-infinity norm below `gamma` in channel 2.
 
@@ -78,6 +79,8 @@ def mixed(
     noise_floor : float
         For observer problems: least measurement noise in the inequalities, as a fraction of the measured channel's range. Verification and
         certificate use the true noise.
+    penalty_floor : float
+        For observer problems: least weight of the scaled correction in the inequalities.
 
     Returns
     -------
@@ -99,7 +102,8 @@ def mixed(
     True
     """
     if isinstance(plant, ObserverProblem):
-        return _for_observer(plant, gamma=gamma, scalings=scalings, max_states=max_states, time_limit_s=time_limit_s, noise_floor=noise_floor)
+        floors = {"noise_floor": noise_floor, "penalty_floor": penalty_floor}
+        return _for_observer(plant, floors, gamma=gamma, scalings=scalings, max_states=max_states, time_limit_s=time_limit_s)
     if plant.dt == 0:
         raise SynthesisError("Mixed synthesis works in discrete time, found a continuous plant (dt = 0); sample it.")
     if gamma <= 0 or not scalings or min(scalings) <= 0 or time_limit_s <= 0 or max_states < 1:
@@ -110,10 +114,12 @@ def mixed(
     reasons: list[str] = []
     notes: list[str] = []
     found: list[_Verified] = []
-    for limit in (max_states, max(max_states - 2, 1)):
+    smaller = max(max_states - 2, 1)
+    for limit, last_resort in ((max_states, False), (smaller, False), (smaller, True)):
         small, notes = _reduced(plant, limit)
-        found = [v for a in scalings for v in [_best_for(plant, small, gamma, a, time_limit_s, reasons)] if v is not None]
-        if found or small is plant:
+        attempts = ladder(time_limit_s, last_resort=last_resort)
+        found = [v for a in scalings for v in [_best_for(plant, small, gamma, a, attempts, reasons)] if v is not None]
+        if found:
             break
     if not found:
         raise SynthesisError("Mixed synthesis: no controller survived; " + "; ".join(reasons) + ". Raise gamma, max_states, noise or the time limit.")
@@ -134,12 +140,12 @@ def _reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant
 
 
 def _best_for(
-    plant: GeneralizedPlant, small: GeneralizedPlant, gamma: float, scaling: float, time_limit_s: float, reasons: list[str]
+    plant: GeneralizedPlant, small: GeneralizedPlant, gamma: float, scaling: float, attempts: Sequence[Attempt], reasons: list[str]
 ) -> _Verified | None:
     """Climb the ladder of solvers for one scaling until a controller survives verification."""
     balanced = balance(_scaled(small, scaling))
     inequalities = MixedInequalities(balanced.plant, balanced.spread, gamma)
-    for attempt in ladder(time_limit_s):
+    for attempt in attempts:
         solution = inequalities.solve(attempt)
         verdict = solution if isinstance(solution, str) else _verify(plant, balanced, solution, gamma, attempt.solver, scaling)
         if isinstance(verdict, _Verified):
@@ -196,10 +202,10 @@ def _synthesis(plant: GeneralizedPlant, best: _Verified, notes: list[str], elaps
     )
 
 
-def _for_observer(problem: ObserverProblem, *, noise_floor: float, **options: Any) -> Synthesis:
+def _for_observer(problem: ObserverProblem, floors: dict[str, float], **options: Any) -> Synthesis:
     """Solve the reduced observer problem; certify the filter on the set, in physical units."""
     problem.require_sound()
-    plant = problem.mixed_plant(noise_floor)
+    plant = problem.mixed_plant(**floors)
     found = mixed(plant, **options)
     controller = problem.to_physical(found.controller)
     value, error = certify(problem, controller)

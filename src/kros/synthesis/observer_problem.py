@@ -216,12 +216,12 @@ class ObserverProblem:
             )
         return penalise(shape_inputs(plant, block_diagonal(filters)), self.correction_penalty)
 
-    def mixed_plant(self, noise_floor: float = 1e-3) -> GeneralizedPlant:
+    def mixed_plant(self, noise_floor: float = 1e-3, penalty_floor: float = 3e-2) -> GeneralizedPlant:
         """Reduced, regularised, scaled form of (37)-(39): w1 = (inputs, n), w2 = output of Delta, z1 = (W_p e, penalty), z2 = input of Delta.
 
         Minimal in the error: the copies of the plant drop out. The remainder has no place in this form and is left to the certificate. With
         the noise of a good encoder the covariances span twelve decades, more than conic solvers can handle; `noise_floor` is the least noise
-        here, as a fraction of the measured channel's range.
+        here, as a fraction of the measured channel's range, `penalty_floor` the least correction penalty.
         """
         A, B, C, W_p = self.scaled
         L, R, U = self.W_L, self.W_R @ self.input_weight, self.W_R @ self.W_L
@@ -251,7 +251,7 @@ class ObserverProblem:
             np.block([[W_p, np.zeros((p, k))], [np.zeros((n_u, n + k))], [np.zeros((m, n)), z2.C]]),
             np.hstack([C, np.zeros((q, k))]),
             np.block([[np.zeros((p + n_u, m + q + m))], [z2.D[:, :m], np.zeros((m, q)), z2.D[:, m:]]]),
-            np.vstack([np.zeros((p, n_u)), self.correction_penalty * np.eye(n_u), np.zeros((m, n_u))]),
+            np.vstack([np.zeros((p, n_u)), max(self.correction_penalty, penalty_floor) * np.eye(n_u), np.zeros((m, n_u))]),
             np.hstack([np.zeros((q, m)), np.diag(sigma), np.zeros((q, m))]),
             np.zeros((q, n_u)),
             L.dt,

@@ -1,0 +1,180 @@
+"""H2 synthesis against published numbers, independent optimisation, FIR Youla programs, and closed forms."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from kros.core import StateSpace, SynthesisError, gain, h2_norm
+from kros.synthesis import GeneralizedPlant, h2, kalman
+from kros.synthesis.constant_gain import luenberger
+
+
+def random_plant(rng, n, dt, d22=True):
+    A = rng.standard_normal((n, n))
+    zero = np.zeros((4, 3))
+    return GeneralizedPlant(
+        A,
+        rng.standard_normal((n, 3)),
+        rng.standard_normal((n, 2)),
+        rng.standard_normal((4, n)),
+        rng.standard_normal((2, n)),
+        rng.standard_normal((4, 3)) if dt > 0 else zero,
+        rng.standard_normal((4, 2)),
+        rng.standard_normal((2, 3)),
+        0.1 * rng.standard_normal((2, 2)) * d22,
+        dt,
+    )
+
+
+def slicot_sb10ed():
+    """Example of the SLICOT routine SB10ED (discrete H2), five inputs and outputs, two controls and measurements."""
+    A = [
+        [-0.7, 0.0, 0.3, 0.0, -0.5, -0.1],
+        [-0.6, 0.2, -0.4, -0.3, 0.0, 0.0],
+        [-0.5, 0.7, -0.1, 0.0, 0.0, -0.8],
+        [-0.7, 0.0, 0.0, -0.5, -1.0, 0.0],
+        [0.0, 0.3, 0.6, -0.9, 0.1, -0.4],
+        [0.5, -0.8, 0.0, 0.0, 0.2, -0.9],
+    ]
+    B = np.array([[-1, -2, -2, 1, 0], [1, 0, 1, -2, 1], [-3, -4, 0, 2, -2], [1, -2, 1, 0, -1], [0, 1, -2, 0, 3], [1, 0, 3, -1, -2]])
+    C = np.array([[1, -1, 2, -2, 0, -3], [-3, 0, 1, -1, 1, 0], [0, 2, 0, -4, 0, -2], [1, -3, 0, 0, 3, 1], [0, 1, -2, 1, 0, -2]])
+    D = np.array([[1, -1, -2, 0, 0], [0, 1, 0, 1, 0], [2, -1, -3, 0, 1], [0, 1, 0, 1, -1], [0, 0, 1, 2, 1]])
+    K = {
+        "A": [
+            [-0.0551, -2.1891, -0.6607, -0.2532, 0.6674, -1.0044],
+            [-1.0379, 2.3804, 0.5031, 0.3960, -0.6605, 1.2673],
+            [-0.0876, -2.1320, -0.4701, -1.1461, 1.2927, -1.5116],
+            [-0.1358, -2.1237, -0.9560, -0.7144, 0.6673, -0.7957],
+            [0.4900, 0.0895, 0.2634, -0.2354, 0.1623, -0.2663],
+            [0.1672, -0.4163, 0.2871, -0.1983, 0.4944, -0.6967],
+        ],
+        "B": [[-0.5985, -0.5464], [0.5285, 0.6087], [-0.7600, -0.4472], [-0.7288, -0.6090], [0.0532, 0.0658], [-0.0663, 0.0059]],
+        "C": [[0.2500, -1.0200, -0.3371, -0.2733, 0.2747, -0.4444], [0.0654, 0.2095, 0.0632, 0.2089, -0.1895, 0.1834]],
+        "D": [[-0.2181, -0.2070], [0.1094, 0.1159]],
+    }
+    plant = GeneralizedPlant(A, B[:, :3], B[:, 3:], C[:3], C[3:], D[:3, :3], D[:3, 3:], D[3:, :3], D[3:, 3:], 1.0)
+    return plant, K
+
+
+def test_slicot_example():
+    plant, K = slicot_sb10ed()
+    # The routine assumes D11 = 0 and ignores what stands there.
+    strictly = GeneralizedPlant(plant.A, plant.B1, plant.B2, plant.C1, plant.C2, 0 * plant.D11, plant.D12, plant.D21, plant.D22, 1.0)
+    found = {name: h2(p).controller for name, p in (("without", strictly), ("with", plant))}
+    closest = min(max(np.abs(getattr(k, x) - K[x]).max() for x in "ABCD") for k in found.values())
+    assert closest < 1e-4
+
+
+def test_lqg_scalar_closed_form():
+    # x+ = a x + w + u, z = (x, u), y = x + v: both Riccati equations are X = a^2 X / (1 + X) + 1.
+    a = 0.9
+    X = (a**2 + np.sqrt(a**4 + 4)) / 2
+    plant = GeneralizedPlant([[a]], [[1.0, 0]], [[1.0]], [[1.0], [0]], [[1.0]], np.zeros((2, 2)), [[0], [1.0]], [[0, 1.0]], [[0]], 1.0)
+    found = h2(plant)
+    filtered = X / (1 + X)  # variance after the measurement
+    # cost = tr(X W) + (F^2 R_b) * filtered variance, with W = 1, F = -a X / (1 + X), R_b = 1 + X
+    assert found.h2_norm**2 == pytest.approx(X + (a * X / (1 + X)) ** 2 * (1 + X) * filtered)
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_no_perturbation_of_the_controller_does_better(dt):
+    rng = np.random.default_rng(1)
+    for _ in range(6):
+        plant = random_plant(rng, int(rng.integers(1, 7)), dt)
+        found = h2(plant)
+        assert found.h2_norm == pytest.approx(found.lower_bound, rel=1e-6)
+        assert found.h2_norm == pytest.approx(h2_norm(plant.close(found.controller)))
+        K = found.controller
+        for _ in range(20):
+            moved = {x: getattr(K, x) * (1 + 1e-4 * rng.standard_normal(getattr(K, x).shape)) for x in "ABCD"}
+            assert h2_norm(plant.close(StateSpace(**moved, dt=dt))) >= found.h2_norm * (1 - 1e-9)
+
+
+def test_optimum_is_found_by_blind_search_too():
+    rng = np.random.default_rng(4)
+    plant = random_plant(rng, 1, 1.0, d22=False)
+    found = h2(plant)
+
+    def cost(x):
+        K = StateSpace([[x[0]]], x[None, 1:3], x[3:5, None], x[5:9].reshape(2, 2), 1.0)
+        closed = plant.close(K)
+        return h2_norm(closed) if closed.spectral_radius() < 0.999 else 1e3 * float(closed.spectral_radius())
+
+    results = [minimize(cost, 0.3 * rng.standard_normal(9), method="Nelder-Mead", options={"maxiter": 4000, "maxfev": 4000, "adaptive": True}).fun for _ in range(4)]
+    assert min(results) >= found.h2_norm * (1 - 1e-9)
+    assert min(results) <= found.h2_norm * 1.02
+
+
+def test_fir_youla_program_reaches_the_same_optimum():
+    # A stable plant: T(Q) = P11 + P12 Q P21 is affine in a FIR Q, so least squares over its taps tends to the optimum from above.
+    rng = np.random.default_rng(5)
+    plant = random_plant(rng, 3, 1.0, d22=False)
+    A = plant.A * (0.4 / np.abs(np.linalg.eigvals(plant.A)).max())
+    plant = GeneralizedPlant(A, plant.B1, plant.B2, plant.C1, plant.C2, plant.D11, plant.D12, plant.D21, plant.D22, 1.0)
+    z = np.exp(2j * np.pi * np.arange(400) / 400)
+
+    def response(B, C, D):
+        return C @ np.linalg.solve(z[:, None, None] * np.eye(3) - A, np.broadcast_to(B, (400, *B.shape)).astype(complex)) + D
+
+    P11, P12, P21 = response(plant.B1, plant.C1, plant.D11), response(plant.B2, plant.C1, plant.D12), response(plant.B1, plant.C2, plant.D21)
+    columns = []
+    for tap in range(40):
+        delayed = z[:, None, None] ** -tap * P12
+        for i in range(2):
+            for j in range(2):
+                columns.append((delayed[:, :, [i]] @ P21[:, [j], :]).ravel())
+    design, target = np.array(columns).T, -P11.ravel()
+    real = np.vstack([design.real, design.imag])
+    taps, *_ = np.linalg.lstsq(real, np.concatenate([target.real, target.imag]), rcond=None)
+    value = np.linalg.norm(design @ taps - target) / np.sqrt(400)
+    assert value == pytest.approx(h2(plant).h2_norm, rel=1e-5)
+    assert value >= h2(plant).h2_norm * (1 - 1e-9)
+
+
+def test_kalman_scalar_closed_form_and_simulation():
+    q, r = 1.0, 2.0
+    found = kalman([[1.0]], [[1.0]], [[q]], [[r]])
+    P = (q + np.sqrt(q**2 + 4 * q * r)) / 2
+    assert found.controller.D[0, 0] == pytest.approx(P / (P + r))
+    assert found.h2_norm == pytest.approx(np.sqrt(P))
+
+
+def test_kalman_beats_every_constant_gain():
+    rng = np.random.default_rng(2)
+    A = np.array([[1.0, 0.1], [0.0, 1.0]])
+    C, Q, R = np.array([[1.0, 0.0]]), np.diag([1e-4, 1e-2]), np.array([[0.5]])
+    found = kalman(A, C, Q, R)
+    for _ in range(50):
+        L = found.controller.D * (1 + 0.2 * rng.standard_normal((2, 1)))
+        other = StateSpace(A - L @ C, np.hstack([np.sqrt(Q), -L * np.sqrt(0.5)]), np.eye(2), np.zeros((2, 3)), 1.0)
+        assert h2_norm(other) >= found.h2_norm * (1 - 1e-12)
+
+
+def test_luenberger_places_the_poles():
+    A, C = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[1.0, 0.0]])
+    found = luenberger(A, C, [0.5, 0.6])
+    assert np.sort(np.linalg.eigvals(A - found.controller.D @ C)) == pytest.approx([0.5, 0.6])
+    with pytest.raises(SynthesisError, match=r"0\.5.*|poles"):
+        luenberger(np.diag([1.0, 0.9]), [[0.0, 1.0]], [0.5, 0.6])
+
+
+def test_continuous_lqg_against_scipy_formula():
+    # Double integrator with unit weights: X = [[sqrt 3, 1], [1, sqrt 3]], and the filter is its mirror image.
+    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    plant = GeneralizedPlant(
+        A,
+        np.hstack([np.eye(2), np.zeros((2, 1))]),
+        B,
+        np.vstack([np.eye(2), np.zeros((1, 2))]),
+        [[1.0, 0.0]],
+        np.zeros((3, 3)),
+        [[0], [0], [1.0]],
+        [[0, 0, 1.0]],
+        [[0.0]],
+        0.0,
+    )
+    K = h2(plant).controller
+    assert K.C == pytest.approx(np.array([[-1.0, -np.sqrt(3)]]))
+    assert K.B == pytest.approx(np.array([[np.sqrt(3)], [1.0]]))
+    assert not K.D.any()
+    assert gain(K.D, 0.0).dt == 0

@@ -1,0 +1,250 @@
+"""Worst-case H2: the certificate against brute force, quadrature against closed forms, the design against a game by hand."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import least_squares, minimize
+
+from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm
+from kros.synthesis import Injection, ObserverProblem, Status, worst_case_h2
+from kros.synthesis.ball import Ball, spread
+from kros.synthesis.certificate import certify, density
+from kros.synthesis.quadrature import circle_mean
+
+DT = 1e-3
+
+
+class Fitted:
+    def __init__(self, system):
+        self.system = system
+
+
+def log_fit(freqs_hz, magnitude, dt, order=None, max_order=4, tolerance_db=1.0, side="above"):
+    """Stand-in for the weight fit: least squares of the log magnitude with real poles and zeros, then lifted or lowered."""
+    tau = np.tan(np.pi * dt * freqs_hz)
+    k = order or 2
+
+    def response(p):
+        square = tau[:, None] ** 2
+        return p[0] + 0.5 * np.sum(np.log(square + np.exp(2 * p[1 : 1 + k])) - np.log(square + np.exp(2 * p[1 + k :])), axis=1)
+
+    low, high = np.log(tau[0]), np.log(min(tau[-2], 1e3))
+    knots = np.linspace(low, high, 2 * k + 2)[1:-1]
+    start = np.concatenate([[np.log(magnitude[-2])], knots[::2], knots[1::2]])
+    found = least_squares(lambda p: response(p) - np.log(magnitude), start, bounds=(np.r_[-50, [low - 3] * 2 * k], np.r_[50, [8] * 2 * k])).x
+    error = response(found) - np.log(magnitude)
+    found[0] -= error.min() if side == "above" else error.max()
+    system = gain([[np.exp(found[0])]], dt)
+    for zero, pole in zip(np.exp(found[1 : 1 + k]), np.exp(found[1 + k :]), strict=True):
+        d, a = (1 + zero) / (1 + pole), (1 - pole) / (1 + pole)
+        system = system @ StateSpace([[a]], [[1.0]], [[d * a - (1 - zero) / (1 + pole)]], [[d]], dt)
+    return Fitted(system)
+
+
+def lag(low, high, corner_hz):
+    a = np.exp(-2 * np.pi * corner_hz * DT)
+    d, c = np.linalg.solve([[1, 1 / (1 - a)], [1, -1 / (1 + a)]], [low, high])
+    return StateSpace([[a]], [[1.0]], [[c]], [[d]], DT)
+
+
+def drive(rng):
+    kt, b, kp, kv, wc = np.array([60, 3, 12, 3, 600]) * np.exp(0.1 * rng.standard_normal(5))
+    A = np.array([[0, 1, 0, 0], [0, -b, kt, 2], [-wc * kv * kp, -wc * kv, -wc, 0], [0.5, 1, 0, -30]])
+    B = np.array([[0, 0], [0, 0], [wc * kv * kp, wc * kv], [0, 0]])
+    M = expm(DT * np.block([[A, B], [np.zeros((2, 6))]]))
+    return StateSpace(M[:4, :4], M[:4, 4:], np.eye(4), np.zeros((4, 2)), DT)
+
+
+def problem(seed=0, injection=Injection.STATE, **changes):
+    rng = np.random.default_rng(seed)
+    nominal = drive(rng)
+    parts = {
+        "nominal": nominal,
+        "C": np.eye(4)[:1],
+        "W_L": block_diagonal([lag(10 ** rng.uniform(-2.5, -1.5), 10 ** rng.uniform(-0.9, -0.3), 10 ** rng.uniform(0.5, 2)) for _ in range(2)]),
+        "W_R": gain(np.diag([1.0, rng.uniform(0.3, 1)]), DT),
+        "input_scale": np.array([3.0, 3.0]),
+        "output_scale": np.array([3.0, 3.0, 0.5, 1.0]),
+        "noise": np.array([1e-4]),
+        "n_original": 3,
+        "injection": injection,
+    }
+    return ObserverProblem(**{**parts, **changes})
+
+
+def random_matrices(rng, m=2):
+    N = rng.standard_normal((m, m)) + 1j * rng.standard_normal((m, m))
+    N *= rng.uniform(0.1, 0.9) / np.linalg.norm(N, 2)
+    M = rng.standard_normal((m, m)) + 1j * rng.standard_normal((m, m))
+    T = rng.standard_normal((3, m)) + 1j * rng.standard_normal((3, m))
+    return N, M, T
+
+
+def contraction(x, m):
+    """A unitary matrix from 2 m^2 real numbers (extreme points of the contractions)."""
+    U, _, Vh = np.linalg.svd((x[: m * m] + 1j * x[m * m :]).reshape(m, m))
+    return U @ Vh
+
+
+def test_the_set_is_a_matrix_ball():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        N, M, _ = random_matrices(rng)
+        ball = Ball.of(N[None], np.eye(2)[None])
+        delta = contraction(rng.standard_normal(8), 2) * rng.uniform(0, 1)
+        X = delta @ np.linalg.inv(np.eye(2) - N @ delta)
+        theta = np.linalg.solve(ball.left[0], X - ball.center[0]) @ np.linalg.inv(ball.right[0])
+        assert np.linalg.norm(theta, 2) <= 1 + 1e-9
+        # and back: every theta comes from a contraction
+        theta = contraction(rng.standard_normal(8), 2)
+        X = ball.center[0] + ball.left[0] @ theta @ ball.right[0]
+        assert np.linalg.norm(X @ np.linalg.inv(np.eye(2) + N @ X), 2) <= 1 + 1e-9
+
+
+def test_bound_against_optimised_perturbations():
+    rng = np.random.default_rng(1)
+    ratios = []
+    for _ in range(25):
+        N, M, T = random_matrices(rng)
+        bound = Ball.of(N[None], M[None]).bound(T[None])[0]
+
+        def size(x, N=N, M=M, T=T):
+            delta = contraction(x, 2)
+            return -np.linalg.norm(T @ delta @ np.linalg.solve(np.eye(2) - N @ delta, M))
+
+        found = -min(minimize(size, rng.standard_normal(8), method="BFGS").fun for _ in range(4))
+        assert found <= bound * (1 + 1e-9)
+        ratios.append(bound / found)
+    assert max(ratios) < 1.5, "a factor two would follow from bounding each term alone"
+
+
+def test_bound_is_exact_for_a_scalar_weight():
+    rng = np.random.default_rng(2)
+    w = 0.6
+    T = rng.standard_normal((1, 3, 2)) + 0j
+    # N = w I, M = I: the worst perturbation is 1 / (1 - w) times a unitary.
+    assert Ball.of(w * np.eye(2)[None] + 0j, np.eye(2)[None] + 0j).bound(T)[0] == pytest.approx(np.linalg.norm(T) / (1 - w))
+    assert spread(T, np.eye(2)[None])[0] == pytest.approx(np.linalg.norm(T))
+
+
+def test_average_and_worst_spectra_are_attained():
+    rng = np.random.default_rng(3)
+    N, M = np.diag([0.5, 0.2j])[None], np.diag([1.0, 2.0])[None] + 0j
+    T = rng.standard_normal((1, 3, 2)) + 0j
+    ball = Ball.of(N, M)
+    thetas = [contraction(rng.standard_normal(8), 2) for _ in range(20000)]
+    sampled = np.mean([np.sum(np.abs(ball.center[0] + ball.left[0] @ t @ ball.right[0]) ** 2, axis=-1) for t in thetas], axis=0)
+    assert ball.average()[0] == pytest.approx(sampled, rel=0.02)
+    worst = max(np.linalg.norm(T[0] @ (ball.center[0] + ball.left[0] @ t @ ball.right[0])) for t in thetas[:3000])
+    assert worst <= ball.bound(T)[0]
+    assert np.all(ball.worst_spectrum(T)[0] <= (np.linalg.norm(ball.center[0], axis=-1) + np.linalg.norm(ball.left[0], axis=-1) * 2.5) ** 2)
+
+
+@pytest.mark.parametrize("pole", [0.5, 0.999, 0.9999999, 0.999 * np.exp(0.3j), 0.9999999 * np.exp(1e-3j), 0.999999 * np.exp(3.0j)])
+def test_quadrature_over_many_decades(pole):
+    # |1 / (z - p)|^2 and its mirror image have mean 1 / (1 - |p|^2).
+    def power(theta):
+        zeta = np.expm1(1j * theta)
+        return (np.abs(zeta - (pole - 1)) ** -2 + np.abs(zeta - (np.conj(pole) - 1)) ** -2) / 2
+
+    mean, error = circle_mean(power, np.log(np.array([pole + 0j])), 1e-8)
+    truth = 1 / (1 - abs(pole) ** 2)
+    assert abs(mean - truth) <= max(error, 1e-9 * truth) + 1e-9 * truth
+    assert error <= 1e-7 * truth
+
+
+def test_error_system_is_the_formula():
+    for injection in Injection.INPUT, Injection.STATE:
+        case = problem(1, injection)
+        A, B, C, W_p = case.scaled
+        K = worst_case_h2(case, fit=log_fit, refinements=0).controller
+        freqs = np.array([0.01, 1.0, 30.0, 400.0])
+        loop = case.error_system(K).frequency_response(freqs)
+        J = B if injection is Injection.INPUT else np.eye(4)
+        for f, z in enumerate(np.exp(2j * np.pi * freqs * DT)):
+            R = np.linalg.inv(z * np.eye(4) - A)
+            k = case.to_scaled(K).frequency_response(freqs[[f]])[0]
+            S = np.linalg.inv(np.eye(4) + R @ J @ k @ C)
+            assert loop[f] == pytest.approx(W_p @ S @ np.hstack([R @ B, np.eye(4), -R @ J @ k]), rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_certificate_covers_random_members_of_the_set(injection, seed):
+    """Simulate the definition itself: random plants G (I - W_L Delta W_R)^-1 per frequency, error density summed over a fine grid."""
+    case = problem(seed, injection)
+    found = worst_case_h2(case, fit=log_fit)
+    assert found.status is Status.CERTIFIED
+    assert found.lower_bound <= found.worst_case_h2
+    assert found.gap_percent < 20
+    assert found.quadrature_error < 1e-3 * found.worst_case_h2
+    rng = np.random.default_rng(seed)
+    theta = np.geomspace(1e-6, np.pi, 3000)
+    freqs = theta / (2 * np.pi * DT)
+    loop = case.error_system(found.controller)
+    response = loop.frequency_response(freqs)
+    left, right = case.W_L.frequency_response(freqs), case.W_R.frequency_response(freqs)
+    bound = density(case, loop, freqs)
+    noise = np.sum(np.abs(response[..., 6:]) ** 2, axis=(-2, -1))
+    highest = np.zeros_like(noise)
+    for _ in range(30):
+        delta = contraction(rng.standard_normal(8), 2)
+        E = left @ delta @ right
+        error = response[..., :2] @ np.linalg.solve(np.eye(2) - E, E)
+        power = np.sum(np.abs(error) ** 2, axis=(-2, -1)) + noise
+        assert np.all(power <= bound * (1 + 1e-9))
+        assert np.sqrt(np.trapezoid(power, theta) / np.pi) <= found.worst_case_h2 * 1.001
+        highest = np.maximum(highest, power)
+    assert np.sqrt(np.trapezoid(bound, theta) / np.pi) == pytest.approx(found.worst_case_h2, rel=2e-3)
+    assert np.sqrt(np.trapezoid(highest, theta) / np.pi) > 0.7 * found.worst_case_h2
+
+
+def test_exact_when_the_set_is_a_scaled_identity():
+    """W_L = w I with scalar constants: the worst spectrum is white of size (w / (1 - w))^2, so the Kalman filter for it is the answer."""
+    w = 0.3
+    case = problem(2, W_L=gain(w * np.eye(2), DT), W_R=gain(np.eye(2), DT))
+    found = worst_case_h2(case, fit=lambda f, m, dt, **_: Fitted(gain([[m.max()]], dt)))
+    A, B, C, W_p = case.scaled
+    from scipy.linalg import solve_discrete_are
+
+    P = solve_discrete_are(A.T, C.T, (w / (1 - w)) ** 2 * B @ B.T, np.eye(1))
+    assert found.worst_case_h2 == pytest.approx(np.sqrt(np.trace(W_p @ P @ W_p.T)), rel=1e-4)
+    assert found.gap_percent < 0.01
+    assert found.controller.n_states == 0
+
+
+def test_design_beats_neighbours_and_other_observers():
+    case = problem(3)
+    found = worst_case_h2(case, fit=log_fit)
+    rng = np.random.default_rng(0)
+    K = found.controller
+    for _ in range(10):
+        other = StateSpace(K.A, K.B * (1 + 0.1 * rng.standard_normal(K.B.shape)), K.C, K.D * (1 + 0.1 * rng.standard_normal(K.D.shape)), DT)
+        if case.error_system(other).is_stable():
+            assert certify(case, other)[0] >= found.lower_bound
+            assert certify(case, other)[0] >= 0.98 * found.worst_case_h2
+    nothing = certify(case, gain(np.zeros((4, 1)), DT))[0]
+    assert found.worst_case_h2 < nothing
+
+
+def test_remainder_enters_bound_and_design():
+    without = problem(4)
+    left = block_diagonal([lag(0.01, 0.05, 10.0) for _ in range(4)])
+    case = problem(4, remainder_left=left, remainder_right=gain(np.eye(2), DT))
+    plain = worst_case_h2(without, fit=log_fit)
+    found = worst_case_h2(case, fit=log_fit)
+    assert found.worst_case_h2 > plain.worst_case_h2
+    assert found.worst_case_h2 <= certify(case, plain.controller)[0] * (1 + 1e-6)
+    assert found.lower_bound <= found.worst_case_h2
+
+
+def test_noise_only_matches_the_norm():
+    case = problem(5)
+    found = worst_case_h2(case, fit=log_fit)
+    loop = case.error_system(found.controller)
+    assert found.h2_norm == pytest.approx(h2_norm(StateSpace(loop.A, loop.B[:, 6:], loop.C, loop.D[:, 6:], DT)))
+
+
+def test_a_set_that_is_not_well_posed_is_refused():
+    with pytest.raises(SynthesisError, match=r"\|\|W_R W_L\|\| = 1\.2.*below 1"):
+        worst_case_h2(problem(0, W_L=gain(1.2 * np.eye(2), DT), W_R=gain(np.eye(2), DT)), fit=log_fit)

@@ -1,0 +1,280 @@
+"""Bad input to the synthesis layer: every refusal names what is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import kros.synthesis
+from kros.core import ConfigError, DataError, DimensionError, StateSpace, SynthesisError, block_diagonal, gain
+from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, Synthesis, h2, kalman, mixed, worst_case_h2
+from kros.synthesis.certificate import certify
+from kros.synthesis.constant_gain import luenberger
+from kros.synthesis.paper_plant import paper_plant
+from kros.synthesis.verify import closed_loop, observer_loop, spectral_radius_max
+
+DT = 1e-3
+
+
+def plant(**changes):
+    parts = {
+        "A": [[0.9]],
+        "B1": [[1.0, 0.0]],
+        "B2": [[1.0]],
+        "C1": [[1.0], [0.0]],
+        "C2": [[1.0]],
+        "D11": np.zeros((2, 2)),
+        "D12": [[0.0], [1.0]],
+        "D21": [[0.0, 1.0]],
+        "D22": [[0.0]],
+        "dt": 1.0,
+    }
+    return GeneralizedPlant(**{**parts, **changes})
+
+
+def problem(**changes):
+    nominal = StateSpace([[0.99, 0.01], [0.0, 0.9]], [[0.0], [0.1]], np.eye(2), np.zeros((2, 1)), DT)
+    parts = {
+        "nominal": nominal,
+        "C": [[1.0, 0.0]],
+        "W_L": gain([[0.2]], DT),
+        "W_R": gain([[1.0]], DT),
+        "input_scale": [1.0],
+        "output_scale": [1.0, 2.0],
+        "noise": [1e-3],
+    }
+    return ObserverProblem(**{**parts, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"B1": [[1.0], [0.0]]}, r"B1 should have shape \(1, 1\)"),
+        ({"D12": [[1.0]]}, r"D12 should have shape \(2, 1\)"),
+        ({"C2": [[np.nan]]}, "NaN"),
+        ({"dt": -1.0}, "negative"),
+        ({"n_w1": 3}, "n_w1 = 3 should lie between 0 and 2"),
+        ({"n_z1": -1}, "n_z1 = -1"),
+    ],
+)
+def test_generalized_plant_checks_its_shapes(changes, message):
+    with pytest.raises(DimensionError, match=message):
+        plant(**changes)
+
+
+@pytest.mark.parametrize(
+    ("controller", "message"),
+    [
+        (gain(np.eye(2), 1.0), "1 x 1 at 1.0 s, found 2 x 2"),
+        (gain([[1.0]], 0.5), "found 1 x 1 at 0.5 s"),
+    ],
+)
+def test_closing_the_loop_checks_sizes_and_periods(controller, message):
+    with pytest.raises(DimensionError, match=message):
+        plant().close(controller)
+
+
+def test_singular_algebraic_loop_is_refused():
+    with pytest.raises(DimensionError, match="I - D22"):
+        plant(D22=[[1.0]]).close(gain([[1.0]], 1.0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "label"),
+    [
+        ({"A": [[1.1]], "B2": [[0.0]]}, r"A1a: \(A, B2\) stabilisable \(mode 1.1"),
+        ({"A": [[1.1]], "C2": [[0.0]]}, r"A1b: \(C2, A\) detectable \(mode 1.1"),
+        ({"D12": [[0.0], [0.0]]}, "A2a: D12"),
+        ({"D21": [[0.0, 0.0]]}, "A2b: D21"),
+        ({"A": [[1.0]], "C1": [[0.0], [0.0]]}, "A3: no zero"),
+        ({"A": [[1.0]], "B1": [[0.0, 0.0]]}, "A4: no zero"),
+        ({"A": [[-1.0]], "dt": 0.0, "D11": np.ones((2, 2))}, "D11 = 0 in continuous time"),
+    ],
+)
+def test_h2_names_the_violated_assumption(changes, label):
+    with pytest.raises(SynthesisError, match=label):
+        h2(plant(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"C": [[1.0, 0.0, 0.0]]}, r"C should be \(q, 2\)"),
+        ({"noise": [0.0]}, "noise should be 1 positive"),
+        ({"noise": [1e-3, 1e-3]}, "noise should be 1 positive"),
+        ({"input_scale": [-1.0]}, "input_scale should be 1 positive"),
+        ({"output_scale": [1.0]}, "output_scale should be 2 positive"),
+        ({"W_L": gain([[0.2]], 0.5)}, "W_L is sampled at 0.5 s, the nominal model at 0.001 s"),
+        ({"W_R": gain(np.eye(2), DT)}, "W_R should be 1 x 1, found 2 x 2"),
+        ({"W_p": np.eye(3)}, r"W_p should be \(p, 2\)"),
+        ({"n_original": 3}, "n_original = 3"),
+        ({"correction_penalty": 0.0}, "correction_penalty"),
+        ({"injection": Injection.NONE}, "found NONE"),
+        ({"remainder_left": gain(np.eye(2), DT)}, "come together"),
+    ],
+)
+def test_observer_problem_checks_its_parts(changes, message):
+    with pytest.raises(DimensionError, match=message):
+        problem(**changes)
+
+
+def test_weights_must_be_diagonal():
+    nominal = StateSpace(0.5 * np.eye(2), np.eye(2), np.eye(2), np.zeros((2, 2)), DT)
+    coupled = StateSpace(np.diag([0.5, 0.6]), np.eye(2), [[0.1, 0.05], [0.0, 0.1]], 0.1 * np.eye(2), DT)
+    with pytest.raises(DimensionError, match="W_L should be diagonal"):
+        problem(nominal=nominal, W_L=coupled, W_R=gain(np.eye(2), DT), input_scale=[1.0, 1.0])
+
+
+@pytest.mark.parametrize("method", [worst_case_h2, mixed])
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"W_L": gain([[1.0]], DT)}, r"\|\|W_R W_L\|\| = 1 should be below 1"),
+        ({"W_L": StateSpace([[1.0]], [[1.0]], [[0.1]], [[0.1]], DT)}, "W_L has spectral radius 1"),
+        ({"nominal": StateSpace(np.diag([1.0, 0.9]), [[1.0], [0.1]], np.eye(2), np.zeros((2, 1)), DT), "C": [[0.0, 1.0]]}, "not detectable, mode 1"),
+        ({"nominal": StateSpace(np.diag([1.0, 0.9]), [[1.0], [0.1]], np.eye(2), np.zeros((2, 1)), DT)}, "nominal has spectral radius 1"),
+        ({"nominal": StateSpace(-np.eye(2), [[0.0], [0.1]], np.eye(2), np.zeros((2, 1)), 0.0), "W_L": gain([[0.2]], 0.0), "W_R": gain([[1.0]], 0.0)}, "sample it"),
+    ],
+)
+def test_problems_without_a_sound_answer_are_refused(method, changes, message):
+    with pytest.raises(SynthesisError, match=message):
+        method(problem(**changes))
+
+
+def test_certificate_refuses_an_unstable_observer():
+    with pytest.raises(SynthesisError, match="spectral radius"):
+        certify(problem(), gain([[-1.0], [0.0]], DT))
+
+
+def test_mixed_refuses_what_it_cannot_do():
+    with pytest.raises(SynthesisError, match="continuous"):
+        mixed(plant(A=[[-1.0]], dt=0.0))
+    with pytest.raises(ConfigError, match="gamma = 0"):
+        mixed(plant(), gamma=0)
+    with pytest.raises(ConfigError, match="scalings"):
+        mixed(plant(), scalings=())
+    with pytest.raises(SynthesisError, match="A2a"):
+        mixed(plant(D12=[[0.0], [0.0]]))
+
+
+def test_mixed_says_why_nothing_survives():
+    # z2 = w2 + (something): the gain from w2 to z2 is at least one whatever K does.
+    base = plant()
+    impossible = GeneralizedPlant(
+        base.A,
+        np.hstack([base.B1, [[0.0]]]),
+        base.B2,
+        np.vstack([base.C1, [[0.0]]]),
+        base.C2,
+        np.diag([0.0, 0.0, 2.0])[:, [0, 1, 2]],
+        np.vstack([base.D12, [[0.0]]]),
+        np.hstack([base.D21, [[0.0]]]),
+        base.D22,
+        1.0,
+        n_w1=2,
+        n_z1=2,
+    )
+    with pytest.raises(SynthesisError, match=r"no controller survived.*(infeasible|failed|not below 1).*Raise gamma"):
+        mixed(impossible, time_limit_s=5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (([[1.0, 0], [0, 1.2]], [[1.0, 0]], np.eye(2), [[1.0]]), SynthesisError, "not detectable, mode 1.2"),
+        (([[0.5]], [[1.0]], [[1.0]], [[0.0]]), SynthesisError, "R is not positive definite"),
+        (([[0.5]], [[1.0]], [[-1.0]], [[1.0]]), SynthesisError, "eigenvalue -1"),
+        (([[0.5]], [[1.0, 0]], [[1.0]], [[1.0]]), DimensionError, r"C \(q, n\)"),
+        (([[1.0]], [[1.0]], [[0.0]], [[1.0]]), SynthesisError, "unit circle|no stabilising|residual"),
+    ],
+)
+def test_kalman_refusals(arguments, error, message):
+    with pytest.raises(error, match=message):
+        kalman(*arguments)
+
+
+def test_luenberger_refusals():
+    with pytest.raises(SynthesisError, match="inside the unit circle"):
+        luenberger([[1.0]], [[1.0]], [1.0])
+    with pytest.raises(DimensionError, match="needs 1 poles"):
+        luenberger([[1.0]], [[1.0]], [0.5, 0.6])
+
+
+def test_published_plant_checks_its_weights():
+    nominal, one = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], DT), gain([[1.0]], DT)
+    with pytest.raises(DimensionError, match="W_u should be 1 x 1, found 2 x 2"):
+        paper_plant(nominal, [[1.0]], one, gain(np.eye(2), DT), one)
+    with pytest.raises(DimensionError, match="W_D is sampled at 1.0 s"):
+        paper_plant(nominal, [[1.0]], one, one, gain([[1.0]], 1.0))
+    with pytest.raises(DimensionError, match=r"C should be \(q, 1\)"):
+        paper_plant(nominal, [[1.0, 0.0]], one, one, one)
+
+
+def test_result_survives_saving(tmp_path):
+    found = kalman([[0.9]], [[1.0]], [[1.0]], [[1.0]])
+    full = replace(found, status=Status.INACCURATE, injection=Injection.INPUT, worst_case_h2=2.5, notes=("one", "two"))
+    for synthesis in (found, full):
+        synthesis.save(tmp_path)
+        back = Synthesis.load(tmp_path)
+        for name in Synthesis.__dataclass_fields__:
+            if name != "controller":
+                assert getattr(back, name) == getattr(synthesis, name)
+        assert all(np.array_equal(getattr(back.controller, x), getattr(synthesis.controller, x)) for x in "ABCD")
+        assert back.controller.dt == synthesis.controller.dt
+    with pytest.raises(DataError, match="there is no file"):
+        Synthesis.load(tmp_path / "elsewhere")
+
+
+def test_block_triangular_closed_loop():
+    rng = np.random.default_rng(0)
+    case = problem()
+    units = StateSpace(case.nominal.A * np.array([0.5, 0.9, 1.0])[:, None, None], np.ones((3, 2, 1)), np.ones((3, 1, 2)), np.zeros((3, 1, 1)), DT)
+    for injection, rows in ((Injection.INPUT, 1), (Injection.STATE, 2)):
+        K = StateSpace([[0.5]], [[0.1]], 0.1 * rng.standard_normal((rows, 1)), 0.1 * rng.standard_normal((rows, 1)), DT)
+        loop = np.linalg.eigvals(observer_loop(case.nominal, case.C, K, injection))
+        for k in range(3):
+            whole = np.linalg.eigvals(closed_loop(units[k], case.nominal, case.C, K, injection))
+            expected = np.concatenate([loop, np.linalg.eigvals(units.A[k])])
+            assert np.sort(np.abs(whole)) == pytest.approx(np.sort(np.abs(expected)), abs=1e-6)
+        highest = max(np.abs(loop).max(), np.abs(np.linalg.eigvals(case.nominal.A)).max())
+        assert spectral_radius_max(units, case.nominal, case.C, K, injection) == pytest.approx(highest)
+    with pytest.raises(DimensionError, match="2 x 1 at 0.001 s"):
+        observer_loop(case.nominal, case.C, gain([[1.0]], DT), Injection.STATE)
+    with pytest.raises(DimensionError, match="NONE"):
+        observer_loop(case.nominal, case.C, gain([[1.0]], DT), Injection.NONE)
+
+
+def test_closed_loop_matrix_is_the_simulation():
+    case = problem()
+    rng = np.random.default_rng(1)
+    K = StateSpace([[0.5]], [[0.1]], [[0.2]], [[0.3]], DT)
+    unit_A = case.nominal.A * 0.9
+    x, x_hat, x_c = rng.standard_normal(2), rng.standard_normal(2), rng.standard_normal(1)
+    matrix = closed_loop(StateSpace(unit_A, np.zeros((2, 1)), np.eye(2), np.zeros((2, 1)), DT), case.nominal, case.C, K, Injection.INPUT)
+    nu = case.C @ (x - x_hat)
+    correction = K.C @ x_c + K.D @ nu
+    expected = np.concatenate([unit_A @ x, case.nominal.A @ x_hat + case.nominal.B @ correction, K.A @ x_c + K.B @ nu])
+    assert matrix @ np.concatenate([x, x_hat, x_c]) == pytest.approx(expected)
+
+
+def test_units_of_measure_do_not_matter():
+    case = problem(W_L=block_diagonal([gain([[0.2]], DT)]))
+    A, B = case.nominal.A, case.nominal.B
+    T = np.diag([1e3, 1e-2])
+    other = problem(
+        nominal=StateSpace(T @ A @ np.linalg.inv(T), T @ B / 7, np.eye(2), np.zeros((2, 1)), DT),
+        C=case.C @ np.linalg.inv(T) * 5,
+        input_scale=case.input_scale * 7,
+        output_scale=T @ case.output_scale,
+        noise=case.noise * 5,
+    )
+    K = gain([[0.1], [0.05]], DT)
+    scaled = gain(T @ K.D / 5, DT)
+    assert certify(other, scaled)[0] == pytest.approx(certify(case, K)[0], rel=1e-9)
+
+
+def test_public_names():
+    assert set(kros.synthesis.__all__) <= set(dir(kros.synthesis))
+    assert callable(kros.synthesis.h2)
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = kros.synthesis.nothing

@@ -1,19 +1,42 @@
 """Uncertainty of a population: six forms, residuals, nominal, cover and weights, outliers. The stage's result is an `UncertainModel`."""
 
-from .fit import FittedMagnitude, Side, fit_magnitude
-from .forms import Form, existence, rebuild, residual
+from .cover import Cover, Structure, cover_ratio, optimal_cover, optimal_left
+from .fit import FittedMagnitude, Side, fit_magnitude, invert
+from .forms import Form, existence, rebuild, residual, residual_shape
+from .model import UncertainModel, scale_system
+from .nominal import NominalChoice, choose_nominals
+from .outliers import OutlierModel, OutlierScore, score_outliers
+from .quantify import quantify
 from .residuals import all_bounds, bounds, misfit, sigma_max
+from .weights import Weight, fit_weight
 
 __all__ = [
+    "Cover",
     "FittedMagnitude",
     "Form",
+    "NominalChoice",
+    "OutlierModel",
+    "OutlierScore",
     "Side",
+    "Structure",
+    "UncertainModel",
+    "Weight",
     "all_bounds",
     "bounds",
+    "choose_nominals",
+    "cover_ratio",
     "existence",
     "fit_magnitude",
+    "fit_weight",
+    "invert",
     "misfit",
+    "optimal_cover",
+    "optimal_left",
+    "quantify",
     "rebuild",
     "residual",
+    "residual_shape",
+    "scale_system",
+    "score_outliers",
     "sigma_max",
 ]

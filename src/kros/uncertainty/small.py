@@ -38,7 +38,7 @@ def multiply(left: Array, right: Array) -> Array:
     scratch = np.empty(rest, out.dtype)
     for i in range(p):
         for j in range(m):
-            np.multiply(left[i, 0], right[0, j], out=out[i, j])
+            np.multiply(left[i, 0], right[0, j], out=out[i, j, ...])
             for k in range(1, r):
                 out[i, j] += np.multiply(left[i, k], right[k, j], out=scratch)
     return out

@@ -1,0 +1,128 @@
+"""Covers against textbook cases, an exhaustive search, and a general convex optimiser."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kros.uncertainty import cover_ratio, optimal_cover, optimal_left
+
+
+def residuals(seed: int, units: int, freqs: int, p: int, m: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(units, freqs, p, m)) + 1j * rng.normal(size=(units, freqs, p, m))
+
+
+def sound(E: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The condition of design section 7, one matrix at a time."""
+    return np.array([[np.linalg.norm(E[k, f] / left[f][:, None] / right[f], 2) for f in range(E.shape[1])] for k in range(len(E))])
+
+
+def exhaustive_cost_db(E: np.ndarray) -> float:
+    """Mean log cost of the best cover of 2 x 2 residuals at one frequency, by a nested grid search over two ratios."""
+    spans, centre = 12.0, np.zeros(2)
+    best = np.inf
+    for _ in range(9):
+        x = centre[0] + np.linspace(-spans, spans, 25)
+        y = centre[1] + np.linspace(-spans, spans, 25)
+        X, Y = np.meshgrid(x, y, indexing="ij")
+        left, right = np.exp([X / 2, -X / 2]), np.exp([Y / 2, -Y / 2])
+        M = E[:, :, :, None, None] / left[:, None] / right[None, :]
+        sigma = np.linalg.norm(np.moveaxis(M, (1, 2), (-2, -1)), 2, axis=(-2, -1)).max(axis=0)
+        i, j = np.unravel_index(np.argmin(sigma), sigma.shape)
+        best, centre, spans = min(best, sigma[i, j]), np.array([x[i], y[j]]), spans / 4
+    return float(20 * np.log10(best))
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (4, 2), (2, 4), (3, 3), (1, 1), (4, 4)])
+@pytest.mark.parametrize("structure", ["diagonal", "scalar"])
+def test_every_cover_is_sound_and_touches(shape: tuple[int, int], structure: str) -> None:
+    E = residuals(1, 5, 8, *shape)
+    found = optimal_cover(E, structure)
+    ratio = sound(E, found.left, found.right)
+    np.testing.assert_allclose(ratio.max(axis=0), 1.0, rtol=1e-10)
+    np.testing.assert_allclose(cover_ratio(E, found.left, found.right), ratio, rtol=1e-10)
+
+
+def test_diagonal_residuals_of_one_unit_are_covered_by_their_moduli() -> None:
+    d = np.array([[0.3, 2.0], [5.0, 0.1], [1.0, 1.0]])
+    found = optimal_cover(np.einsum("fi,ij->fij", d, np.eye(2))[None] * 1j)
+    np.testing.assert_allclose(np.einsum("fii->fi", found.entries()), d, rtol=0.05)
+
+
+def test_single_full_matrix_costs_its_singular_value_after_the_best_scaling() -> None:
+    """All entries of modulus one, unitary up to a factor: no scaling helps, the cover is sqrt(2)."""
+    E = np.array([[1.0, 1.0], [1.0, -1.0]])[None, None] + 0j
+    np.testing.assert_allclose(optimal_cover(E).cost_db(), 20 * np.log10(np.sqrt(2)), atol=0.02)
+
+
+def test_rank_one_residual_is_covered_by_its_dyad() -> None:
+    """`E = a b^H` scaled to equal moduli has norm sqrt(p m) times the mean: cost from the closed form."""
+    a, b = np.array([1.0, 30.0]), np.array([0.2, 5.0])
+    E = np.outer(a, b)[None, None] + 0j
+    expected = 20 * np.log10(2.0) + 10 * np.log10(a.prod()) + 10 * np.log10(b.prod())
+    np.testing.assert_allclose(optimal_cover(E).cost_db(), expected, atol=0.02)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_by_two_covers_are_optimal(seed: int) -> None:
+    E = residuals(seed, 6, 3, 2, 2) * 10.0 ** np.random.default_rng(seed).uniform(-1, 1, size=(1, 3, 2, 2))
+    exact = [exhaustive_cost_db(E[:, f]) for f in range(3)]
+    gap = optimal_cover(E).cost_db() - exact
+    assert (gap < 0.1).all()
+    assert (gap > -1e-3).all()
+
+
+@pytest.mark.parametrize("shape", [(4, 2), (3, 3)])
+def test_larger_covers_are_optimal(shape: tuple[int, int]) -> None:
+    from scipy.optimize import minimize
+
+    E = residuals(7, 4, 1, *shape) * np.logspace(-1, 1, shape[0])[:, None]
+    p = shape[0]
+
+    def cost(x: np.ndarray) -> float:
+        M = E[:, 0] * np.exp(-x[:p])[:, None] * np.exp(-x[p:])
+        return float(x[:p].mean() + x[p:].mean() + np.log(np.linalg.norm(M, 2, axis=(1, 2)).max()))
+
+    x = np.zeros(sum(shape))
+    for _ in range(6):
+        x = minimize(cost, x, method="Nelder-Mead", options={"maxiter": 4000, "xatol": 1e-7, "fatol": 1e-9, "adaptive": True}).x
+    gap = optimal_cover(E).cost_db()[0] - 20 * np.log10(np.e) * cost(x)
+    assert gap < 0.1
+
+
+def test_best_left_for_the_optimal_right_is_the_optimal_left() -> None:
+    E = residuals(9, 6, 4, 2, 2)
+    found = optimal_cover(E)
+    left = optimal_left(E, found.right)
+    assert (sound(E, left, found.right) <= 1 + 1e-10).all()
+    np.testing.assert_allclose(20 * np.log10(left).mean(axis=1), 20 * np.log10(found.left).mean(axis=1), atol=0.05)
+
+
+def test_entrywise_bounds_are_no_cover() -> None:
+    """Why the cover is not taken entry by entry: this W bounds all entries and is exceeded five times."""
+    E = np.array([[1.0, 1.0], [1.0, -1.0]]) + 0j
+    W = np.array([[1.0, 1.0], [1.0, 1.5]])
+    assert (np.abs(E) <= W).all()
+    assert np.linalg.norm(np.linalg.solve(W, E), 2) > 5
+    found = optimal_cover(E[None, None])
+    assert sound(E[None, None], found.left, found.right).max() <= 1 + 1e-12
+
+
+def test_zero_residuals_need_nothing() -> None:
+    E = residuals(10, 3, 4, 2, 2)
+    E[:, 1] = 0
+    found = optimal_cover(E)
+    assert not found.left[1].any()
+    assert np.isfinite(found.entries()).all()
+    assert (cover_ratio(E, found.left, found.right) <= 1 + 1e-10).all()
+
+
+def test_triangular_residuals_stay_finite() -> None:
+    E = residuals(11, 3, 4, 2, 2)
+    E[:, :, 1, 0] = 0
+    found = optimal_cover(E)
+    assert np.isfinite(np.log(found.left)).all()
+    lower = np.log10(np.abs(E[:, :, 0, 0]).max(axis=0)) + np.log10(np.abs(E[:, :, 1, 1]).max(axis=0))
+    assert (found.cost_db() >= 10 * lower - 1e-6).all()  # no cover can cost less than the diagonal alone
+    assert (found.cost_db() <= 10 * lower + 0.5).all()

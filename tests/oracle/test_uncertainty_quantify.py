@@ -1,0 +1,194 @@
+"""Weights of whole populations: sound on dense grids, checked by a slow independent evaluation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from kros.core import StateSpace
+from kros.core.errors import ConfigError, DataError, DimensionError
+from kros.uncertainty import Form, UncertainModel, quantify
+
+DT = 1e-3
+
+
+def drives(n_units: int, seed: int) -> StateSpace:
+    """Position, velocity and current of drives under a cascaded loop, from targets of position and velocity, parameters spread by 5-15 %."""
+    rng = np.random.default_rng(seed)
+    A, B = np.zeros((n_units, 3, 3)), np.zeros((n_units, 3, 2))
+    for k in range(n_units):
+        inertia, friction, torque, lag = np.array([0.5, 6.0, 40.0, 2e-3]) * np.exp(np.array([0.05, 0.15, 0.05, 0.1]) * rng.normal(size=4))
+        a = np.array([[-0.5, 1, 0], [0, -friction / inertia, torque / inertia], [-14.4 / lag, -1.2 / lag, -1 / lag]])
+        b = np.array([[0.5, 0], [0, 0], [14.4 / lag, 1.3 / lag]])
+        step = expm(np.block([[a, b], [np.zeros((2, 5))]]) * DT)
+        A[k], B[k] = step[:3, :3], step[:3, 3:]
+    return StateSpace(A, B, np.broadcast_to(np.eye(3), A.shape), np.zeros(B.shape), DT)
+
+
+def random_population(n_units: int, seed: int) -> StateSpace:
+    """Perturbations of one random stable 4 x 2 system."""
+    rng = np.random.default_rng(seed)
+    base = rng.normal(size=(4, 4))
+    base *= 0.95 / np.abs(np.linalg.eigvals(base)).max()
+    A = base * (1 + 0.02 * rng.normal(size=(n_units, 4, 4)))
+    A *= np.minimum(1, 0.97 / np.abs(np.linalg.eigvals(A)).max(axis=1))[:, None, None]
+    B = rng.normal(size=(4, 2)) * (1 + 0.05 * rng.normal(size=(n_units, 4, 2)))
+    return StateSpace(A, B, np.broadcast_to(np.eye(4), A.shape), np.zeros(B.shape), DT)
+
+
+def response(system: StateSpace, z: complex) -> np.ndarray:
+    n = system.n_states
+    return system.C @ np.linalg.solve(z * np.eye(n) - system.A, system.B + 0j) + system.D
+
+
+def slow_ratio(model: UncertainModel, units: StateSpace, freqs: np.ndarray) -> float:
+    """Largest `sigma_max(W_L^-1 E W_R^-1)`, one unit and frequency at a time, from the definition."""
+    pinv, worst = np.linalg.pinv, 0.0
+    for f in freqs:
+        z = np.exp(2j * np.pi * f * DT)
+        scale = lambda g: g / model.output_scale[:, None] * model.input_scale  # noqa: E731
+        left, right, g = response(model.weight.left, z), response(model.weight.right, z), scale(response(model.nominal_system, z))
+        for k in range(units.batch_shape[0]):
+            gp = scale(response(units[k], z))
+            E = {
+                Form.ADDITIVE: lambda g=g, gp=gp: gp - g,
+                Form.INPUT_MULTIPLICATIVE: lambda g=g, gp=gp: pinv(g) @ (gp - g),
+                Form.OUTPUT_MULTIPLICATIVE: lambda g=g, gp=gp: (gp - g) @ pinv(g),
+                Form.INVERSE_ADDITIVE: lambda g=g, gp=gp: pinv(gp) @ (gp - g) @ pinv(g),
+                Form.INVERSE_INPUT_MULTIPLICATIVE: lambda g=g, gp=gp: pinv(gp) @ (gp - g),
+                Form.INVERSE_OUTPUT_MULTIPLICATIVE: lambda g=g, gp=gp: (gp - g) @ pinv(gp),
+            }[model.form]()
+            worst = max(worst, np.linalg.norm(np.linalg.solve(left, E) @ np.linalg.inv(right), 2))
+    return worst
+
+
+@pytest.mark.parametrize("form", ["inverse_input_multiplicative", "additive"])
+def test_weights_of_drives_are_sound_and_tight(form: str) -> None:
+    units = drives(10, 1)
+    model = quantify(units, form, np.geomspace(1e-2, 500.0, 300), output_scale=[1, 3, 1], input_scale=[1, 3])
+    off_grid = np.random.default_rng(0).uniform(np.log(1e-2), np.log(500.0), 80)
+    assert slow_ratio(model, units, np.concatenate([np.exp(off_grid), [1e-6, 500.0]])) <= 1 + 1e-6
+    assert model.cover_max <= 1
+    assert model.overbound_db_max <= 3
+    assert max(*model.weight.left_orders, *model.weight.right_orders) <= 4
+    for system in (model.weight.left, model.weight.right):
+        assert system.is_stable()
+        assert StateSpace(system.A - system.B @ np.linalg.solve(system.D, system.C), system.B, system.C, system.D, DT).is_stable()
+
+
+@pytest.mark.parametrize("form", list(Form))
+def test_weights_of_random_tall_systems_are_sound(form: Form) -> None:
+    units = random_population(4, 2)
+    model = quantify(units, form, np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
+    assert slow_ratio(model, units, np.linspace(1.0, 500.0, 41)) <= 1 + 1e-6
+    assert model.cover_max <= 1
+
+
+def test_remainder_covers_what_the_form_leaves_out() -> None:
+    units = random_population(4, 3)
+    model = quantify(units, "inverse_input_multiplicative", np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
+    assert model.misfit_max > 0.01
+    assert model.remainder is not None
+    for f in np.linspace(2.0, 490.0, 23):
+        z = np.exp(2j * np.pi * f * DT)
+        g, left, right = response(model.nominal_system, z), response(model.remainder.left, z), response(model.remainder.right, z)
+        for k in range(4):
+            gp = response(units[k], z)
+            rest = gp - g @ np.linalg.inv(np.eye(2) - np.linalg.pinv(gp) @ (gp - g))
+            assert np.linalg.norm(np.linalg.solve(left, rest) @ np.linalg.inv(right), 2) <= 1 + 1e-6
+    additive = quantify(units, "additive", np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
+    assert additive.remainder is None
+    assert additive.misfit_max < 1e-12
+
+
+def test_scalar_first_order_population_has_the_residual_of_the_textbook() -> None:
+    """Lags `(1 - a) / (z - a)`: inverse input residual `1 - G / Gp` is exact, zero at DC, and the gain ratio at Nyquist is known."""
+    poles = np.array([0.88, 0.9, 0.92])[:, None, None]
+    units = StateSpace(poles, 1 - poles, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), DT)
+    model = quantify(units, freqs_hz=np.geomspace(1e-3, 500.0, 300))
+    assert model.nominal == 1
+    at_top = max(abs(1 - (0.1 / 1.9) / ((1 - a) / (1 + a))) for a in (0.88, 0.92))
+    np.testing.assert_allclose(model.bounds[model.form][-1], at_top, rtol=1e-10)
+    np.testing.assert_allclose(model.cover.entries()[-1, 0, 0], at_top, rtol=1e-9)
+    assert model.misfit_max < 1e-12
+    assert model.remainder is None
+
+
+@settings(max_examples=5, deadline=None)
+@given(seed=st.integers(0, 1000), exponents=st.lists(st.integers(-4, 4), min_size=5, max_size=5))
+def test_units_of_measure_and_order_of_units_do_not_matter(seed: int, exponents: list[int]) -> None:
+    """Channels in other units with the matching ranges, and units in another order, give the same covers."""
+    units, freqs = drives(5, seed), np.geomspace(1.0, 500.0, 24)
+    out, into = 10.0 ** np.array(exponents[:3]), 10.0 ** np.array(exponents[3:])
+    options = {"tolerance_db": 20.0, "density": 1, "max_order": 1}
+    plain = quantify(units, "input_multiplicative", freqs, **options)
+    other = StateSpace(units.A, units.B / into, units.C * out[:, None], units.D, DT)
+    scaled = quantify(other, "input_multiplicative", freqs, output_scale=out, input_scale=into, **options)
+    shuffled = quantify(units[[3, 1, 4, 0, 2]], "input_multiplicative", freqs, **options)
+    for form, peak in plain.peak_db.items():
+        assert scaled.peak_db[form] == pytest.approx(peak, rel=1e-6)
+        assert shuffled.peak_db[form] == pytest.approx(peak, rel=1e-9)
+    assert scaled.nominal == plain.nominal
+    np.testing.assert_allclose(shuffled.cover.entries(), plain.cover.entries(), rtol=1e-6)
+    np.testing.assert_allclose(scaled.cover.entries(), plain.cover.entries(), rtol=1e-5)
+
+
+def test_identical_units_have_no_uncertainty() -> None:
+    one = drives(1, 4)
+    units = StateSpace(*(np.repeat(getattr(one, x), 3, axis=0) for x in "ABCD"), DT)
+    model = quantify(units, freqs_hz=np.geomspace(1.0, 500.0, 20))
+    assert model.cover_max == 0
+    assert model.peak_db[model.form] == -np.inf
+    assert not model.weight.left.D.any()
+
+
+def test_nominal_may_be_named_or_brought_along(tmp_path: Path) -> None:
+    units, freqs = drives(4, 5), np.geomspace(1.0, 500.0, 30)
+    ids = ("a", "b", "c", "d")
+    assert quantify(units, freqs_hz=freqs, unit_ids=ids, nominal="c", max_order=1).nominal == 2
+    mean = StateSpace(units.A.mean(axis=0), units.B.mean(axis=0), np.eye(3), np.zeros((3, 2)), DT)
+    pooled = quantify(units, freqs_hz=freqs, unit_ids=ids, nominal=mean, max_order=1)
+    assert (pooled.nominal, pooled.nominal_id) == (-1, "pooled")
+    assert slow_ratio(pooled, units, np.array([1.3, 40.0, 333.0])) <= 1 + 1e-6
+    pooled.save(tmp_path)
+    loaded = UncertainModel.load(tmp_path)
+    assert loaded.peak_db == pooled.peak_db
+    assert loaded.weight.left_orders == pooled.weight.left_orders
+    assert loaded.nominals == pooled.nominals
+    np.testing.assert_array_equal(loaded.weight.left.A, pooled.weight.left.A)
+    np.testing.assert_array_equal(loaded.misfit, pooled.misfit)
+    with pytest.raises(ConfigError, match="'z'"):
+        quantify(units, freqs_hz=freqs, unit_ids=ids, nominal="z")
+    with pytest.raises(ConfigError, match="range"):
+        quantify(units, freqs_hz=freqs, nominal=9)
+
+
+def test_bad_input_is_refused() -> None:
+    units = drives(3, 6)
+    with pytest.raises(DataError, match="two units"):
+        quantify(units[[0]])
+    with pytest.raises(DimensionError, match="unit axis"):
+        quantify(units[0])
+    with pytest.raises(ConfigError, match="Nyquist"):
+        quantify(units, freqs_hz=[1.0, 600.0])
+    with pytest.raises(ConfigError, match="unknown"):
+        quantify(units, "nonsense")
+    with pytest.raises(ConfigError, match="diagonal"):
+        quantify(units, freqs_hz=[1.0, 2.0], structure="full")
+    with pytest.raises(DimensionError, match="output_scale"):
+        quantify(units, output_scale=[1, 2])
+    with pytest.raises(DimensionError, match="differ"):
+        quantify([units[0], StateSpace(units.A[1], units.B[1], np.eye(3), np.zeros((3, 2)), 2 * DT)])
+    unstable = StateSpace(np.stack([units.A[0], 1.2 * np.eye(3)]), units.B[:2], units.C[:2], units.D[:2], DT)
+    with pytest.raises(DataError, match="unstable"):
+        quantify(unstable, unit_ids=("a", "b"))
+    broken = StateSpace(units.A * np.array([1, np.nan, 1])[:, None, None], units.B, units.C, units.D, DT)
+    with pytest.raises(DataError, match="unit 1 has NaN"):
+        quantify(broken)
+    with pytest.raises(DataError, match="continuous"):
+        quantify(StateSpace(-np.abs(units.A), units.B, units.C, units.D, 0.0))

@@ -174,9 +174,9 @@ def check(
         typer.echo(json.dumps(scores, indent=1, ensure_ascii=False))
     else:
         for row in scores:
-            typer.echo(
-                f"{row['unit']}  {row['condition']}  score {row['score']:.2f} (threshold {row['threshold']:.2f})  {'OUTLIER' if row['outlier'] else 'ok'}"
-            )
+            threshold = "none, too few units" if row["threshold"] is None else f"{row['threshold']:.2f} dB"
+            verdict = "OUTLIER" if row["outlier"] else "ok"
+            typer.echo(f"{row['unit']}  {row['condition']}  score {row['score']:.2f} dB (threshold {threshold})  {verdict}")
     if any(row["outlier"] for row in scores):
         raise typer.Exit(NOT_MET)
 

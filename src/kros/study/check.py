@@ -18,6 +18,7 @@ from .estimate import check_channels, load_calibration, open_data, unit_paramete
 from .executors import Executor, open_executor
 from .pipeline import load_run
 from .stages.identify import reduce_episodes
+from .stages.quantify import score_row
 from .store import Store
 
 
@@ -30,7 +31,7 @@ def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]
         ``unit, condition, score, threshold, outlier, frequency_hz`` and more, one row a unit and condition that the study knows.
     """
     config, store = load_run(run)
-    folders = sorted(p.parent for p in store.path("outliers").glob("*/outliers.json"))
+    folders = sorted(p.parent for p in store.path("outliers").glob("*/outlier_model.json"))
     if not folders:
         raise ConfigError(f"Run {run}: has no outlier scores to compare with; run the study until quantify, with at least three units.")
     population = open_data(config, data)
@@ -78,10 +79,8 @@ def score_condition(
             "status": ("ok",) * len(units),
         }
     )
-    from .stages.quantify import scaled_responses
-
-    responses = scaled_responses(fresh, units, outliers.freqs_hz)
-    return [{"condition": models.condition, **row} for row in outliers.score(responses, units)]
+    responses = fresh.systems().frequency_response(outliers.freqs_hz)
+    return [score_row(outliers.score(unit, response), models.condition) for unit, response in zip(units, responses, strict=True)]
 
 
 def training_keys(population: Population) -> dict[tuple[str, str], tuple[EpisodeKey, ...]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,7 +16,6 @@ from ..observer import Observer, kalman_candidates, noise_covariances
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, worst_case_h2
 from .tuning import TuningSet
 
-log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 IDENTITY, TUNED = "identity", "tuned"
 _CORNERS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)
@@ -92,7 +90,6 @@ def produce(task: Task) -> Product:
     try:
         synthesis, facts, problem = MAKERS[task.method](task)
     except SynthesisError as error:
-        log.warning("%s: %s", task.name, error)
         return Product(task.name, None, {"status": "failed", "reason": str(error)}, task.problem)
     return Product(task.name, synthesis, facts, problem)
 

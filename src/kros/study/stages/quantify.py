@@ -14,7 +14,7 @@ from ...core.errors import IdentificationError
 from ...core.frequency import log_grid
 from ...core.norms import hinf_norm
 from ...identify import ModelSet
-from ...uncertainty import OutlierModel, UncertainModel, quantify, residual, sigma_max
+from ...uncertainty import OutlierScore, UncertainModel, quantify, residual, score_outliers, sigma_max
 from ..config import UncertaintyConfig
 from ..context import Context
 
@@ -107,20 +107,25 @@ def score_units(context: Context) -> tuple[list[Path], set[str]]:
         if len(models.unit_ids) < 3:
             log.info("%s: outlier scores need at least three units, found %d", condition, len(models.unit_ids))
             continue
-        outliers = OutlierModel.fit(
-            scaled_responses_on_grid(models, context.config.uncertainty),
-            models.unit_ids,
-            form=context.config.uncertainty.form,
+        freqs = log_grid(models.sample_period_s, context.config.uncertainty.n_freqs)
+        outliers = score_outliers(
+            models.systems().frequency_response(freqs),
+            freqs,
+            context.config.uncertainty.form,
+            unit_ids=models.unit_ids,
+            output_scale=models.output_scale,
+            input_scale=models.input_scale,
             false_alarm_rate=context.config.uncertainty.false_alarm_rate,
         )
         place = context.model_folder(name, condition).name
         outliers.save(folder / place)
         files += sorted((folder / place).iterdir())
-        rows += [{"condition": condition, **row} for row in outliers.rows()]
+        rows += [score_row(score, condition) for score in outliers.scores]
     write_json(folder / "scores.json", {"schema": 1, "rows": rows})
     return [*files, folder / "scores.json"], {row["unit"] for row in rows if row["outlier"]}
 
 
-def scaled_responses_on_grid(models: ModelSet, config: UncertaintyConfig) -> Array:
-    """Return scaled responses on the default grid."""
-    return scaled_responses(models, list(models.unit_ids), log_grid(models.sample_period_s, config.n_freqs))
+def score_row(score: OutlierScore, condition: str) -> dict[str, Any]:
+    """Return a score as a row of metrics, with where it comes from."""
+    row = {"unit": score.unit, "condition": condition, "score": score.score_db, "threshold": score.threshold_db, "outlier": score.outlier}
+    return row | {"freq_hz": score.freq_hz, "entry": score.entry}

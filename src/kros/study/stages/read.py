@@ -74,6 +74,8 @@ def read_group(task: GroupTask) -> GroupFacts:
     else:
         record = write_group(task.population, task.unit, task.condition, task.folder, task.on_nan)
         episodes, population = record.episodes, task.population
+    if not episodes:
+        raise DataError(f"Unit {task.unit} ({task.condition}): every episode was dropped; fix the source or leave the unit out.")
     first = population.read(EpisodeKey(task.unit, task.condition, episodes[0]))
     names = population.states + population.inputs
     return GroupFacts(task.unit, task.condition, record, episodes, {m: resolution(first[:, names.index(m)]) for m in population.measured})

@@ -34,7 +34,9 @@ def run(context: Context) -> list[Path]:
     files, facts = [], {}
     for task, product in zip(tasks, products, strict=True):
         facts[task.name] = dict(product.facts)
-        if product.synthesis is not None:
+        if product.synthesis is None:
+            log.warning("%s could not be made: %s", task.name, product.facts["reason"])
+        else:
             facts[task.name] |= certificate(task, product.synthesis, certified_problem(task, tasks, products))
             files += save(context, task, product.synthesis)
     made = [p.name for p in products if p.synthesis is not None]

@@ -19,12 +19,15 @@ class Cell:
         Shown smaller, behind the text.
     bar : float or None
         Share of the cell's width that is shaded, 0 to 1.
+    long : bool
+        A sentence that may take several lines.
     """
 
     text: str
     strong: bool = False
     note: str = ""
     bar: float | None = None
+    long: bool = False
 
 
 @dataclass(frozen=True)

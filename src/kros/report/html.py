@@ -10,7 +10,7 @@ from ..core.artifacts import write_bytes
 from .encode import to_svg
 from .figures import draw_all
 from .names import condition_label
-from .run_folder import NotShownError, RunFolder
+from .run_folder import RunFolder
 from .sections import SECTIONS
 from .theme import Tone
 from .verdict import verdict
@@ -63,19 +63,11 @@ def page(run: RunFolder, metrics: Mapping[str, Any]) -> str:
     return environment.get_template("report.html.jinja").render(
         name=run.study.get("name", run.folder.name),
         subtitle=_subtitle(metrics),
-        verdict=verdict(metrics, measured_channels(run)),
+        verdict=verdict(metrics, run.measured_states),
         sections=[s for s in (section(run, metrics) for section in SECTIONS) if s is not None],
         figures=figures,
         style=Markup(stylesheet()),
     )
-
-
-def measured_channels(run: RunFolder) -> tuple[str, ...]:
-    """Return the states that are measured at run time; none where the run does not know its channels yet."""
-    try:
-        return tuple(c.name for c in run.channels if c.measured)
-    except NotShownError:
-        return ()
 
 
 def stylesheet() -> str:

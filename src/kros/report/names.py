@@ -119,7 +119,8 @@ def main_observers(names: Sequence[str], deployed: str | None) -> list[str]:
     first = deployed if deployed in known else (robust or known or [""])[0]
     model, method = split_observer(first)
     other = model.replace("koopman", "linear") if is_koopman(model) else model.replace("linear", "koopman")
-    wanted = [f"{other}/{method}", f"{model}/open_loop", f"{model}/kalman_tuned", first]
+    twin = next((n for n in (f"{other}/{m}" for m in (method, "worst_case_h2", "mixed", "kalman_tuned")) if n in known), "")
+    wanted = [twin, f"{model}/open_loop", f"{model}/kalman_tuned", first]
     return [n for n in dict.fromkeys(wanted) if n in known]
 
 

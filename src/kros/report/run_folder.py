@@ -93,6 +93,14 @@ class RunFolder:
         return next(iter(self.models.values())).channels if models.is_dir() and any(models.iterdir()) else self.population.channels
 
     @property
+    def measured_states(self) -> tuple[str, ...]:
+        """States that are measured at run time; none where the run does not know its channels yet."""
+        try:
+            return tuple(c.name for c in self.channels if c.measured)
+        except NotShownError:
+            return ()
+
+    @property
     def sample_period_s(self) -> float:
         """Sampling period, s."""
         models = self.folder / "models"

@@ -47,7 +47,7 @@ def draw_certificates(axes: Axes, certified: Mapping[str, float], bounds: Mappin
             axes.plot(bound, place, "|", ms=9, mew=1.8, color=Tone.INK.light)
         axes.plot(certified[name], place, "o", ms=5.5, color=colour)
     axes.set_xscale("log")
-    plain_log_ticks(axes, [v for v in [*certified.values(), *bounds.values()] if v])
+    plain_log_ticks(axes, [v for v in [*certified.values(), *bounds.values()] if v], most=7)
     axes.set_yticks(range(len(order)), [observer_label(n) for n in order])
     for label, name in zip(axes.get_yticklabels(), order, strict=True):
         label.set_fontweight("bold" if name == deployed else "normal")

@@ -6,6 +6,7 @@ Needs: the evaluation.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import ceil, floor, log10
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -80,12 +81,22 @@ def _keep_comparable(axes: Axes, cells: Sequence[ErrorCell | None]) -> None:
         plain_log_ticks(axes, [v for v in values if v <= 1e4 * min(values)])
 
 
-def plain_log_ticks(axes: Axes, values: Sequence[float]) -> None:
-    """Fit a logarithmic axis around values and number it in plain figures, at least three of them."""
-    from matplotlib.ticker import LogLocator, NullFormatter
+def plain_log_ticks(axes: Axes, values: Sequence[float], most: int = 3) -> None:
+    """Fit a logarithmic axis around values and number it in plain figures, as many as there is room for."""
+    from matplotlib.ticker import FixedLocator, NullLocator
 
     low, high = min(values) / 1.6, max(max(values) * 1.6, 4 * min(values))
     axes.set_xlim(low, high)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low < 30 else (1, 3) if high / low < 1000 else (1,), numticks=20))
+    axes.xaxis.set_major_locator(FixedLocator(log_ticks(low, high, most)))
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_minor_locator(NullLocator())
+
+
+def log_ticks(low: float, high: float, most: int = 3) -> list[float]:
+    """Return at most `most` round numbers between two positive ones, in the densest steps that allows it."""
+    exponents = range(floor(log10(low)), ceil(log10(high)) + 1)
+    for steps in ((1, 2, 5), (1, 3), (1,)):
+        found = [s * 10.0**e for e in exponents for s in steps if low <= s * 10.0**e <= high]
+        if len(found) <= most:
+            return found
+    return found[:: ceil(len(found) / most)]

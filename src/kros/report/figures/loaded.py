@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from ...evaluate.errors import error_spectrum
 from ..canvas import grid, legend, logarithmic
-from ..names import condition_label, main_observers, observer_label, observer_look, split_observer
+from ..names import BASELINES, condition_label, main_observers, observer_label, observer_look, split_observer
 from ..run_folder import NotShownError, RunFolder, Shown
 from .drawing import Drawing
 from .spectra import band
@@ -22,7 +22,7 @@ def draw(run: RunFolder) -> Drawing:
     shown = next((s for s in run.shown if s.key.condition != run.identify_on), None)
     if shown is None or not shown.observers:
         raise NotShownError("the recordings have one condition only")
-    names = [n for n in main_observers(list(shown.observers), run.deployed) if split_observer(n)[1] not in ("open_loop", "kalman_tuned")]
+    names = _compared(list(shown.observers), run.deployed)
     channels = states(run)[:4]
     figure, axes = grid(len(channels), 3, 1.35, width_ratios=(1.5, 1, 1))
     window, band_hz = steady_window(run, shown, _ZOOM_S), run.evaluation.get("band_hz")
@@ -47,6 +47,13 @@ def draw(run: RunFolder) -> Drawing:
     axes[-1, 2].set_xlabel("frequency (Hz)")
     legend(figure, axes[0, 0])
     return Drawing(figure, _caption(run, shown))
+
+
+def _compared(observers: list[str], deployed: str | None) -> list[str]:
+    """The observer that is handed over and its twin; beside a lonely one the tuned Kalman filters."""
+    main = [n for n in main_observers(observers, deployed) if split_observer(n)[1] != "open_loop"]
+    robust = [n for n in main if split_observer(n)[1] not in BASELINES]
+    return robust if len(robust) > 1 else main
 
 
 def _errors(shown: Shown, names: list[str], channel: int) -> list[Line]:

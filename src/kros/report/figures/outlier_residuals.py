@@ -1,6 +1,6 @@
 """Residual of the most conspicuous unit against those of all the others, entry by entry (the paper's Figure 15).
 
-Needs: outlier scores, models in the condition of the highest score, the choice of the nominal unit.
+Needs: outlier scores, models in the condition of the highest score.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 NAME, TITLE = "outlier_residuals", "Residuals of the most conspicuous unit"
 Array = npt.NDArray[Any]
-_POINTS = 120
+_POINTS, _NOMINALS, _MOST = 120, 24, 200
 _INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
 
 
@@ -36,42 +36,54 @@ def draw(run: RunFolder) -> Drawing:
     top = max(rows, key=lambda r: (bool(r["outlier"]), float(r["score"])))
     models = run.condition_models(next(iter(run.models)), top["condition"])
     form = next(iter(run.uncertain.values())).form
-    others = [u for u in models.unit_ids if u != top["unit"] and not _flagged(rows, u, top["condition"])]
-    nominal = str(run.choice["nominal"])
-    nominal = nominal if nominal in others else others[0]
+    flagged = {r["unit"] for r in rows if r["outlier"] and r["condition"] == top["condition"]}
+    others = [u for u in models.unit_ids if u != top["unit"] and u not in flagged][:_MOST]
     freqs = log_grid(models.sample_period_s, _POINTS, decades=5)
-    E = _residuals(models, form, nominal, [*others, top["unit"]], freqs)
-    names = models.inputs if form in _INPUT_SIDE else tuple(str(i + 1) for i in range(max(E.shape[-2:])))
-    figure, axes = grid(E.shape[-2], E.shape[-1], 1.7, sharex=True, sharey=True)
+    levels = typical_residuals(models, form, others, top["unit"], freqs)
+    names = models.inputs if form in _INPUT_SIDE else tuple(str(i + 1) for i in range(max(levels.shape[-2:])))
+    figure, axes = grid(levels.shape[-2], levels.shape[-1], 1.7, sharex=True, sharey=True)
     for i, row in enumerate(axes):
         for j, panel in enumerate(row):
-            _panel(panel, freqs, decibel(E[..., i, j]), top["unit"])
+            _panel(panel, freqs, levels[..., i, j], top["unit"])
             panel.set_title(f"{_short(names[j])} → {_short(names[i])}")
     for panel in axes[-1]:
         frequency_axis(panel, freqs)
     for panel in axes[:, 0]:
         panel.set_ylabel("residual (dB)")
-    low, high = _limits(decibel(E))
-    axes[0, 0].set_ylim(low, high)
+    axes[0, 0].set_ylim(*_limits(levels))
     legend(figure, axes[0, 0])
-    return Drawing(figure, _caption(top, form, nominal))
+    return Drawing(figure, _caption(top, form))
 
 
-def _flagged(rows: list[dict[str, Any]], unit: str, condition: str) -> bool:
-    return any(r["outlier"] for r in rows if (r["unit"], r["condition"]) == (unit, condition))
+def typical_residuals(models: ModelSet, form: Form, others: list[str], unit: str, freqs: Array) -> Array:
+    """Return entries of the residuals, dB: the median over the other units, each taken as nominal once.
 
+    Parameters
+    ----------
+    models : ModelSet
+    form : Form
+    others : list of str
+        Units that count as the batch.
+    unit : str
+        Unit that is looked at; comes last.
+    freqs : ndarray, shape (frequency,), Hz
 
-def _residuals(models: ModelSet, form: Form, nominal: str, units: list[str], freqs: Array) -> Array:
-    """Residuals of units against the nominal one in scaled signals, shape (unit, frequency, p', m')."""
-    response = models.systems([nominal, *units]).frequency_response(freqs) * models.input_scale / models.output_scale[:, None]
-    return residual(form, response[0], response[1:])
+    Returns
+    -------
+    ndarray, shape (len(others) + 1, frequency, p', m')
+    """
+    response = models.systems([*others, unit]).frequency_response(freqs) * models.input_scale / models.output_scale[:, None]
+    chosen = np.unique(np.linspace(0, len(others) - 1, min(_NOMINALS, len(others))).round().astype(int))
+    levels = np.stack([decibel(residual(form, response[k], response)) for k in chosen])
+    levels[np.arange(len(chosen)), chosen] = np.nan  # a unit against itself says nothing
+    alone = len(chosen) == 1
+    return np.nanmedian(levels[:, 1:] if alone else levels, axis=0)
 
 
 def _panel(axes: Axes, freqs: Array, lines: Array, unit: str) -> None:
     from matplotlib.collections import LineCollection
 
-    with np.errstate(invalid="ignore"):
-        top = np.nanmax(np.where(np.isfinite(lines[:-1]), lines[:-1], -400.0), axis=0)
+    top = lines[:-1].max(axis=0)
     paths = [np.column_stack([freqs, line]) for line in lines[:-1] if np.isfinite(line).all()]
     axes.add_collection(LineCollection(paths, colors=Tone.BLUE.light, linewidths=0.6, alpha=0.3, label=f"{len(lines) - 1} others"))
     axes.plot(freqs, top, color=Tone.BLUE.light, lw=1.3, label="largest of the others")
@@ -88,9 +100,10 @@ def _short(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _caption(top: dict[str, Any], form: Form, nominal: str) -> str:
+def _caption(top: dict[str, Any], form: Form) -> str:
     state = "flagged" if top["outlier"] else "not flagged, but the highest score"
     return (
-        f"Entries of the {form_label(form.value)} residual against unit {nominal}, {condition_label(top['condition'])}. "
-        f"Unit {top['unit']} ({state}) beside all others: a unit is conspicuous where it leaves their envelope."
+        f"Entries of the {form_label(form.value)} residual, {condition_label(top['condition'])}; every other unit is the nominal "
+        "one in turn, and the median is shown, so that "
+        f"no single nominal decides. Unit {top['unit']} ({state}) beside all others: it is conspicuous where it leaves their envelope."
     )

@@ -34,10 +34,10 @@ def draw(run: RunFolder) -> Drawing:
     for panel, condition in zip(axes[:, 0], conditions, strict=True):
         _panel(panel, [r for r in rows if r["condition"] == condition], units)
         panel.set_title(condition_label(condition))
-        panel.set_ylabel("score")
+        panel.set_ylabel("score (dB)")
     units_axis(axes[-1, 0], units)
     flagged = sorted({r["unit"] for r in rows if r["outlier"]}, key=natural_key)
-    text = "Score of every unit against the cover of all the others, in each condition. Dashed: the threshold for the stated rate of false alarms. "
+    text = "How far every unit sticks out of the cover of all the others, in each condition. Dashed: threshold for the stated rate of false alarms. "
     return Drawing(figure, text + (f"Above it: {', '.join(flagged)}." if flagged else "No unit is above it."))
 
 
@@ -58,7 +58,7 @@ def _panel(axes: Axes, rows: list[dict[str, Any]], units: list[str]) -> None:
                 size=7.5,
                 color=tone.light,
             )
-    threshold = next((r["threshold"] for r in rows if r.get("threshold") is not None), None)
+    threshold = next((r[key] for r in rows for key in ("threshold", "threshold_db") if r.get(key) is not None), None)
     if threshold is not None and np.isfinite(threshold):
         axes.axhline(threshold, color=Tone.SOFT.light, lw=0.9, ls="--")
         axes.annotate(

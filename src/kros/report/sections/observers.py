@@ -17,12 +17,13 @@ def result(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     if not tables:
         return None
     deployed = metrics["study"].get("deployed")
+    measured = run.measured_states
     text = (
         "RMS error in percent of the signal's range on held-out episodes that nothing was fitted to. Off nominal: mean over the "
         "units other than the nominal one, and the "
         "worst of them. Best of each column in bold; the observer that is handed over is set off."
     )
-    return Section("results", "Results", [text], [errors(t, deployed) for t in tables], ["errors"])
+    return Section("results", "Results", [text], [errors(t, deployed, measured) for t in tables], ["errors"])
 
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
@@ -37,16 +38,17 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     return Section("observers", "Observers at work", [text], [], ["observers_in_time", "observer_spectra"])
 
 
-def errors(table: ErrorTable, deployed: str | None) -> Table:
-    """Return one condition's errors as a table."""
+def errors(table: ErrorTable, deployed: str | None, measured: tuple[str, ...] = ()) -> Table:
+    """Return one condition's errors as a table, channels that are measured last."""
+    channels = sorted(table.channels, key=lambda c: c in measured)
     rows = []
     for observer in table.observers:
         cells = [Cell(observer_label(observer))]
-        for channel in table.channels:
+        for channel in channels:
             cells += _cells(table, channel, table.cells[observer].get(channel))
         rows.append(cells)
-    head = ["observer", *(["nominal", "mean", "worst"] * len(table.channels))]
-    groups = [("", 1), *((c.replace("_", " ") + ("" if c in table.ranked else ": the load's torque"), 3) for c in table.channels)]
+    head = ["observer", *(["nominal", "mean", "worst"] * len(channels))]
+    groups = [("", 1), *((c.replace("_", " ") + ("" if c in table.ranked else " (not ranked)"), 3) for c in channels)]
     emphasised = [i for i, o in enumerate(table.observers) if o == deployed]
     caption = f"Errors in percent, {condition_label(table.condition)}."
     if len(table.ranked) < len(table.channels):

@@ -17,7 +17,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section:
     filed = [u for u, group in facts["groups"].items() if group == OUTLIERS]
     episodes = {c: [sum(row[1] == c for row in facts[part]) for part in ("train", "test")] for c in study["conditions"]}
     counts = "; ".join(f"{condition_label(c)}: {train} for training, {test} held out" for c, (train, test) in episodes.items())
-    text = f"{study['units']} units, sampled every {number(1e3 * study['sample_period_s'])} ms. Episodes: {counts}. "
+    text = f"{study['units']} units, sampled every {1e3 * study['sample_period_s']:g} ms. Episodes: {counts}. "
     if len(episodes) > 1:
         text += f"Models, uncertainty and observers come from “{condition_label(study['identify_on'])}” alone; the rest only tests them. "
     if filed:

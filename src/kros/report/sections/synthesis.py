@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..content import Cell, Section, Table
-from ..names import number, observer_label
+from ..names import BASELINES, number, observer_label, split_observer
 from ..run_folder import RunFolder
 
 _TEXT = (
@@ -19,6 +19,18 @@ _TEXT = (
     "and says nothing about robustness."
 )
 
+_HEAD = (
+    "observer",
+    "status",
+    "filter states",
+    "certified worst case",
+    "lower bound",
+    "gap (%)",
+    "spectral radius",
+    "as it runs",
+    "solved in (s)",
+)
+
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     """Return the certificate table."""
@@ -27,36 +39,43 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         return None
     deployed = metrics["study"].get("deployed")
     rows = [_row(name, entry) for name, entry in observers.items()]
-    head = [
-        "observer",
-        "status",
-        "filter states",
-        "certified worst case",
-        "lower bound",
-        "gap (%)",
-        "spectral radius",
-        "as it runs",
-        "solved in (s)",
-    ]
+    head, rows = _without_empty(_HEAD, rows)
     emphasised = [i for i, name in enumerate(observers) if name == deployed]
     caption = "Certificates. “As it runs”: one bound for the observer with its state lifted anew at every step, for any unit. Handed over: the row set off."
-    failed = [f"{observer_label(n)}: {e['reason']}" for n, e in observers.items() if e.get("reason")]
-    return Section(
-        "synthesis", "Synthesis", [_TEXT, *failed], [Table(head, rows, caption, emphasised=emphasised)], ["synthesis", "certificates"]
-    )
+    tables = [Table(head, rows, caption, emphasised=emphasised), *_remarks(run)]
+    return Section("synthesis", "Synthesis", [_TEXT], tables, ["synthesis", "certificates"])
+
+
+def _without_empty(head: Sequence[str], rows: list[list[Cell]]) -> tuple[list[str], list[list[Cell]]]:
+    """Drop columns in which nothing is known."""
+    kept = [i for i in range(len(head)) if any(row[i].text != "–" for row in rows)]
+    return [head[i] for i in kept], [[row[i] for i in kept] for row in rows]
+
+
+def _remarks(run: RunFolder) -> list[Table]:
+    """Reasons why there is no observer, or no certificate; observers with the same reason share a row."""
+    reasons: dict[tuple[str, str], list[str]] = {}
+    for name, facts in run.observers_record["facts"].items():
+        if facts.get("reason"):
+            what = "no observer" if facts.get("status") == "failed" else "no certificate"
+            reason = "; ".join(dict.fromkeys(facts["reason"].split("; ")))
+            reasons.setdefault((what, reason), []).append(observer_label(name))
+    rows = [[Cell("; ".join(names)), Cell(what, strong=True), Cell(reason, long=True)] for (what, reason), names in reasons.items()]
+    return [Table(["observer", "", "reason"], rows, "What could not be made or certified, and why")] if rows else []
 
 
 def _row(name: str, entry: Mapping[str, Any]) -> list[Cell]:
-    relift = entry.get("relift_certified")
+    relift, radius = entry.get("relift_certified"), entry.get("spectral_radius_max")
     running = "–" if relift is None else (f"gain {number(entry.get('relift_gain'))}" if relift else "no certificate")
-    radius = entry.get("spectral_radius_max")
+    # A baseline's own optimum bounds its own objective, not the worst case.
+    bound = entry.get("lower_bound") if split_observer(name)[1] not in BASELINES else None
     return [
         Cell(observer_label(name)),
         Cell(entry.get("status") or "–"),
         Cell("–" if entry.get("order") is None else str(entry["order"])),
         Cell(number(entry.get("worst_case_h2"), 4)),
-        Cell(number(entry.get("lower_bound"), 4)),
-        Cell(number(entry.get("gap_percent"))),
+        Cell(number(bound or None, 4)),
+        Cell(number(entry.get("gap_percent") if bound else None)),
         Cell("–" if radius is None else f"{radius:.6f}", strong=radius is not None and radius >= 1),
         Cell(running),
         Cell(number(entry.get("solve_s"))),

@@ -86,25 +86,21 @@ class Ball:
         P = T @ self.left
         _, _, Vh_p = np.linalg.svd(P)
         U_q, _, _ = np.linalg.svd(self.right)
-        best: Array | None = None
-        best_value: Array | None = None
         starts = (
             _polar(_hermitian(self.left) @ self.center @ _hermitian(self.right)),  # aligned with the centre
             _polar(_hermitian(P) @ (T @ self.center) @ _hermitian(self.right)),  # aligned with the centre, as T sees it
             _hermitian(Vh_p) @ _hermitian(U_q),  # worst without the centre
         )
+        best, best_value = np.zeros_like(self.center), np.full(T.shape[:-2], -1.0)
         for theta in starts:
-            for _ in range(iterations):
-                error = T @ self.center + P @ theta @ self.right
+            for k in range(iterations + 1):
+                element = self.center + self.left @ theta @ self.right
+                error = T @ element
+                if k in (0, iterations):
+                    value = np.linalg.norm(error, axis=(-2, -1))
+                    better = value > best_value * (1 + 1e-6)
+                    best, best_value = np.where(better[..., None, None], element, best), np.where(better, value, best_value)
                 theta = _polar(_hermitian(P) @ error @ _hermitian(self.right))
-            element = self.center + self.left @ theta @ self.right
-            value = np.linalg.norm(T @ element, axis=(-2, -1))
-            if best is None or best_value is None:
-                best, best_value = element, value
-            else:
-                best = np.where((value > best_value * (1 + 1e-6))[..., None, None], element, best)
-                best_value = np.maximum(value, best_value)
-        assert best is not None
         return np.sum(np.abs(best) ** 2, axis=-1)
 
 

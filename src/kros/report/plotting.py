@@ -62,7 +62,7 @@ def _draw(result: Any) -> Figure:
     )
 
 
-@_draw.register
+@_draw.register(Population)
 @styled
 def _population(result: Population) -> Figure:
     if not result.episodes:
@@ -84,7 +84,7 @@ _draw.register(ModelSet, styled(bode_figure))
 _draw.register(UncertainModel, styled(uncertain_figure))
 
 
-@_draw.register
+@_draw.register(Synthesis)
 @styled
 def _synthesis(result: Synthesis) -> Figure:
     figure, axes = grid(1, 2, 2.6, legend_rows=0, width_ratios=(1.6, 1))

@@ -66,10 +66,10 @@ def _comparison(table: ErrorTable, name: str, method: str, label: str, channels:
     )
     if other is None or other == name:
         return []
-    parts = []
-    for channel in channels:
-        own, theirs = table.cells[name][channel].mean, table.cells[other][channel].mean
-        parts.append(f"{channel.replace('_', ' ')} " + ("diverges" if theirs is None else f"{number(theirs)} %{_ratio(own, theirs)}"))
+    theirs = {c: table.cells[other][c].mean for c in channels}
+    if any(value is None for value in theirs.values()):
+        return [f"{label} diverges on some units."]
+    parts = [f"{c.replace('_', ' ')} {number(v)} %{_ratio(table.cells[name][c].mean, v)}" for c, v in theirs.items() if v is not None]
     return [f"{label} gives {_join(parts)}."]
 
 
@@ -79,11 +79,9 @@ def _ratio(own: float | None, theirs: float) -> str:
     ratio = theirs / own
     if 0.99 < ratio < 1.01:
         return " (the same)"
-    return (
-        f" ({number(ratio)} times as much)"
-        if ratio >= 2
-        else (f" ({100 * (ratio - 1):.0f} % more)" if ratio > 1 else f" ({100 * (1 - ratio):.0f} % less)")
-    )
+    if ratio > 1.95:
+        return f" ({number(ratio, 2)} times as much)"
+    return f" ({100 * (ratio - 1):.0f} % more)" if ratio > 1 else f" ({100 * (1 - ratio):.0f} % less)"
 
 
 def _certificate(metrics: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,427 @@
+"""The page, the figures as files and the plots, on a small run folder written by the dataclasses that the stages use."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import numpy.typing as npt
+import pytest
+from matplotlib.figure import Figure
+
+from kros.core.artifacts import save_artifact, write_json
+from kros.core.errors import ConfigError, DataError
+from kros.core.lti import StateSpace, gain
+from kros.data import from_arrays
+from kros.data.population import Channel, Role
+from kros.identify import ModelSet, PhaseCalibration, PhaseSpec, UnitPhase
+from kros.lifting import Lifting
+from kros.observer import Observer
+from kros.report import plot, render, write_figures
+from kros.report.encode import to_svg
+from kros.report.figures import FIGURES, draw_all
+from kros.report.figures.forms import paper_bounds
+from kros.report.figures.outlier_residuals import typical_residuals
+from kros.report.figures.synthesis_bode import scaled_filter
+from kros.report.figures.trajectories import longest_steady, steady_stretches
+from kros.report.run_folder import NotShownError, RunFolder
+from kros.report.theme import Tone
+from kros.synthesis.result import Injection, Status, Synthesis
+from kros.uncertainty import Form, UncertainModel, quantify, residual
+
+DT = 0.001
+UNITS = ("000000", "001", "002", "003", "0<b>4")
+STATES = ("position", "velocity", "current")
+CHANNELS = (
+    Channel("position", Role.STATE, "rad", measured=True),
+    Channel("velocity", Role.STATE, "rad/s"),
+    Channel("current", Role.STATE, "1"),
+    Channel("target_position", Role.INPUT, "rad"),
+    Channel("target_velocity", Role.INPUT, "rad/s"),
+)
+METHODS = ("open_loop", "kalman_tuned", "mixed", "worst_case_h2")
+Array = npt.NDArray[np.float64]
+
+
+def models(name: str, condition: str, seed: int) -> ModelSet:
+    """Stable models of five units that differ by a few percent; the first differs by more."""
+    rng = np.random.default_rng(seed)
+    lifting = Lifting(STATES, ("sin(100*position + phase)",), ("phase",)) if name.startswith("koopman") else Lifting(STATES)
+    n, m = lifting.n_lifted, 2
+    base = 0.9 * np.eye(n) + 0.02 * rng.standard_normal((n, n))
+    spread = np.array([0.2, 0.01, 0.02, 0.03, 0.02])[:, None, None]
+    A = base + 0.02 * spread * rng.standard_normal((5, n, n))
+    B = 0.1 * rng.standard_normal((n, m)) * (1 + spread * rng.standard_normal((5, n, m)))
+    parameters = {"phase": np.linspace(0.1, 5.0, 5)} if lifting.parameters else {}
+    covariance = np.broadcast_to(np.eye(n), (5, n, n))
+    return ModelSet(
+        name, condition, lifting, CHANNELS, DT, UNITS, A, B, parameters, covariance, np.full(n, 2.0), np.full(m, 3.0), 90.0, ("ok",) * 5
+    )
+
+
+@pytest.fixture(scope="session")
+def uncertain() -> dict[str, UncertainModel]:
+    found = {}
+    for name in ("koopman_edmd", "linear_edmd"):
+        found[name] = quantify(models(name, "noload", 1), freqs_hz=np.geomspace(0.1, 500, 60), unit_ids=UNITS[1:], max_order=2, density=3)
+    return found
+
+
+def synthesis(n: int, method: str) -> Synthesis:
+    bound = 0.8 if method == "worst_case_h2" else None
+    return Synthesis(
+        method, gain(np.full((n, 1), 0.25), DT), Status.CERTIFIED, Injection.STATE, worst_case_h2=1.0 if bound else None, lower_bound=bound
+    )
+
+
+def shown_signals(seed: int) -> tuple[Array, Array]:
+    """Six seconds, forward and back at constant speed with an oscillation at 50 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(6000) * DT
+    speed = np.pi * np.where(t < 3, 1.0, -1.0) * (np.minimum(np.minimum(t % 3, 3 - t % 3), 0.2) / 0.2)
+    position = np.cumsum(speed) * DT
+    velocity = speed + 0.02 * np.sin(100 * position) + 1e-4 * rng.standard_normal(t.size)
+    current = 0.2 * np.tanh(speed) + 0.02 * np.sin(100 * position)
+    return np.column_stack([position, velocity, current]), np.column_stack([position, speed])
+
+
+def write_read_stage(run: Path) -> None:
+    write_json(run / "study.json", {"name": "tiny & small", "data": {"reader": "parquet"}})
+    groups = {u: "outliers" if u == "000000" else "population" for u in UNITS}
+    keys = [[u, c, "1"] for u in UNITS for c in ("load", "noload")]
+    facts = {
+        "recordings": "recordings",
+        "identify_on": "noload",
+        "groups": groups,
+        "train": keys,
+        "test": keys,
+        "resolution": {"position": 1e-6},
+    }
+    save_artifact(run / "population", "facts", {**facts, "dropped": []})
+
+
+def write_models(run: Path, uncertain: dict[str, UncertainModel]) -> None:
+    phases = {u: UnitPhase(0.5 * i, -0.9 - 0.01 * i, 0.99 - 0.1 * (i == 2), 12) for i, u in enumerate(UNITS)}
+    PhaseCalibration(PhaseSpec(), -0.9, phases).save(run / "calibration")
+    for name in uncertain:
+        models(name, "noload", 1).save(run / "models" / name)
+        models(name, "load", 2).save(run / "models" / f"{name}@load")
+        uncertain[name].save(run / "uncertainty" / name)
+    save_artifact(run / "uncertainty", "choice", {"nominal": "001", "worst_off_nominal": "002", "dropped": []})
+    rows = [
+        {
+            "unit": u,
+            "condition": c,
+            "score": 9.0 if (u, c) == ("000000", "load") else -2.0,
+            "threshold": 5.0,
+            "outlier": (u, c) == ("000000", "load"),
+        }
+        for u in UNITS
+        for c in ("load", "noload")
+    ]
+    write_json(run / "outliers" / "scores.json", {"schema": 1, "rows": rows})
+
+
+def write_observers(run: Path) -> list[str]:
+    names = [f"{m}/{k}" for m in ("koopman_edmd", "linear_edmd") for k in METHODS]
+    for name in names:
+        kind, method = name.split("/")
+        found = models(kind, "noload", 1)
+        result = synthesis(found.lifting.n_lifted, method)
+        result.save(run / "synthesis" / name)
+        observer = Observer(name, found.lifting, found.A[1], found.B[1], (0,), found.inputs, result.controller, Injection.STATE, DT)
+        observer.save(run / "observers" / f"{name}.json")
+    facts: dict[str, Any] = {n: {"order": 0, "spectral_radius_max": 0.99, "worst_case_h2": 1.0 + i} for i, n in enumerate(names)}
+    facts["linear_edmd/hinf"] = {"status": "failed", "reason": "a reason; a reason; another"}
+    save_artifact(run / "observers", "observers", {"names": names, "deployed": "koopman_edmd/worst_case_h2", "facts": facts})
+    return names
+
+
+def write_evaluation(run: Path, names: list[str]) -> list[dict[str, Any]]:
+    rng = np.random.default_rng(5)
+    kinds = ["koopman_edmd", "linear_edmd"]
+    shown = [["001", "noload", "1"], ["002", "noload", "1"], ["001", "load", "1"]]
+    arrays: dict[str, Array] = {"freqs_hz": np.linspace(0, 500, 257)}
+    for number in range(len(shown)):
+        states, inputs = shown_signals(number)
+        arrays |= {f"shown{number}/states": states, f"shown{number}/inputs": inputs}
+        for name in names:
+            arrays[f"shown{number}/observer/{name}"] = states + 1e-3 * rng.standard_normal(states.shape)
+        for kind in kinds if number < 2 else []:
+            arrays[f"shown{number}/model/{kind}"] = states + 1e-3 * rng.standard_normal(states.shape)
+    for kind in kinds:
+        arrays[f"spectrum/model/{kind}"] = rng.uniform(1e-6, 1e-4, (257, 3))
+    for name in names:
+        for role in ("nominal", "off_nominal"):
+            for condition in ("load", "noload"):
+                arrays[f"spectrum/{role}/{condition}/{name}"] = rng.uniform(1e-6, 1e-4, (257, 3))
+    arrays["shown0/observer/linear_edmd/mixed"][3000:] = np.inf  # an estimate that diverges
+    roles = dict(zip(UNITS, ["outlier", "nominal", "off_nominal", "off_nominal", "off_nominal"], strict=True))
+    rows = [
+        {
+            "observer": n,
+            "unit": u,
+            "role": roles[u],
+            "condition": c,
+            "channel": x,
+            "rms": 0.1,
+            "error_percent": None if n.endswith("mixed") else 1.0 + i,
+        }
+        for i, n in enumerate(names)
+        for u in UNITS
+        for c in ("load", "noload")
+        for x in STATES
+    ]
+    free = {k: {c: {"median": 1.0 + i, "worst": 2.0 + i} for c in STATES} for i, k in enumerate(kinds)}
+    content = {"rows": rows, "free_run": free, "band_hz": [45.0, 55.0], "roles": roles, "shown": shown, "observers": names, "models": kinds}
+    save_artifact(run / "evaluation", "evaluation", {**content, "states": STATES}, arrays)
+    return rows
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory, uncertain: dict[str, UncertainModel]) -> tuple[Path, dict[str, Any]]:
+    """A finished run and its metrics."""
+    run = tmp_path_factory.mktemp("run")
+    write_read_stage(run)
+    write_models(run, uncertain)
+    names = write_observers(run)
+    rows = write_evaluation(run, names)
+    entry = {
+        "nominal": "001",
+        "form": "inverse_input_multiplicative",
+        "peak_db": {f.value: -10.0 for f in Form},
+        "misfit_max": 0.02,
+        "weight": {"structure": "diagonal", "orders": [[1, 2], [2, 0]], "cover_max": 0.999, "overbound_db_max": 1.2},
+    }
+    metrics = {
+        **early_metrics(),
+        "models": {k: {"order": 4, "spectral_radius_max": 0.99, "freerun_error_percent": {}} for k in ("koopman_edmd", "linear_edmd")},
+        "uncertainty": {k: entry for k in ("koopman_edmd", "linear_edmd")},
+        "observers": {n: {"order": 0, "status": "certified", "worst_case_h2": 1.0, "spectral_radius_max": 0.99} for n in names},
+        "evaluation": rows,
+        "outliers": [{"unit": u, "condition": "load", "score": 1.0, "outlier": u == "000000"} for u in UNITS],
+    }
+    metrics["study"] = {**metrics["study"], "deployed": "koopman_edmd/worst_case_h2"}
+    return run, metrics
+
+
+def early_metrics() -> dict[str, Any]:
+    study = {"units": 4, "conditions": ["load", "noload"], "identify_on": "noload", "sample_period_s": DT}
+    return {"schema": 1, "study": study, "timing_s": {"read": 1.0}, "units": [{"unit": u, "group": "", "status": "ok"} for u in UNITS]}
+
+
+@pytest.fixture(scope="session")
+def page(finished: tuple[Path, dict[str, Any]]) -> str:
+    return render(*finished).read_text(encoding="utf-8")
+
+
+class Outline(HTMLParser):
+    """Collects what a browser would load, and checks that tags are balanced."""
+
+    VOID = frozenset({"meta", "br", "link", "img"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stack: list[str] = []
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.tags: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._note(tag, attrs)
+        if tag not in self.VOID:
+            self.stack.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._note(tag, attrs)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.stack
+        assert self.stack.pop() == tag
+
+    def _note(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            if name in ("href", "xlink:href", "src"):
+                self.links.append(value or "")
+
+
+def outline(page: str) -> Outline:
+    parser = Outline()
+    parser.feed(page)
+    assert parser.stack == []
+    return parser
+
+
+def test_page_stands_alone(page: str) -> None:
+    found = outline(page)
+    assert all(link.startswith("#") for link in found.links)
+    assert not found.tags & {"script", "link", "img", "iframe"}
+    assert "@import" not in page
+    assert re.findall(r"url\((?!#)", page) == []
+    assert len(page) < 6_000_000
+
+
+def test_identifiers_are_unique_and_references_lead_somewhere(page: str) -> None:
+    found = outline(page)
+    assert len(set(found.ids)) == len(found.ids)
+    assert {link[1:] for link in found.links} | set(re.findall(r"url\(#([^)]*)\)", page)) <= set(found.ids)
+
+
+def test_every_figure_is_on_the_page_with_a_caption(page: str) -> None:
+    assert page.count("<figure") == page.count("<figcaption>") == len(FIGURES)
+    assert "is left out" not in page
+
+
+def test_text_is_escaped(page: str) -> None:
+    assert "0<b>4" not in page
+    assert "0&lt;b&gt;4" in page
+    assert "<h1>tiny &amp; small</h1>" in page
+
+
+def test_colours_follow_the_page(page: str) -> None:
+    figures = "".join(re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL))
+    assert not any(tone.light in figures for tone in Tone)
+    used = set(re.findall(r"var\((--[a-z]+)\)", figures))
+    defined = set(re.findall(r"(--[a-z]+):", page.partition("</style>")[0]))
+    assert used
+    assert used <= defined
+    assert "prefers-color-scheme:dark" in page
+
+
+def test_diverged_and_failed_observers_are_told(page: str) -> None:
+    assert "diverged" in page
+    assert "a reason; another" in page
+    assert "a reason; a reason" not in page
+
+
+def test_half_a_run_is_told_by_halves(tmp_path: Path) -> None:
+    write_read_stage(tmp_path)
+    text = render(tmp_path, early_metrics()).read_text(encoding="utf-8")
+    outline(text)
+    assert "<figure" not in text
+    assert "stopped before an observer was made" in text
+    assert "is left out: the observers have not been evaluated yet" in text
+    assert all(result.drawing is None and result.reason for result in draw_all(RunFolder(tmp_path)))
+
+
+def test_plant_without_phase_has_no_calibration(finished: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    write_read_stage(tmp_path)
+    models("linear_edmd", "noload", 1).save(tmp_path / "models" / "linear_edmd")
+    text = render(tmp_path, {**early_metrics(), "models": {"linear_edmd": finished[1]["models"]["linear_edmd"]}}).read_text(
+        encoding="utf-8"
+    )
+    assert "Phase calibration</h2>" not in text
+    assert text.count("<figure") == 1  # the models
+
+
+def test_broken_artifact_is_an_error(tmp_path: Path) -> None:
+    write_read_stage(tmp_path)
+    (tmp_path / "evaluation").mkdir()
+    (tmp_path / "evaluation" / "evaluation.json").write_text("{")
+    with pytest.raises(DataError, match="not valid JSON"):
+        render(tmp_path, early_metrics())
+    assert not (tmp_path / "report.html").exists()
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> tuple[str, ...]:
+    """Leave out most figures, for speed."""
+    chosen = ("phase", "forms", "errors_chart")
+    monkeypatch.setattr("kros.report.figures.FIGURES", chosen)
+    return chosen
+
+
+def test_figures_as_files(finished: tuple[Path, dict[str, Any]], tmp_path: Path, few: tuple[str, ...]) -> None:
+    names = write_figures(finished[0], tmp_path / "new" / "figures")
+    assert len(names) == 2 * len(few)
+    for name in names:
+        content = (tmp_path / "new" / "figures" / name).read_bytes()
+        assert content.startswith(b"\x89PNG" if name.endswith("png") else b"%PDF")
+    with pytest.raises(ConfigError, match="is a file"):
+        write_figures(finished[0], tmp_path / "new" / "figures" / names[0])
+
+
+@pytest.mark.usefixtures("few")
+def test_same_run_gives_the_same_figures(finished: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    first, second = ([(tmp_path / n / f).read_bytes() for f in write_figures(finished[0], tmp_path / n)] for n in "ab")
+    assert first == second
+    drawn = [[to_svg(r.drawing.figure, r.name) for r in draw_all(RunFolder(finished[0])) if r.drawing] for _ in range(2)]
+    assert drawn[0] == drawn[1]
+
+
+def test_phase_figure_shows_the_calibration(finished: tuple[Path, dict[str, Any]]) -> None:
+    calibration = RunFolder(finished[0]).calibration
+    phase, lag, concentration = plot(calibration).axes
+    drawn = [np.concatenate([line.get_ydata() for line in axes.lines if line.get_marker() == "o"]) for axes in (phase, lag, concentration)]
+    assert drawn[0] == pytest.approx(np.degrees([u.phase_rad for u in calibration.units.values()]))
+    assert drawn[1] == pytest.approx(np.degrees([u.lag_rad for u in calibration.units.values()]))
+    assert drawn[2] == pytest.approx([u.concentration for u in calibration.units.values()])
+
+
+def test_plot_takes_every_result(uncertain: dict[str, UncertainModel]) -> None:
+    population = from_arrays({"a": [np.zeros((50, 5)) + np.arange(50.0)[:, None]]}, CHANNELS, sample_period_s=DT)
+    before = dict(matplotlib.rcParams)
+    for result in (population, models("koopman_edmd", "noload", 1), uncertain["linear_edmd"], synthesis(4, "mixed")):
+        figure = plot(result)
+        assert isinstance(figure, Figure)
+        assert figure.axes
+        figure.canvas.draw()
+    assert dict(matplotlib.rcParams) == before
+    with pytest.raises(ConfigError, match="found a int"):
+        plot(3)
+
+
+def test_drawing_leaves_pyplot_alone() -> None:
+    code = (
+        "import sys, numpy as np; from kros.core.lti import gain; import kros.report; assert 'matplotlib' not in sys.modules;"
+        "from kros.synthesis.result import Status, Synthesis; kros.report.plot(Synthesis('h2', gain([[1.0]], 0.1), Status.OPTIMAL));"
+        "assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_steady_stretches_are_found_in_both_directions() -> None:
+    speed = np.concatenate([np.zeros(5), np.full(20, 2.0), np.zeros(5), np.full(30, -2.0), np.full(10, 1.0)])
+    assert steady_stretches(speed) == [(5, 25), (30, 60)]
+    assert longest_steady(speed) == (30, 60)
+    assert longest_steady(np.zeros(9)) == (0, 0)
+
+
+def test_output_forms_of_the_paper_never_fall_below_one(uncertain: dict[str, UncertainModel]) -> None:
+    found = paper_bounds(uncertain["koopman_edmd"], models("koopman_edmd", "noload", 1))
+    assert set(found) == {Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE}
+    assert all(np.all(bound > 1 - 1e-9) for _, bound in found.values())
+
+
+def test_typical_residuals_are_medians_over_nominals() -> None:
+    found, freqs = models("linear_edmd", "noload", 1), np.array([1.0, 30.0])
+    others = list(UNITS[1:])
+    G = found.systems([*others, "000000"]).frequency_response(freqs) * 3.0 / 2.0
+    levels = typical_residuals(found, Form.INVERSE_INPUT_MULTIPLICATIVE, others, "000000", freqs)
+    for unit in range(5):
+        one_by_one = [np.abs(residual("inverse_input_multiplicative", G[k], G[unit])) for k in range(4) if k != unit]
+        assert levels[unit] == pytest.approx(np.median([20 * np.log10(e) for e in one_by_one], axis=0))
+
+
+def test_filter_is_scaled_by_the_ranges() -> None:
+    found = models("linear_edmd", "noload", 1)
+    K = StateSpace([[0.5]], [[1.0]], [[1.0], [2.0]], [[0.0], [0.0]], DT)
+    into_inputs = scaled_filter(Synthesis("mixed", K, Status.OPTIMAL, Injection.INPUT), found)
+    # innovation of range 2 over the pole at one half, correction of range 3
+    assert into_inputs.frequency_response([0.0])[0, :, 0] == pytest.approx([2 / 0.5 / 3, 4 / 0.5 / 3])
+
+
+def test_condition_without_models_is_not_shown(finished: tuple[Path, dict[str, Any]]) -> None:
+    run = RunFolder(finished[0])
+    assert run.condition_models("koopman_edmd", "load").condition == "load"
+    with pytest.raises(NotShownError, match="hot"):
+        run.condition_models("koopman_edmd", "hot")

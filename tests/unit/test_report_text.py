@@ -1,0 +1,212 @@
+"""Numbers and sentences of the report, against values counted by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kros.report.canvas import decibel, power_of_ten, spread, thin, thin_log
+from kros.report.error_table import error_table
+from kros.report.figures.errors_chart import log_ticks
+from kros.report.names import best_models, main_observers, model_label, number, observer_label, observer_look
+from kros.report.theme import Tone
+from kros.report.verdict import verdict
+
+
+def row(
+    observer: str, unit: str, channel: str, percent: float | None, condition: str = "noload", role: str = "off_nominal"
+) -> dict[str, object]:
+    return {
+        "observer": observer,
+        "unit": unit,
+        "role": role,
+        "condition": condition,
+        "channel": channel,
+        "rms": None,
+        "error_percent": percent,
+    }
+
+
+ROWS = [
+    row("koopman/worst_case_h2", "a", "velocity", 0.1, role="nominal"),
+    row("koopman/worst_case_h2", "b", "velocity", 0.2),
+    row("koopman/worst_case_h2", "c", "velocity", 0.4),
+    row("koopman/worst_case_h2", "z", "velocity", 50.0, role="outlier"),
+    row("koopman/open_loop", "a", "velocity", 0.05, role="nominal"),
+    row("koopman/open_loop", "b", "velocity", 0.9),
+    row("koopman/open_loop", "c", "velocity", 0.3),
+    row("koopman/kalman_tuned", "a", "velocity", 1.0, role="nominal"),
+    row("koopman/kalman_tuned", "b", "velocity", None),
+    row("koopman/kalman_tuned", "c", "velocity", 1.0),
+]
+METRICS = {
+    "schema": 1,
+    "study": {
+        "units": 3,
+        "conditions": ["load", "noload"],
+        "identify_on": "noload",
+        "sample_period_s": 0.001,
+        "deployed": "koopman/worst_case_h2",
+    },
+    "evaluation": ROWS,
+    "observers": {"koopman/worst_case_h2": {"worst_case_h2": 1.5, "gap_percent": 12.0, "relift_certified": False}},
+    "outliers": [
+        {"unit": "z", "condition": "load", "score": 9.0, "outlier": True},
+        {"unit": "b", "condition": "load", "score": -1.0, "outlier": False},
+    ],
+}
+
+
+def test_error_table_takes_off_nominal_units_alone() -> None:
+    (table,) = error_table(ROWS, "noload")
+    cell = table.cells["koopman/worst_case_h2"]["velocity"]
+    assert (cell.nominal, cell.worst, cell.worst_unit, cell.diverged) == (0.1, 0.4, "c", 0)
+    assert cell.mean == pytest.approx((0.2 + 0.4) / 2)
+    assert table.best("velocity", "mean") == pytest.approx(0.3)
+    assert table.best("velocity", "nominal") == 0.05
+    assert table.best("velocity", "worst") == 0.4
+
+
+def test_diverged_estimates_have_no_mean() -> None:
+    (table,) = error_table(ROWS, "noload")
+    cell = table.cells["koopman/kalman_tuned"]["velocity"]
+    assert (cell.mean, cell.worst, cell.diverged) == (None, None, 1)
+
+
+def test_nominal_alone_stands_for_the_mean() -> None:
+    (table,) = error_table([row("linear/h2", "a", "velocity", 0.7, role="nominal")], "noload")
+    assert table.cells["linear/h2"]["velocity"].mean == 0.7
+
+
+def test_current_under_load_is_not_ranked() -> None:
+    rows = [row("linear/h2", "b", c, 1.0, condition) for c in ("velocity", "current") for condition in ("load", "noload")]
+    home, load = error_table(rows, "noload")
+    assert (home.condition, load.condition) == ("noload", "load")
+    assert home.ranked == {"velocity", "current"}
+    assert load.ranked == {"velocity"}
+    assert load.best("current", "mean") is None
+
+
+def test_verdict_tells_the_numbers() -> None:
+    text = " ".join(verdict(METRICS, ("position",)))
+    assert "3 units of one batch were recorded (loaded and no load)." in text
+    assert "“Koopman, worst-case H2”" in text
+    assert "velocity to 0.300 % of its range (0.400 % on the worst unit, c)" in text
+    assert "Open loop, the nominal model alone, gives velocity 0.600 % (2.0 times as much)." in text
+    assert "The tuned Kalman filter diverges on some units." in text
+    assert "at most 12.0 % above" in text
+    assert "No certificate could be found for it as it runs" in text
+    assert "Flagged as not belonging to the batch: z (loaded)." in text
+
+
+@pytest.mark.parametrize("absent", ["evaluation", "observers", "outliers"])
+def test_verdict_without_a_part(absent: str) -> None:
+    text = " ".join(verdict({k: v for k, v in METRICS.items() if k != absent}))
+    assert text.startswith("3 units")
+
+
+def test_verdict_of_a_run_that_stopped_early() -> None:
+    study = {k: v for k, v in METRICS["study"].items() if k != "deployed"}
+    assert verdict({"schema": 1, "study": study})[-1] == "The run stopped before an observer was made."
+
+
+def test_verdict_warns_of_a_diverging_observer() -> None:
+    rows = [row("koopman/worst_case_h2", "b", "velocity", None)]
+    assert "do not use it" in " ".join(verdict({**METRICS, "evaluation": rows}))
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.4, "0.400"),
+        (21.34, "21.3"),
+        (-12.345, "−12.3"),
+        (1234.5, "1234"),
+        (123456.0, "1.23·10⁵"),
+        (6.16e-5, "6.16·10⁻⁵"),
+        (0.0, "0"),
+        (None, "–"),
+        (float("nan"), "–"),
+        (float("inf"), "–"),
+    ],
+)
+def test_number(value: float | None, text: str) -> None:
+    assert number(value) == text
+
+
+def test_names_are_words() -> None:
+    assert model_label("koopman_edmd") == "Koopman (EDMD)"
+    assert model_label("linear") == "linear"
+    assert observer_label("koopman/worst_case_h2") == "Koopman, worst-case H2"
+    assert observer_label("filtered_difference") == "filtered difference"
+
+
+def test_main_observers_are_few_and_the_deployed_comes_last() -> None:
+    names = [f"{m}/{k}" for m in ("koopman", "linear") for k in ("open_loop", "kalman_white", "kalman_tuned", "mixed", "worst_case_h2")]
+    assert main_observers(names, "koopman/mixed") == ["linear/mixed", "koopman/open_loop", "koopman/kalman_tuned", "koopman/mixed"]
+    assert main_observers(names, None)[-1] == "koopman/mixed"
+    assert main_observers(["linear_edmd/open_loop"], None) == ["linear_edmd/open_loop"]
+
+
+def test_koopman_and_linear_twins_differ_in_colour() -> None:
+    for method in ("worst_case_h2", "mixed", "residual_h2"):
+        assert observer_look(f"koopman/{method}").colour != observer_look(f"linear/{method}").colour
+
+
+def test_best_models_prefer_our_own() -> None:
+    assert best_models(["koopman_edmd", "linear_edmd", "koopman", "linear"]) == ["linear", "koopman"]
+    assert best_models(["linear_edmd"]) == ["linear_edmd"]
+
+
+def test_tones_are_unique_so_that_the_page_can_replace_them() -> None:
+    assert len({t.light for t in Tone}) == len(Tone)
+    assert len({t.variable for t in Tone}) == len(Tone)
+
+
+def test_thinned_line_keeps_every_extreme_and_the_order() -> None:
+    rng = np.random.default_rng(3)
+    x, y = np.arange(20_000.0), rng.standard_normal(20_000)
+    y[12_345], y[777] = 40.0, -40.0
+    thin_x, thin_y = thin(x, y, 500)
+    assert len(thin_x) <= 1000 + 500
+    assert (thin_y.max(), thin_y.min()) == (40.0, -40.0)
+    assert np.all(np.diff(thin_x) >= 0)
+    assert np.array_equal(y[thin_x.astype(int)], thin_y)
+    for block in range(10):  # what a column of pixels shows is the same
+        part, kept = slice(block * 2000, (block + 1) * 2000), (thin_x >= block * 2000) & (thin_x < (block + 1) * 2000)
+        assert (thin_y[kept].max(), thin_y[kept].min()) == (y[part].max(), y[part].min())
+
+
+def test_short_lines_stay_as_they_are() -> None:
+    x = np.arange(10.0)
+    assert thin(x, x)[1] is x
+    assert thin_log(x, x)[1] is x
+
+
+def test_thinned_frequency_line_keeps_peaks() -> None:
+    freqs, values = np.geomspace(1, 1e3, 5000), np.ones((2, 5000))
+    values[1, 2501] = 7.0
+    _, kept = thin_log(freqs, values, 100)
+    assert kept.shape == (2, 100)
+    assert kept[1].max() == 7.0
+    assert kept[0].max() == 1.0
+
+
+def test_spread_labels_do_not_overlap() -> None:
+    places = spread([0.1, 0.1, 0.11, 0.5, 0.9], 0.1)
+    assert np.all(np.diff(places) > 0.099)
+    assert spread([0.2, 0.8], 0.1) == [0.2, 0.8]
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.3, 2.0), (1e-5, 0.1), (4.0, 60.0), (1.1, 1.9)])
+def test_log_ticks_are_few_round_and_inside(low: float, high: float) -> None:
+    ticks = log_ticks(low, high)
+    assert len(ticks) <= 3
+    assert all(low <= t <= high for t in ticks)
+    assert all(f"{t:e}"[0] in "1235" for t in ticks)
+
+
+def test_decibels() -> None:
+    assert decibel([1.0, -10.0, 0.1j]) == pytest.approx([0.0, 20.0, -20.0])
+    assert np.isnan(decibel([0.0])).all()
+    assert power_of_ten(1e-12) == "10⁻¹²"

@@ -70,7 +70,7 @@ def test_two_by_two_covers_are_optimal(seed: int) -> None:
     exact = [exhaustive_cost_db(E[:, f]) for f in range(3)]
     gap = optimal_cover(E).cost_db() - exact
     assert (gap < 0.1).all()
-    assert (gap > -1e-3).all()
+    assert (gap > -0.02).all()  # the resolution of the search
 
 
 @pytest.mark.parametrize("shape", [(4, 2), (3, 3)])

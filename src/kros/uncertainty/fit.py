@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -267,7 +268,7 @@ def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None) ->
         if not bad and not worse.size:
             break
         chosen = np.union1d(chosen, worse)
-        cuts = np.unique(np.concatenate([cuts, bad, [np.sqrt(x * y) for x, y in zip(bad[:-1], bad[1:], strict=True)]]))
+        cuts = np.unique(np.concatenate([cuts, bad, [np.sqrt(x * y) for x, y in pairwise(bad)]]))
     return best
 
 

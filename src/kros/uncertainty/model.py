@@ -23,7 +23,6 @@ from .weights import Weight
 Array = npt.NDArray[Any]
 
 
-
 @dataclass(frozen=True, eq=False)
 class UncertainModel:
     """A nominal model and a bound on how the units of the population differ from it.

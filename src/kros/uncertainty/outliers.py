@@ -40,7 +40,7 @@ Array = npt.NDArray[Any]
 FALSE_ALARM_RATE = 3e-3
 _SMOOTHING_DECADES = 1.0 / 3.0
 _FLOOR_DB = 40.0
-_FREQUENCIES = 240
+_FREQUENCIES = 120
 _SINKHORN = 50
 _SMALLEST = 1e-12  # relative to the largest typical entry
 
@@ -213,10 +213,10 @@ def score_outliers(
             f"{freqs.size} frequencies for {G.shape[1]}."
         )
     if not 0 < false_alarm_rate < 1 or np.any(np.diff(freqs) <= 0) or freqs[0] <= 0:
-        raise ConfigError(f"Outlier scores: need a rate between 0 and 1 and increasing positive frequencies, found {false_alarm_rate}, {freqs[:3]}.")
-    scales = tuple(
-        np.ones(n) if s is None else np.asarray(s, float) for s, n in ((output_scale, G.shape[2]), (input_scale, G.shape[3]))
-    )
+        raise ConfigError(
+            f"Outlier scores: need a rate between 0 and 1 and increasing positive frequencies, found {false_alarm_rate}, {freqs[:3]}."
+        )
+    scales = tuple(np.ones(n) if s is None else np.asarray(s, float) for s, n in ((output_scale, G.shape[2]), (input_scale, G.shape[3])))
     rows = np.unique(np.linspace(0, len(freqs) - 1, _FREQUENCIES).round().astype(int))
     freqs, G = freqs[rows], G[:, rows] / scales[0][:, None] * scales[1]
     distance, entries = _distances(form, G, freqs)

@@ -193,7 +193,9 @@ def _read_models(
     count = system.batch_shape[0]
     ids = tuple(str(k) for k in range(count)) if unit_ids is None else tuple(unit_ids)
     if len(ids) != count or len(set(ids)) != count:
-        raise DimensionError(f"Quantify: needs one id for each of {count} units, all different, found {len(ids)} ({', '.join(ids[:5])} ...).")
+        raise DimensionError(
+            f"Quantify: needs one id for each of {count} units, all different, found {len(ids)} ({', '.join(ids[:5])} ...)."
+        )
     _check(system, ids)
     return system, ids, (_scale("output", output_scale, system.n_outputs), _scale("input", input_scale, system.n_inputs))
 
@@ -210,24 +212,32 @@ def stack_systems(models: Any) -> StateSpace:
         systems = list(models)
         found = {(s.n_states, s.n_outputs, s.n_inputs, s.dt) for s in systems}
         if len(found) != 1:
-            raise DimensionError(f"Quantify: units differ in (states, outputs, inputs, sampling period): {sorted(found)}; identify them alike.")
+            raise DimensionError(
+                f"Quantify: units differ in (states, outputs, inputs, sampling period): {sorted(found)}; identify them alike."
+            )
         A, B, C, D = (np.stack([getattr(s, x) for s in systems]) for x in "ABCD")
         models = StateSpace(A, B, C, D, systems[0].dt)
     if len(models.batch_shape) != 1:
-        raise DimensionError(f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}; stack the units.")
+        raise DimensionError(
+            f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}; stack the units."
+        )
     return models
 
 
 def _check(system: StateSpace, ids: tuple[str, ...]) -> None:
     if len(ids) < 2:
-        raise DataError(f"Quantify: uncertainty of a population needs at least two units, found {len(ids)} ({', '.join(ids)}); record more units.")
+        raise DataError(
+            f"Quantify: uncertainty of a population needs at least two units, found {len(ids)} ({', '.join(ids)}); record more units."
+        )
     if system.dt <= 0:
         raise DataError("Quantify: found continuous-time models; weights are fitted in discrete time, so sample the models first.")
     finite = np.ones(len(ids), bool)
     for name in "ABCD":
         finite &= np.broadcast_to(np.isfinite(getattr(system, name)).all(axis=(-2, -1)), (len(ids),))
     if not finite.all():
-        raise DataError(f"Quantify: unit {ids[int(np.argmin(finite))]} has NaN or infinity in its model; leave it out or identify it again.")
+        raise DataError(
+            f"Quantify: unit {ids[int(np.argmin(finite))]} has NaN or infinity in its model; leave it out or identify it again."
+        )
     stable = np.broadcast_to(system.is_stable(), (len(ids),))
     if not stable.all():
         unit = int(np.argmin(stable))

@@ -6,9 +6,10 @@ The squared magnitude is `n / d` with
     phi_k(tau) = prod_(j <= k) tau / (tau + tau_j)  prod_(j > k) tau_j / (tau + tau_j)
 
 `phi_k` is the power `tau^k` over the common denominator `prod (tau + tau_j)`, of size one between two knots and small elsewhere: real poles
-and zeros give positive coefficients, and nothing cancels over any number of decades. Only the numerators of `n` and `d` matter. With `w = (z - 1) / (z + 1)`, `w^2 = -tau` on the
-unit circle: a root `t` off the half-line `[0, inf)` gives the zero or pole `w = -sqrt(-t)` in the open left half-plane, which is the inside
-of the unit circle in `z`. Roots come from high-precision arithmetic, because they spread over twice as many decades as the frequencies.
+and zeros give positive coefficients, and nothing cancels over any number of decades. Only the numerators of `n` and `d` matter. With
+`w = (z - 1) / (z + 1)`, `w^2 = -tau` on the unit circle: a root `t` off the half-line `[0, inf)` gives the zero or pole `w = -sqrt(-t)` in
+the open left half-plane, which is the inside of the unit circle in `z`. Roots come from high-precision arithmetic, because they spread over
+twice as many decades as the frequencies.
 
 The system is a cascade of sections of first and second order in `zeta = z - 1`: poles next to `z = 1` keep their relative precision.
 """
@@ -18,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -131,7 +133,7 @@ def _newton_polygon(powers: Array) -> Array:
         hull.append(int(later[np.argmax((height[later] - height[hull[-1]]) / (later - hull[-1]))]))
     z = [
         np.exp((height[i] - height[j]) / (j - i) + 1j * (2 * np.pi * k / (j - i) + 2 * np.pi * i / max(degree, 1) + 0.7))
-        for i, j in zip(hull[:-1], hull[1:], strict=True)
+        for i, j in pairwise(hull)
         for k in range(j - i)
     ]
     return np.array(z, complex)
@@ -219,7 +221,8 @@ def _section(q: list[complex], p: list[complex], dt: float) -> StateSpace:
     if len(p) == 1:
         step = p[0].real - q[0].real
         size = np.sqrt(abs(step))
-        return StateSpace([[1 + p[0].real]], [[size]], [[np.copysign(size, step)]], [[1.0]], dt)
+        A, B, C = np.array([[1 + p[0].real]]), np.array([[size]]), np.array([[np.copysign(size, step)]])
+        return StateSpace(A, B, C, np.ones((1, 1)), dt)
     # Numerator minus denominator: b1 zeta + b0.
     b1 = float(np.real(p[0] + p[1] - q[0] - q[1]))
     b0 = float(np.real(q[0] * q[1] - p[0] * p[1]))
@@ -230,7 +233,7 @@ def _section(q: list[complex], p: list[complex], dt: float) -> StateSpace:
     A = np.array([[1 - s1, kappa], [-(imag**2) / kappa, 1 - s2]])
     C = np.array([[(b0 - b1 * s1) / kappa, b1]])
     size = np.sqrt(max(float(np.abs(C).max()), np.finfo(float).tiny))
-    return StateSpace(A, np.array([[0.0], [size]]), C / size, [[1.0]], dt)
+    return StateSpace(A, np.array([[0.0], [size]]), C / size, np.ones((1, 1)), dt)
 
 
 def _pair(zeros: list[complex], poles: list[complex]) -> list[tuple[list[complex], list[complex]]]:

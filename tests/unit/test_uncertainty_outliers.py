@@ -1,0 +1,107 @@
+"""Outlier scores: the planted unit on top, nothing flagged without reason, and the same answer in any order and units of measure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from kros.core import StateSpace
+from kros.core.errors import ConfigError, DataError, DimensionError
+from kros.uncertainty import Form, OutlierModel, score_outliers
+
+DT = 1e-3
+FREQS = np.geomspace(5e-3, 500.0, 150)
+
+
+def responses(n_units: int, seed: int, outlier: bool = False) -> np.ndarray:
+    """Drives under a velocity loop; the outlier, last, is loosely fastened: more friction, less torque, slower current."""
+    rng = np.random.default_rng(seed)
+    A, B = np.zeros((n_units, 3, 3)), np.zeros((n_units, 3, 2))
+    for k in range(n_units):
+        inertia, friction, torque, lag = np.array([0.5, 6.0, 40.0, 2e-3]) * np.exp(np.array([0.05, 0.15, 0.05, 0.1]) * rng.normal(size=4))
+        if outlier and k == n_units - 1:
+            inertia, friction, torque, lag = 1.5 * inertia, 2.5 * friction, 0.6 * torque, 2 * lag
+        a = np.array([[-0.5, 1, 0], [0, -friction / inertia, torque / inertia], [-14.4 / lag, -1.2 / lag, -1 / lag]])
+        b = np.array([[0.5, 0], [0, 0], [14.4 / lag, 1.3 / lag]])
+        step = expm(np.block([[a, b], [np.zeros((2, 5))]]) * DT)
+        A[k], B[k] = step[:3, :3], step[:3, 3:]
+    return StateSpace(A, B, np.broadcast_to(np.eye(3), A.shape), np.zeros(B.shape), DT).frequency_response(FREQS)
+
+
+@pytest.mark.parametrize("form", [Form.ADDITIVE, Form.INVERSE_INPUT_MULTIPLICATIVE])
+def test_planted_outlier_has_the_top_score_and_false_alarms_are_rare(form: Form) -> None:
+    false_alarms = 0
+    for seed in range(5):
+        model = score_outliers(responses(13, seed, outlier=True), FREQS, form)
+        scores = [s.score_db for s in model.scores]
+        assert int(np.argmax(scores)) == 12
+        assert model.scores[12].outlier
+        false_alarms += sum(s.outlier for s in model.scores[:12])
+    assert false_alarms <= 1
+
+
+def test_flagged_units_are_left_out_of_the_model() -> None:
+    model = score_outliers(responses(13, 0, outlier=True), FREQS, unit_ids=tuple("abcdefghijklm"))
+    flagged = {s.unit for s in model.scores if s.outlier}
+    assert "m" in flagged
+    assert set(model.unit_ids) == set("abcdefghijklm") - flagged
+    assert model.extrapolated
+    assert 5e-3 <= model.scores[12].freq_hz <= 500.0
+    assert model.scores[12].score_db > model.threshold_db
+
+
+def test_order_of_units_and_units_of_measure_do_not_matter() -> None:
+    G = responses(8, 3, outlier=True)
+    plain = score_outliers(G, FREQS)
+    order = np.random.default_rng(0).permutation(8)
+    shuffled = score_outliers(G[order], FREQS)
+    out, into = np.array([10.0, 1e-3, 7.0]), np.array([100.0, 0.2])
+    scaled = score_outliers(G * out[:, None] / into, FREQS, output_scale=out, input_scale=into)
+    reference = np.array([s.score_db for s in plain.scores])
+    np.testing.assert_allclose([s.score_db for s in shuffled.scores], reference[order], atol=1e-9)
+    np.testing.assert_allclose([s.score_db for s in scaled.scores], reference, atol=1e-6)
+
+
+def test_new_units_are_scored_against_a_stored_population(tmp_path: Path) -> None:
+    G = responses(13, 4, outlier=True)
+    out = np.array([1.0, 5.0, 2.0])
+    score_outliers(G[:11], FREQS, output_scale=out).save(tmp_path)
+    model = OutlierModel.load(tmp_path)
+    rows = np.searchsorted(FREQS, model.freqs_hz)
+    good, bad = model.score("new", G[11][rows]), model.score("loose", G[12][rows])
+    assert not good.outlier
+    assert bad.outlier
+    assert bad.score_db > good.score_db
+    assert bad.threshold_db == model.threshold_db
+    with pytest.raises(DimensionError, match="stored frequencies"):
+        model.score("short", G[11][:3])
+
+
+def test_three_units_flag_nothing(tmp_path: Path) -> None:
+    model = score_outliers(responses(3, 5, outlier=True), FREQS)
+    assert not any(s.outlier for s in model.scores)
+    assert all(np.isfinite(s.score_db) for s in model.scores)
+    model.save(tmp_path)
+    assert OutlierModel.load(tmp_path).threshold_db == pytest.approx(model.threshold_db)
+
+
+def test_identical_units_score_zero() -> None:
+    G = np.repeat(responses(1, 6), 5, axis=0)
+    model = score_outliers(G, FREQS)
+    assert [s.score_db for s in model.scores] == [0.0] * 5
+    assert not any(s.outlier for s in model.scores)
+
+
+def test_bad_input_is_refused() -> None:
+    G = responses(4, 7)
+    with pytest.raises(DataError, match="three units"):
+        score_outliers(G[:2], FREQS)
+    with pytest.raises(DataError, match="frequency"):
+        score_outliers(G, FREQS[:-1])
+    with pytest.raises(ConfigError, match="rate"):
+        score_outliers(G, FREQS, false_alarm_rate=2.0)
+    with pytest.raises(DimensionError, match="unit, frequency"):
+        score_outliers(G[0], FREQS)

@@ -98,7 +98,9 @@ def main(count: int) -> None:
                 flush=True,
             )
     print(f"mixed: median {np.median(times):.2f} s, worst {max(times):.2f} s, {failures} failures of {2 * count}")
-    print(f"worst_case_h2: Riccati part median {1e3 * np.median(riccati):.2f} ms, worst {1e3 * max(riccati):.2f} ms; gap median {np.median(gaps):.2f} %")
+    print(
+        f"worst_case_h2: Riccati part median {1e3 * np.median(riccati):.2f} ms, worst {1e3 * max(riccati):.2f} ms; gap median {np.median(gaps):.2f} %"
+    )
 
 
 if __name__ == "__main__":

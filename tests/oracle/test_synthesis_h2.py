@@ -100,7 +100,10 @@ def test_optimum_is_found_by_blind_search_too():
         closed = plant.close(K)
         return h2_norm(closed) if closed.spectral_radius() < 0.999 else 1e3 * float(closed.spectral_radius())
 
-    results = [minimize(cost, 0.3 * rng.standard_normal(9), method="Nelder-Mead", options={"maxiter": 4000, "maxfev": 4000, "adaptive": True}).fun for _ in range(4)]
+    results = [
+        minimize(cost, 0.3 * rng.standard_normal(9), method="Nelder-Mead", options={"maxiter": 4000, "maxfev": 4000, "adaptive": True}).fun
+        for _ in range(2)
+    ]
     assert min(results) >= found.h2_norm * (1 - 1e-9)
     assert min(results) <= found.h2_norm * 1.02
 
@@ -116,13 +119,16 @@ def test_fir_youla_program_reaches_the_same_optimum():
     def response(B, C, D):
         return C @ np.linalg.solve(z[:, None, None] * np.eye(3) - A, np.broadcast_to(B, (400, *B.shape)).astype(complex)) + D
 
-    P11, P12, P21 = response(plant.B1, plant.C1, plant.D11), response(plant.B2, plant.C1, plant.D12), response(plant.B1, plant.C2, plant.D21)
+    P11, P12, P21 = (
+        response(plant.B1, plant.C1, plant.D11),
+        response(plant.B2, plant.C1, plant.D12),
+        response(plant.B1, plant.C2, plant.D21),
+    )
     columns = []
     for tap in range(40):
         delayed = z[:, None, None] ** -tap * P12
         for i in range(2):
-            for j in range(2):
-                columns.append((delayed[:, :, [i]] @ P21[:, [j], :]).ravel())
+            columns.extend((delayed[:, :, [i]] @ P21[:, [j], :]).ravel() for j in range(2))
     design, target = np.array(columns).T, -P11.ravel()
     real = np.vstack([design.real, design.imag])
     taps, *_ = np.linalg.lstsq(real, np.concatenate([target.real, target.imag]), rcond=None)
@@ -174,7 +180,7 @@ def test_continuous_lqg_against_scipy_formula():
         0.0,
     )
     K = h2(plant).controller
-    assert K.C == pytest.approx(np.array([[-1.0, -np.sqrt(3)]]))
-    assert K.B == pytest.approx(np.array([[np.sqrt(3)], [1.0]]))
+    assert pytest.approx(np.array([[-1.0, -np.sqrt(3)]])) == K.C
+    assert pytest.approx(np.array([[np.sqrt(3)], [1.0]])) == K.B
     assert not K.D.any()
     assert gain(K.D, 0.0).dt == 0

@@ -51,7 +51,13 @@ def random_stabilising(plant, rng):
     """A random dynamic controller that keeps the loop stable."""
     _, _, n_u, _, n_y = plant.sizes
     for scale in (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001):
-        K = StateSpace(np.diag(rng.uniform(-0.5, 0.5, 2)), rng.standard_normal((2, n_y)), scale * rng.standard_normal((n_u, 2)), scale * rng.standard_normal((n_u, n_y)), DT)
+        K = StateSpace(
+            np.diag(rng.uniform(-0.5, 0.5, 2)),
+            rng.standard_normal((2, n_y)),
+            scale * rng.standard_normal((n_u, 2)),
+            scale * rng.standard_normal((n_u, n_y)),
+            DT,
+        )
         if plant.close(K).is_stable():
             return K
     raise AssertionError("no stabilising controller found; the plant itself should be stable")
@@ -105,7 +111,9 @@ def test_fact_three_degenerate(build):
 def test_close_solves_the_algebraic_loop():
     rng = np.random.default_rng(8)
     plant = GeneralizedPlant(
-        *(rng.standard_normal(s) for s in ((3, 3), (3, 2), (3, 1), (2, 3), (2, 3), (2, 2), (2, 1), (2, 2))), 0.3 * rng.standard_normal((2, 1)), 1.0
+        *(rng.standard_normal(s) for s in ((3, 3), (3, 2), (3, 1), (2, 3), (2, 3), (2, 2), (2, 1), (2, 2))),
+        0.3 * rng.standard_normal((2, 1)),
+        1.0,
     )
     K = StateSpace(rng.standard_normal((2, 2)), rng.standard_normal((2, 2)), rng.standard_normal((1, 2)), rng.standard_normal((1, 2)), 1.0)
     freqs = np.array([0.01, 0.1, 0.37])

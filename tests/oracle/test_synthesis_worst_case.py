@@ -31,7 +31,9 @@ def log_fit(freqs_hz, magnitude, dt, order=None, max_order=4, tolerance_db=1.0, 
     low, high = np.log(tau[0]), np.log(min(tau[-2], 1e3))
     knots = np.linspace(low, high, 2 * k + 2)[1:-1]
     start = np.concatenate([[np.log(magnitude[-2])], knots[::2], knots[1::2]])
-    found = least_squares(lambda p: response(p) - np.log(magnitude), start, bounds=(np.r_[-50, [low - 3] * 2 * k], np.r_[50, [8] * 2 * k])).x
+    found = least_squares(
+        lambda p: response(p) - np.log(magnitude), start, bounds=(np.r_[-50, [low - 3] * 2 * k], np.r_[50, [8] * 2 * k])
+    ).x
     error = response(found) - np.log(magnitude)
     found[0] -= error.min() if side == "above" else error.max()
     system = gain([[np.exp(found[0])]], dt)
@@ -61,7 +63,9 @@ def problem(seed=0, injection=Injection.STATE, **changes):
     parts = {
         "nominal": nominal,
         "C": np.eye(4)[:1],
-        "W_L": block_diagonal([lag(10 ** rng.uniform(-2.5, -1.5), 10 ** rng.uniform(-0.9, -0.3), 10 ** rng.uniform(0.5, 2)) for _ in range(2)]),
+        "W_L": block_diagonal(
+            [lag(10 ** rng.uniform(-2.5, -1.5), 10 ** rng.uniform(-0.9, -0.3), 10 ** rng.uniform(0.5, 2)) for _ in range(2)]
+        ),
         "W_R": gain(np.diag([1.0, rng.uniform(0.3, 1)]), DT),
         "input_scale": np.array([3.0, 3.0]),
         "output_scale": np.array([3.0, 3.0, 0.5, 1.0]),
@@ -89,7 +93,7 @@ def contraction(x, m):
 def test_the_set_is_a_matrix_ball():
     rng = np.random.default_rng(0)
     for _ in range(20):
-        N, M, _ = random_matrices(rng)
+        N, _, _ = random_matrices(rng)
         ball = Ball.of(N[None], np.eye(2)[None])
         delta = contraction(rng.standard_normal(8), 2) * rng.uniform(0, 1)
         X = delta @ np.linalg.inv(np.eye(2) - N @ delta)
@@ -104,7 +108,7 @@ def test_the_set_is_a_matrix_ball():
 def test_bound_against_optimised_perturbations():
     rng = np.random.default_rng(1)
     ratios = []
-    for _ in range(25):
+    for _ in range(10):
         N, M, T = random_matrices(rng)
         bound = Ball.of(N[None], M[None]).bound(T[None])[0]
 
@@ -112,7 +116,7 @@ def test_bound_against_optimised_perturbations():
             delta = contraction(x, 2)
             return -np.linalg.norm(T @ delta @ np.linalg.solve(np.eye(2) - N @ delta, M))
 
-        found = -min(minimize(size, rng.standard_normal(8), method="BFGS").fun for _ in range(4))
+        found = -min(minimize(size, rng.standard_normal(8), method="BFGS").fun for _ in range(2))
         assert found <= bound * (1 + 1e-9)
         ratios.append(bound / found)
     assert max(ratios) < 1.5, "a factor two would follow from bounding each term alone"

@@ -131,9 +131,19 @@ def test_weights_must_be_diagonal():
     [
         ({"W_L": gain([[1.0]], DT)}, r"\|\|W_R W_L\|\| = 1 should be below 1"),
         ({"W_L": StateSpace([[1.0]], [[1.0]], [[0.1]], [[0.1]], DT)}, "W_L has spectral radius 1"),
-        ({"nominal": StateSpace(np.diag([1.0, 0.9]), [[1.0], [0.1]], np.eye(2), np.zeros((2, 1)), DT), "C": [[0.0, 1.0]]}, "not detectable, mode 1"),
+        (
+            {"nominal": StateSpace(np.diag([1.0, 0.9]), [[1.0], [0.1]], np.eye(2), np.zeros((2, 1)), DT), "C": [[0.0, 1.0]]},
+            "not detectable, mode 1",
+        ),
         ({"nominal": StateSpace(np.diag([1.0, 0.9]), [[1.0], [0.1]], np.eye(2), np.zeros((2, 1)), DT)}, "nominal has spectral radius 1"),
-        ({"nominal": StateSpace(-np.eye(2), [[0.0], [0.1]], np.eye(2), np.zeros((2, 1)), 0.0), "W_L": gain([[0.2]], 0.0), "W_R": gain([[1.0]], 0.0)}, "sample it"),
+        (
+            {
+                "nominal": StateSpace(-np.eye(2), [[0.0], [0.1]], np.eye(2), np.zeros((2, 1)), 0.0),
+                "W_L": gain([[0.2]], 0.0),
+                "W_R": gain([[1.0]], 0.0),
+            },
+            "sample it",
+        ),
     ],
 )
 def test_problems_without_a_sound_answer_are_refused(method, changes, message):
@@ -204,7 +214,7 @@ def test_published_plant_checks_its_weights():
     nominal, one = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], DT), gain([[1.0]], DT)
     with pytest.raises(DimensionError, match="W_u should be 1 x 1, found 2 x 2"):
         paper_plant(nominal, [[1.0]], one, gain(np.eye(2), DT), one)
-    with pytest.raises(DimensionError, match="W_D is sampled at 1.0 s"):
+    with pytest.raises(DimensionError, match=r"W_D is sampled at 1\.0 s"):
         paper_plant(nominal, [[1.0]], one, one, gain([[1.0]], 1.0))
     with pytest.raises(DimensionError, match=r"C should be \(q, 1\)"):
         paper_plant(nominal, [[1.0, 0.0]], one, one, one)
@@ -228,7 +238,9 @@ def test_result_survives_saving(tmp_path):
 def test_block_triangular_closed_loop():
     rng = np.random.default_rng(0)
     case = problem()
-    units = StateSpace(case.nominal.A * np.array([0.5, 0.9, 1.0])[:, None, None], np.ones((3, 2, 1)), np.ones((3, 1, 2)), np.zeros((3, 1, 1)), DT)
+    units = StateSpace(
+        case.nominal.A * np.array([0.5, 0.9, 1.0])[:, None, None], np.ones((3, 2, 1)), np.ones((3, 1, 2)), np.zeros((3, 1, 1)), DT
+    )
     for injection, rows in ((Injection.INPUT, 1), (Injection.STATE, 2)):
         K = StateSpace([[0.5]], [[0.1]], 0.1 * rng.standard_normal((rows, 1)), 0.1 * rng.standard_normal((rows, 1)), DT)
         loop = np.linalg.eigvals(observer_loop(case.nominal, case.C, K, injection))
@@ -238,7 +250,7 @@ def test_block_triangular_closed_loop():
             assert np.sort(np.abs(whole)) == pytest.approx(np.sort(np.abs(expected)), abs=1e-6)
         highest = max(np.abs(loop).max(), np.abs(np.linalg.eigvals(case.nominal.A)).max())
         assert spectral_radius_max(units, case.nominal, case.C, K, injection) == pytest.approx(highest)
-    with pytest.raises(DimensionError, match="2 x 1 at 0.001 s"):
+    with pytest.raises(DimensionError, match=r"2 x 1 at 0\.001 s"):
         observer_loop(case.nominal, case.C, gain([[1.0]], DT), Injection.STATE)
     with pytest.raises(DimensionError, match="NONE"):
         observer_loop(case.nominal, case.C, gain([[1.0]], DT), Injection.NONE)

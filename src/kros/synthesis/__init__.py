@@ -11,9 +11,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .constant_gain import kalman, luenberger
     from .generalized_plant import GeneralizedPlant
     from .h2_optimal import h2
-    from .constant_gain import kalman, luenberger
     from .mixed_optimal import mixed
     from .observer_problem import ObserverProblem
     from .result import Injection, Status, Synthesis

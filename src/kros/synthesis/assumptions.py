@@ -94,11 +94,8 @@ def h2_violations(plant: GeneralizedPlant) -> list[Violation]:
     -------
     list of Violation
     """
-    found = []
-    for mode in unreachable_modes(plant.A, plant.B2, plant.dt)[:1]:
-        found.append(Violation(Assumption.STABILISABLE, f"mode {mode:.6g}"))
-    for mode in unreachable_modes(plant.A.T, plant.C2.T, plant.dt)[:1]:
-        found.append(Violation(Assumption.DETECTABLE, f"mode {mode:.6g}"))
+    found = [Violation(Assumption.STABILISABLE, f"mode {mode:.6g}") for mode in unreachable_modes(plant.A, plant.B2, plant.dt)[:1]]
+    found += [Violation(Assumption.DETECTABLE, f"mode {mode:.6g}") for mode in unreachable_modes(plant.A.T, plant.C2.T, plant.dt)[:1]]
     n, _, n_u, _, n_y = plant.sizes
     rank12, rank21 = _rank(plant.D12), _rank(plant.D21)
     if rank12 < n_u:
@@ -108,10 +105,10 @@ def h2_violations(plant: GeneralizedPlant) -> list[Violation]:
     if plant.dt == 0 and np.any(plant.D11):
         found.append(Violation(Assumption.PROPER, f"largest entry {np.abs(plant.D11).max():.3g}"))
     if not found and n:
-        for zero in _boundary_zeros(plant.A, plant.B2, plant.C1, plant.D12, plant.dt)[:1]:
-            found.append(Violation(Assumption.NO_ZERO_CONTROL, f"zero {zero:.6g}"))
-        for zero in _boundary_zeros(plant.A.T, plant.C2.T, plant.B1.T, plant.D21.T, plant.dt)[:1]:
-            found.append(Violation(Assumption.NO_ZERO_MEASUREMENT, f"zero {zero:.6g}"))
+        zeros = _boundary_zeros(plant.A, plant.B2, plant.C1, plant.D12, plant.dt)[:1]
+        found += [Violation(Assumption.NO_ZERO_CONTROL, f"zero {zero:.6g}") for zero in zeros]
+        zeros = _boundary_zeros(plant.A.T, plant.C2.T, plant.B1.T, plant.D21.T, plant.dt)[:1]
+        found += [Violation(Assumption.NO_ZERO_MEASUREMENT, f"zero {zero:.6g}") for zero in zeros]
     return found
 
 

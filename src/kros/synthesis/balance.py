@@ -55,7 +55,9 @@ def balance(plant: GeneralizedPlant) -> Balanced:
         root = np.linalg.cholesky(E + F + F.T + W)
         inverse = np.linalg.inv(np.linalg.cholesky(E))
     except LinAlgError as error:
-        raise SynthesisError("Mixed synthesis: some states of the plant are not reached by any disturbance; reduce the plant to a minimal one.") from error
+        raise SynthesisError(
+            "Mixed synthesis: some states of the plant are not reached by any disturbance; reduce the plant to a minimal one."
+        ) from error
     U, s, Vh = np.linalg.svd(inverse @ root)
     T, back = (U / np.sqrt(s)).T @ inverse, root @ Vh.T / np.sqrt(s)
     closed = performance.close(K)

@@ -63,7 +63,9 @@ def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5
     problem.require_sound()
     loop = problem.error_system(controller)
     if not loop.is_stable():
-        raise SynthesisError(f"Certificate: the nominal observer loop has spectral radius {float(loop.spectral_radius()):.9g}; no bound is finite.")
+        raise SynthesisError(
+            f"Certificate: the nominal observer loop has spectral radius {float(loop.spectral_radius()):.9g}; no bound is finite."
+        )
     dt = problem.nominal.dt
     squared, error = circle_mean(lambda theta: density(problem, loop, theta / (2 * np.pi * dt)), _log_poles(problem, loop), rtol)
     upper = float(np.sqrt(squared + error))

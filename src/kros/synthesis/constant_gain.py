@@ -63,12 +63,18 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     A, C, Q, R = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (A, C, Q, R))
     n, q = A.shape[0], C.shape[0]
     if A.shape != (n, n) or C.shape != (q, n) or Q.shape != (n, n) or R.shape != (q, q):
-        raise DimensionError(f"Kalman predictor: needs A (n, n), C (q, n), Q (n, n), R (q, q), found {A.shape}, {C.shape}, {Q.shape}, {R.shape}.")
+        raise DimensionError(
+            f"Kalman predictor: needs A (n, n), C (q, n), Q (n, n), R (q, q), found {A.shape}, {C.shape}, {Q.shape}, {R.shape}."
+        )
     if np.linalg.eigvalsh((R + R.T) / 2).min() <= 0:
-        raise SynthesisError("Kalman predictor: the measurement noise covariance R is not positive definite; every measurement needs some noise.")
+        raise SynthesisError(
+            "Kalman predictor: the measurement noise covariance R is not positive definite; every measurement needs some noise."
+        )
     lowest = np.linalg.eigvalsh((Q + Q.T) / 2)
     if lowest.min() < -1e-12 * max(lowest.max(), 1e-300):
-        raise SynthesisError(f"Kalman predictor: the process noise covariance Q has the eigenvalue {lowest.min():.3g}; it must be positive semidefinite.")
+        raise SynthesisError(
+            f"Kalman predictor: the process noise covariance Q has the eigenvalue {lowest.min():.3g}; it must be positive semidefinite."
+        )
     require_detectable(A, C, "Kalman predictor")
     start = time.perf_counter()
     L, P = predictor(A, C, Q, R, np.zeros((n, q)), "Kalman predictor")
@@ -76,7 +82,9 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     closed = A - L @ C
     radius = float(np.abs(np.linalg.eigvals(closed)).max(initial=0.0))
     if radius >= 1:
-        raise SynthesisError(f"Kalman predictor: the error dynamics have spectral radius {radius:.9g}; add process noise on the modes on the unit circle.")
+        raise SynthesisError(
+            f"Kalman predictor: the error dynamics have spectral radius {radius:.9g}; add process noise on the modes on the unit circle."
+        )
     values, vectors = np.linalg.eigh((Q + Q.T) / 2)
     noise = np.hstack([vectors * np.sqrt(np.maximum(values, 0)), -L @ np.linalg.cholesky(R)])
     norm = h2_norm(StateSpace(closed, noise, np.eye(n), np.zeros((n, n + q)), dt))
@@ -118,18 +126,32 @@ def luenberger(A: npt.ArrayLike, C: npt.ArrayLike, poles: npt.ArrayLike, dt: flo
     if wanted.shape != (A.shape[0],) or C.shape[1:] != A.shape[:1]:
         raise DimensionError(f"Luenberger observer: needs {A.shape[0]} poles and C (q, {A.shape[0]}), found {wanted.shape} and {C.shape}.")
     if np.abs(wanted).max() >= 1:
-        raise SynthesisError(f"Luenberger observer: wanted poles should lie inside the unit circle, found magnitude {np.abs(wanted).max():.6g}.")
+        raise SynthesisError(
+            f"Luenberger observer: wanted poles should lie inside the unit circle, found magnitude {np.abs(wanted).max():.6g}."
+        )
     start = time.perf_counter()
     try:
         L = place_poles(A.T, C.T, wanted).gain_matrix.T
     except (ValueError, np.linalg.LinAlgError) as error:
-        raise SynthesisError(f"Luenberger observer: the poles cannot be placed ({error}); use distinct poles in conjugate pairs, or measure more.") from error
+        raise SynthesisError(
+            f"Luenberger observer: the poles cannot be placed ({error}); use distinct poles in conjugate pairs, or measure more."
+        ) from error
     elapsed = time.perf_counter() - start
     reached = np.linalg.eigvals(A - L @ C)
     miss = max(np.abs(reached - pole).min() for pole in wanted)
     if miss > 1e-3:
-        raise SynthesisError(f"Luenberger observer: a pole was missed by {miss:.3g}; the pair (A, C) is nearly unobservable, keep that pole where A has it.")
-    return Synthesis("luenberger", gain(L, dt), Status.OPTIMAL, Injection.STATE, spectral_radius=float(np.abs(reached).max()), solve_s=elapsed, solver="pole placement")
+        raise SynthesisError(
+            f"Luenberger observer: a pole was missed by {miss:.3g}; the pair (A, C) is nearly unobservable, keep that pole where A has it."
+        )
+    return Synthesis(
+        "luenberger",
+        gain(L, dt),
+        Status.OPTIMAL,
+        Injection.STATE,
+        spectral_radius=float(np.abs(reached).max()),
+        solve_s=elapsed,
+        solver="pole placement",
+    )
 
 
 def predictor(A: Array, C: Array, Q: Array, R: Array, S: Array, purpose: str) -> tuple[Array, Array]:
@@ -142,4 +164,6 @@ def require_detectable(A: Array, C: Array, purpose: str) -> None:
     """Raise a `SynthesisError` naming the first mode on or outside the unit circle that C does not see."""
     modes = unreachable_modes(A.T, C.T, 1.0)
     if modes:
-        raise SynthesisError(f"{purpose}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible in y; measure another state.")
+        raise SynthesisError(
+            f"{purpose}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible in y; measure another state."
+        )

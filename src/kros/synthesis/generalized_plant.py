@@ -83,7 +83,9 @@ class GeneralizedPlant:
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 found = {key: getattr(self, key).shape for key in _MATRICES}
-                raise DimensionError(f"Generalized plant: {name} should have shape {shape}, found {found}; transpose or pad the offending matrix.")
+                raise DimensionError(
+                    f"Generalized plant: {name} should have shape {shape}, found {found}; transpose or pad the offending matrix."
+                )
         if not all(np.isfinite(getattr(self, name)).all() for name in _MATRICES):
             raise DimensionError("Generalized plant: a matrix contains NaN or infinity; look at the weights that went into it.")
         if self.dt < 0:
@@ -110,7 +112,9 @@ class GeneralizedPlant:
     def channel(self, rows: slice, columns: slice) -> GeneralizedPlant:
         """Return the plant restricted to some performance outputs and disturbances."""
         D11 = self.D11[rows][:, columns]
-        return GeneralizedPlant(self.A, self.B1[:, columns], self.B2, self.C1[rows], self.C2, D11, self.D12[rows], self.D21[:, columns], self.D22, self.dt)
+        return GeneralizedPlant(
+            self.A, self.B1[:, columns], self.B2, self.C1[rows], self.C2, D11, self.D12[rows], self.D21[:, columns], self.D22, self.dt
+        )
 
     def open_loop(self) -> StateSpace:
         """Return the plant as one system from (w, u) to (z, y)."""
@@ -139,7 +143,9 @@ class GeneralizedPlant:
             )
         loop = np.eye(n_y) - self.D22 @ K.D
         if np.linalg.cond(loop) > 1e14:
-            raise DimensionError("Closing the loop: I - D22 D^c is singular, so the algebraic loop has no solution; use a strictly proper controller.")
+            raise DimensionError(
+                "Closing the loop: I - D22 D^c is singular, so the algebraic loop has no solution; use a strictly proper controller."
+            )
         # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y
         solved = np.linalg.solve(loop, np.hstack([self.C2, self.D22 @ K.C, self.D21]))
         y_x, y_w = solved[:, : self.A.shape[0] + K.n_states], solved[:, self.A.shape[0] + K.n_states :]

@@ -76,7 +76,8 @@ def h2(plant: GeneralizedPlant, injection: Injection = Injection.NONE) -> Synthe
     norm = h2_norm(closed)
     if not np.isfinite(norm) or abs(norm - promised) > _AGREEMENT * max(promised, 1e-12):
         raise SynthesisError(
-            f"H2 synthesis: the closed loop has norm {norm:.9g} where the Riccati solutions promise {promised:.9g}; scale states, inputs and outputs to similar size."
+            f"H2 synthesis: the closed loop has norm {norm:.9g} where the Riccati solutions promise {promised:.9g}; "
+            "scale states, inputs and outputs to similar size."
         )
     return Synthesis(
         method="h2",

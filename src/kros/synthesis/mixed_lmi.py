@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,11 @@ Array = npt.NDArray[Any]
 _STRICT = 1e-9
 # Least eigenvalue of the scaled P: keeps I - X Y away from singular, without which the controller cannot be recovered. It costs about as much.
 _MARGIN = 1e-3
+
+
+def _cvxpy() -> Any:
+    """Import cvxpy when it is needed: it takes a second. Its own annotations do not describe what it exports."""
+    return import_module("cvxpy")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +66,7 @@ def ladder(time_limit_s: float, *, last_resort: bool) -> list[Attempt]:
 
     Clarabel with dense blocks and a supernodal factorisation is fastest; a moderate accuracy is enough, since everything is verified.
     """
-    import cvxpy as cp
+    cp = _cvxpy()
 
     installed = cp.installed_solvers()
     if last_resort:
@@ -90,7 +96,7 @@ class MixedInequalities:
     """
 
     def __init__(self, plant: GeneralizedPlant, sizes: Array, gamma: float) -> None:
-        import cvxpy as cp
+        cp = _cvxpy()
 
         self.plant = plant
         n, _, n_u, _, n_y = plant.sizes
@@ -104,7 +110,7 @@ class MixedInequalities:
 
     def _common(self) -> tuple[Any, Any]:
         """P and V = A~ - P, scaled."""
-        import cvxpy as cp
+        cp = _cvxpy()
 
         p, eye = self.plant, np.eye(self.plant.sizes[0])
         less = p.A - eye
@@ -114,7 +120,7 @@ class MixedInequalities:
 
     def _channel(self, rows: slice, columns: slice) -> tuple[Any, Any, Any]:
         """B~, C~, D~ of one channel, scaled; disturbances without effect on it are left out."""
-        import cvxpy as cp
+        cp = _cvxpy()
 
         part = self.plant.channel(rows, columns)
         used = np.any(np.vstack([part.B1, part.D21, part.D11]), axis=0)
@@ -124,7 +130,7 @@ class MixedInequalities:
         return self._scale @ B, C @ self._scale, D11 + part.D12 @ self.Dn @ D21
 
     def _constraints(self, gamma: float) -> list[Any]:
-        import cvxpy as cp
+        cp = _cvxpy()
 
         p = self.plant
         P, V = self._common()
@@ -145,7 +151,7 @@ class MixedInequalities:
 
     def solve(self, attempt: Attempt) -> Solution | str:
         """Solve with one solver; return the solution, or the reason why there is none."""
-        import cvxpy as cp
+        cp = _cvxpy()
 
         try:
             with warnings.catch_warnings():

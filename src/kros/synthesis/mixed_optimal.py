@@ -29,9 +29,10 @@ from .h2_optimal import absorb_feedthrough, h2, stability_margin
 from .mixed_lmi import Attempt, MixedInequalities, Solution, ladder
 from .observer_problem import ObserverProblem
 from .reduction import truncate
-from .result import Injection, Status, Synthesis
+from .result import Status, Synthesis
 
 Array = npt.NDArray[Any]
+_SCALINGS = (1.0, 4.0, 16.0)
 _log = logging.getLogger(__name__)
 
 
@@ -53,9 +54,9 @@ def mixed(
     plant: GeneralizedPlant | ObserverProblem,
     *,
     gamma: float = 1.0,
-    scalings: Sequence[float] = (1.0,),
+    scalings: Sequence[float] | None = None,
     max_states: int = 8,
-    time_limit_s: float = 60.0,
+    time_limit_s: float = 20.0,
     noise_floor: float = 1e-3,
     penalty_floor: float = 3e-2,
 ) -> Synthesis:
@@ -69,7 +70,7 @@ def mixed(
     gamma : float
         Level of the H-infinity constraint.
     scalings : sequence of float
-        Scalings of the second channel to try; the best verified result is kept. Leave it at 1 for observer problems.
+        Scalings of the second channel to try; the best verified result is kept. Default 1, 4 and 16; for observer problems 1, see above.
     max_states : int
         Stable plants are reduced to this number by balanced truncation for the inequalities only (their cost grows with the sixth power of
         the states, and states of no consequence make them ill-conditioned); where every solver fails, to two fewer. The controller is
@@ -103,7 +104,10 @@ def mixed(
     """
     if isinstance(plant, ObserverProblem):
         floors = {"noise_floor": noise_floor, "penalty_floor": penalty_floor}
-        return _for_observer(plant, floors, gamma=gamma, scalings=scalings, max_states=max_states, time_limit_s=time_limit_s)
+        return _for_observer(
+            plant, floors, gamma=gamma, scalings=(1.0,) if scalings is None else scalings, max_states=max_states, time_limit_s=time_limit_s
+        )
+    scalings = _SCALINGS if scalings is None else scalings
     if plant.dt == 0:
         raise SynthesisError("Mixed synthesis works in discrete time, found a continuous plant (dt = 0); sample it.")
     if gamma <= 0 or not scalings or min(scalings) <= 0 or time_limit_s <= 0 or max_states < 1:
@@ -115,14 +119,20 @@ def mixed(
     notes: list[str] = []
     found: list[_Verified] = []
     smaller = max(max_states - 2, 1)
+    tried: set[int] = set()
     for limit, last_resort in ((max_states, False), (smaller, False), (smaller, True)):
         small, notes = _reduced(plant, limit)
+        if (last_resort and any("infeasible" in reason for reason in reasons)) or (not last_resort and small.sizes[0] in tried):
+            continue
+        tried.add(small.sizes[0])
         attempts = ladder(time_limit_s, last_resort=last_resort)
         found = [v for a in scalings for v in [_best_for(plant, small, gamma, a, attempts, reasons)] if v is not None]
         if found:
             break
     if not found:
-        raise SynthesisError("Mixed synthesis: no controller survived; " + "; ".join(reasons) + ". Raise gamma, max_states, noise or the time limit.")
+        raise SynthesisError(
+            "Mixed synthesis: no controller survived; " + "; ".join(reasons) + ". Raise gamma, max_states, noise or the time limit."
+        )
     best = min(found, key=lambda v: v.h2)
     return _synthesis(plant, best, notes, time.perf_counter() - start)
 
@@ -136,7 +146,9 @@ def _reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant
     kept = small.sizes[0]
     if kept == n:
         return plant, []
-    return small, [f"Inequalities on {kept} of {n} states (discarded Hankel singular values sum to {tail:.2g} of the largest); verified on all."]
+    return small, [
+        f"Inequalities on {kept} of {n} states (discarded Hankel singular values sum to {tail:.2g} of the largest); verified on all."
+    ]
 
 
 def _best_for(
@@ -186,7 +198,9 @@ def part(plant: GeneralizedPlant, closed: StateSpace, channel: int) -> StateSpac
 def _synthesis(plant: GeneralizedPlant, best: _Verified, notes: list[str], elapsed: float) -> Synthesis:
     lower = h2(plant.channel(plant.rows(1), plant.columns(1))).lower_bound
     useful = lower is not None and lower > 1e-9 * best.h2
-    notes.append(f"Value of the inequalities {best.value:.6g} (bound of the H2 norm with the common Lyapunov matrix), channel scaling {best.scaling:g}.")
+    notes.append(
+        f"Value of the inequalities {best.value:.6g} (bound of the H2 norm with the common Lyapunov matrix), channel scaling {best.scaling:g}."
+    )
     return Synthesis(
         method="mixed",
         controller=best.controller,
@@ -215,6 +229,7 @@ def _for_observer(problem: ObserverProblem, floors: dict[str, float], **options:
         injection=problem.injection,
         worst_case_h2=value,
         quadrature_error=error,
+        spectral_radius=float(problem.error_system(controller).spectral_radius()),
         lower_bound=None,
         gap_percent=None,
         notes=(

@@ -101,13 +101,17 @@ class ObserverProblem:
         object.__setattr__(self, "C", np.atleast_2d(np.asarray(self.C, dtype=float)))
         n, m, q = self.nominal.n_states, self.nominal.n_inputs, self.C.shape[0]
         if self.C.shape[1] != n:
-            raise DimensionError(f"Observer problem: C should be (q, {n}) for {n} lifted states, found {self.C.shape}; select rows of the identity.")
+            raise DimensionError(
+                f"Observer problem: C should be (q, {n}) for {n} lifted states, found {self.C.shape}; select rows of the identity."
+            )
         if self.n_original is not None and not 1 <= self.n_original <= n:
             raise DimensionError(f"Observer problem: n_original = {self.n_original} should lie between 1 and {n}.")
         for name, size in (("input_scale", m), ("output_scale", n), ("noise", q)):
             value = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
             if value.shape != (size,) or not np.all(np.isfinite(value) & (value > 0)):
-                raise DimensionError(f"Observer problem: {name} should be {size} positive numbers, found {value}; noise of an encoder is its step / sqrt(12).")
+                raise DimensionError(
+                    f"Observer problem: {name} should be {size} positive numbers, found {value}; noise of an encoder is its step / sqrt(12)."
+                )
             object.__setattr__(self, name, value)
         if self.W_p is None:
             kept = n if self.n_original is None else self.n_original
@@ -116,7 +120,9 @@ class ObserverProblem:
         if self.W_p.shape[1] != n:  # type: ignore[union-attr]
             raise DimensionError(f"Observer problem: W_p should be (p, {n}), found {self.W_p.shape}; lifted functions get zero columns.")  # type: ignore[union-attr]
         if self.correction_penalty <= 0:
-            raise DimensionError(f"Observer problem: correction_penalty = {self.correction_penalty} should be positive; 1e-3 is the default.")
+            raise DimensionError(
+                f"Observer problem: correction_penalty = {self.correction_penalty} should be positive; 1e-3 is the default."
+            )
         if self.injection is Injection.NONE:
             raise DimensionError("Observer problem: injection should be Injection.INPUT or Injection.STATE, found NONE.")
         if (self.remainder_left is None) != (self.remainder_right is None):
@@ -133,9 +139,13 @@ class ObserverProblem:
         if weight is None:
             return
         if (weight.n_outputs, weight.n_inputs) != (size, size) or weight.batch_shape:
-            raise DimensionError(f"Observer problem: {name} should be {size} x {size}, found {weight.n_outputs} x {weight.n_inputs}{weight.batch_shape or ''}.")
+            raise DimensionError(
+                f"Observer problem: {name} should be {size} x {size}, found {weight.n_outputs} x {weight.n_inputs}{weight.batch_shape or ''}."
+            )
         if weight.dt != self.nominal.dt:
-            raise DimensionError(f"Observer problem: {name} is sampled at {weight.dt} s, the nominal model at {self.nominal.dt} s; fit it at the model's period.")
+            raise DimensionError(
+                f"Observer problem: {name} is sampled at {weight.dt} s, the nominal model at {self.nominal.dt} s; fit it at the model's period."
+            )
 
     @property
     def input_weight(self) -> StateSpace:
@@ -150,7 +160,7 @@ class ObserverProblem:
             self.nominal.A * x / x[:, None],
             self.nominal.B * u / x[:, None],
             self.C * x / self.noise[:, None],
-            self.W_p * x,  # type: ignore[operator]
+            self.W_p * x,
         )
 
     def require_sound(self) -> float:
@@ -165,7 +175,9 @@ class ObserverProblem:
             raise SynthesisError("Observer synthesis works in discrete time, found a continuous nominal model (dt = 0); sample it.")
         modes = unreachable_modes(self.nominal.A.T, self.C.T, self.nominal.dt)
         if modes:
-            raise SynthesisError(f"Observer synthesis: (A, C) is not detectable, mode {modes[0]:.6g} is invisible in y; measure another state.")
+            raise SynthesisError(
+                f"Observer synthesis: (A, C) is not detectable, mode {modes[0]:.6g} is invisible in y; measure another state."
+            )
         for name in ("nominal", "W_L", "W_R", "W_u", "remainder_left", "remainder_right"):
             system: StateSpace | None = getattr(self, name)
             if system is not None and not system.is_stable():

@@ -65,7 +65,9 @@ def paper_plant(nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: Sta
                 [zero((k_d, 2 * n + k_p + k_u)), W_D.A],
             ]
         ),
-        np.block([[B @ W_u.D, B @ W_D.D], [B @ W_u.D, zero((n, m))], [zero((k_p, 2 * m))], [W_u.B, zero((k_u, m))], [zero((k_d, m)), W_D.B]]),
+        np.block(
+            [[B @ W_u.D, B @ W_D.D], [B @ W_u.D, zero((n, m))], [zero((k_p, 2 * m))], [W_u.B, zero((k_u, m))], [zero((k_d, m)), W_D.B]]
+        ),
         np.vstack([zero((n, m)), B, zero((k_p + k_u + k_d, m))]),
         np.block([[W_p.D, -W_p.D, W_p.C, zero((p, k_u + k_d))], [zero((m, 2 * n + k_p)), W_u.C, W_D.C]]),
         np.hstack([C, -C, zero((q, k_p + k_u + k_d))]),
@@ -126,4 +128,6 @@ def _check(nominal: StateSpace, W_p: StateSpace, W_u: StateSpace, W_D: StateSpac
         if (weight.n_outputs, weight.n_inputs) != (outputs, inputs):
             raise DimensionError(f"Published plant: {name} should be {outputs} x {inputs}, found {weight.n_outputs} x {weight.n_inputs}.")
         if weight.dt != nominal.dt:
-            raise DimensionError(f"Published plant: {name} is sampled at {weight.dt} s, the nominal model at {nominal.dt} s; resample one of them.")
+            raise DimensionError(
+                f"Published plant: {name} is sampled at {weight.dt} s, the nominal model at {nominal.dt} s; resample one of them."
+            )

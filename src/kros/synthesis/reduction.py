@@ -40,9 +40,7 @@ def truncate(plant: GeneralizedPlant, n_states: int) -> tuple[GeneralizedPlant, 
     k = min(n_states, int(np.sum(h > _NEGLIGIBLE * h[0])))
     left = (U[:, :k] / np.sqrt(h[:k])).T @ S
     right = R @ Vh[:k].T / np.sqrt(h[:k])
-    small = replace(
-        plant, A=left @ plant.A @ right, B1=left @ plant.B1, B2=left @ plant.B2, C1=plant.C1 @ right, C2=plant.C2 @ right
-    )
+    small = replace(plant, A=left @ plant.A @ right, B1=left @ plant.B1, B2=left @ plant.B2, C1=plant.C1 @ right, C2=plant.C2 @ right)
     return small, float(h[k:].sum() / h[0])
 
 

@@ -51,7 +51,9 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, p
         ) from error
     X = (X + X.T) / 2
     if dt > 0 and _residual(A, B, Q, R, S, X) > 1e-5:
-        raise SynthesisError(f"{purpose}: the Riccati solution has residual {_residual(A, B, Q, R, S, X):.2g}; scale states, inputs and outputs to similar size.")
+        raise SynthesisError(
+            f"{purpose}: the Riccati solution has residual {_residual(A, B, Q, R, S, X):.2g}; scale states, inputs and outputs to similar size."
+        )
     return X
 
 
@@ -67,7 +69,7 @@ def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> flo
     if np.abs(np.linalg.eigvals(closed)).max() >= 1:
         return float("inf")
     cost = Q + S @ F + F.T @ S.T + F.T @ R @ F
-    return float(np.linalg.norm(closed.T @ X @ closed + cost - X) / max(np.linalg.norm(X), 1e-300))
+    return float(np.linalg.norm(closed.T @ X @ closed + cost - X)) / max(float(np.linalg.norm(X)), 1e-300)
 
 
 def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:

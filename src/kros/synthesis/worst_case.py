@@ -2,7 +2,8 @@ r"""Worst-case H2 observers: filtering of a shaped disturbance, by one Riccati e
 
 K is outside the loop of the uncertainty, so the worst case over the set is a disturbance spectrum, and the best K for a given spectrum is a
 Kalman predictor (state injection) or an H2 controller (input injection). The game between K and the spectrum is solved by fictitious play:
-start from the average spectrum of the set, find the spectrum that is worst for the resulting K, then for the next, and average these. Every iterate is certified
+start from the average spectrum of the set, find the
+spectrum that is worst for the resulting K, then for the next, and average these. Every iterate is certified
 independently, the best is kept; every averaged spectrum gives a lower bound, the best is kept.
 
 *State injection.* With ``d = C_d x_d + D_d nu``, ``x_d+ = A_d x_d + B_d nu`` the shaped input disturbance, and ``r`` the shaped remainder,
@@ -32,8 +33,8 @@ from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, block_diagonal
 from ..core.norms import h2_norm
 from .certificate import certify, uncertain_ball
-from .h2_optimal import h2
 from .constant_gain import predictor
+from .h2_optimal import h2
 from .observer_problem import ObserverProblem, is_diagonal
 from .result import Injection, Status, Synthesis
 

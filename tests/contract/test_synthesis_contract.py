@@ -1,0 +1,85 @@
+"""One contract for all observer syntheses: what the result claims is recomputed here from the result and the problem alone."""
+
+import numpy as np
+import pytest
+
+from kros.core import StateSpace, block_diagonal, gain, h2_norm
+from kros.synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, worst_case_h2
+from kros.synthesis.certificate import certify
+from kros.synthesis.verify import observer_loop
+
+DT = 1e-2
+
+
+class Constant:
+    """Shaping by a constant: crude on purpose, since the certificate must not depend on the fit."""
+
+    def __init__(self, freqs_hz, magnitude, dt, side="above", **_):
+        self.system = gain([[magnitude.max() if side == "above" else magnitude.min()]], dt)
+
+
+def problem(injection):
+    nominal = StateSpace(
+        [[1.0, 0.01, 0.0], [-0.05, 0.9, 0.1], [0.0, -0.1, 0.7]], [[0.0, 0.0], [0.05, 0.0], [0.1, 0.3]], np.eye(3), np.zeros((3, 2)), DT
+    )
+    lag = StateSpace([[0.8]], [[1.0]], [[-0.03]], [[0.3]], DT)
+    return ObserverProblem(
+        nominal=nominal,
+        C=[[1.0, 0.0, 0.0]],
+        W_L=block_diagonal([lag, lag]),
+        W_R=gain(np.diag([1.0, 0.7]), DT),
+        input_scale=[2.0, 1.0],
+        output_scale=[1.0, 3.0, 1.0],
+        noise=[1e-3],
+        injection=injection,
+    )
+
+
+METHODS = {
+    "worst_case_h2": lambda case: worst_case_h2(case, fit=Constant),
+    "worst_case_h2 fitted": worst_case_h2,
+    "mixed": mixed,
+}
+
+
+@pytest.mark.parametrize("injection", [Injection.INPUT, Injection.STATE])
+@pytest.mark.parametrize("method", METHODS)
+def test_claims_are_recomputed(method, injection):
+    case = problem(injection)
+    found = METHODS[method](case)
+    assert isinstance(found, Synthesis)
+    assert found.injection is injection
+    assert isinstance(found.status, Status)
+    assert (found.controller.n_outputs, found.controller.n_inputs) == ((2, 1) if injection is Injection.INPUT else (3, 1))
+    loop = np.abs(np.linalg.eigvals(observer_loop(case.nominal, case.C, found.controller, injection))).max()
+    assert loop < 1
+    assert found.spectral_radius == pytest.approx(loop, rel=1e-6)
+    value, error = certify(case, found.controller)
+    assert found.worst_case_h2 == pytest.approx(value, rel=1e-6)
+    assert found.quadrature_error == pytest.approx(error, abs=1e-6 * value)
+    if found.lower_bound is not None:
+        assert 0 < found.lower_bound <= found.worst_case_h2
+        assert found.gap_percent == pytest.approx(100 * (found.worst_case_h2 / found.lower_bound - 1))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_lower_bound_serves_every_method(method):
+    bound = worst_case_h2(problem(Injection.STATE), refinements=2).lower_bound
+    for injection in Injection.INPUT, Injection.STATE:
+        assert METHODS[method](problem(injection)).worst_case_h2 >= bound
+
+
+def test_constant_gains_are_certified_by_the_same_code():
+    case = problem(Injection.STATE)
+    found = kalman(case.nominal.A, case.C, 0.01 * np.eye(3), [[1e-6]], DT)
+    assert certify(case, found.controller)[0] > worst_case_h2(case).lower_bound
+
+
+def test_noise_part_of_the_certificate_is_the_lyapunov_norm():
+    """With weights that vanish only the noise is left, and the quadrature must give its H2 norm."""
+    case = problem(Injection.STATE)
+    quiet = ObserverProblem(case.nominal, case.C, gain(1e-12 * np.eye(2), DT), case.W_R, case.input_scale, case.output_scale, case.noise)
+    K = gain([[0.3], [0.1], [0.0]], DT)
+    loop = quiet.error_system(K)
+    noise = StateSpace(loop.A, loop.B[:, 5:], loop.C, loop.D[:, 5:], DT)
+    assert certify(quiet, K)[0] == pytest.approx(h2_norm(noise), rel=1e-5)

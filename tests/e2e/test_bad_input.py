@@ -70,7 +70,7 @@ def test_unknown_reader(kros, study, tmp_path):
         ("[lifting]\nfunctions = ['sin(positoin)']", ("positoin", "position")),
         ("[lifting]\nfunctions = ['__import__(\"os\").abort()']", ("not allowed",)),
         ("[calibrate]\nangle = 'theta'", ("theta", "position")),
-        ("[split]\ntest = ['000', '001', '002', '003']", ("split.test",)),
+        ("[split]\ntest = ['0', '1', '2', '3']", ("split.test",)),
         ("[data.csv]\nfiles = 1\n[data.x]", ("data.x",)),
         ("not toml", ("TOML",)),
     ],

@@ -102,10 +102,10 @@ def test_estimates_are_written_one_row_group_an_episode(kros, demo, tmp_path, me
     table = file.read()
     assert table.column_names == ["unit", "condition", "episode", "k", "position_hat", "velocity_hat", "current_hat"]
     rows = table.to_pandas() if hasattr(table, "to_pandas") else None
-    one = rows[(rows.unit == "001002") & (rows.condition == "noload") & (rows.episode == "003")]
+    one = rows[(rows.unit == "001002") & (rows.condition == "noload") & (rows.episode == "3")]
     from kros.data import EpisodeKey, read_parquet
 
-    truth = read_parquet(demo / "simulated").read(EpisodeKey("001002", "noload", "003"))
+    truth = read_parquet(demo / "simulated").read(EpisodeKey("001002", "noload", "3"))
     error = 100 * np.sqrt(np.mean((one["velocity_hat"].to_numpy() - truth[:, 1]) ** 2)) / np.abs(truth[:, 1]).max()
     expected = [
         r["error_percent"]

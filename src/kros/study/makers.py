@@ -18,6 +18,7 @@ from .tuning import TuningSet
 
 Array = npt.NDArray[np.float64]
 IDENTITY, TUNED = "identity", "tuned"
+_MIXED_NOISE = 1e-3  # of the range; matrix inequalities do not resolve an encoder's 1e-7
 _CORNERS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)
 
 
@@ -121,7 +122,9 @@ def kalman_tuned(task: Task) -> Made:
 
 def make_mixed(task: Task) -> Made:
     """The paper's mixed H2/H-infinity problem on the reduced, regularised plant, corrected through the input."""
-    problem = replace(task.require_problem(), injection=Injection.INPUT)
+    problem = task.require_problem()
+    ranges = problem.C @ problem.output_scale
+    problem = replace(problem, injection=Injection.INPUT, noise=np.maximum(problem.noise, _MIXED_NOISE * np.abs(ranges)))
     synthesis = mixed(problem.mixed_plant(), time_limit_s=task.time_limit_s)
     return replace(synthesis, controller=problem.to_physical(synthesis.controller), injection=Injection.INPUT), {}, task.problem
 

@@ -25,6 +25,7 @@ from ...data.population import DEFAULT_CONDITION
 from ...data.writers import GroupRecord
 from ..config import StudyConfig
 from ..context import Context
+from ..presets import resolve_lifting, resolve_phase
 
 PARQUET = "parquet"
 
@@ -63,6 +64,12 @@ def check_source(config: StudyConfig, single_allowed: bool) -> None:
     check_population(population, allow_single=single_allowed)
     split_episodes(population, config.split.test)
     _identify_on(config, population)
+    resolve_phase(config, population, resolve_lifting(config, population))
+    if not population.measured:
+        raise DataError(
+            f"No channel is measured: an observer needs a state that is available at run time, found states {', '.join(population.states)}; "
+            "declare measured = true for at least one."
+        )
 
 
 def read_group(task: GroupTask) -> GroupFacts:

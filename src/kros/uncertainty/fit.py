@@ -32,6 +32,7 @@ _POINTS = 150  # of the grid in the first programs
 _ROUNDS = 6
 _TOP = 10.0  # tau beyond which (80 % of Nyquist) no knots are placed
 _EXCHANGE = 10**0.002 - 1  # 0.02 dB of squared magnitude
+_HOPELESS = 2.0  # an order whose overbound is beyond this many tolerances is not polished while a higher one is allowed
 _GAIN = 0.9  # a further order that brings the overbound in dB to this share needs no other start
 
 
@@ -138,7 +139,7 @@ def fit_magnitude(
     best: FittedMagnitude | None = None
     lower: _Bound | None = None
     for candidate in range(highest + 1) if order is None else (order, *range(order + 1)):
-        found, lower = problem.fit(candidate, tolerance_db, lower)
+        found, lower = problem.fit(candidate, tolerance_db, lower, last=candidate == highest)
         if found is not None and (best is None or found.overbound_db < best.overbound_db):
             best = found
         if best is not None and (best.within_tolerance or best.order == order):
@@ -168,14 +169,15 @@ class _Problem:
     nyquist_zeros: int
     dc_zeros: int
 
-    def fit(self, order: int, tolerance_db: float, lower: _Bound | None) -> tuple[FittedMagnitude | None, _Bound | None]:
+    def fit(self, order: int, tolerance_db: float, lower: _Bound | None, *, last: bool) -> tuple[FittedMagnitude | None, _Bound | None]:
         """Fit one order, starting from the bound of a lower order; None where the programs fail."""
         tau = bilinear_squared(self.freqs, self.dt)
         shape = self._zero_factor(tau)
         keep = shape > 1e-30
         targets = self.values[keep] ** (2 if self.side is Side.ABOVE else -2) / shape[keep]
         unit = np.exp(np.mean(np.log(targets)))
-        found = _minimax(tau[keep], targets / unit, order, lower)
+        hopeless = np.inf if last else 10 ** (_HOPELESS * tolerance_db / 10)
+        found = _minimax(tau[keep], targets / unit, order, lower, hopeless)
         if found is None:
             return None, lower
         rational = found.rational
@@ -209,7 +211,7 @@ class _Bound:
     ratio: float
 
 
-def _minimax(tau: Array, targets: Array, order: int, lower: _Bound | None) -> _Bound | None:
+def _minimax(tau: Array, targets: Array, order: int, lower: _Bound | None, hopeless: float) -> _Bound | None:
     """Best n / d of one order above the targets, positive on the whole axis; `lower` is the best of an order less.
 
     The problem has no local optima, but programs are solved in finite precision: knots where the data bend come first, evenly spaced ones
@@ -217,11 +219,11 @@ def _minimax(tau: Array, targets: Array, order: int, lower: _Bound | None) -> _B
     """
     if order == 0:
         return _Bound(RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0)), float(targets.max() / targets.min()))
-    best = _exchange(tau, targets, _knots(tau, targets, order, 0.05), lower)
+    best = _exchange(tau, targets, _knots(tau, targets, order, 0.05), lower, hopeless)
     for even in (1.0, 0.3):
         if best is not None and (lower is None or best.ratio < lower.ratio * (1 - 1e-3) or lower.ratio < 1 + _EXCHANGE):
             break
-        other = _exchange(tau, targets, _knots(tau, targets, order, even), lower)
+        other = _exchange(tau, targets, _knots(tau, targets, order, even), lower, hopeless)
         best = other if best is None or (other is not None and other.ratio < best.ratio) else best
     return best
 
@@ -240,8 +242,8 @@ def _knots(tau: Array, targets: Array, order: int, even: float) -> Array:
     return np.exp(np.interp((np.arange(order) + 0.5) / order * share[-1], share, middle))
 
 
-def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None) -> _Bound | None:
-    """Solve on part of the grid, and add the points at which the bound found there is worse."""
+def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None, hopeless: float) -> _Bound | None:
+    """Solve on part of the grid, and add the points at which the bound found there is worse; a ratio beyond `hopeless` is left as it is."""
     chosen = np.unique(np.linspace(0, len(tau) - 1, _POINTS).round().astype(int))
     cuts = np.zeros(0)
     phi, best = basis(tau, knots), None
@@ -265,7 +267,7 @@ def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None) ->
                 d,
             )
         worse = np.setdiff1d(_extremes(ratio, 1.0, float(ratio[chosen].max())), chosen)
-        if not bad and not worse.size:
+        if not bad and (not worse.size or (best is not None and best.ratio > hopeless)):
             break
         chosen = np.union1d(chosen, worse)
         cuts = np.unique(np.concatenate([cuts, bad, [np.sqrt(x * y) for x, y in pairwise(bad)]]))

@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from kros.core.artifacts import save_artifact, write_json
 from kros.core.errors import ConfigError, DataError
 from kros.core.lti import StateSpace, gain
-from kros.data import from_arrays
-from kros.data.population import Channel, Role
+from kros.data import from_arrays, write_parquet
+from kros.data.population import Channel, EpisodeKey, Population, Role, Unit
 from kros.identify import ModelSet, PhaseCalibration, PhaseSpec, UnitPhase
 from kros.lifting import Lifting
 from kros.observer import Observer
@@ -28,6 +28,7 @@ from kros.report.encode import to_svg
 from kros.report.figures import FIGURES, draw_all
 from kros.report.figures.forms import paper_bounds
 from kros.report.figures.outlier_residuals import typical_residuals
+from kros.report.figures.spectra import band_shares
 from kros.report.figures.synthesis_bode import scaled_filter
 from kros.report.figures.trajectories import longest_steady, steady_stretches
 from kros.report.run_folder import NotShownError, RunFolder
@@ -309,8 +310,23 @@ def test_half_a_run_is_told_by_halves(tmp_path: Path) -> None:
     outline(text)
     assert "<figure" not in text
     assert "stopped before an observer was made" in text
-    assert "is left out: the observers have not been evaluated yet" in text
+    assert "is left out: the recordings are not in their place any more" in text
     assert all(result.drawing is None and result.reason for result in draw_all(RunFolder(tmp_path)))
+
+
+def test_stopped_run_shows_its_recordings(tmp_path: Path) -> None:
+    write_read_stage(tmp_path)
+    states, inputs = shown_signals(0)
+    sources = {EpisodeKey("001", c, "1"): np.hstack([states, inputs]) for c in ("load", "noload")}
+    write_parquet(Population(CHANNELS, DT, (Unit("001"),), tuple(sources), sources.__getitem__), tmp_path / "recordings")
+    drawn = [r.name for r in draw_all(RunFolder(tmp_path)) if r.drawing]
+    assert drawn == ["signals"]
+
+
+def test_shares_of_power_in_a_band() -> None:
+    freqs, own, other = np.arange(100.0), np.ones((100, 2)), np.ones((100, 2))
+    own[45:56], other[45:56, 1] = 0.5, 0.25
+    assert band_shares(freqs, own, other, CHANNELS[:2], (45.0, 55.0)) == pytest.approx({"position": 0.5, "velocity": 2.0})
 
 
 def test_plant_without_phase_has_no_calibration(finished: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:

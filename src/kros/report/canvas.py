@@ -128,7 +128,7 @@ def settle(figure: Figure) -> None:
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
-        figure.set_layout_engine("none")
+        figure.set_layout_engine(None)  # a placeholder, "none", would still draw everything twice
 
 
 def limit_decibels(axes: Axes, floor_db: float = 90.0) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.artifacts import write_bytes
+from ..data.population import DEFAULT_CONDITION
 from .encode import to_svg
 from .figures import draw_all
 from .names import condition_label
@@ -80,4 +81,4 @@ def stylesheet() -> str:
 
 def _subtitle(metrics: Mapping[str, Any]) -> str:
     study = metrics["study"]
-    return f"{study['units']} units · {', '.join(condition_label(c) for c in study['conditions'])}"
+    return " · ".join([f"{study['units']} units", *(condition_label(c) for c in study["conditions"] if c != DEFAULT_CONDITION)])

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import floor, isfinite, log10
 
+from ..data.population import DEFAULT_CONDITION, EpisodeKey
 from .theme import Tone
 
 _METHODS = {
@@ -129,6 +130,12 @@ def axis_label(channel: str, unit: str) -> str:
     readable = _UNITS.get(unit, unit)
     name = channel.replace("_", " ")
     return f"{name} ({readable})" if readable else name
+
+
+def episode_title(key: EpisodeKey) -> str:
+    """Return what an episode is called above an axis."""
+    where = "" if key.condition == DEFAULT_CONDITION else f"{condition_label(key.condition)}: "
+    return f"{where}unit {key.unit}, episode {key.episode}"
 
 
 def condition_label(condition: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ..data.population import DEFAULT_CONDITION
 from .error_table import ErrorTable, error_table
 from .names import condition_label, number, observer_label, split_observer
 from .sections.outliers import flagged_text
@@ -25,9 +26,9 @@ def verdict(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[
 
 def _recorded(metrics: Mapping[str, Any]) -> list[str]:
     study = metrics["study"]
-    conditions = " and ".join(condition_label(c) for c in study["conditions"])
+    conditions = " and ".join(condition_label(c) for c in study["conditions"] if c != DEFAULT_CONDITION)
     units = f"{study['units']} unit" + ("s" if study["units"] != 1 else "")
-    return [f"{units} of one batch were recorded ({conditions})."]
+    return [f"{units} of one batch were recorded" + (f" ({conditions})." if conditions else ".")]
 
 
 def _handed_over(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str]:

@@ -6,9 +6,10 @@ Needs: the evaluation's kept episodes with models.
 from __future__ import annotations
 
 from ..canvas import grid, legend
-from ..names import best_models, is_koopman, model_label, model_look, number
+from ..names import best_models, episode_title, is_koopman, model_label, model_look, number
 from ..run_folder import NotShownError, RunFolder
 from .drawing import Drawing
+from .spectra import band_shares
 from .trajectories import TRUTH, clip_to, draw_lines, hide_times, label_rows, shade, states, steady_window
 
 NAME, TITLE = "free_run", "Predictions of the models"
@@ -33,7 +34,7 @@ def draw(run: RunFolder) -> Drawing:
         shade(full, shown.time_s, window)
     label_rows(axes[:, 0], channels)
     hide_times(axes[:-1].ravel())
-    axes[0, 0].set_title(f"unit {shown.key.unit}, episode {shown.key.episode}")
+    axes[0, 0].set_title(episode_title(shown.key))
     axes[0, 1].set_title(f"{_ZOOM_S:g} s at constant speed" if run.calibrated else f"{_ZOOM_S:g} s of it")
     for panel in axes[-1]:
         panel.set_xlabel("time (s)")
@@ -44,8 +45,17 @@ def draw(run: RunFolder) -> Drawing:
 def _caption(run: RunFolder, chosen: list[str]) -> str:
     text = "The whole held-out episode from the true first state and the recorded inputs alone, no measurement fed back. "
     lifted = [n for n in chosen if is_koopman(n)]
-    if lifted and len(chosen) == 2 and run.calibrated:
+    if lifted and len(chosen) == 2 and _carries(run, chosen):
         text += "The linear model follows the average; the Koopman model carries the gearbox oscillation as well. "
     free = run.evaluation["free_run"]
     parts = [f"{model_label(n)} " + ", ".join(f"{c} {number(v['median'])} %" for c, v in free[n].items()) for n in chosen if n in free]
     return text + (f"Median error over units: {'; '.join(parts)}." if parts else "")
+
+
+def _carries(run: RunFolder, chosen: list[str]) -> bool:
+    """Whether the Koopman model leaves less than half of the linear one's power around the gearbox frequency in some state."""
+    band_hz = run.evaluation.get("band_hz")
+    if not band_hz:
+        return False
+    other, own = (run.arrays[f"spectrum/model/{n}"] for n in chosen)
+    return min(band_shares(run.arrays["freqs_hz"], own, other, states(run), band_hz).values(), default=1.0) < 0.5

@@ -9,7 +9,7 @@ from ..canvas import grid, legend
 from ..names import best_models, model_label, model_look
 from ..run_folder import NotShownError, RunFolder
 from .drawing import Drawing
-from .spectra import band, density_label, draw_spectra, robust_top
+from .spectra import band, band_shares, density_label, draw_spectra, robust_top, share_text
 from .trajectories import states
 
 NAME, TITLE = "free_run_spectra", "Spectra of the prediction errors"
@@ -37,9 +37,11 @@ def draw(run: RunFolder) -> Drawing:
     axes[1, 0].set_ylabel("PSD, logarithmic")
     legend(figure, axes[0, 0])
     text = "Power spectral densities of the free-run errors, mean over all held-out episodes."
-    text += (
-        " In the shaded band around the gearbox frequency the Koopman model leaves less; the linear scale is cut above 10 Hz's largest value."
-        if band_hz
-        else ""
-    )
+    if band_hz and len(chosen) == 2:
+        own, other = (run.arrays[f"spectrum/model/{n}"] for n in reversed(chosen))
+        shares = share_text(band_shares(freqs, own, other, channels, band_hz))
+        text += (
+            f" Shaded: the band around the gearbox frequency at top speed, where the {model_label(chosen[1])} model leaves, relative to the "
+            f"{model_label(chosen[0])} one, this much power: {shares}. Linear scales end at the largest value above 10 Hz."
+        )
     return Drawing(figure, text)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from ...evaluate.errors import error_spectrum
 from ..canvas import grid, legend, logarithmic
-from ..names import BASELINES, condition_label, main_observers, observer_label, observer_look, split_observer
+from ..names import BASELINES, condition_label, episode_title, main_observers, observer_label, observer_look, split_observer
 from ..run_folder import NotShownError, RunFolder, Shown
 from .drawing import Drawing
 from .spectra import band
@@ -39,7 +39,7 @@ def draw(run: RunFolder) -> Drawing:
     hide_times(axes[:-1].ravel())
     figure.align_ylabels(axes[:, 0])
     label_rows(axes[:, 0], channels, suffix=" error")
-    axes[0, 0].set_title(f"{condition_label(shown.key.condition)}: unit {shown.key.unit}, episode {shown.key.episode}")
+    axes[0, 0].set_title(episode_title(shown.key))
     axes[0, 1].set_title(f"{_ZOOM_S:g} s of it")
     axes[0, 2].set_title("PSD, unit²/Hz")
     axes[-1, 0].set_xlabel("time (s)")

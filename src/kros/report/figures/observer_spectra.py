@@ -6,10 +6,10 @@ Needs: the evaluation's observer spectra.
 from __future__ import annotations
 
 from ..canvas import grid, legend
-from ..names import main_observers, observer_label, observer_look, split_observer
+from ..names import is_koopman, main_observers, observer_label, observer_look, split_observer
 from ..run_folder import NotShownError, RunFolder
 from .drawing import Drawing
-from .spectra import band, density_label, draw_spectra, robust_top
+from .spectra import band, band_shares, density_label, draw_spectra, robust_top, share_text
 from .trajectories import states
 
 NAME, TITLE = "observer_spectra", "Spectra of the estimation errors"
@@ -44,7 +44,17 @@ def draw(run: RunFolder) -> Drawing:
         axes[-1, i].set_xlabel("frequency (Hz)")
     legend(figure, axes[0, 0], columns=2)
     text = "Power spectral densities of the estimation errors: nominal unit, and the mean over all other units."
-    text += (
-        " The shaded band holds the gearbox frequency at top speed. Linear scales end at the largest value above 10 Hz." if band_hz else ""
-    )
+    if band_hz:
+        text += f" Shaded: the band around the gearbox frequency at top speed{_compared(run, names, rows[-1][0])}."
+        text += " Linear scales end at the largest value above 10 Hz."
     return Drawing(figure, text)
+
+
+def _compared(run: RunFolder, names: list[str], role: str) -> str:
+    """How much of the linear twin's power in the band the observer that is handed over leaves."""
+    own, twin = names[-1], names[0]
+    if own == twin or is_koopman(own) == is_koopman(twin):
+        return ""
+    first, second = (run.arrays[f"spectrum/{role}/{run.identify_on}/{n}"] for n in (own, twin))
+    shares = band_shares(run.arrays["freqs_hz"], first, second, states(run)[:4], run.evaluation["band_hz"])
+    return f", where off nominal {observer_label(own)} leaves, relative to {observer_label(twin)}, this much power: {share_text(shares)}"

@@ -6,7 +6,7 @@ Needs: the evaluation's kept episodes with observers.
 from __future__ import annotations
 
 from ..canvas import grid, legend
-from ..names import main_observers, observer_label, observer_look
+from ..names import is_koopman, main_observers, observer_label, observer_look
 from ..run_folder import NotShownError, RunFolder
 from .drawing import Drawing
 from .trajectories import TRUTH, clip_to, draw_lines, hide_times, label_rows, shade, states, steady_window
@@ -52,8 +52,8 @@ def draw(run: RunFolder) -> Drawing:
 def _caption(run: RunFolder, names: list[str]) -> str:
     measured = " and ".join(c.name for c in states(run) if c.measured)
     text = f"Estimates from {measured} alone, as recorded, of states that are not measured. "
-    if run.calibrated:
-        text += "The Koopman observer follows the gearbox oscillation in velocity and current; its linear twin gives the average. "
+    if run.calibrated and any(is_koopman(n) for n in names):
+        text += "On the right, how much of the gearbox oscillation each of them follows; a linear model can only give the average. "
     return (
         text + "The start shows how fast an observer finds the true state: all begin at the first measurement with everything else at zero."
     )

@@ -1,15 +1,16 @@
 """Recorded signals of one held-out episode in every condition, with the velocity error at constant speed.
 
-Needs: the evaluation's kept episodes.
+Needs: the evaluation's kept episodes, or the recordings.
 """
 
 from __future__ import annotations
 
 from ..canvas import grid, legend
-from ..names import Look, axis_label, condition_label
-from ..run_folder import RunFolder, Shown
+from ..names import Look, axis_label, episode_title
+from ..run_folder import RunFolder
 from ..theme import Tone
 from .drawing import Drawing
+from .recorded import recorded_episodes
 from .trajectories import clip_to, draw_lines, hide_times, label_rows, reference_columns, shade, states, steady_window
 
 NAME, TITLE = "signals", "Recorded signals"
@@ -19,7 +20,7 @@ _ZOOM_S = 0.4
 
 def draw(run: RunFolder) -> Drawing:
     """Draw one episode of the nominal unit in at most two conditions, side by side."""
-    shown = _one_each(run)
+    shown = recorded_episodes(run)[:2]
     channels, references = states(run)[:5], reference_columns(run)
     zoomed = "velocity" if "velocity" in references else next(iter(references), None)
     figure, axes = grid(len(channels) + (zoomed is not None), len(shown), 1.15, sharey="row")
@@ -32,7 +33,7 @@ def draw(run: RunFolder) -> Drawing:
             draw_lines(column[i], episode.time_s, lines, width=1.0)
             if zoomed is not None:
                 shade(column[i], episode.time_s, window)
-        column[0].set_title(f"{condition_label(episode.key.condition)}: unit {episode.key.unit}, episode {episode.key.episode}")
+        column[0].set_title(episode_title(episode.key))
         column[len(channels) - 1].set_xlabel("time (s)")
         hide_times(column[: len(channels) - 1])
         if zoomed is not None:
@@ -48,11 +49,6 @@ def draw(run: RunFolder) -> Drawing:
     figure.align_ylabels(axes[:, 0])
     legend(figure, axes[0, 0])
     return Drawing(figure, _caption(run, zoomed, len(shown)))
-
-
-def _one_each(run: RunFolder) -> list[Shown]:
-    nominal = run.shown[0].key.unit
-    return [s for s in run.shown if s.key.unit == nominal][:2]
 
 
 def _caption(run: RunFolder, zoomed: str | None, columns: int) -> str:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ...data.population import Channel
 from ..canvas import logarithmic as logarithmic_axis
-from ..names import Look, axis_label
+from ..names import Look, axis_label, number
 from ..theme import Tone
 
 if TYPE_CHECKING:
@@ -59,6 +59,26 @@ def band(axes: Axes, band_hz: Sequence[float] | None) -> None:
     """Mark the band around the gearbox frequency."""
     if band_hz is not None:
         axes.axvspan(band_hz[0], band_hz[1], color=Tone.GRID.light, lw=0, zorder=0.5)
+
+
+def band_shares(freqs_hz: Array, own: Array, other: Array, channels: Sequence[Channel], band_hz: Sequence[float]) -> dict[str, float]:
+    """Return the power inside a band relative to another's, by channel.
+
+    Parameters
+    ----------
+    freqs_hz : ndarray, shape (n_freqs,), Hz
+    own, other : ndarray, shape (n_freqs, n)
+    channels : sequence of Channel
+    band_hz : (float, float)
+    """
+    inside = (freqs_hz >= band_hz[0]) & (freqs_hz <= band_hz[1])
+    power = own[inside].sum(axis=0), other[inside].sum(axis=0)
+    return {c.name: float(power[0][i] / power[1][i]) for i, c in enumerate(channels) if power[1][i] > 0 and np.isfinite(power[0][i])}
+
+
+def share_text(shares: Mapping[str, float]) -> str:
+    """Return shares for a sentence: ``velocity 20 %, current 3 %``."""
+    return ", ".join(f"{name} {number(100 * share, 2)} %" for name, share in shares.items())
 
 
 def density_label(channel: Channel) -> str:

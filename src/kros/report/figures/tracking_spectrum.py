@@ -1,6 +1,6 @@
 """Power spectrum of the tracking error at constant speed, against multiples of the disturbance's frequency (the paper's Figure 4).
 
-Needs: the phase calibration, the evaluation's kept episodes.
+Needs: the phase calibration, the evaluation's kept episodes, or the recordings.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ import numpy.typing as npt
 
 from ...evaluate.errors import error_spectrum
 from ..canvas import grid, legend, logarithmic
-from ..names import condition_label
+from ..names import episode_title
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import Tone
 from .drawing import Drawing
+from .recorded import recorded_episodes
 from .trajectories import steady_stretches
 
 NAME, TITLE = "tracking_spectrum", "Tracking error at constant speed"
@@ -27,11 +28,10 @@ def draw(run: RunFolder) -> Drawing:
     """Draw the spectrum for one episode of every condition."""
     spec = run.calibration.spec
     figure, axes = grid(1, 1, 2.3)
-    shown = {s.key.condition: s for s in reversed(run.shown) if s.key.unit == run.shown[0].key.unit}
     frequency = 0.0
-    for condition, tone in zip(sorted(shown, key=lambda c: c != run.identify_on), (Tone.BLUE, Tone.GOLD, Tone.GREEN), strict=False):
-        freqs, density, frequency = _spectrum(run, shown[condition])
-        axes[0, 0].plot(freqs[1:], density[1:], color=tone.light, label=f"{condition_label(condition)}, unit {shown[condition].key.unit}")
+    for shown, tone in zip(recorded_episodes(run), (Tone.BLUE, Tone.GOLD, Tone.GREEN), strict=False):
+        freqs, density, frequency = _spectrum(run, shown)
+        axes[0, 0].plot(freqs[1:], density[1:], color=tone.light, label=episode_title(shown.key))
     logarithmic(axes[0, 0])
     top = 0.5 / run.sample_period_s
     for multiple in range(1, min(6, int(top / frequency)) + 1):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ...data.population import OUTLIERS
+from ...data.population import DEFAULT_CONDITION, OUTLIERS
 from ..content import Section, Table, text_cells
 from ..names import condition_label, number
 from ..run_folder import NotShownError, RunFolder
@@ -16,7 +16,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section:
     study, facts = metrics["study"], run.facts
     filed = [u for u, group in facts["groups"].items() if group == OUTLIERS]
     episodes = {c: [sum(row[1] == c for row in facts[part]) for part in ("train", "test")] for c in study["conditions"]}
-    counts = "; ".join(f"{condition_label(c)}: {train} for training, {test} held out" for c, (train, test) in episodes.items())
+    counts = "; ".join(f"{_where(c)}{train} for training, {test} held out" for c, (train, test) in episodes.items())
     text = f"{study['units']} units, sampled every {1e3 * study['sample_period_s']:g} ms. Episodes: {counts}. "
     if len(episodes) > 1:
         text += f"Models, uncertainty and observers come from “{condition_label(study['identify_on'])}” alone; the rest only tests them. "
@@ -25,6 +25,10 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section:
     if facts.get("dropped"):
         text += f"Left out for bad samples: {', '.join(facts['dropped'])}."
     return Section("recordings", "Recordings", [text], [t for t in [_channels(run)] if t], ["signals", "tracking_spectrum"])
+
+
+def _where(condition: str) -> str:
+    return "" if condition == DEFAULT_CONDITION else f"{condition_label(condition)} "
 
 
 def _channels(run: RunFolder) -> Table | None:

@@ -100,7 +100,8 @@ class UncertaintyConfig(_Section):
     max_order: int = Field(4, ge=1, le=8)
     tolerance_db: float = Field(1.0, gt=0)
     drop_outliers: bool = False
-    false_alarm_rate: float = Field(1e-3, gt=0, lt=1)
+    outlier_form: FORMS = "additive"
+    false_alarm_rate: float = Field(3e-3, gt=0, lt=1)
 
 
 class SynthesisConfig(_Section):

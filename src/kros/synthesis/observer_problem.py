@@ -75,6 +75,8 @@ class ObserverProblem:
         Right weight of the additive remainder on scaled inputs.
     injection : Injection
         Where the correction enters.
+    process_noise : ndarray, shape (n,), optional
+        Standard deviation of white noise on every (lifted) state per sample, independent of everything else; default none.
 
     Raises
     ------
@@ -96,6 +98,7 @@ class ObserverProblem:
     remainder_left: StateSpace | None = None
     remainder_right: StateSpace | None = None
     injection: Injection = Injection.STATE
+    process_noise: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "C", np.atleast_2d(np.asarray(self.C, dtype=float)))
@@ -113,6 +116,10 @@ class ObserverProblem:
                     f"Observer problem: {name} should be {size} positive numbers, found {value}; noise of an encoder is its step / sqrt(12)."
                 )
             object.__setattr__(self, name, value)
+        level = np.zeros(n) if self.process_noise is None else np.asarray(self.process_noise, dtype=float)
+        if level.shape != (n,) or not np.all(np.isfinite(level) & (level >= 0)):
+            raise DimensionError(f"Observer problem: process_noise should be {n} numbers of at least zero, found {level}.")
+        object.__setattr__(self, "process_noise", level)
         if self.W_p is None:
             kept = n if self.n_original is None else self.n_original
             object.__setattr__(self, "W_p", np.diag(1 / self.output_scale)[:kept])
@@ -194,35 +201,40 @@ class ObserverProblem:
         return size
 
     def error_plant(self) -> GeneralizedPlant:
-        """Unweighted error system in scaled coordinates: w = (d, r, n), z = W_p e, u = y^c, y = C e + n."""
+        """Unweighted error system in scaled coordinates: w = (d, r, n, v), z = W_p e, u = y^c, y = C e + n; v is process noise."""
         A, B, C, W_p = self.scaled
         n, m, q, p = A.shape[0], B.shape[1], C.shape[0], W_p.shape[0]
         J = B if self.injection is Injection.INPUT else np.eye(n)
         return GeneralizedPlant(
             A,
-            np.hstack([B, np.zeros((n, n + q))]),
+            np.hstack([B, np.zeros((n, n + q)), np.diag(self.scaled_process_noise)]),
             -J,
             W_p,
             C,
-            np.hstack([np.zeros((p, m)), W_p, np.zeros((p, q))]),
+            np.hstack([np.zeros((p, m)), W_p, np.zeros((p, q + n))]),
             np.zeros((p, J.shape[1])),
-            np.hstack([np.zeros((q, m)), C, np.eye(q)]),
+            np.hstack([np.zeros((q, m)), C, np.eye(q), np.zeros((q, n))]),
             np.zeros((q, J.shape[1])),
             self.nominal.dt,
         )
 
+    @property
+    def scaled_process_noise(self) -> Array:
+        """Standard deviation of the process noise over `output_scale`, shape (n,)."""
+        return self.process_noise / self.output_scale  # type: ignore[operator]
+
     def error_system(self, controller: StateSpace) -> StateSpace:
-        """Closed error system from (d, r, n), scaled, to W_p e, for a controller in physical units."""
+        """Closed error system from (d, r, n, v), scaled, to W_p e, for a controller in physical units."""
         return self.error_plant().close(self.to_scaled(controller))
 
     def shaped_plant(self, disturbance: StateSpace, remainder: StateSpace | None = None) -> GeneralizedPlant:
-        """Regularised plant for H2: white noise through the shaping filters, penalty on the correction, w = (nu_d, nu_r, n)."""
-        q, dt = self.C.shape[0], self.nominal.dt
-        filters = [disturbance] + ([remainder] if remainder is not None else []) + [gain(np.eye(q), dt)]
+        """Regularised plant for H2: white noise through the shaping filters, penalty on the correction, w = (nu_d, nu_r, n, v)."""
+        q, n, dt = self.C.shape[0], self.nominal.n_states, self.nominal.dt
+        filters = [disturbance] + ([remainder] if remainder is not None else []) + [gain(np.eye(q + n), dt)]
         plant = self.error_plant()
         if remainder is None:
-            m, n = self.nominal.n_inputs, self.nominal.n_states
-            kept = np.r_[0:m, m + n : m + n + q]
+            m = self.nominal.n_inputs
+            kept = np.r_[0:m, m + n : m + n + q + n]
             plant = GeneralizedPlant(
                 plant.A, plant.B1[:, kept], plant.B2, plant.C1, plant.C2, plant.D11[:, kept], plant.D12, plant.D21[:, kept], plant.D22, dt
             )

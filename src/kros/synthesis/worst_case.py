@@ -93,7 +93,7 @@ def worst_case_h2(
     -------
     Synthesis
         ``worst_case_h2`` with ``quadrature_error`` included, ``lower_bound`` for all observers of either injection, and their gap; ``h2_norm``
-        is the norm of the error under the measurement noise alone (the nominal machine).
+        is the norm of the error under measurement and process noise alone (the nominal machine).
 
     Raises
     ------
@@ -226,7 +226,9 @@ def _shaped_kalman(problem: ObserverProblem, shaping: _Shaping) -> tuple[StateSp
     to_error = np.hstack([np.eye(n), np.zeros((n, kd)), r.C])
     feed = np.hstack([np.zeros((n, d.n_inputs)), r.D])  # white part of e
     C_s, D_s = C @ to_error, C @ feed
-    L, P = predictor(A_s, C_s, B_s @ B_s.T, np.eye(q) + D_s @ D_s.T, B_s @ D_s.T, "Worst-case H2 synthesis")
+    Q_s = B_s @ B_s.T
+    Q_s[:n, :n] += np.diag(problem.scaled_process_noise**2)
+    L, P = predictor(A_s, C_s, Q_s, np.eye(q) + D_s @ D_s.T, B_s @ D_s.T, "Worst-case H2 synthesis")
     L_xi, L_d, L_r = L[:n], L[n : n + kd], L[n + kd :]
     K = StateSpace(
         np.block([[d.A, np.zeros((kd, kr))], [np.zeros((kr, kd)), r.A]]),

@@ -111,7 +111,7 @@ def score_units(context: Context) -> tuple[list[Path], set[str]]:
         outliers = score_outliers(
             models.systems().frequency_response(freqs),
             freqs,
-            context.config.uncertainty.form,
+            context.config.uncertainty.outlier_form,
             unit_ids=models.unit_ids,
             output_scale=models.output_scale,
             input_scale=models.input_scale,

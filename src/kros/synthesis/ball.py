@@ -14,6 +14,8 @@ inequality ``||P Theta Q||_F^2 = tr(P^H P  Theta Q Q^H Theta^H) <= sum_i s_i(P)^
 
     ||T X M||_F <= ||T X_c M||_F + (sum_i s_i(T R_l)^2 s_i(R_r M)^2)^(1/2).
 
+The smaller of this and the dual bound of `dual_bound` is used.
+
 *Lower bound.* The worst case is at least any average over the set. Theta uniform on the unitary matrices has mean zero and
 ``E[Theta Q Q^H Theta^H] = I ||Q||_F^2 / m``, so for every T
 
@@ -35,6 +37,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from .dual_bound import dual_bound
 
 Array = npt.NDArray[Any]
 
@@ -68,8 +72,9 @@ class Ball:
 
     def bound(self, T: Array) -> Array:
         """Upper bound of ``||T X M||_F`` over the set, shape (f,)."""
-        inner = np.linalg.norm(T @ self.center, axis=(-2, -1))
-        return inner + spread(T @ self.left, self.right)
+        inner, outer = T @ self.center, T @ self.left
+        simple = np.linalg.norm(inner, axis=(-2, -1)) + spread(outer, self.right)
+        return np.minimum(simple, dual_bound(inner, outer, self.right))
 
     def average(self) -> Array:
         """Diagonal of the average spectrum, shape (f, m)."""

@@ -267,6 +267,23 @@ def test_noise_only_matches_the_norm():
     assert found.h2_norm == pytest.approx(h2_norm(StateSpace(loop.A, loop.B[:, 6:], loop.C, loop.D[:, 6:], DT)))
 
 
+def test_process_noise_enters_design_and_certificate():
+    level = np.array([0.0, 1e-2, 1e-3, 1e-2])
+    quiet, case = problem(6), problem(6, process_noise=level)
+    found, plain = worst_case_h2(case, fit=log_fit), worst_case_h2(quiet, fit=log_fit)
+    assert found.lower_bound <= found.worst_case_h2 <= certify(case, plain.controller)[0] * (1 + 1e-4)
+    A, _, C, W_p = case.scaled
+    loop = case.error_system(plain.controller)
+    extra = StateSpace(loop.A, loop.B[:, 7:], loop.C, loop.D[:, 7:], DT)
+    together, alone = certify(case, plain.controller)[0], certify(quiet, plain.controller)[0]
+    assert together**2 == pytest.approx(alone**2 + h2_norm(extra) ** 2, rel=1e-4)
+    z = np.exp(2j * np.pi * 5.0 * DT)
+    R = np.linalg.inv(z * np.eye(4) - A)
+    k = case.to_scaled(plain.controller).frequency_response([5.0])[0]
+    expected = W_p @ np.linalg.inv(np.eye(4) + R @ k @ C) @ R @ np.diag(level / case.output_scale)
+    assert extra.frequency_response([5.0])[0] == pytest.approx(expected, rel=1e-6, abs=1e-12)
+
+
 def test_a_set_that_is_not_well_posed_is_refused():
     with pytest.raises(SynthesisError, match=r"\|\|W_R W_L\|\| = 1\.2.*below 1"):
         worst_case_h2(problem(0, W_L=gain(1.2 * np.eye(2), DT), W_R=gain(np.eye(2), DT)), fit=log_fit)

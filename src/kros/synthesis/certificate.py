@@ -4,9 +4,9 @@ r"""Certified worst-case H2 norm of an observer, for any correction filter, howe
     \frac{1}{2\pi}\int \Big(b_\Delta(\theta) + b_r(\theta)\Big)^2 + \|T_n\|_F^2 \, d\theta,
     \qquad b_\Delta = \|T X_c M\|_F + \Big(\sum_i \sigma_i(T R_l)^2 \sigma_i(R_r M)^2\Big)^{1/2}
 
-or the sharper dual bound of `dual_bound`, whichever is smaller. ``b_r`` bounds the additive remainder in the same way (a ball around zero); it adds by the triangle inequality since the same input drives
-both. The noise is independent, so its square adds. Delta is any frequency-wise contraction, causal or not: the bound is for that set, and
-an upper bound for causal perturbations.
+or the sharper dual bound of `dual_bound`, whichever is smaller. ``b_r`` bounds the additive remainder in the same way (a ball around zero);
+it adds by the triangle inequality since the same input drives both. The noise is independent, so its square adds. Delta is any
+frequency-wise contraction, causal or not: the bound is for that set, and an upper bound for causal perturbations.
 """
 
 from __future__ import annotations

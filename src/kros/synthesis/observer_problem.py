@@ -221,7 +221,7 @@ class ObserverProblem:
     @property
     def scaled_process_noise(self) -> Array:
         """Standard deviation of the process noise over `output_scale`, shape (n,)."""
-        return self.process_noise / self.output_scale  # type: ignore[operator]
+        return self.process_noise / self.output_scale
 
     def error_system(self, controller: StateSpace) -> StateSpace:
         """Closed error system from (d, r, n, v), scaled, to W_p e, for a controller in physical units."""

@@ -19,15 +19,12 @@ class Cell:
         Shown smaller, behind the text.
     bar : float or None
         Share of the cell's width that is shaded, 0 to 1.
-    long : bool
-        A sentence that may take several lines.
     """
 
     text: str
     strong: bool = False
     note: str = ""
     bar: float | None = None
-    long: bool = False
 
 
 @dataclass(frozen=True)
@@ -45,6 +42,8 @@ class Table:
         Whether the reader opens it.
     emphasised : sequence of int
         Rows that are set off.
+    prose : bool
+        Whether cells hold sentences instead of numbers.
     """
 
     head: Sequence[str]
@@ -53,6 +52,7 @@ class Table:
     groups: Sequence[tuple[str, int]] = ()
     folded: bool = False
     emphasised: Sequence[int] = ()
+    prose: bool = False
 
 
 @dataclass(frozen=True)

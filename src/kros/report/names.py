@@ -132,15 +132,27 @@ def axis_label(channel: str, unit: str) -> str:
     return f"{name} ({readable})" if readable else name
 
 
+def squared(unit: str) -> str:
+    """Return the square of a unit of measure, such as ``(rad/s)²``."""
+    if unit in ("", "1"):
+        return "1"
+    return f"({unit})²" if set(unit) & set(" /·*") else f"{unit}²"
+
+
 def episode_title(key: EpisodeKey) -> str:
     """Return what an episode is called above an axis."""
     where = "" if key.condition == DEFAULT_CONDITION else f"{condition_label(key.condition)}: "
-    return f"{where}unit {key.unit}, episode {key.episode}"
+    return shorten(f"{where}unit {key.unit}, episode {key.episode}", 46)
 
 
 def condition_label(condition: str) -> str:
     """Return what a condition is called."""
     return {"noload": "no load", "load": "loaded"}.get(condition, condition)
+
+
+def shorten(text: str, most: int) -> str:
+    """Return a text cut to a number of characters."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 def number(value: float | None, digits: int = 3) -> str:

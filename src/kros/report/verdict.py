@@ -7,7 +7,7 @@ from typing import Any
 
 from ..data.population import DEFAULT_CONDITION
 from .error_table import ErrorTable, error_table
-from .names import condition_label, number, observer_label, split_observer
+from .names import BASELINES, condition_label, number, observer_label, split_observer
 from .sections.outliers import flagged_text
 
 
@@ -49,7 +49,18 @@ def _handed_over(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[
     sentences.append(f"{source} estimates {_join(parts)} on held-out episodes of the other units, in the mean.")
     for method, label in (("open_loop", "Open loop, the nominal model alone,"), ("kalman_tuned", "The tuned Kalman filter")):
         sentences += _comparison(table, name, method, label, known)
-    return sentences
+    return sentences + _better(table, name, known)
+
+
+def _better(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
+    """Observers that do clearly better in some channel, by name."""
+    parts = []
+    for channel in channels:
+        own, best = table.cells[name][channel].mean, table.best(channel, "mean")
+        if own is not None and best is not None and best < 0.95 * own:
+            other = next(o for o in table.observers if table.cells[o][channel].mean == best)
+            parts.append(f"“{observer_label(other)}” in {channel.replace('_', ' ')} ({number(best)} %)")
+    return [f"Better in the mean: {_join(parts)}."] if parts else []
 
 
 def _channel(table: ErrorTable, name: str, channel: str) -> str:
@@ -86,8 +97,10 @@ def _ratio(own: float | None, theirs: float) -> str:
 
 
 def _certificate(metrics: Mapping[str, Any]) -> list[str]:
-    entry = metrics.get("observers", {}).get(metrics["study"].get("deployed") or "", {})
-    sentences = []
+    name = metrics["study"].get("deployed") or ""
+    entry, sentences = metrics.get("observers", {}).get(name, {}), []
+    if name and all(split_observer(n)[1] in BASELINES for n in metrics.get("observers", {})):
+        sentences.append("No robust observer could be made from this population; the reasons stand under Synthesis.")
     if entry.get("worst_case_h2") is not None:
         gap = entry.get("gap_percent")
         near = f", at most {number(gap)} % above what any correction of this kind can reach" if gap is not None else ""

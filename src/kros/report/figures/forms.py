@@ -41,7 +41,7 @@ _PAPER_FORMS = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE) 
 def draw(run: RunFolder) -> Drawing:
     """Draw one panel a model."""
     chosen = {n: run.uncertain[n] for n in best_models(run.uncertain)}
-    variants = {n: paper_bounds(model, run.models[n]) for n, model in chosen.items() if n in run.models}
+    variants = {n: paper_bounds(m, run.models[n]) for n, m in chosen.items() if n in run.models and is_tall(m)}
     first = next(iter(chosen.values()))
     text = (
         "Largest singular value of the residuals over all units, for the nominal unit that suits each form best; signals over "
@@ -50,6 +50,11 @@ def draw(run: RunFolder) -> Drawing:
     )
     text += " Dashed: the paper's variants of both output forms, 0 dB and more everywhere whatever the units do." if variants else ""
     return Drawing(forms_figure(chosen, variants), text)
+
+
+def is_tall(model: UncertainModel) -> bool:
+    """Tell whether there are more outputs than inputs, where the paper's output forms contain the identity."""
+    return len(model.output_scale) > len(model.input_scale)
 
 
 def paper_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tuple[Array, Array]]:
@@ -93,8 +98,8 @@ def _panel(axes: Axes, model: UncertainModel, variants: Mapping[Form, tuple[Arra
         axes.plot(freqs, decibel(line), color=FORM_TONES[form].light, lw=2.4 if used else 1.2, zorder=3 if used else 2)
     for form, (freqs, bound) in variants.items():
         axes.plot(freqs, decibel(bound), "--", color=FORM_TONES[form].light, lw=1.0)
-    if variants:
-        level = max(float(decibel(bound)[0]) for _, bound in variants.values())
+    level = max((float(decibel(bound)[0]) for _, bound in variants.values()), default=np.inf)
+    if level < 3:
         axes.annotate(
             "output forms as in the paper",
             (0, level),

@@ -10,10 +10,9 @@ from ..names import best_models, episode_title, is_koopman, model_label, model_l
 from ..run_folder import NotShownError, RunFolder
 from .drawing import Drawing
 from .spectra import band_shares
-from .trajectories import TRUTH, clip_to, draw_lines, hide_times, label_rows, shade, states, steady_window
+from .trajectories import TRUTH, clip_to, draw_lines, hide_times, label_rows, shade, states, steady_window, zoom_s
 
 NAME, TITLE = "free_run", "Predictions of the models"
-_ZOOM_S = 0.3
 
 
 def draw(run: RunFolder) -> Drawing:
@@ -24,7 +23,8 @@ def draw(run: RunFolder) -> Drawing:
         raise NotShownError("no model was run freely on the episode that is shown")
     channels = states(run)[:6]
     figure, axes = grid(len(channels), 2, 1.25, width_ratios=(1.5, 1))
-    window = steady_window(run, shown, _ZOOM_S)
+    length_s = zoom_s(run, shown)
+    window = steady_window(run, shown, length_s)
     for i, (full, zoom) in enumerate(axes):
         lines = [("recorded", shown.states[:, i], TRUTH)] + [(model_label(n), shown.models[n][:, i], model_look(n)) for n in chosen]
         draw_lines(full, shown.time_s, lines, width=0.9)
@@ -35,7 +35,7 @@ def draw(run: RunFolder) -> Drawing:
     label_rows(axes[:, 0], channels)
     hide_times(axes[:-1].ravel())
     axes[0, 0].set_title(episode_title(shown.key))
-    axes[0, 1].set_title(f"{_ZOOM_S:g} s at constant speed" if run.calibrated else f"{_ZOOM_S:g} s of it")
+    axes[0, 1].set_title(f"{length_s:g} s at constant speed" if run.calibrated else f"{length_s:g} s of it")
     for panel in axes[-1]:
         panel.set_xlabel("time (s)")
     legend(figure, axes[0, 0])

@@ -24,7 +24,7 @@ def draw(run: RunFolder) -> Drawing:
     spectra = {model_label(n): (run.arrays[f"spectrum/model/{n}"], model_look(n)) for n in chosen}
     figure, axes = grid(2, len(channels), 1.55, sharex=True)
     band_hz = run.evaluation.get("band_hz")
-    top = min(3.5 * band_hz[1], freqs[-1]) if band_hz else freqs[-1]
+    top = min(3.5 * band_hz[1], freqs[-1]) if band_hz else None
     for row, logarithmic in zip(axes, (False, True), strict=True):
         draw_spectra(row, freqs, spectra, logarithmic, top)
         for panel in row:

@@ -11,10 +11,9 @@ from ..names import BASELINES, condition_label, episode_title, main_observers, o
 from ..run_folder import NotShownError, RunFolder, Shown
 from .drawing import Drawing
 from .spectra import band
-from .trajectories import Line, draw_lines, hide_times, label_rows, states, steady_window
+from .trajectories import Line, draw_lines, hide_times, label_rows, states, steady_window, zoom_s
 
 NAME, TITLE = "loaded", "Errors in the other condition"
-_ZOOM_S = 0.3
 
 
 def draw(run: RunFolder) -> Drawing:
@@ -25,7 +24,8 @@ def draw(run: RunFolder) -> Drawing:
     names = _compared(list(shown.observers), run.deployed)
     channels = states(run)[:4]
     figure, axes = grid(len(channels), 3, 1.35, width_ratios=(1.5, 1, 1))
-    window, band_hz = steady_window(run, shown, _ZOOM_S), run.evaluation.get("band_hz")
+    length_s = zoom_s(run, shown)
+    window, band_hz = steady_window(run, shown, length_s), run.evaluation.get("band_hz")
     for i, (full, zoom, spectrum) in enumerate(axes):
         lines = _errors(shown, names, i)
         draw_lines(full, shown.time_s, lines, width=0.9)
@@ -40,7 +40,7 @@ def draw(run: RunFolder) -> Drawing:
     figure.align_ylabels(axes[:, 0])
     label_rows(axes[:, 0], channels, suffix=" error")
     axes[0, 0].set_title(episode_title(shown.key))
-    axes[0, 1].set_title(f"{_ZOOM_S:g} s of it")
+    axes[0, 1].set_title(f"{length_s:g} s of it")
     axes[0, 2].set_title("PSD, unit²/Hz")
     axes[-1, 0].set_xlabel("time (s)")
     axes[-1, 1].set_xlabel("time (s)")

@@ -29,7 +29,7 @@ def draw(run: RunFolder) -> Drawing:
     freqs, channels, band_hz = run.arrays["freqs_hz"], states(run)[:4], run.evaluation.get("band_hz")
     names = main_observers(run.evaluation["observers"], run.deployed)
     figure, axes = grid(len(rows), len(channels), 1.35, legend_rows=2, sharex=True)
-    top = min(3.5 * band_hz[1], freqs[-1]) if band_hz else freqs[-1]
+    top = min(3.5 * band_hz[1], freqs[-1]) if band_hz else None
     for row, (role, logarithmic, label) in zip(axes, rows, strict=True):
         spectra = {observer_label(n): (run.arrays[f"spectrum/{role}/{condition}/{n}"], observer_look(n)) for n in names}
         draw_spectra(row, freqs, spectra, logarithmic, top)

@@ -6,13 +6,12 @@ Needs: the evaluation's kept episodes with observers.
 from __future__ import annotations
 
 from ..canvas import grid, legend
-from ..names import is_koopman, main_observers, observer_label, observer_look
+from ..names import is_koopman, main_observers, observer_label, observer_look, shorten
 from ..run_folder import NotShownError, RunFolder
 from .drawing import Drawing
-from .trajectories import TRUTH, clip_to, draw_lines, hide_times, label_rows, shade, states, steady_window
+from .trajectories import TRUTH, clip_to, draw_lines, hide_times, label_rows, shade, states, steady_window, zoom_s
 
 NAME, TITLE = "observers_in_time", "Estimates"
-_ZOOM_S = 0.3
 
 
 def draw(run: RunFolder) -> Drawing:
@@ -26,7 +25,8 @@ def draw(run: RunFolder) -> Drawing:
     channels = [all_states[i] for i in rows]
     figure, axes = grid(len(rows) * len(shown), 2, 1.25, legend_rows=2, width_ratios=(1.3, 1))
     for block, episode in enumerate(shown):
-        window = steady_window(run, episode, _ZOOM_S)
+        length_s = zoom_s(run, episode)
+        window = steady_window(run, episode, length_s)
         panels = axes[block * len(rows) : (block + 1) * len(rows)]
         for i, (full, zoom) in zip(rows, panels, strict=True):
             lines = [("recorded", episode.states[:, i], TRUTH)] + [
@@ -40,8 +40,8 @@ def draw(run: RunFolder) -> Drawing:
         label_rows(panels[:, 0], channels)
         hide_times(panels[:-1].ravel())
         role = "nominal" if block == 0 else "worst off-nominal"
-        panels[0, 0].set_title(f"{role}: unit {episode.key.unit}, episode {episode.key.episode}")
-        panels[0, 1].set_title(f"{_ZOOM_S:g} s of it")
+        panels[0, 0].set_title(shorten(f"{role}: unit {episode.key.unit}, episode {episode.key.episode}", 46))
+        panels[0, 1].set_title(f"{length_s:g} s of it")
     for panel in axes[-1]:
         panel.set_xlabel("time (s)")
     figure.align_ylabels(axes[:, 0])

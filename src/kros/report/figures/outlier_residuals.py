@@ -44,7 +44,7 @@ def draw(run: RunFolder) -> Drawing:
     figure, axes = grid(levels.shape[-2], levels.shape[-1], 1.7, sharex=True, sharey=True)
     for i, row in enumerate(axes):
         for j, panel in enumerate(row):
-            _panel(panel, freqs, levels[..., i, j], top["unit"])
+            _panel(panel, freqs, levels[..., i, j], top)
             panel.set_title(f"{_short(names[j])} → {_short(names[i])}")
     for panel in axes[-1]:
         frequency_axis(panel, freqs)
@@ -80,14 +80,14 @@ def typical_residuals(models: ModelSet, form: Form, others: list[str], unit: str
     return np.nanmedian(levels[:, 1:] if alone else levels, axis=0)
 
 
-def _panel(axes: Axes, freqs: Array, lines: Array, unit: str) -> None:
+def _panel(axes: Axes, freqs: Array, lines: Array, row: dict[str, Any]) -> None:
     from matplotlib.collections import LineCollection
 
     top = lines[:-1].max(axis=0)
     paths = [np.column_stack([freqs, line]) for line in lines[:-1] if np.isfinite(line).all()]
     axes.add_collection(LineCollection(paths, colors=Tone.BLUE.light, linewidths=0.6, alpha=0.3, label=f"{len(lines) - 1} others"))
     axes.plot(freqs, top, color=Tone.BLUE.light, lw=1.3, label="largest of the others")
-    axes.plot(freqs, lines[-1], color=Tone.ALARM.light, lw=1.6, label=f"unit {unit}")
+    axes.plot(freqs, lines[-1], color=(Tone.ALARM if row["outlier"] else Tone.ORANGE).light, lw=1.6, label=f"unit {row['unit']}")
 
 
 def _limits(lines: Array) -> tuple[float, float]:

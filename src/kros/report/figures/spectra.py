@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ...data.population import Channel
+from ..canvas import frequency_axis
 from ..canvas import logarithmic as logarithmic_axis
-from ..names import Look, axis_label, number
+from ..names import Look, axis_label, number, squared
 from ..theme import Tone
 
 if TYPE_CHECKING:
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 Array = npt.NDArray[Any]
 
 
-def draw_spectra(row: Sequence[Axes], freqs_hz: Array, spectra: Mapping[str, tuple[Array, Look]], logarithmic: bool, top_hz: float) -> None:
+def draw_spectra(
+    row: Sequence[Axes], freqs_hz: Array, spectra: Mapping[str, tuple[Array, Look]], logarithmic: bool, top_hz: float | None
+) -> None:
     """Draw the spectra of all states in one row of axes.
 
     Parameters
@@ -30,16 +33,19 @@ def draw_spectra(row: Sequence[Axes], freqs_hz: Array, spectra: Mapping[str, tup
     spectra : mapping of label to (ndarray, shape (n_freqs, n), Look)
     logarithmic : bool
         Scale of the vertical axis.
-    top_hz : float
-        End of the horizontal axis.
+    top_hz : float or None
+        End of a linear frequency axis; None for a logarithmic one up to Nyquist.
     """
-    inside = (freqs_hz <= top_hz) & (freqs_hz > 0)
+    inside = (freqs_hz <= (top_hz or np.inf)) & (freqs_hz > 0)
     for i, axes in enumerate(row):
         for label, (density, look) in spectra.items():
             line = density[inside, i]
             if np.isfinite(line).all():
                 axes.plot(freqs_hz[inside], line, look.style, color=look.colour, label=label, lw=1.2)
-        axes.set_xlim(0, top_hz)
+        if top_hz is None:
+            frequency_axis(axes, freqs_hz, "")
+        else:
+            axes.set_xlim(0, top_hz)
         if logarithmic:
             logarithmic_axis(axes)
         else:
@@ -83,6 +89,4 @@ def share_text(shares: Mapping[str, float]) -> str:
 
 def density_label(channel: Channel) -> str:
     """Return the label of a power spectral density."""
-    unit = channel.unit
-    squared = "1" if unit in ("", "1") else (f"({unit})²" if "/" in unit else f"{unit}²")
-    return f"{axis_label(channel.name, '')} error, {squared}/Hz"
+    return f"{axis_label(channel.name, '')} error, {squared(channel.unit)}/Hz"

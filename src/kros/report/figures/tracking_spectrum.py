@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ...evaluate.errors import error_spectrum
 from ..canvas import grid, legend, logarithmic
-from ..names import episode_title
+from ..names import episode_title, squared
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import Tone
 from .drawing import Drawing
@@ -48,17 +48,13 @@ def draw(run: RunFolder) -> Drawing:
     axes[0, 0].set_xlim(0, min(top, 6.6 * frequency))
     axes[0, 0].set_xlabel("frequency (Hz)")
     unit = next(c.unit for c in run.channels if c.name == spec.measured)
-    axes[0, 0].set_ylabel(f"{spec.measured} error,\nPSD ({_squared(unit)}/Hz)")
+    axes[0, 0].set_ylabel(f"{spec.measured} error,\nPSD ({squared(unit)}/Hz)")
     legend(figure, axes[0, 0])
     return Drawing(
         figure,
         f"Power spectral density of {spec.reference.replace('_', ' ')} minus {spec.measured} at the highest speed. The gearbox puts its peaks at "
         f"{frequency:.3g} Hz, where {spec.ratio:g} times the speed lies, and at multiples; the lifting models the first.",
     )
-
-
-def _squared(unit: str) -> str:
-    return f"({unit})²" if "/" in unit else f"{unit}²"
 
 
 def _spectrum(run: RunFolder, shown: Shown) -> tuple[Array, Array, float]:

@@ -34,6 +34,11 @@ def reference_columns(run: RunFolder) -> dict[str, int]:
     return {c.name: inputs.index(f"target_{c.name}") for c in states(run) if f"target_{c.name}" in inputs}
 
 
+def zoom_s(run: RunFolder, shown: Shown) -> float:
+    """Return the length of a zoom: some fifteen turns of a gearbox, for other plants an eighth of the episode."""
+    return 0.3 if run.calibrated else float(f"{shown.time_s[-1] / 8:.1g}")
+
+
 def steady_window(run: RunFolder, shown: Shown, length_s: float) -> slice:
     """Return a window at constant speed: in the longest stretch of the highest steady reference, else in the middle of the episode."""
     size = min(round(length_s / run.sample_period_s), len(shown.time_s))

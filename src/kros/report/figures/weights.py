@@ -76,6 +76,8 @@ def _draw_row(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] |
 
 
 def _draw_entries(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: Sequence[str] | None) -> None:
+    if magnitudes.shape[1] > 1 and np.allclose(magnitudes, magnitudes[:, :1]):  # a scalar weight
+        magnitudes, cover, names = magnitudes[:, :1], cover[:, :1], ["every signal"]
     ends = []
     frequency_axis(axes, freqs_hz, "")
     for i, tone in zip(range(magnitudes.shape[1]), _TONES, strict=False):

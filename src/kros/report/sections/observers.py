@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ...data.population import DEFAULT_CONDITION
 from ..content import Cell, Section, Table
 from ..error_table import ErrorCell, ErrorTable, error_table
 from ..names import condition_label, number, observer_label
@@ -50,7 +51,8 @@ def errors(table: ErrorTable, deployed: str | None, measured: tuple[str, ...] = 
     head = ["observer", *(["nominal", "mean", "worst"] * len(channels))]
     groups = [("", 1), *((c.replace("_", " ") + ("" if c in table.ranked else " (not ranked)"), 3) for c in channels)]
     emphasised = [i for i, o in enumerate(table.observers) if o == deployed]
-    caption = f"Errors in percent, {condition_label(table.condition)}."
+    where = "" if table.condition == DEFAULT_CONDITION else f", {condition_label(table.condition)}"
+    caption = f"Errors in percent{where}."
     if len(table.ranked) < len(table.channels):
         caption += " The current's error under load is the load's torque itself: reported, not ranked."
     return Table(head, rows, caption, groups, emphasised=emphasised)

@@ -60,8 +60,8 @@ def _remarks(run: RunFolder) -> list[Table]:
             what = "no observer" if facts.get("status") == "failed" else "no certificate"
             reason = "; ".join(dict.fromkeys(facts["reason"].split("; ")))
             reasons.setdefault((what, reason), []).append(observer_label(name))
-    rows = [[Cell("; ".join(names)), Cell(what, strong=True), Cell(reason, long=True)] for (what, reason), names in reasons.items()]
-    return [Table(["observer", "", "reason"], rows, "What could not be made or certified, and why")] if rows else []
+    rows = [[Cell("; ".join(names)), Cell(what, strong=True), Cell(reason)] for (what, reason), names in reasons.items()]
+    return [Table(["observer", "", "reason"], rows, "What could not be made or certified, and why", prose=True)] if rows else []
 
 
 def _row(name: str, entry: Mapping[str, Any]) -> list[Cell]:

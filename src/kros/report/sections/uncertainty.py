@@ -16,6 +16,12 @@ _PAPER = (
     "the residuals used here are zero for equal plants and show what the units really do."
 )
 
+_HIGH = (
+    "Peaks of 0 dB and more ({names}): units differ by more than all of the signal somewhere, and in an inverse form the set then "
+    "contains ill-posed plants. Another form, "
+    "better models, or fewer unlike units in one batch would bring it down."
+)
+
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     """Return forms, peaks and weights."""
@@ -28,7 +34,10 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "over frequency says how much. "
         f"The design uses the {form_label(first['form'])} form. Below 0 dB a unit differs by less than all of the signal."
     )
-    return Section("uncertainty", "Uncertainty", [text, _PAPER], [_peaks(entries), _weights(entries)], ["forms", "weights"])
+    tall = any(len(m.output_scale) > len(m.input_scale) for m in run.uncertain.values())
+    high = [n for n, e in entries.items() if (e["peak_db"].get(e["form"]) or 0) >= 0]
+    paragraphs = [text, *([_PAPER] if tall else []), *([_HIGH.format(names=", ".join(model_label(n) for n in high))] if high else [])]
+    return Section("uncertainty", "Uncertainty", paragraphs, [_peaks(entries), _weights(entries)], ["forms", "weights"])
 
 
 def _peaks(entries: Mapping[str, Any]) -> Table:

@@ -76,6 +76,8 @@ def thin_log(freqs_hz: Array, values: Array, points: int = 220) -> tuple[Array, 
     ----------
     freqs_hz : ndarray, shape (n,), Hz
     values : ndarray, shape (..., n)
+    points : int
+        Most points that are left.
 
     Returns
     -------

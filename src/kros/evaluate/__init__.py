@@ -1,6 +1,6 @@
 """Evaluation: errors and spectra of estimates and free runs against recordings."""
 
 from .batch import EpisodeBatch
-from .errors import ErrorSummary, error_spectrum, summarise
+from .errors import ErrorSummary, error_percent, error_rms, error_spectrum, summarise
 
-__all__ = ["EpisodeBatch", "ErrorSummary", "error_spectrum", "summarise"]
+__all__ = ["EpisodeBatch", "ErrorSummary", "error_percent", "error_rms", "error_spectrum", "summarise"]

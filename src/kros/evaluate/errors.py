@@ -51,15 +51,31 @@ def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt:
     ErrorSummary
         Not-a-number or infinite where the estimate diverged.
     """
-    rms, percent, spectra = [], [], []
+    segment = int(min(_SEGMENT, lengths.min()))
+    spectra = []
     for i, length in enumerate(lengths):
-        error = estimate[:length, i] - truth[:length, i]
         with np.errstate(over="ignore", invalid="ignore"):
-            rms.append(np.sqrt(np.mean(error**2, axis=0)))
-            percent.append(100 * rms[-1] / np.maximum(np.abs(truth[:length, i]).max(axis=0), np.finfo(float).tiny))
-            freqs, density = error_spectrum(error, dt, int(min(_SEGMENT, lengths.min())))
+            freqs, density = error_spectrum(estimate[:length, i] - truth[:length, i], dt, segment)
         spectra.append(density)
-    return ErrorSummary(np.array(rms), np.array(percent), np.array(spectra), freqs)
+    rms = error_rms(estimate, truth, lengths)
+    return ErrorSummary(rms, _of_range(rms, truth, lengths), np.array(spectra), freqs)
+
+
+def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
+    """Return the root mean square error of every episode, shape (batch, n); arguments as in `summarise`."""
+    inside = np.arange(len(truth))[:, None, None] < lengths[:, None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.sqrt(np.sum((estimate - truth) ** 2, axis=0, where=inside) / lengths[:, None])
+
+
+def error_percent(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
+    """Return ``100 rms(x_hat - x) / max|x|`` of every episode, shape (batch, n); arguments as in `summarise`."""
+    return _of_range(error_rms(estimate, truth, lengths), truth, lengths)
+
+
+def _of_range(rms: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
+    inside = np.arange(len(truth))[:, None, None] < lengths[:, None]
+    return 100 * rms / np.max(np.abs(truth), axis=0, where=inside, initial=np.finfo(float).tiny)
 
 
 def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT) -> tuple[Array, Array]:
@@ -68,6 +84,9 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT) -> tuple[Ar
     Parameters
     ----------
     error : ndarray, shape (n_samples, ...)
+    dt : float, s
+    segment : int
+        Samples of a segment.
 
     Returns
     -------

@@ -45,6 +45,7 @@ class Observer:
     controller : StateSpace
         From innovation (q) to correction: (m) for input injection, (n_lifted) for state injection.
     injection : Injection
+    sample_period_s : float
     parameters : mapping of str to float
         Default values of the lifting's parameters, the nominal unit's.
     """

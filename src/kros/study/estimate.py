@@ -59,6 +59,8 @@ def unit_parameters(population: Population, calibration: PhaseCalibration | None
 
     Parameters
     ----------
+    population : Population
+    calibration : PhaseCalibration or None
     prefer : str
         Condition to calibrate on, where a unit has it.
     """

@@ -19,9 +19,8 @@ from .tuning import TuningSet
 
 Array = npt.NDArray[np.float64]
 IDENTITY, TUNED = "identity", "tuned"
-_MIXED_NOISE = 1e-3  # of the range; matrix inequalities do not resolve an encoder's 1e-7
-_CORNERS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)
-_PROCESS_NOISE = (0.0, 1e-2, 1e-1)
+_CORNERS_HZ = (0.03, 0.3, 3.0, 30.0)
+_NOISES = ((0.0, 0.0), (1e-2, 0.0), (1e-1, 0.0), (0.0, 1e-2), (0.0, 1e-1), (0.0, 1.0))  # process, measurement
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,40 +123,36 @@ def kalman_tuned(task: Task) -> Made:
 
 def make_mixed(task: Task) -> Made:
     """The paper's mixed H2/H-infinity problem on the reduced, regularised plant, corrected through the input."""
-    problem = task.require_problem()
-    ranges = problem.C @ problem.output_scale
-    problem = replace(problem, injection=Injection.INPUT, noise=np.maximum(problem.noise, _MIXED_NOISE * np.abs(ranges)))
-    synthesis = mixed(problem.mixed_plant(), time_limit_s=task.time_limit_s)
-    return replace(synthesis, controller=problem.to_physical(synthesis.controller), injection=Injection.INPUT), {}, task.problem
+    problem = replace(task.require_problem(), injection=Injection.INPUT)
+    return mixed(problem, time_limit_s=task.time_limit_s), {}, task.problem
 
 
 def make_worst_case_h2(task: Task) -> Made:
-    """Worst-case H2 for the input weight asked for, or for the input weight and process noise that do best on training episodes.
+    """Worst-case H2 in the surroundings asked for, or in those that do best on training episodes.
 
-    Both are assumptions about the machine's surroundings that nobody knows beforehand, like the process noise of the tuned Kalman filter,
-    which is chosen on the same episodes. A candidate counts only if it does not spoil the measured states.
+    How the inputs are spread over frequency and how much white noise there is nobody knows beforehand; the process noise of the tuned
+    Kalman filter is chosen on the same episodes. A candidate counts only if it does not spoil the measured states.
     """
     problem = task.require_problem()
     if task.input_weight != TUNED:
-        assumed = assume(problem, task.input_weight, 0.0)
-        return worst_case_h2(assumed, max_order=task.max_order), {"input_weight_hz": _corner(task.input_weight)}, assumed
+        surroundings = Surroundings(task.input_weight)
+        assumed = surroundings.of(problem)
+        return worst_case_h2(assumed, max_order=task.max_order), surroundings.facts(), assumed
     judge, fit = task.tuning.read(), remembering(fit_magnitude)
     limit = judge.percent(task.observer(open_loop(task)[0]))
-    best: tuple[tuple[bool, float], float | str, float, Synthesis] | None = None
-    for weight in (c for c in (IDENTITY, *_CORNERS_HZ) if c == IDENTITY or float(c) < 0.25 / task.models.sample_period_s):
-        for noise in _PROCESS_NOISE:
-            synthesis = worst_case_h2(assume(problem, weight, noise), max_order=2, tolerance_db=3.0, refinements=0, fit=fit)
-            verdict = rank(judge.percent(task.observer(synthesis)), limit, list(task.models.measured))
-            if best is None or verdict < best[0]:
-                best = (verdict, weight, noise, synthesis)
+    best: tuple[tuple[bool, float], Surroundings, Synthesis] | None = None
+    for surroundings in candidates(task.models.sample_period_s):
+        synthesis = worst_case_h2(surroundings.of(problem), max_order=2, tolerance_db=3.0, refinements=0, fit=fit)
+        verdict = rank(judge.percent(task.observer(synthesis)), limit, list(task.models.measured))
+        if best is None or verdict < best[0]:
+            best = (verdict, surroundings, synthesis)
     assert best is not None
-    _, weight, noise, synthesis = best
-    assumed = assume(problem, weight, noise)
+    _, surroundings, synthesis = best
+    assumed = surroundings.of(problem)
     accurate = worst_case_h2(assumed, max_order=task.max_order)  # of higher order: for its lower bound
     lower = max((b for b in (synthesis.lower_bound, accurate.lower_bound) if b is not None), default=None)
     gap = None if lower is None or synthesis.worst_case_h2 is None else 100 * (synthesis.worst_case_h2 / lower - 1)
-    facts = {"input_weight_hz": _corner(weight), "process_noise": noise}
-    return replace(synthesis, lower_bound=lower, gap_percent=gap), facts, assumed
+    return replace(synthesis, lower_bound=lower, gap_percent=gap), surroundings.facts(), assumed
 
 
 def rank(percent: Array, limit: Array, measured: list[int]) -> tuple[bool, float]:
@@ -181,29 +176,45 @@ def remembering(fit: Callable[..., Any]) -> Callable[..., Any]:
     return fitted
 
 
-def _corner(weight: float | str) -> float | None:
-    return None if weight == IDENTITY else float(weight)
-
-
-def assume(problem: ObserverProblem, weight: float | str, process_noise: float) -> ObserverProblem:
-    """Return the problem under assumptions about its surroundings.
+@dataclass(frozen=True)
+class Surroundings:
+    """What is assumed about the machine's surroundings.
 
     Parameters
     ----------
-    problem : ObserverProblem
-    weight : float or "identity"
+    input_weight : float or "identity"
         Corner of the low-pass spectrum of the scaled inputs in Hz, or white inputs as in the paper.
-    process_noise : float
-        Standard deviation of white noise on every state and sample, as a share of its range.
+    process_noise, measurement_noise : float
+        Standard deviation of white noise on every state and measurement per sample, as a share of the range; measurements have at least
+        the noise that was found in the recordings.
     """
-    if process_noise:
-        problem = replace(problem, process_noise=process_noise * problem.output_scale)
-    if weight == IDENTITY:
-        return problem
-    dt, m = problem.nominal.dt, problem.nominal.n_inputs
-    pole = float(np.exp(-2 * np.pi * float(weight) * dt))
-    lowpass = StateSpace([[pole]], [[1 - pole]], [[pole]], [[1 - pole]], dt)
-    return replace(problem, W_u=block_diagonal([lowpass] * m))
+
+    input_weight: float | str = IDENTITY
+    process_noise: float = 0.0
+    measurement_noise: float = 0.0
+
+    def of(self, problem: ObserverProblem) -> ObserverProblem:
+        """Return the problem in these surroundings."""
+        ranges = np.abs(problem.C) @ problem.output_scale
+        noise = np.maximum(problem.noise, self.measurement_noise * ranges)
+        problem = replace(problem, process_noise=self.process_noise * problem.output_scale, noise=noise)
+        if self.input_weight == IDENTITY:
+            return problem
+        dt, m = problem.nominal.dt, problem.nominal.n_inputs
+        pole = float(np.exp(-2 * np.pi * float(self.input_weight) * dt))
+        lowpass = StateSpace([[pole]], [[1 - pole]], [[pole]], [[1 - pole]], dt)
+        return replace(problem, W_u=block_diagonal([lowpass] * m))
+
+    def facts(self) -> dict[str, Any]:
+        """Return them for the records."""
+        corner = None if self.input_weight == IDENTITY else float(self.input_weight)
+        return {"input_weight_hz": corner, "process_noise": self.process_noise, "measurement_noise": self.measurement_noise}
+
+
+def candidates(sample_period_s: float) -> list[Surroundings]:
+    """Return the surroundings that are tried."""
+    corners = (IDENTITY, *(c for c in _CORNERS_HZ if c < 0.25 / sample_period_s))
+    return [Surroundings(corner, *noise) for corner in corners for noise in _NOISES]
 
 
 MAKERS: dict[str, Callable[[Task], Made]] = {

@@ -72,6 +72,8 @@ def run_study(
         Processes for maps over units. More than one needs the usual ``if __name__ == "__main__":`` guard in a script.
     scheduler : str, optional
         Address of a Dask scheduler, instead of processes.
+    progress : Progress, optional
+        Told which stage runs and how far it is.
 
     Returns
     -------
@@ -138,8 +140,9 @@ def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:
     """Return the requirements of the study that its result does not meet."""
     found = []
     deployed = metrics.get("observers", {}).get(metrics["study"].get("deployed") or "", {})
-    if config.require.robust and deployed.get("status") != "optimal":
-        found.append(f"require.robust: the deployed observer {metrics['study'].get('deployed')} has status {deployed.get('status')!r}")
+    if config.require.robust and (deployed.get("status") == "failed" or deployed.get("worst_case_h2") is None):
+        reason = deployed.get("reason", "none was computed")
+        found.append(f"require.robust: the deployed observer {metrics['study'].get('deployed')} has no certificate ({reason})")
     flagged = [f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]]
     if config.require.no_outliers and flagged:
         found.append(f"require.no_outliers: flagged are {', '.join(flagged)}")

@@ -8,17 +8,18 @@ import numpy as np
 import numpy.typing as npt
 
 from ..data.population import EpisodeKey, Population
-from ..evaluate import EpisodeBatch, summarise
+from ..evaluate import EpisodeBatch, error_percent
 from ..observer import Observer, run_observer
 
 Array = npt.NDArray[np.float64]
 TUNING_UNITS = 12
+TUNING_EPISODES = 3
 TUNING_S = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class TuningSet:
-    """The first training episode of some units, cut short, with each unit's lifting parameters."""
+    """The first training episodes of some units, cut short, with each unit's lifting parameters."""
 
     population: Population
     keys: tuple[EpisodeKey, ...]
@@ -28,7 +29,7 @@ class TuningSet:
         """Read the episodes."""
         limit = round(TUNING_S / self.population.sample_period_s)
         batch = EpisodeBatch.read(self.population, self.keys, limit)
-        return Judge(batch, batch.parameters(self.parameters), self.population.sample_period_s)
+        return Judge(batch, batch.parameters(self.parameters))
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +38,12 @@ class Judge:
 
     batch: EpisodeBatch
     parameters: dict[str, Array]
-    sample_period_s: float
 
     def percent(self, observer: Observer) -> Array:
         """Return the mean error of every state in percent of its range, shape (n,); infinite where the observer diverges."""
         values = self.parameters if observer.lifting.parameters else None
         estimate = run_observer(observer, self.batch.states[..., list(observer.measured)], self.batch.inputs, values)
-        percent = summarise(estimate, self.batch.states, self.batch.lengths, self.sample_period_s).percent.mean(axis=0)
+        percent = error_percent(estimate, self.batch.states, self.batch.lengths).mean(axis=0)
         return np.where(np.isfinite(percent), percent, np.inf)
 
     def hidden_percent(self, observer: Observer) -> float:

@@ -46,6 +46,8 @@ def profile(checkpoints: Array, starts: Array, n_samples: int, period_s: float) 
     checkpoints : ndarray, shape (n_moves + 1,), rad
     starts : ndarray, shape (n_moves,)
         Sample at which each move starts; a move lasts its distance at full speed plus the ramps.
+    n_samples : int
+    period_s : float, s
 
     Returns
     -------

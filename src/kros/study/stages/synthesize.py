@@ -16,10 +16,10 @@ from ...identify import ModelSet
 from ...observer import Observer
 from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...synthesis.certificate import certify
-from ...uncertainty import UncertainModel
+from ...uncertainty import Form, UncertainModel
 from ..context import Context
 from ..makers import Product, Task, produce
-from ..tuning import TUNING_UNITS, TuningSet
+from ..tuning import TUNING_EPISODES, TUNING_UNITS, TuningSet
 from . import calibrate
 
 log = logging.getLogger(__name__)
@@ -66,7 +66,13 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     unit = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
     folder = context.store.path("uncertainty", name)
     noise = measurement_noise(context, models)
-    problem = observer_problem(models, unit, UncertainModel.load(folder), noise, context) if folder.exists() else None
+    problem = None
+    if config.uncertainty.form == Form.INVERSE_INPUT_MULTIPLICATIVE.value:
+        problem = observer_problem(models, unit, UncertainModel.load(folder), noise, context)
+    else:
+        log.warning(
+            "synthesis knows the inverse input multiplicative form only so far; with %s there are baselines alone", config.uncertainty.form
+        )
     methods = config.observer.baselines + (config.synthesis.methods if problem is not None else ())
     ordered = [m for m in ("open_loop", "kalman_white", "kalman_tuned", "mixed", "worst_case_h2") if m in methods]
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
@@ -101,10 +107,10 @@ def measurement_noise(context: Context, models: ModelSet) -> Array:
 
 
 def tuning_set(context: Context, models: ModelSet) -> TuningSet:
-    """Return the training episodes that observers are tuned on: the first of each of the first units."""
+    """Return the training episodes that observers are tuned on: the first ones of the first units."""
     facts, calibration = context.facts, calibrate.load(context)
     units = [u for u in facts.pooled if u in models.unit_ids][:TUNING_UNITS]
-    keys = tuple(facts.keys("train", u, facts.identify_on)[0] for u in units)
+    keys = tuple(k for u in units for k in facts.keys("train", u, facts.identify_on)[:TUNING_EPISODES])
     parameters: dict[str, dict[str, float]] = {
         u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in units
     }

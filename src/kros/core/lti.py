@@ -83,7 +83,8 @@ class StateSpace:
     def __getitem__(self, index: Any) -> StateSpace:
         """Return one system, or a smaller batch, of a batch."""
         shape = self.batch_shape
-        return StateSpace(*(np.broadcast_to(getattr(self, x), shape + getattr(self, x).shape[-2:])[index] for x in "ABCD"), self.dt)
+        A, B, C, D = (np.broadcast_to(matrix, shape + matrix.shape[-2:])[index] for matrix in (self.A, self.B, self.C, self.D))
+        return StateSpace(A, B, C, D, self.dt)
 
     def poles(self) -> Array:
         """Return the eigenvalues of A, shape (..., n)."""
@@ -152,4 +153,5 @@ def block_diagonal(systems: Sequence[StateSpace]) -> StateSpace:
         rows, cols = sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)
         return block_diag(*blocks).reshape(rows, cols)
 
-    return StateSpace(*(stack([getattr(s, name) for s in systems]) for name in "ABCD"), systems[0].dt)
+    A, B, C, D = (stack([getattr(s, name) for s in systems]) for name in "ABCD")
+    return StateSpace(A, B, C, D, systems[0].dt)

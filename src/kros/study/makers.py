@@ -201,8 +201,8 @@ class Surroundings:
         if self.input_weight == IDENTITY:
             return problem
         dt, m = problem.nominal.dt, problem.nominal.n_inputs
-        pole = float(np.exp(-2 * np.pi * float(self.input_weight) * dt))
-        lowpass = StateSpace([[pole]], [[1 - pole]], [[pole]], [[1 - pole]], dt)
+        pole = np.exp([[-2 * np.pi * float(self.input_weight) * dt]])
+        lowpass = StateSpace(pole, 1 - pole, pole, 1 - pole, dt)
         return replace(problem, W_u=block_diagonal([lowpass] * m))
 
     def facts(self) -> dict[str, Any]:
@@ -213,7 +213,7 @@ class Surroundings:
 
 def candidates(sample_period_s: float) -> list[Surroundings]:
     """Return the surroundings that are tried."""
-    corners = (IDENTITY, *(c for c in _CORNERS_HZ if c < 0.25 / sample_period_s))
+    corners: tuple[float | str, ...] = (IDENTITY, *(c for c in _CORNERS_HZ if c < 0.25 / sample_period_s))
     return [Surroundings(corner, *noise) for corner in corners for noise in _NOISES]
 
 

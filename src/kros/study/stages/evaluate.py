@@ -90,7 +90,7 @@ def run(context: Context) -> list[Path]:
         for name, o in zip(models, outcomes[len(observers) :], strict=True)
     }
     folder = context.store.path("evaluation")
-    content = {
+    content: dict[str, Any] = {
         "rows": rows,
         "free_run": free,
         "band_hz": band,

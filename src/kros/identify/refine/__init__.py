@@ -1,0 +1,7 @@
+"""Population refinement: a pooled model on free-run error, then every unit with a prior centred on it."""
+
+from .model import RefinedModels, TradeOff
+from .options import RefineOptions
+from .population import refine_population
+
+__all__ = ["RefineOptions", "RefinedModels", "TradeOff", "refine_population"]

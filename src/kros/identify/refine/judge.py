@@ -1,0 +1,110 @@
+"""Free runs over whole training episodes: the held-out error that chooses the prior's strength, and the check that runs stay bounded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import IdentificationError
+from ...data.population import EpisodeKey, Population
+from ...lifting import Lifting
+from ..free_run import free_run
+
+Array = npt.NDArray[np.float64]
+_AT_ONCE = 20_000_000  # numbers of recordings in memory
+
+
+def free_run_errors(
+    A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, Array], population: Population, keys: Sequence[EpisodeKey]
+) -> tuple[Array, Array, Array]:
+    """Return what the free runs of several models differ by from one episode of every unit.
+
+    Parameters
+    ----------
+    A : ndarray, shape (model, unit, n_lifted, n_lifted)
+    B : ndarray, shape (model, unit, n_lifted, m)
+    lifting : Lifting
+    parameters : mapping of str to ndarray, shape (unit,)
+    population : Population
+    keys : sequence of EpisodeKey
+        One for every unit.
+
+    Returns
+    -------
+    rms : ndarray, shape (model, unit, n)
+        Of the error; infinite where a run diverged.
+    top : ndarray, shape (unit, n)
+        Largest magnitude recorded.
+    reached : ndarray, shape (model, unit, n)
+        Largest magnitude of the free run.
+    """
+    n, models = lifting.n_states, len(A)
+    rms, reached, top = np.full((models, len(keys), n), np.inf), np.full((models, len(keys), n), np.inf), np.zeros((len(keys), n))
+    episodes = [population.read(key) for key in keys]
+    by_length: dict[int, list[int]] = {}
+    for row, episode in enumerate(episodes):
+        by_length.setdefault(len(episode), []).append(row)
+    for length, same in by_length.items():
+        step = max(1, _AT_ONCE // (length * models * episodes[same[0]].shape[1]))
+        for rows in (same[i : i + step] for i in range(0, len(same), step)):
+            data = np.stack([episodes[row] for row in rows])
+            x, u = data[..., :n], data[..., n:]
+            top[rows] = np.abs(x).max(axis=1)
+            own = {name: np.tile(values[rows], models) for name, values in parameters.items()}
+            run = free_run(
+                A[:, rows].reshape(-1, *A.shape[2:]),
+                B[:, rows].reshape(-1, *B.shape[2:]),
+                lifting,
+                own,
+                np.tile(x[:, 0], (models, 1)),
+                np.tile(u, (models, 1, 1)),
+            ).reshape(models, *x.shape)
+            with np.errstate(over="ignore", invalid="ignore"):
+                found, far = np.sqrt(np.mean((run - x) ** 2, axis=2)), np.abs(run).max(axis=2)
+            rms[:, rows] = np.where(np.isfinite(found), found, np.inf)
+            reached[:, rows] = np.where(np.isfinite(far), far, np.inf)
+    return rms, top, reached
+
+
+def require_bounded(
+    A: Array,
+    B: Array,
+    lifting: Lifting,
+    parameters: Mapping[str, Array],
+    population: Population,
+    keys: Mapping[str, Sequence[EpisodeKey]],
+    limit: Array,
+) -> None:
+    """Run every unit's model over all of its training episodes, and refuse one that leaves the limit.
+
+    Parameters
+    ----------
+    A : ndarray, shape (unit, n_lifted, n_lifted)
+    B : ndarray, shape (unit, n_lifted, m)
+    lifting : Lifting
+    parameters : mapping of str to ndarray, shape (unit,)
+    population : Population
+    keys : mapping of str to sequence of EpisodeKey
+    limit : ndarray, shape (n,)
+        Largest magnitude of every state that is still bounded.
+
+    Raises
+    ------
+    IdentificationError
+        Names the unit, the episode and the state.
+    """
+    flat = [(row, key) for row, episodes in enumerate(keys.values()) for key in episodes]
+    width = max(1, _AT_ONCE // (len(population.channels) * 20_000))
+    for part in (flat[i : i + width] for i in range(0, len(flat), width)):
+        rows = [row for row, _ in part]
+        own = {name: values[rows] for name, values in parameters.items()}
+        _, _, reached = free_run_errors(A[None, rows], B[None, rows], lifting, own, population, [key for _, key in part])
+        over = np.argwhere(~(reached[0] <= limit))
+        if len(over):
+            which, state = over[0]
+            raise IdentificationError(
+                f"Refinement: the free run over {part[which][1]} reaches {reached[0, which, state]:.3g} in {lifting.states[state]!r}, "
+                f"beyond {limit[state]:.3g}; use a stronger prior, longer horizons, or functions that stay bounded."
+            )

@@ -1,0 +1,71 @@
+"""Results of the population refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..edmd import KoopmanMatrices
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TradeOff:
+    """What one strength of the prior brings.
+
+    Parameters
+    ----------
+    strength : float
+    held_out_percent : tuple of float
+        Free-run error of every state on the held-out training episodes, ``100 rms / max|x|``, median over the pooled units.
+    score : float
+        Mean square of the held-out errors in units of `sigma`, over states and pooled units.
+    peak_db : float
+        Peak residual of the inverse input multiplicative form over the pooled units, for the best nominal; nan for one unit.
+    """
+
+    strength: float
+    held_out_percent: tuple[float, ...]
+    score: float
+    peak_db: float
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedModels:
+    """Refined models of a population.
+
+    Parameters
+    ----------
+    unit_ids : tuple of str
+    units : KoopmanMatrices
+        A (unit, n, n) and B (unit, n, m).
+    pooled : KoopmanMatrices
+        A (n, n) and B (n, m) of the model fitted to all pooled units at once.
+    strength : float
+        Of the prior, as chosen on held-out training episodes.
+    trade_off : tuple of TradeOff
+        One row for every strength that was tried, strongest first, and a first one for the pooled model alone (strength infinite).
+    sigma : ndarray, shape (n_states,)
+        Errors that count as one.
+    status : tuple of str
+        Per unit ``ok``, or what to know about its fit.
+    information : ndarray, shape (unit, P, P)
+        Gauss-Newton matrix of every unit's cost, prior included, for parameters V with ``[A B] = V T^T``.
+    whitening : ndarray, shape (p, p)
+        T.
+    spectral_radius : ndarray, shape (unit,)
+    """
+
+    unit_ids: tuple[str, ...]
+    units: KoopmanMatrices
+    pooled: KoopmanMatrices
+    strength: float
+    trade_off: tuple[TradeOff, ...]
+    sigma: Array
+    status: tuple[str, ...]
+    information: Array
+    whitening: Array
+    spectral_radius: Array

@@ -1,0 +1,74 @@
+"""Settings of the population refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ...core.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """Settings of `refine_population`.
+
+    Parameters
+    ----------
+    horizons : tuple of int
+        Samples of the free runs, from short to long; the last is the one that the result minimises.
+    segments : int
+        Stretches of recordings used of every unit, spread over its training episodes.
+    strengths : tuple of float
+        Strengths of the prior to choose from. The unit is information: at 1 a relative change of the input (the residual of the
+        inverse input multiplicative form, root mean square over frequency) costs as much as errors of the size of `sigma`.
+    tolerance : float
+        The strongest prior whose held-out error exceeds the lowest by no more than this share is chosen.
+    balance : float
+        A state's error counts in units of ``start**balance * range**(1 - balance)``, with `start` the free-run error of the EDMD
+        model and `range` that of the state: 0 weighs states by their range, 1 asks every state for the same improvement.
+    margin : float
+        Stable means a spectral radius below ``1 - margin``.
+    alpha_factor : float
+        The start is a pooled EDMD model with this times the smallest alpha that stabilises it.
+    iterations : int
+        Most steps of Levenberg-Marquardt per horizon and strength.
+    least_gain : float
+        Relative decrease of the cost below which a horizon is done.
+    bound : float
+        A free run on training episodes may reach this times the range of the states.
+    seed : int
+        Where the segments start.
+
+    Raises
+    ------
+    ConfigError
+        When a setting is out of its range.
+    """
+
+    horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)
+    segments: int = 24
+    strengths: tuple[float, ...] = (1e3, 1e2, 1e1, 1.0, 1e-1, 1e-2)
+    tolerance: float = 0.05
+    balance: float = 0.5
+    margin: float = 1e-5
+    alpha_factor: float = 4.0
+    iterations: int = 15
+    least_gain: float = 1e-3
+    bound: float = 10.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        good = {
+            "horizons": len(self.horizons) > 0 and min(self.horizons, default=0) >= 1 and tuple(sorted(self.horizons)) == self.horizons,
+            "segments": self.segments >= 1,
+            "strengths": len(self.strengths) > 0 and min(self.strengths, default=0.0) > 0,
+            "tolerance": self.tolerance >= 0,
+            "balance": 0 <= self.balance <= 1,
+            "margin": 0 <= self.margin < 1,
+            "alpha_factor": self.alpha_factor >= 1,
+            "iterations": self.iterations >= 1,
+            "least_gain": self.least_gain > 0,
+            "bound": self.bound >= 1,
+        }
+        for name, fine in good.items():
+            if not fine:
+                raise ConfigError(f"Refinement: {name} = {getattr(self, name)} is out of its range; see RefineOptions for what it may be.")

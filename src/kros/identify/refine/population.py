@@ -1,0 +1,305 @@
+"""Refinement of a population: one pooled model on free-run error, then every unit with a prior centred on it.
+
+    factors -> pooled EDMD -> pooled refined model (horizons 5 .. 1000) -> units at each strength of the prior -> strength -> units
+
+Models that predict alike may differ wildly in weakly excited directions, and what differs is uncertainty. The prior therefore measures
+the distance from the pooled model as the uncertainty does (`metric`), and the strength is chosen on held-out training episodes: the
+strongest one whose error is as good as the best.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DimensionError, IdentificationError
+from ...core.linalg import qr_triangle
+from ...data.population import EpisodeKey, Population
+from ...lifting import Lifting
+from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
+from ..factors import Factor
+from .judge import free_run_errors, require_bounded
+from .marquardt import Solution, minimise
+from .metric import response_metric
+from .model import RefinedModels, TradeOff
+from .options import RefineOptions
+from .problem import OneStep, Problem
+from .segments import Segments, held_segments, read_segments
+
+log = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
+_LEAST_ERROR = 1e-6  # of the start, relative to a state's range: exact data have no error to scale by
+
+
+def refine_population(
+    population: Population,
+    keys: Mapping[str, Sequence[EpisodeKey]],
+    lifting: Lifting,
+    parameters: Mapping[str, Array],
+    factor: Factor,
+    pooled: npt.NDArray[np.bool_] | None = None,
+    options: RefineOptions | None = None,
+) -> RefinedModels:
+    """Refine the models of a population on free-run error.
+
+    Parameters
+    ----------
+    population : Population
+    keys : mapping of str to sequence of EpisodeKey
+        Training episodes of every unit; the last one of each judges the strength of the prior.
+    lifting : Lifting
+    parameters : mapping of str to ndarray, shape (unit,)
+        The lifting's parameters, in the order of `keys`.
+    factor : Factor
+        Of ``[Psi | Theta_plus]`` for this lifting, the batch over units in the order of `keys` (see `lifted_factor`).
+    pooled : ndarray of bool, shape (unit,), optional
+        Units that make the pooled model and choose the strength; all by default. The others get the same prior.
+    options : RefineOptions, optional
+
+    Returns
+    -------
+    RefinedModels
+        Stable linear models with a bounded re-lifted free run on every training episode.
+
+    Raises
+    ------
+    IdentificationError
+        When no stable start exists, free runs diverge or leave their bound; names the unit where there is one.
+    DimensionError
+        When keys, parameters and factors do not fit together.
+    """
+    options = RefineOptions() if options is None else options
+    pooled = np.ones(len(keys), dtype=bool) if pooled is None else np.asarray(pooled, dtype=bool)
+    _check(population, keys, lifting, parameters, factor, pooled)
+    parameters = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters}
+    segments = read_segments(population, keys, max(options.horizons), options.segments, options.seed)
+    held = held_segments(options.segments, keys)
+    fitted = segments.first(options.segments - held)
+    rows = np.flatnonzero(pooled)
+    start, problem = _start(lifting, parameters, factor, fitted, rows, options)
+    common = _refine_pooled(start, _restrict(problem, rows), options)
+    prepared = _with_prior(problem, common, factor, rows)
+    path = _path(prepared, common, options)
+    judged = _Judge(population, keys, lifting, parameters, rows, problem, _scales(factor, rows, lifting))
+    trade_off = judged.trade_off([common, *path], (np.inf, *sorted(options.strengths, reverse=True)))
+    choice = _choose(trade_off[1:], options.tolerance)
+    strength = trade_off[1 + choice].strength
+    log.info("prior of strength %g chosen, held-out score %.4g", strength, trade_off[1 + choice].score)
+    final = replace(prepared, segments=segments, prior=_scaled(prepared, strength))
+    solution = minimise(final.evaluate, final.admissible, path[choice], options.iterations, options.least_gain)
+    units = _matrices(solution.V, problem.T, lifting.n_lifted)
+    limit = options.bound * factor.peak[rows, : lifting.n_states].max(axis=0)
+    require_bounded(units.A, units.B, lifting, parameters, population, keys, limit)
+    return RefinedModels(
+        unit_ids=tuple(keys),
+        units=units,
+        pooled=_matrices(common, problem.T, lifting.n_lifted),
+        strength=strength,
+        trade_off=trade_off,
+        sigma=problem.sigma,
+        status=_status(solution, units, options.margin),
+        information=solution.matrix[:, :-1, :-1],
+        whitening=problem.T,
+        spectral_radius=units.spectral_radius(),
+    )
+
+
+def _check(
+    population: Population,
+    keys: Mapping[str, Sequence[EpisodeKey]],
+    lifting: Lifting,
+    parameters: Mapping[str, Array],
+    factor: Factor,
+    pooled: npt.NDArray[np.bool_],
+) -> None:
+    width = 2 * lifting.n_lifted + len(population.inputs)
+    wrong = [name for name in lifting.parameters if np.shape(parameters.get(name)) != (len(keys),)]
+    if factor.R.shape != (len(keys), width, width) or wrong or pooled.shape != (len(keys),) or not pooled.any():
+        raise DimensionError(
+            f"Refinement: {len(keys)} units with {lifting.n_lifted} lifted states and {len(population.inputs)} inputs need factors of shape "
+            f"{(len(keys), width, width)}, found {factor.R.shape}, parameters of one value a unit (wrong: {wrong}) and at least one pooled "
+            f"unit, found {int(pooled.sum())} of {pooled.size}; pass factors from lifted_factor for the same units."
+        )
+
+
+def _scales(factor: Factor, rows: npt.NDArray[np.int64], lifting: Lifting) -> tuple[Array, Array]:
+    """Ranges of lifted states and inputs over the pooled units."""
+    peak = factor.peak[rows].max(axis=0)
+    peak = np.where(peak > 0, peak, 1.0)
+    return peak[: lifting.n_lifted], peak[lifting.n_lifted :]
+
+
+def _start(
+    lifting: Lifting,
+    parameters: Mapping[str, Array],
+    factor: Factor,
+    segments: Segments,
+    rows: npt.NDArray[np.int64],
+    options: RefineOptions,
+) -> tuple[Array, Problem]:
+    """Pooled EDMD in whitened parameters (1, n_lifted, p), and the problem of all units without a prior."""
+    nl, n = lifting.n_lifted, lifting.n_states
+    R = qr_triangle(factor.R[rows].reshape(-1, factor.R.shape[-1]))
+    p = R.shape[-1] - nl
+    alpha = options.alpha_factor * smallest_stabilising_alpha([(R[None], nl)], options.margin)
+    matrices = edmd(R, nl, alpha)
+    T = _whitening(R[:p, :p], int(factor.n_samples[rows].sum()))
+    V = np.linalg.solve(T, np.concatenate([matrices.A, matrices.B], axis=-1).T).T[None]
+    one_step = OneStep.of(factor.R, T, n, nl, factor.n_samples, rows)
+    problem = Problem(lifting, parameters, segments, T, np.ones(n), one_step, options.margin)
+    normal = _restrict(problem, rows).run(V)
+    with np.errstate(invalid="ignore"):
+        error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())
+    span = _scales(factor, rows, lifting)[0][:n]
+    error = np.clip(np.where(np.isfinite(error), error, span), _LEAST_ERROR * span, span)
+    return V, replace(problem, sigma=error**options.balance * span ** (1 - options.balance))
+
+
+def _whitening(R11: Array, n_samples: int) -> Array:
+    """T with ``(R11 T)^T (R11 T) = n_samples I``; a direction that the data do not excite keeps its size."""
+    size = np.maximum(np.linalg.norm(R11, axis=0), np.finfo(float).tiny)
+    _, values, right = np.linalg.svd(R11 / size)
+    values = np.maximum(values, len(values) * np.finfo(float).eps * values[0])
+    return np.asarray((right.T / values) * np.sqrt(n_samples) / size[:, None])
+
+
+def _restrict(problem: Problem, rows: npt.NDArray[np.int64]) -> Problem:
+    """The problem of one model for some units."""
+    own = {name: values[rows] for name, values in problem.parameters.items()}
+    one_step = replace(problem.one_step, matrix=problem.one_step.matrix[rows])
+    return replace(problem, parameters=own, segments=problem.segments.units(rows), one_step=one_step, pooled=True)
+
+
+def _refine_pooled(V: Array, problem: Problem, options: RefineOptions) -> Array:
+    """Fit one model to all units, horizons growing; shape (n_lifted, p).
+
+    On the way the model may be unstable: kept stable from the start, the search runs into the edge of stability and stops there, far
+    from the optimum. Where the end is unstable, rows of lifted functions, which free runs do not see, are shortened until it is not; if
+    that is not enough, the search is repeated within the stable models.
+    """
+    free = _grow(V, problem, options, problem.finite)
+    stable = _shorten(free, problem)
+    if stable is None:
+        log.warning("refinement of the pooled model: the best model is unstable, so it is sought among the stable ones")
+        return np.asarray(_grow(V, problem, options, problem.admissible)[0])
+    if not problem.admissible(free)[0]:
+        stable = minimise(problem.evaluate, problem.admissible, stable, options.iterations, options.least_gain).V
+    return np.asarray(stable[0])
+
+
+def _grow(V: Array, problem: Problem, options: RefineOptions, admissible: Callable[[Array], npt.NDArray[np.bool_]]) -> Array:
+    for horizon in options.horizons:
+        now = problem.at(horizon)
+        solution = minimise(now.evaluate, admissible, V, options.iterations, options.least_gain)
+        if not np.isfinite(solution.cost).all():
+            raise IdentificationError(
+                f"Refinement of the pooled model: free runs over {horizon} samples diverge; add a shorter horizon before it, or leave out "
+                "lifting functions that grow."
+            )
+        V = solution.V
+        log.debug("pooled model at horizon %d: cost %.6g after %d steps", horizon, solution.cost[0], solution.iterations)
+    return V
+
+
+def _shorten(V: Array, problem: Problem) -> Array | None:
+    """Scale the rows of lifted functions by the largest of a few factors that makes the model stable; None where none does."""
+    n = problem.lifting.n_states
+    for factor in np.linspace(1.0, 0.0, 41):
+        trial = V.copy()
+        trial[:, n:] *= factor
+        if problem.admissible(trial).all():
+            return trial
+    return None
+
+
+def _with_prior(problem: Problem, common: Array, factor: Factor, rows: npt.NDArray[np.int64]) -> Problem:
+    """The problem of all units at the longest horizon, with the prior's metric and centre."""
+    model = _matrices(common, problem.T, problem.lifting.n_lifted)
+    metric = response_metric(model.A, model.B, problem.T, *_scales(factor, rows, problem.lifting))
+    return replace(problem, prior=metric, centre=common)
+
+
+def _scaled(problem: Problem, strength: float) -> Array:
+    """The prior of one strength: as many residuals as a unit's free runs have."""
+    prior = problem.prior
+    if prior is None:
+        raise IdentificationError("Refinement: the problem has no prior; this is a mistake of kros, please report it.")
+    return strength * problem.residuals * prior
+
+
+def _path(problem: Problem, common: Array, options: RefineOptions) -> Array:
+    """Fit all units at every strength, strongest first, each from the one before; shape (strength, unit, n_lifted, p)."""
+    V = np.repeat(common[None], problem.segments.n_units, axis=0)
+    path = []
+    for strength in sorted(options.strengths, reverse=True):
+        now = replace(problem, prior=_scaled(problem, strength))
+        V = minimise(now.evaluate, now.admissible, V, options.iterations, options.least_gain).V
+        path.append(V)
+    return np.stack(path)
+
+
+def _matrices(V: Array, T: Array, n_lifted: int) -> KoopmanMatrices:
+    W = V @ T.T
+    return KoopmanMatrices(W[..., :n_lifted], W[..., n_lifted:])
+
+
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """Scores models on the last training episode of every pooled unit."""
+
+    population: Population
+    keys: Mapping[str, Sequence[EpisodeKey]]
+    lifting: Lifting
+    parameters: Mapping[str, Array]
+    rows: npt.NDArray[np.int64]
+    problem: Problem
+    scales: tuple[Array, Array]
+
+    def trade_off(self, V: Sequence[Array], strengths: Sequence[float]) -> tuple[TradeOff, ...]:
+        """Return accuracy and uncertainty of models (unit, n_lifted, p), or of one for all units."""
+        full = np.stack([np.broadcast_to(v, (len(self.keys), *v.shape[-2:]))[self.rows] for v in V])
+        models = _matrices(full, self.problem.T, self.lifting.n_lifted)
+        last = [episodes[-1] for episodes in self.keys.values()]
+        own = {name: values[self.rows] for name, values in self.parameters.items()}
+        rms, top, _ = free_run_errors(models.A, models.B, self.lifting, own, self.population, [last[row] for row in self.rows])
+        percent = np.median(100 * rms / np.maximum(top, np.finfo(float).tiny), axis=1)
+        score = np.mean((rms / self.problem.sigma) ** 2, axis=(1, 2))
+        return tuple(
+            TradeOff(float(s), tuple(percent[i].tolist()), float(score[i]), self._peak_db(models.A[i], models.B[i]))
+            for i, s in enumerate(strengths)
+        )
+
+    def _peak_db(self, A: Array, B: Array) -> float:
+        """Peak residual for the best nominal; the identical models of the pooled row have none."""
+        if len(A) < 2:
+            return float("nan")
+        output, entry = self.scales
+        z = np.exp(1j * np.pi * np.logspace(-6, 0, 200))
+        G = np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j) * entry / output[:, None]
+        inverse = np.linalg.pinv(G)
+        peaks = [np.linalg.norm(inverse @ (G[row] - G), ord=2, axis=(-2, -1)).max() for row in range(len(G))]
+        with np.errstate(divide="ignore"):
+            return float(20 * np.log10(min(peaks)))
+
+
+def _choose(rows: Sequence[TradeOff], tolerance: float) -> int:
+    """The strongest prior whose held-out score is as good as the best, within the tolerance."""
+    best = min(row.score for row in rows)
+    if not np.isfinite(best):
+        raise IdentificationError(
+            "Refinement: at every strength of the prior a free run over a held-out training episode diverges; add strengths above "
+            f"{max(row.strength for row in rows):g}."
+        )
+    return next(i for i, row in enumerate(rows) if row.score <= (1 + tolerance) * best)
+
+
+def _status(solution: Solution, units: KoopmanMatrices, margin: float) -> tuple[str, ...]:
+    radius = units.spectral_radius()
+    return tuple(
+        f"unstable, spectral radius {r:.6f}" if r >= 1 - margin else "ok" if done else "ok, not converged"
+        for r, done in zip(radius, solution.converged, strict=True)
+    )

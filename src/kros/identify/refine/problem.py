@@ -1,0 +1,157 @@
+"""What is minimised: free-run error of the states, one-step error of the lifted functions, distance from the pooled model.
+
+    sum ||(x_data - x_free_run) / sigma||^2  +  sum ||(sigma+ - w psi) / sigma_row||^2  +  (V - V0)^T prior (V - V0)
+
+A free run retracts and re-lifts, so it does not see the rows of the lifted functions; they enter only the linear model used in
+synthesis, and are fitted one step ahead, from the triangular factors.
+
+Symbols
+-------
+V : free parameters, (unit, n_lifted, p);  W = V T^T;  P = n_lifted p
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ...lifting import Lifting
+from .segments import Segments
+from .sensitivity import Normal, normal_equations
+
+Array = npt.NDArray[np.float64]
+_SAMPLES = 64  # residuals of a state that a segment contributes, at least
+_LEAST_VARIANCE = 1e-20  # of the one-step error, relative to the mean square of the function
+
+
+@dataclass(frozen=True, eq=False)
+class OneStep:
+    """Normal equations of the lifted functions' rows.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (unit, p + f, p + f)
+        ``[psi sigma+]^T [psi sigma+]`` per sample, psi whitened.
+    variance : ndarray, shape (f,)
+        Of the one-step error of the pooled least-squares rows.
+    rows : ndarray, shape (f, p)
+        Those rows, as a part of V.
+    """
+
+    matrix: Array
+    variance: Array
+    rows: Array
+
+    @classmethod
+    def of(
+        cls, R: Array, T: Array, n_states: int, n_lifted: int, n_samples: npt.NDArray[np.int64], pooled: npt.NDArray[np.int64]
+    ) -> OneStep:
+        """Read them from factors of ``[Psi | Theta_plus]``, shape (unit, p + n_lifted, p + n_lifted); `pooled` units set the variance."""
+        p = len(T)
+        white = np.concatenate([R[..., :p] @ T, R[..., p + n_states : p + n_lifted]], axis=-1)
+        matrix = np.swapaxes(white, -1, -2) @ white / n_samples[:, None, None]
+        mean = matrix[pooled].mean(axis=0)
+        rows = np.linalg.lstsq(mean[:p, :p], mean[:p, p:], rcond=None)[0].T
+        left = np.diagonal(mean[p:, p:]) - np.sum(rows * mean[:p, p:].T, axis=1)
+        return cls(matrix, np.maximum(left, _LEAST_VARIANCE * np.diagonal(mean[p:, p:])), rows)
+
+    def normal(self, rows: Array, row: int) -> Array:
+        """Return ``[J r]^T [J r]`` of one function for rows (unit, p), per sample and in units of its variance."""
+        p = rows.shape[-1]
+        G, c = self.matrix[:, :p, :p], self.matrix[:, :p, p + row]
+        slope = c - (G @ rows[..., None])[..., 0]
+        rest = self.matrix[:, p + row, p + row] - np.sum(rows * (c + slope), axis=-1)
+        out = np.empty((len(rows), p + 1, p + 1))
+        out[:, :p, :p], out[:, :p, p], out[:, p, :p], out[:, p, p] = G, slope, slope, rest
+        return np.asarray(out / self.variance[row])
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Least squares of all units at one horizon.
+
+    Parameters
+    ----------
+    lifting : Lifting
+    parameters : mapping of str to ndarray, shape (unit,)
+    segments : Segments
+    T : ndarray, shape (p, p)
+    sigma : ndarray, shape (n,)
+    one_step : OneStep
+    margin : float
+    pooled : bool
+        One model for all units.
+    prior : ndarray, shape (P, P), optional
+    centre : ndarray, shape (n_lifted, p), optional
+    """
+
+    lifting: Lifting
+    parameters: Mapping[str, Array]
+    segments: Segments
+    T: Array
+    sigma: Array
+    one_step: OneStep
+    margin: float
+    pooled: bool = False
+    prior: Array | None = None
+    centre: Array | None = None
+
+    @property
+    def residuals(self) -> float:
+        """Residuals that one unit's free runs contribute, on average."""
+        return self.lifting.n_states * float(self.segments.valid[1:].sum()) / self.segments.n_units / self.stride
+
+    @property
+    def stride(self) -> int:
+        """Every how many steps the error counts."""
+        return max(1, (len(self.segments.valid) - 1) // _SAMPLES)
+
+    def at(self, horizon: int) -> Problem:
+        """Return the same problem at a horizon up to that of the segments."""
+        return replace(self, segments=self.segments.cut(horizon))
+
+    def admissible(self, V: Array) -> npt.NDArray[np.bool_]:
+        """Tell which models are finite and stable as linear systems."""
+        A = (V @ self.T.T)[..., : self.lifting.n_lifted]
+        finite = np.isfinite(A).all(axis=(-1, -2))
+        A = np.where(finite[..., None, None], A, 0.0)
+        return np.asarray(finite & (np.abs(np.linalg.eigvals(A)).max(axis=-1) < 1 - self.margin))
+
+    def finite(self, V: Array) -> npt.NDArray[np.bool_]:
+        """Tell which models hold numbers only."""
+        return np.asarray(np.isfinite(V).all(axis=(-1, -2)))
+
+    def run(self, V: Array) -> Normal:
+        """Return the normal equations of the free runs alone."""
+        n = self.lifting.n_states
+        each = np.broadcast_to(V[:, :n], (self.segments.n_units, n, V.shape[-1]))
+        return normal_equations(each, self.T, self.lifting, self.parameters, self.segments, self.sigma, self.stride)
+
+    def evaluate(self, V: Array) -> Array:
+        """Return ``[J r]^T [J r]`` of the whole cost, shape (problem, P + 1, P + 1)."""
+        n, nl, p = self.lifting.n_states, self.lifting.n_lifted, V.shape[-1]
+        normal = self.run(V)
+        each = np.broadcast_to(V, (len(normal.matrix), nl, p))
+        total = np.zeros((len(each), nl * p + 1, nl * p + 1))
+        _add(total, normal.matrix, slice(0, n * p))
+        for row in range(n, nl):
+            _add(total, normal.counts[:, None, None] * self.one_step.normal(each[:, row], row - n), slice(row * p, (row + 1) * p))
+        total = total.sum(axis=0, keepdims=True) if self.pooled else total
+        if self.prior is not None and self.centre is not None:
+            away = (V - self.centre).reshape(len(V), -1)
+            pull = away @ self.prior
+            total[:, :-1, :-1] += self.prior
+            total[:, :-1, -1] -= pull
+            total[:, -1, :-1] -= pull
+            total[:, -1, -1] += np.sum(away * pull, axis=-1)
+        return total
+
+
+def _add(total: Array, part: Array, place: slice) -> None:
+    total[:, place, place] += part[:, :-1, :-1]
+    total[:, place, -1] += part[:, :-1, -1]
+    total[:, -1, place] += part[:, -1, :-1]
+    total[:, -1, -1] += part[:, -1, -1]

@@ -1,0 +1,102 @@
+"""Stretches of training episodes, the data of the refinement: drawn once, cut into shorter pieces for shorter horizons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DataError
+from ...data.population import EpisodeKey, Population
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Stretches of recordings, the same number for every unit.
+
+    Parameters
+    ----------
+    states : ndarray, shape (n_samples, n, unit, segment)
+    inputs : ndarray, shape (n_samples, m, unit, segment)
+    valid : ndarray of bool, shape (n_samples, unit, segment)
+        False behind the end of an episode shorter than the others.
+    """
+
+    states: Array
+    inputs: Array
+    valid: npt.NDArray[np.bool_]
+
+    @property
+    def n_units(self) -> int:
+        """Number of units."""
+        return self.valid.shape[1]
+
+    def units(self, rows: npt.NDArray[Any]) -> Segments:
+        """Return the segments of some units."""
+        return Segments(*(np.ascontiguousarray(a[..., rows, :]) for a in (self.states, self.inputs, self.valid)))
+
+    def first(self, count: int) -> Segments:
+        """Return the first segments of every unit."""
+        return Segments(*(np.ascontiguousarray(a[..., :count]) for a in (self.states, self.inputs, self.valid)))
+
+    def cut(self, horizon: int) -> Segments:
+        """Return pieces of `horizon` steps, as many as there are segments, spread evenly over them."""
+        length = min(horizon + 1, len(self.valid))
+        pieces, n_segments = len(self.valid) // length, self.valid.shape[2]
+        keep = np.unique(np.linspace(0, pieces * n_segments - 1, n_segments).round().astype(int))
+
+        def fold(a: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            moved = np.moveaxis(a[: pieces * length].reshape(pieces, length, *a.shape[1:]), 0, -1)  # (length, .., segment, piece)
+            return np.ascontiguousarray(moved.reshape(*moved.shape[:-2], -1)[..., keep])
+
+        return Segments(fold(self.states), fold(self.inputs), fold(self.valid))
+
+
+def read_segments(population: Population, keys: Mapping[str, Sequence[EpisodeKey]], horizon: int, count: int, seed: int) -> Segments:
+    """Draw segments of every unit, those of its last episode at the end.
+
+    Parameters
+    ----------
+    population : Population
+    keys : mapping of str to sequence of EpisodeKey
+        Training episodes of every unit.
+    horizon : int
+        Steps of a segment; an episode that is shorter gives one segment, which is all of it.
+    count : int
+        Segments of every unit; the first ``count - held_segments(count, keys)`` are from all episodes but the last.
+    seed : int
+
+    Returns
+    -------
+    Segments
+    """
+    held = held_segments(count, keys)
+    n, width = len(population.states), len(population.channels)
+    values = np.empty((horizon + 1, width, len(keys), count))
+    valid = np.ones((horizon + 1, len(keys), count), dtype=bool)
+    for row, (unit, episodes) in enumerate(keys.items()):
+        if not episodes:
+            raise DataError(f"Refinement: unit {unit} has no training episode; leave the unit out or give it one.")
+        rng = np.random.default_rng([seed, row])
+        earlier = list(episodes[:-1]) or list(episodes)
+        owners = [earlier[i % len(earlier)] for i in range(count - held)] + [episodes[-1]] * held
+        for key in dict.fromkeys(owners):
+            samples = population.read(key)
+            for column in (i for i, owner in enumerate(owners) if owner == key):
+                start = int(rng.integers(0, max(1, len(samples) - horizon)))
+                piece = samples[start : start + horizon + 1]
+                values[: len(piece), :, row, column] = piece
+                values[len(piece) :, :, row, column] = piece[-1]
+                valid[len(piece) :, row, column] = False
+    return Segments(np.ascontiguousarray(values[:, :n]), np.ascontiguousarray(values[:, n:]), valid)
+
+
+def held_segments(count: int, keys: Mapping[str, Sequence[EpisodeKey]]) -> int:
+    """Return how many of the segments come from the last episode: its share, at least one where there are two."""
+    typical = int(np.median([len(episodes) for episodes in keys.values()])) if keys else 1
+    return min(count - 1, max(1, round(count / max(1, typical)))) if count > 1 else 0

@@ -72,7 +72,7 @@ def minimise(
         found = evaluate(np.where(allowed[:, None, None], trial, V))
         better = allowed & (found[:, -1, -1] < matrix[:, -1, -1])
         small = found[:, -1, -1] >= (1 - least_gain) * matrix[:, -1, -1]
-        done |= (better & small) | (~better & (mu >= _MOST)) | (matrix[:, -1, -1] == 0)
+        done |= (better & small & (mu <= _START)) | (~better & (mu >= _MOST)) | (matrix[:, -1, -1] == 0)
         V = np.where(better[:, None, None], trial, V)
         matrix = np.where(better[:, None, None], found, matrix)
         mu = np.clip(np.where(better, mu / 10, mu * 10), _LEAST, _MOST)

@@ -1,43 +1,87 @@
-"""How far apart two models are, as the uncertainty of the population will count it: the metric of the prior.
+"""Distance of a unit from the pooled model as the uncertainty of the population will count it: the prior.
 
-With E the residual of the inverse input multiplicative form, to first order ``dE = G^+ dG`` in scaled inputs and outputs. From
-``G = (zI - A)^-1 B = Phi B`` follows ``dG = Phi dW Z`` with ``Z = [G; I]``, so that ``dE = (G^+ Phi) dW Z`` and
+In scaled inputs and outputs E is the residual of the inverse input multiplicative form, with the pooled model G0 as nominal:
 
-    mean over frequency of ||dE||_F^2 = sum_ijkl dW_ij dW_kl Re[(a_i^* a_k)(z_j^* z_l)],      a = G^+ Phi,  z = Z^T
+    E = G^+ (G - G0),      G = Phi B,  Phi = (zI - A)^-1,      dE = (G^+ Phi) dW Z (I - E),  Z = [G; I]
+    cost = N strength level^2 mean over frequency of (||E||_F / level)^(2 power)
+
+A power above one flattens the residual's peak, which is what a weight has to cover; far below `level` the prior is silent.
+`dE` leaves out how the range of G turns, which is of second order.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
 _DECADES_BELOW_NYQUIST = 6
 _POINTS = 100
 
 
-def response_metric(A: Array, B: Array, T: Array, output_scale: Array, input_scale: Array) -> Array:
-    """Return the matrix of the quadratic form above, for changes of V with ``W = V T^T``.
+@dataclass(frozen=True, eq=False)
+class ResponsePrior:
+    """Prior that keeps frequency responses near that of the pooled model.
 
     Parameters
     ----------
     A : ndarray, shape (n, n)
-        Stable.
+        Pooled model, stable.
     B : ndarray, shape (n, m)
     T : ndarray, shape (n + m, n + m)
     output_scale, input_scale : ndarray, shape (n,) and (m,)
-
-    Returns
-    -------
-    ndarray, shape (n (n + m), n (n + m))
+    weight : float
+        Number of residuals times strength.
+    level : float
+    power : int
     """
-    n, m = B.shape
-    z = np.exp(1j * np.pi * np.logspace(-_DECADES_BELOW_NYQUIST, 0, _POINTS))
-    Phi = np.linalg.solve(z[:, None, None] * np.eye(n) - A, np.eye(n) + 0j * z[:, None, None])
-    G = Phi @ B * input_scale
-    a = np.linalg.pinv(G / output_scale[:, None]) @ (Phi / output_scale[:, None])  # (frequency, m, n)
-    Z = T.T @ np.concatenate([G, np.broadcast_to(np.diag(input_scale), (len(z), m, m))], axis=1)  # (frequency, n + m, m)
-    by_row = np.swapaxes(a.conj(), -1, -2) @ a
-    by_column = Z.conj() @ np.swapaxes(Z, -1, -2)
-    form = np.einsum("fik,fjl->ijkl", by_row, by_column).real / len(z)
-    return np.asarray(form.reshape(n * (n + m), -1))
+
+    A: Array
+    B: Array
+    T: Array
+    output_scale: Array
+    input_scale: Array
+    weight: float = 1.0
+    level: float = 0.3
+    power: int = 2
+
+    def scaled(self, weight: float) -> ResponsePrior:
+        """Return the same prior with another weight."""
+        return replace(self, weight=weight)
+
+    def residual(self, V: Array) -> tuple[Complex, Complex, Complex]:
+        """Return E (unit, frequency, m, m) of models V, ``G^+ Phi`` and ``T^T Z (I - E)``."""
+        W = V @ self.T.T
+        n = self.A.shape[-1]
+        m = self.B.shape[-1]
+        z = np.exp(1j * np.pi * np.logspace(-_DECADES_BELOW_NYQUIST, 0, _POINTS))
+        shifted = z[:, None, None] * np.eye(n)
+        Phi = np.linalg.inv(shifted - W[:, None, :, :n])
+        G = Phi @ W[:, None, :, n:] * self.input_scale
+        G0 = np.linalg.solve(shifted - self.A, self.B + 0j * z[:, None, None]) * self.input_scale
+        left = np.linalg.pinv(G / self.output_scale[:, None]) / self.output_scale
+        E = left @ (G - G0)
+        Z = np.concatenate([G, np.broadcast_to(np.diag(self.input_scale), (*G.shape[:2], m, m))], axis=-2)
+        return E, left @ Phi, self.T.T @ Z @ (np.eye(m) - E)
+
+    def normal(self, V: Array) -> Array:
+        """Return ``[J r]^T [J r]`` with r = -E, weighted so that the gradient is that of the cost; shape (unit, P + 1, P + 1)."""
+        E, a, Z = self.residual(V)
+        size = np.sum(np.abs(E) ** 2, axis=(-1, -2)) / self.level**2  # (unit, frequency)
+        slope = self.weight * self.power * size ** (self.power - 1) / size.shape[1]
+        units, rows, columns = V.shape
+        by_row = (np.swapaxes(a.conj(), -1, -2) @ a) * slope[..., None, None]
+        by_column = Z.conj() @ np.swapaxes(Z, -1, -2)
+        form = (
+            by_row.reshape(*size.shape, -1).transpose(0, 2, 1) @ by_column.reshape(*size.shape, -1)
+        ).real  # (unit, rows rows, columns columns)
+        H = form.reshape(units, rows, rows, columns, columns).transpose(0, 1, 3, 2, 4).reshape(units, rows * columns, -1)
+        pull = np.swapaxes(a.conj(), -1, -2) @ (E * slope[..., None, None]) @ np.swapaxes(Z.conj(), -1, -2)
+        g = -pull.real.sum(axis=1).reshape(units, -1)
+        out = np.empty((units, H.shape[-1] + 1, H.shape[-1] + 1))
+        out[:, :-1, :-1], out[:, :-1, -1], out[:, -1, :-1] = H, g, g
+        out[:, -1, -1] = self.weight * self.level**2 * np.mean(size**self.power, axis=1)
+        return out

@@ -18,13 +18,21 @@ class RefineOptions:
     segments : int
         Stretches of recordings used of every unit, spread over its training episodes.
     strengths : tuple of float
-        Strengths of the prior to choose from. The unit is information: at 1 a relative change of the input (the residual of the
-        inverse input multiplicative form, root mean square over frequency) costs as much as errors of the size of `sigma`.
+        Strengths of the prior to choose from. At 1 a residual of one at all frequencies costs as much as the free-run error of the
+        pooled model (with ``power = 1``; see `metric`).
     tolerance : float
         The strongest prior whose held-out error exceeds the lowest by no more than this share is chosen.
     balance : float
         A state's error counts in units of ``start**balance * range**(1 - balance)``, with `start` the free-run error of the EDMD
         model and `range` that of the state: 0 weighs states by their range, 1 asks every state for the same improvement.
+    starts : tuple of float
+        Weighings from which the pooled model is sought; the best end, in the weighing `balance`, is taken.
+    level : float
+        Residual of the inverse input multiplicative form beyond which the prior bites.
+    power : int
+        How suddenly it bites: 1 is quadratic.
+    pooled_segments : int
+        Segments of all units together from which the pooled model is sought; it is finished on all.
     margin : float
         Stable means a spectral radius below ``1 - margin``.
     alpha_factor : float
@@ -49,6 +57,10 @@ class RefineOptions:
     strengths: tuple[float, ...] = (1e3, 1e2, 1e1, 1.0, 1e-1, 1e-2)
     tolerance: float = 0.05
     balance: float = 0.5
+    starts: tuple[float, ...] = (0.5, 0.65, 0.8)
+    level: float = 0.3
+    power: int = 2
+    pooled_segments: int = 240
     margin: float = 1e-5
     alpha_factor: float = 4.0
     iterations: int = 15
@@ -63,6 +75,10 @@ class RefineOptions:
             "strengths": len(self.strengths) > 0 and min(self.strengths, default=0.0) > 0,
             "tolerance": self.tolerance >= 0,
             "balance": 0 <= self.balance <= 1,
+            "starts": len(self.starts) > 0 and 0 <= min(self.starts, default=-1.0) and max(self.starts) <= 1,
+            "level": self.level > 0,
+            "power": self.power >= 1,
+            "pooled_segments": self.pooled_segments >= 1,
             "margin": 0 <= self.margin < 1,
             "alpha_factor": self.alpha_factor >= 1,
             "iterations": self.iterations >= 1,

@@ -24,7 +24,7 @@ from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor
 from .judge import free_run_errors, require_bounded
 from .marquardt import Solution, minimise
-from .metric import response_metric
+from .metric import ResponsePrior
 from .model import RefinedModels, TradeOff
 from .options import RefineOptions
 from .problem import OneStep, Problem
@@ -80,16 +80,16 @@ def refine_population(
     held = held_segments(options.segments, keys)
     fitted = segments.first(options.segments - held)
     rows = np.flatnonzero(pooled)
-    start, problem = _start(lifting, parameters, factor, fitted, rows, options)
-    common = _refine_pooled(start, _restrict(problem, rows), options)
-    prepared = _with_prior(problem, common, factor, rows)
+    start, problem, error, span = _start(lifting, parameters, factor, fitted, rows, options)
+    common = _refine_pooled(start, _restrict(problem, rows), error, span, options)
+    prepared = _with_prior(problem, common, factor, rows, options)
     path = _path(prepared, common, options)
-    judged = _Judge(population, keys, lifting, parameters, rows, problem, _scales(factor, rows, lifting))
+    judged = _Judge(population, keys, lifting, parameters, rows, prepared, _scales(factor, rows, lifting))
     trade_off = judged.trade_off([common, *path], (np.inf, *sorted(options.strengths, reverse=True)))
     choice = _choose(trade_off[1:], options.tolerance)
     strength = trade_off[1 + choice].strength
     log.info("prior of strength %g chosen, held-out score %.4g", strength, trade_off[1 + choice].score)
-    final = replace(prepared, segments=segments, prior=_scaled(prepared, strength))
+    final = _strengthen(replace(prepared, segments=segments), strength)
     solution = minimise(final.evaluate, final.admissible, path[choice], options.iterations, options.least_gain)
     units = _matrices(solution.V, problem.T, lifting.n_lifted)
     limit = options.bound * factor.peak[rows, : lifting.n_states].max(axis=0)
@@ -100,7 +100,7 @@ def refine_population(
         pooled=_matrices(common, problem.T, lifting.n_lifted),
         strength=strength,
         trade_off=trade_off,
-        sigma=problem.sigma,
+        sigma=prepared.sigma,
         status=_status(solution, units, options.margin),
         information=solution.matrix[:, :-1, :-1],
         whitening=problem.T,
@@ -140,8 +140,8 @@ def _start(
     segments: Segments,
     rows: npt.NDArray[np.int64],
     options: RefineOptions,
-) -> tuple[Array, Problem]:
-    """Pooled EDMD in whitened parameters (1, n_lifted, p), and the problem of all units without a prior."""
+) -> tuple[Array, Problem, Array, Array]:
+    """Pooled EDMD in whitened parameters (1, n_lifted, p), the problem of all units without a prior, errors and ranges of states."""
     nl, n = lifting.n_lifted, lifting.n_states
     R = qr_triangle(factor.R[rows].reshape(-1, factor.R.shape[-1]))
     p = R.shape[-1] - nl
@@ -156,7 +156,11 @@ def _start(
         error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())
     span = _scales(factor, rows, lifting)[0][:n]
     error = np.clip(np.where(np.isfinite(error), error, span), _LEAST_ERROR * span, span)
-    return V, replace(problem, sigma=error**options.balance * span ** (1 - options.balance))
+    return V, replace(problem, sigma=_sigma(error, span, options.balance)), error, span
+
+
+def _sigma(error: Array, span: Array, balance: float) -> Array:
+    return np.asarray(error**balance * span ** (1 - balance))
 
 
 def _whitening(R11: Array, n_samples: int) -> Array:
@@ -170,38 +174,51 @@ def _whitening(R11: Array, n_samples: int) -> Array:
 def _restrict(problem: Problem, rows: npt.NDArray[np.int64]) -> Problem:
     """The problem of one model for some units."""
     own = {name: values[rows] for name, values in problem.parameters.items()}
-    one_step = replace(problem.one_step, matrix=problem.one_step.matrix[rows])
+    one_step = replace(problem.one_step, matrix=problem.one_step.matrix[rows], least=problem.one_step.least[rows])
     return replace(problem, parameters=own, segments=problem.segments.units(rows), one_step=one_step, pooled=True)
 
 
-def _refine_pooled(V: Array, problem: Problem, options: RefineOptions) -> Array:
+def _refine_pooled(V: Array, problem: Problem, error: Array, span: Array, options: RefineOptions) -> Array:
     """Fit one model to all units, horizons growing; shape (n_lifted, p).
 
-    On the way the model may be unstable: kept stable from the start, the search runs into the edge of stability and stops there, far
-    from the optimum. Where the end is unstable, rows of lifted functions, which free runs do not see, are shortened until it is not; if
-    that is not enough, the search is repeated within the stable models.
+    The free-run error has several minima, so the search is made once for every way of weighing the states in `options.starts`, and
+    the ends are finished and compared in the weighing asked for. On the way a model may be unstable: kept stable from the start, the
+    search runs into the edge of stability and stops there, far from the optimum.
     """
-    free = _grow(V, problem, options, problem.finite)
-    stable = _shorten(free, problem)
-    if stable is None:
-        log.warning("refinement of the pooled model: the best model is unstable, so it is sought among the stable ones")
-        return np.asarray(_grow(V, problem, options, problem.admissible)[0])
-    if not problem.admissible(free)[0]:
-        stable = minimise(problem.evaluate, problem.admissible, stable, options.iterations, options.least_gain).V
-    return np.asarray(stable[0])
+    few = replace(problem, segments=problem.segments.first(max(2, -(-options.pooled_segments // problem.segments.n_units))))
+    found: list[tuple[float, Array]] = []
+    for balance in options.starts:
+        grown = _grow(V, replace(few, sigma=_sigma(error, span, balance)), options, few.finite)
+        if grown is None:
+            continue
+        end = minimise(few.evaluate, few.finite, grown, options.iterations, options.least_gain)
+        stable = _shorten(end.V, few)
+        if stable is not None and np.isfinite(end.cost).all():
+            final = minimise(problem.evaluate, problem.admissible, stable, options.iterations, options.least_gain)
+            found.append((float(final.cost[0]), final.V[0]))
+            log.debug("pooled model from balance %g: cost %.6g", balance, final.cost[0])
+    if not found:
+        log.warning("refinement of the pooled model: the best models are unstable, so it is sought among the stable ones")
+        grown = _grow(V, problem, options, problem.admissible)
+        if grown is None:
+            raise IdentificationError(
+                f"Refinement of the pooled model: free runs over {max(options.horizons)} samples diverge from every start; add shorter "
+                "horizons, or leave out lifting functions that grow."
+            )
+        return np.asarray(grown[0])
+    return min(found, key=lambda pair: pair[0])[1]
 
 
-def _grow(V: Array, problem: Problem, options: RefineOptions, admissible: Callable[[Array], npt.NDArray[np.bool_]]) -> Array:
+def _grow(V: Array, problem: Problem, options: RefineOptions, admissible: Callable[[Array], npt.NDArray[np.bool_]]) -> Array | None:
+    """Minimise at growing horizons; None where free runs diverge."""
+    V = V.copy()
+    V[:, problem.lifting.n_states :] = problem.one_step.rows if admissible == problem.finite else V[:, problem.lifting.n_states :]
     for horizon in options.horizons:
         now = problem.at(horizon)
         solution = minimise(now.evaluate, admissible, V, options.iterations, options.least_gain)
         if not np.isfinite(solution.cost).all():
-            raise IdentificationError(
-                f"Refinement of the pooled model: free runs over {horizon} samples diverge; add a shorter horizon before it, or leave out "
-                "lifting functions that grow."
-            )
+            return None
         V = solution.V
-        log.debug("pooled model at horizon %d: cost %.6g after %d steps", horizon, solution.cost[0], solution.iterations)
     return V
 
 
@@ -216,19 +233,20 @@ def _shorten(V: Array, problem: Problem) -> Array | None:
     return None
 
 
-def _with_prior(problem: Problem, common: Array, factor: Factor, rows: npt.NDArray[np.int64]) -> Problem:
-    """The problem of all units at the longest horizon, with the prior's metric and centre."""
+def _with_prior(problem: Problem, common: Array, factor: Factor, rows: npt.NDArray[np.int64], options: RefineOptions) -> Problem:
+    """The problem of all units at the longest horizon, errors in units of those of the pooled model, with a prior around it."""
+    normal = _restrict(problem, rows).run(common[None])
+    size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, _LEAST_ERROR**2))
     model = _matrices(common, problem.T, problem.lifting.n_lifted)
-    metric = response_metric(model.A, model.B, problem.T, *_scales(factor, rows, problem.lifting))
-    return replace(problem, prior=metric, centre=common)
+    prior = ResponsePrior(
+        model.A, model.B, problem.T, *_scales(factor, rows, problem.lifting), level=options.level, power=options.power
+    )
+    return replace(problem, sigma=problem.sigma * size, prior=prior)
 
 
-def _scaled(problem: Problem, strength: float) -> Array:
-    """The prior of one strength: as many residuals as a unit's free runs have."""
-    prior = problem.prior
-    if prior is None:
-        raise IdentificationError("Refinement: the problem has no prior; this is a mistake of kros, please report it.")
-    return strength * problem.residuals * prior
+def _strengthen(problem: Problem, strength: float) -> Problem:
+    """Give the prior a strength, in proportion to the residuals that a unit's free runs have."""
+    return problem if problem.prior is None else replace(problem, prior=problem.prior.scaled(strength * problem.residuals))
 
 
 def _path(problem: Problem, common: Array, options: RefineOptions) -> Array:
@@ -236,7 +254,7 @@ def _path(problem: Problem, common: Array, options: RefineOptions) -> Array:
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
     path = []
     for strength in sorted(options.strengths, reverse=True):
-        now = replace(problem, prior=_scaled(problem, strength))
+        now = _strengthen(problem, strength)
         V = minimise(now.evaluate, now.admissible, V, options.iterations, options.least_gain).V
         path.append(V)
     return np.stack(path)

@@ -1,6 +1,6 @@
 """What is minimised: free-run error of the states, one-step error of the lifted functions, distance from the pooled model.
 
-    sum ||(x_data - x_free_run) / sigma||^2  +  sum ||(sigma+ - w psi) / sigma_row||^2  +  (V - V0)^T prior (V - V0)
+    sum ||(x_data - x_free_run) / sigma||^2  +  sum ||(sigma+ - w psi) / sigma_row||^2  +  prior
 
 A free run retracts and re-lifts, so it does not see the rows of the lifted functions; they enter only the linear model used in
 synthesis, and are fitted one step ahead, from the triangular factors.
@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...lifting import Lifting
+from .metric import ResponsePrior
 from .segments import Segments
 from .sensitivity import Normal, normal_equations
 
@@ -35,6 +36,8 @@ class OneStep:
     ----------
     matrix : ndarray, shape (unit, p + f, p + f)
         ``[psi sigma+]^T [psi sigma+]`` per sample, psi whitened.
+    least : ndarray, shape (unit, f)
+        Mean square of every unit's own least-squares error; costs count from there.
     variance : ndarray, shape (f,)
         Of the one-step error of the pooled least-squares rows.
     rows : ndarray, shape (f, p)
@@ -42,6 +45,7 @@ class OneStep:
     """
 
     matrix: Array
+    least: Array
     variance: Array
     rows: Array
 
@@ -56,14 +60,16 @@ class OneStep:
         mean = matrix[pooled].mean(axis=0)
         rows = np.linalg.lstsq(mean[:p, :p], mean[:p, p:], rcond=None)[0].T
         left = np.diagonal(mean[p:, p:]) - np.sum(rows * mean[:p, p:].T, axis=1)
-        return cls(matrix, np.maximum(left, _LEAST_VARIANCE * np.diagonal(mean[p:, p:])), rows)
+        own = np.stack([np.linalg.lstsq(M[:p, :p], M[:p, p:], rcond=None)[0].T for M in matrix])
+        least = np.diagonal(matrix[:, p:, p:], axis1=1, axis2=2) - np.sum(own * np.swapaxes(matrix[:, :p, p:], 1, 2), axis=2)
+        return cls(matrix, least, np.maximum(left, _LEAST_VARIANCE * np.diagonal(mean[p:, p:])), rows)
 
     def normal(self, rows: Array, row: int) -> Array:
         """Return ``[J r]^T [J r]`` of one function for rows (unit, p), per sample and in units of its variance."""
         p = rows.shape[-1]
         G, c = self.matrix[:, :p, :p], self.matrix[:, :p, p + row]
         slope = c - (G @ rows[..., None])[..., 0]
-        rest = self.matrix[:, p + row, p + row] - np.sum(rows * (c + slope), axis=-1)
+        rest = np.maximum(self.matrix[:, p + row, p + row] - np.sum(rows * (c + slope), axis=-1) - self.least[:, row], 0.0)
         out = np.empty((len(rows), p + 1, p + 1))
         out[:, :p, :p], out[:, :p, p], out[:, p, :p], out[:, p, p] = G, slope, slope, rest
         return np.asarray(out / self.variance[row])
@@ -84,8 +90,7 @@ class Problem:
     margin : float
     pooled : bool
         One model for all units.
-    prior : ndarray, shape (P, P), optional
-    centre : ndarray, shape (n_lifted, p), optional
+    prior : ResponsePrior, optional
     """
 
     lifting: Lifting
@@ -96,8 +101,7 @@ class Problem:
     one_step: OneStep
     margin: float
     pooled: bool = False
-    prior: Array | None = None
-    centre: Array | None = None
+    prior: ResponsePrior | None = None
 
     @property
     def residuals(self) -> float:
@@ -140,13 +144,8 @@ class Problem:
         for row in range(n, nl):
             _add(total, normal.counts[:, None, None] * self.one_step.normal(each[:, row], row - n), slice(row * p, (row + 1) * p))
         total = total.sum(axis=0, keepdims=True) if self.pooled else total
-        if self.prior is not None and self.centre is not None:
-            away = (V - self.centre).reshape(len(V), -1)
-            pull = away @ self.prior
-            total[:, :-1, :-1] += self.prior
-            total[:, :-1, -1] -= pull
-            total[:, -1, :-1] -= pull
-            total[:, -1, -1] += np.sum(away * pull, axis=-1)
+        if self.prior is not None:
+            total += self.prior.normal(V)
         return total
 
 

@@ -23,12 +23,22 @@ def kros() -> Callable[..., Result]:
 
 
 @pytest.fixture(scope="session")
-def demo(kros, tmp_path_factory) -> Path:
-    """A finished demo: five units and an outlier, two conditions, four short episodes."""
-    out = tmp_path_factory.mktemp("demo") / "run"
-    result = kros("demo", "--out", out, "--units", 5, "--episodes", 4, "--seconds", 12, "--workers", 1)
+def recorded(kros, tmp_path_factory) -> Path:
+    """Simulated recordings: five units and an outlier, two conditions, four short episodes."""
+    out = tmp_path_factory.mktemp("recorded") / "recordings"
+    result = kros("simulate", out, "--units", 5, "--episodes", 4, "--seconds", 12, "--outlier")
     assert result.exit_code == 0, result.output
     return out
+
+
+@pytest.fixture(scope="session")
+def demo(kros, recorded, tmp_path_factory) -> Path:
+    """A finished study; its input weight is fixed, because tuning it takes most of the time."""
+    folder = tmp_path_factory.mktemp("demo")
+    (folder / "demo.toml").write_text(f'[data]\nsource = "{recorded}"\nreader = "parquet"\n[synthesis]\ninput_weight = 3.0\n')
+    result = kros("run", folder / "demo.toml", "--out", folder / "run", "--workers", 1)
+    assert result.exit_code == 0, result.output
+    return folder / "run"
 
 
 @pytest.fixture(scope="session")
@@ -38,12 +48,12 @@ def metrics(demo) -> dict[str, Any]:
 
 
 @pytest.fixture
-def study(demo, tmp_path) -> Callable[..., Path]:
+def study(recorded, tmp_path) -> Callable[..., Path]:
     """Write a study file on the demo's recordings, with more TOML behind it."""
 
     def write(extra: str = "", source: Path | None = None, reader: str = "parquet") -> Path:
         path = tmp_path / "study.toml"
-        path.write_text(f'[data]\nsource = "{source or demo / "simulated"}"\nreader = "{reader}"\n{extra}\n')
+        path.write_text(f'[data]\nsource = "{source or recorded}"\nreader = "{reader}"\n{extra}\n')
         return path
 
     return write

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,11 @@ import numpy as np
 
 from ..core.artifacts import plain
 from ..core.errors import ConfigError, DataError
-from ..data import Population, check_population, split_episodes
-from ..data.population import EpisodeKey
+from ..data import Population, check_population
 from ..identify import Factor, ModelSet, combine, edmd, lifted_factor
 from ..observer import Observer
 from ..uncertainty import OutlierModel
-from .estimate import check_channels, load_calibration, open_data, unit_parameters
+from .estimate import check_channels, load_calibration, open_data, training_keys, unit_parameters
 from .executors import Executor, open_executor
 from .pipeline import load_run
 from .stages.identify import reduce_episodes
@@ -69,27 +69,9 @@ def score_condition(
     factor = Factor(*(np.stack([getattr(f, name) for f in reduced]) for name in ("R", "peak", "n_samples")))
     values = {name: np.array([parameters[u][name] for u in units]) for name in lifting.parameters}
     matrices = edmd(lifted_factor(factor, lifting, values, lifting).R, lifting.n_lifted, models.alpha or 0.0)
-    fresh = ModelSet(
-        **{
-            **models.__dict__,
-            "unit_ids": tuple(units),
-            "A": matrices.A,
-            "B": matrices.B,
-            "parameters": values,
-            "status": ("ok",) * len(units),
-        }
-    )
+    fresh = replace(models, unit_ids=tuple(units), A=matrices.A, B=matrices.B, parameters=values, status=("ok",) * len(units))
     responses = fresh.systems().frequency_response(outliers.freqs_hz)
     return [score_row(outliers.score(unit, response), models.condition) for unit, response in zip(units, responses, strict=True)]
-
-
-def training_keys(population: Population) -> dict[tuple[str, str], tuple[EpisodeKey, ...]]:
-    """Return the episodes that a unit is identified on: its training part, or its only episode."""
-    groups = {(u, c): keys for u, c, keys in population.groups()}
-    single = {group: keys for group, keys in groups.items() if len(keys) < 2}
-    several = [group for group in groups if group not in single]
-    chosen = Population(**{**population.__dict__, "episodes": tuple(k for group in several for k in groups[group])})
-    return single | {group: split.train for group, split in split_episodes(chosen).items()}
 
 
 def _identify_on(store: Store) -> str:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..core.errors import ConfigError, DataError
-from ..data import Population, open_population
+from ..core.errors import ConfigError, DataError, IdentificationError
+from ..data import Population, open_population, split_episodes
 from ..data.population import EpisodeKey
 from ..evaluate import EpisodeBatch
 from ..identify import PhaseCalibration
@@ -19,6 +21,7 @@ from .pipeline import load_run
 from .stages.calibrate import segments_of
 from .store import Store
 
+log = logging.getLogger(__name__)
 _BATCH = 64
 
 
@@ -55,7 +58,10 @@ def load_calibration(store: Store) -> PhaseCalibration | None:
 
 
 def unit_parameters(population: Population, calibration: PhaseCalibration | None, prefer: str) -> dict[str, dict[str, float]]:
-    """Return every unit's lifting parameters: from the run where it knows the unit, else calibrated on the recordings.
+    """Return every unit's lifting parameters.
+
+    They are calibrated on the unit's own training episodes, on the branch of the run's population; where these do not show them, the run's
+    own calibration of the unit is taken.
 
     Parameters
     ----------
@@ -63,18 +69,36 @@ def unit_parameters(population: Population, calibration: PhaseCalibration | None
     calibration : PhaseCalibration or None
     prefer : str
         Condition to calibrate on, where a unit has it.
+
+    Raises
+    ------
+    IdentificationError
+        When a unit can be calibrated neither way.
     """
+    if calibration is None:
+        return {unit: {} for unit in population.unit_ids}
+    training = training_keys(population)
     parameters: dict[str, dict[str, float]] = {}
     for unit in population.unit_ids:
-        if calibration is None:
-            parameters[unit] = {}
-        elif unit in calibration.units:
-            parameters[unit] = {calibration.spec.parameter: calibration.units[unit].phase_rad}
-        else:
-            keys = population.keys(unit, prefer) or population.keys(unit)
-            phase = calibration.calibrate(segments_of((population, keys, calibration.spec)), unit)
-            parameters[unit] = {calibration.spec.parameter: phase.phase_rad}
+        own = {condition: keys for (u, condition), keys in training.items() if u == unit}
+        try:
+            phase = calibration.calibrate(segments_of((population, own.get(prefer) or next(iter(own.values())), calibration.spec)), unit)
+        except IdentificationError:
+            if unit not in calibration.units:
+                raise
+            log.info("unit %s: its recordings do not show the phase, that of the run is taken", unit)
+            phase = calibration.units[unit]
+        parameters[unit] = {calibration.spec.parameter: phase.phase_rad}
     return parameters
+
+
+def training_keys(population: Population) -> dict[tuple[str, str], tuple[EpisodeKey, ...]]:
+    """Return the episodes that a unit is identified on: its training part, or its only episode."""
+    groups = {(u, c): keys for u, c, keys in population.groups()}
+    single = {group: keys for group, keys in groups.items() if len(keys) < 2}
+    several = [group for group in groups if group not in single]
+    chosen = replace(population, episodes=tuple(k for group in several for k in groups[group]))
+    return single | {group: split.train for group, split in split_episodes(chosen).items()}
 
 
 def estimate_recordings(run: Path, data: Path, out: Path) -> int:

@@ -1,0 +1,14 @@
+"""The demo command, alone: it simulates, tunes, and says where the report is."""
+
+import json
+
+
+def test_the_demo_command_runs_everything_tunes_and_says_where_the_report_is(kros, tmp_path):
+    out = tmp_path / "demo"
+    result = kros("demo", "--out", out, "--units", 3, "--episodes", 2, "--seconds", 6, "--workers", 1)
+    assert result.exit_code == 0, result.output
+    assert f"report: {out / 'report.html'}" in result.stdout
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["study"]["units"] == 3
+    observers = {name: o for name, o in metrics["observers"].items() if name.endswith(("worst_case_h2", "kalman_tuned"))}
+    assert all("process_noise" in o or "process_noise_level" in o for o in observers.values())

@@ -8,8 +8,6 @@ import pytest
 
 from kros.data import Channel, Role, from_arrays, write_parquet
 
-pytestmark = pytest.mark.xdist_group("study")  # one worker makes the recordings, once
-
 
 @pytest.fixture
 def raw(kros, tmp_path) -> Path:

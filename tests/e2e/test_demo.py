@@ -9,8 +9,6 @@ import pytest
 
 from kros.identify import ModelSet
 
-pytestmark = pytest.mark.xdist_group("study")  # one worker makes the demo, once
-
 STAGES = ["read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report"]
 FORMS = {
     "additive",

@@ -19,8 +19,8 @@ from .tuning import TuningSet
 
 Array = npt.NDArray[np.float64]
 IDENTITY, TUNED = "identity", "tuned"
-_CORNERS_HZ = (0.03, 0.3, 3.0, 30.0)
-_NOISES = ((0.0, 0.0), (1e-2, 0.0), (1e-1, 0.0), (0.0, 1e-2), (0.0, 1e-1), (0.0, 1.0))  # process, measurement
+_CORNERS_HZ = (0.03, 1.0, 30.0)
+_NOISES = ((0.0, 0.0), (1e-2, 0.0), (0.0, 1e-1), (0.0, 1.0))  # process, measurement
 
 
 @dataclass(frozen=True, eq=False)

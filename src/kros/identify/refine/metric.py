@@ -3,9 +3,9 @@
 In scaled inputs and outputs E is the residual of the inverse input multiplicative form, with the pooled model G0 as nominal:
 
     E = G^+ (G - G0),      G = Phi B,  Phi = (zI - A)^-1,      dE = (G^+ Phi) dW Z (I - E),  Z = [G; I]
-    cost = N strength level^2 mean over frequency of (||E||_F / level)^(2 power)
+    cost = N strength level^2 mean over frequency of [(1 + e)^power - 1] / power,      e = (||E||_F / level)^2
 
-A power above one flattens the residual's peak, which is what a weight has to cover; far below `level` the prior is silent.
+which is quadratic below `level`; a power above one flattens the residual's peak, which is what a weight has to cover.
 `dE` leaves out how the range of G turns, which is of second order.
 """
 
@@ -71,7 +71,7 @@ class ResponsePrior:
         """Return ``[J r]^T [J r]`` with r = -E, weighted so that the gradient is that of the cost; shape (unit, P + 1, P + 1)."""
         E, a, Z = self.residual(V)
         size = np.sum(np.abs(E) ** 2, axis=(-1, -2)) / self.level**2  # (unit, frequency)
-        slope = self.weight * self.power * size ** (self.power - 1) / size.shape[1]
+        slope = self.weight * (1 + size) ** (self.power - 1) / size.shape[1]
         units, rows, columns = V.shape
         by_row = (np.swapaxes(a.conj(), -1, -2) @ a) * slope[..., None, None]
         by_column = Z.conj() @ np.swapaxes(Z, -1, -2)
@@ -83,5 +83,5 @@ class ResponsePrior:
         g = -pull.real.sum(axis=1).reshape(units, -1)
         out = np.empty((units, H.shape[-1] + 1, H.shape[-1] + 1))
         out[:, :-1, :-1], out[:, :-1, -1], out[:, -1, :-1] = H, g, g
-        out[:, -1, -1] = self.weight * self.level**2 * np.mean(size**self.power, axis=1)
+        out[:, -1, -1] = self.weight * self.level**2 * np.mean(((1 + size) ** self.power - 1) / self.power, axis=1)
         return out

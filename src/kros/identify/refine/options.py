@@ -33,12 +33,16 @@ class RefineOptions:
         How suddenly it bites: 1 is quadratic.
     pooled_segments : int
         Segments of all units together from which the pooled model is sought; it is finished on all.
+    guard : float
+        Spectral radii above ``1 - guard`` are penalised, so that the search slides along the edge of stability.
     margin : float
         Stable means a spectral radius below ``1 - margin``.
     alpha_factor : float
         The start is a pooled EDMD model with this times the smallest alpha that stabilises it.
     iterations : int
-        Most steps of Levenberg-Marquardt per horizon and strength.
+        Most steps of Levenberg-Marquardt per horizon of the pooled model, and of the units at the strength chosen.
+    path_iterations : int
+        Most steps at each strength before one is chosen; each starts where the stronger prior ended.
     least_gain : float
         Relative decrease of the cost below which a horizon is done.
     bound : float
@@ -54,16 +58,18 @@ class RefineOptions:
 
     horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)
     segments: int = 24
-    strengths: tuple[float, ...] = (1e3, 1e2, 1e1, 1.0, 1e-1, 1e-2)
-    tolerance: float = 0.05
+    strengths: tuple[float, ...] = (1e3, 1e2, 1e1, 1.0, 1e-1)
+    tolerance: float = 0.1
     balance: float = 0.5
     starts: tuple[float, ...] = (0.5, 0.65, 0.8)
     level: float = 0.3
     power: int = 2
     pooled_segments: int = 240
+    guard: float = 2e-3
     margin: float = 1e-5
     alpha_factor: float = 4.0
     iterations: int = 15
+    path_iterations: int = 8
     least_gain: float = 1e-3
     bound: float = 10.0
     seed: int = 0
@@ -79,9 +85,10 @@ class RefineOptions:
             "level": self.level > 0,
             "power": self.power >= 1,
             "pooled_segments": self.pooled_segments >= 1,
+            "guard": 0 < self.guard < 1,
             "margin": 0 <= self.margin < 1,
             "alpha_factor": self.alpha_factor >= 1,
-            "iterations": self.iterations >= 1,
+            "iterations": min(self.iterations, self.path_iterations) >= 1,
             "least_gain": self.least_gain > 0,
             "bound": self.bound >= 1,
         }

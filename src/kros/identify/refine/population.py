@@ -186,16 +186,17 @@ def _refine_pooled(V: Array, problem: Problem, error: Array, span: Array, option
     search runs into the edge of stability and stops there, far from the optimum.
     """
     few = replace(problem, segments=problem.segments.first(max(2, -(-options.pooled_segments // problem.segments.n_units))))
-    found: list[tuple[float, Array]] = []
+    found: list[tuple[float, Array, Array]] = []
     for balance in options.starts:
         grown = _grow(V, replace(few, sigma=_sigma(error, span, balance)), options, few.finite)
         if grown is None:
             continue
         end = minimise(few.evaluate, few.finite, grown, options.iterations, options.least_gain)
-        stable = _shorten(end.V, few)
+        stable = _shorten(end.V, problem, options.guard)
         if stable is not None and np.isfinite(end.cost).all():
-            final = minimise(problem.evaluate, problem.admissible, stable, options.iterations, options.least_gain)
-            found.append((float(final.cost[0]), final.V[0]))
+            edged = _normalised(problem, stable, options) if not found else replace(problem, sigma=found[0][2], guard=options.guard)
+            final = minimise(edged.evaluate, edged.admissible, stable, options.iterations, options.least_gain)
+            found.append((float(final.cost[0]), final.V[0], edged.sigma))
             log.debug("pooled model from balance %g: cost %.6g", balance, final.cost[0])
     if not found:
         log.warning("refinement of the pooled model: the best models are unstable, so it is sought among the stable ones")
@@ -222,26 +223,33 @@ def _grow(V: Array, problem: Problem, options: RefineOptions, admissible: Callab
     return V
 
 
-def _shorten(V: Array, problem: Problem) -> Array | None:
-    """Scale the rows of lifted functions by the largest of a few factors that makes the model stable; None where none does."""
+def _normalised(problem: Problem, V: Array, options: RefineOptions) -> Problem:
+    """The problem with errors in units of those that a pooled model V leaves, and with a soft edge of stability."""
+    normal = problem.run(V)
+    size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, _LEAST_ERROR**2))
+    return replace(problem, sigma=problem.sigma * size, guard=options.guard)
+
+
+def _shorten(V: Array, problem: Problem, guard: float) -> Array | None:
+    """Scale the rows of lifted functions by the largest of a few factors that makes the model stable, off the edge where it can be."""
     n = problem.lifting.n_states
-    for factor in np.linspace(1.0, 0.0, 41):
-        trial = V.copy()
-        trial[:, n:] *= factor
-        if problem.admissible(trial).all():
-            return trial
+    for margin in (max(guard, problem.margin), problem.margin):
+        for factor in np.linspace(1.0, 0.0, 21):
+            trial = V.copy()
+            trial[:, n:] *= factor
+            if replace(problem, margin=margin).admissible(trial).all():
+                return trial
     return None
 
 
 def _with_prior(problem: Problem, common: Array, factor: Factor, rows: npt.NDArray[np.int64], options: RefineOptions) -> Problem:
     """The problem of all units at the longest horizon, errors in units of those of the pooled model, with a prior around it."""
-    normal = _restrict(problem, rows).run(common[None])
-    size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, _LEAST_ERROR**2))
+    edged = _normalised(_restrict(problem, rows), common[None], options)
     model = _matrices(common, problem.T, problem.lifting.n_lifted)
     prior = ResponsePrior(
         model.A, model.B, problem.T, *_scales(factor, rows, problem.lifting), level=options.level, power=options.power
     )
-    return replace(problem, sigma=problem.sigma * size, prior=prior)
+    return replace(problem, sigma=edged.sigma, guard=options.guard, prior=prior)
 
 
 def _strengthen(problem: Problem, strength: float) -> Problem:
@@ -255,7 +263,7 @@ def _path(problem: Problem, common: Array, options: RefineOptions) -> Array:
     path = []
     for strength in sorted(options.strengths, reverse=True):
         now = _strengthen(problem, strength)
-        V = minimise(now.evaluate, now.admissible, V, options.iterations, options.least_gain).V
+        V = minimise(now.evaluate, now.admissible, V, options.path_iterations, options.least_gain).V
         path.append(V)
     return np.stack(path)
 

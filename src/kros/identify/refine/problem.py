@@ -1,6 +1,6 @@
 """What is minimised: free-run error of the states, one-step error of the lifted functions, distance from the pooled model.
 
-    sum ||(x_data - x_free_run) / sigma||^2  +  sum ||(sigma+ - w psi) / sigma_row||^2  +  prior
+    sum ||(x_data - x_free_run) / sigma||^2  +  sum ||(sigma+ - w psi) / sigma_row||^2  +  edge of stability  +  prior
 
 A free run retracts and re-lifts, so it does not see the rows of the lifted functions; they enter only the linear model used in
 synthesis, and are fitted one step ahead, from the triangular factors.
@@ -19,12 +19,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ...lifting import Lifting
+from .barrier import stability_barrier
 from .metric import ResponsePrior
 from .segments import Segments
 from .sensitivity import Normal, normal_equations
 
 Array = npt.NDArray[np.float64]
 _SAMPLES = 64  # residuals of a state that a segment contributes, at least
+_ROW_WEIGHT = 0.1  # of a lifted function's one-step error against a state's free-run error
 _LEAST_VARIANCE = 1e-20  # of the one-step error, relative to the mean square of the function
 
 
@@ -90,6 +92,8 @@ class Problem:
     margin : float
     pooled : bool
         One model for all units.
+    guard : float, optional
+        Width of the soft edge of stability; none by default.
     prior : ResponsePrior, optional
     """
 
@@ -101,6 +105,7 @@ class Problem:
     one_step: OneStep
     margin: float
     pooled: bool = False
+    guard: float | None = None
     prior: ResponsePrior | None = None
 
     @property
@@ -142,8 +147,11 @@ class Problem:
         total = np.zeros((len(each), nl * p + 1, nl * p + 1))
         _add(total, normal.matrix, slice(0, n * p))
         for row in range(n, nl):
-            _add(total, normal.counts[:, None, None] * self.one_step.normal(each[:, row], row - n), slice(row * p, (row + 1) * p))
+            _add(total, _ROW_WEIGHT * normal.counts[:, None, None] * self.one_step.normal(each[:, row], row - n), slice(row * p, (row + 1) * p))
         total = total.sum(axis=0, keepdims=True) if self.pooled else total
+        if self.guard is not None:
+            weight = self.residuals * (self.segments.n_units if self.pooled else 1)
+            total += stability_barrier(V, self.T, self.guard, weight)
         if self.prior is not None:
             total += self.prior.normal(V)
         return total

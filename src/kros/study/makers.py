@@ -27,7 +27,8 @@ _NOISES = ((0.0, 0.0), (1e-2, 0.0), (0.0, 1e-1), (0.0, 1.0))  # process, measure
 class Task:
     """Everything a worker needs for one observer.
 
-    `problem` is None where there is no uncertain set; `noise` is the standard deviation of every measurement's noise.
+    `problem` is None where there is no usable uncertain set, and `refusal` says why; `noise` is the standard deviation of every
+    measurement's noise.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Task:
     models: ModelSet
     unit: str
     problem: ObserverProblem | None
+    refusal: str
     noise: Array
     tuning: TuningSet
     input_weight: float | str
@@ -70,7 +72,7 @@ class Task:
     def require_problem(self) -> ObserverProblem:
         """Return the uncertain set, or say that there is none."""
         if self.problem is None:
-            raise SynthesisError(f"{self.name}: needs an uncertain set, and the uncertainty stage made none.")
+            raise SynthesisError(self.refusal)
         return self.problem
 
 

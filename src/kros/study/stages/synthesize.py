@@ -35,7 +35,8 @@ def run(context: Context) -> list[Path]:
     for task, product in zip(tasks, products, strict=True):
         facts[task.name] = dict(product.facts)
         if product.synthesis is None:
-            log.warning("%s could not be made: %s", task.name, product.facts["reason"])
+            if product.facts["reason"] != task.refusal:
+                log.warning("%s could not be made: %s", task.name, product.facts["reason"])
         else:
             facts[task.name] |= certificate(task, product.synthesis, certified_problem(task, tasks, products))
             files += save(context, task, product.synthesis)
@@ -66,18 +67,32 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     unit = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
     folder = context.store.path("uncertainty", name)
     noise = measurement_noise(context, models)
-    problem = None
-    if config.uncertainty.form == Form.INVERSE_INPUT_MULTIPLICATIVE.value:
-        problem = observer_problem(models, unit, UncertainModel.load(folder), noise, context)
-    else:
-        log.warning(
-            "synthesis knows the inverse input multiplicative form only so far; with %s there are baselines alone", config.uncertainty.form
-        )
-    methods = config.observer.baselines + (config.synthesis.methods if problem is not None else ())
+    problem, refusal = usable_problem(models, unit, UncertainModel.load(folder), noise, context)
+    methods = config.observer.baselines + config.synthesis.methods
     ordered = [m for m in ("open_loop", "kalman_white", "kalman_tuned", "mixed", "worst_case_h2") if m in methods]
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings["max_order"] = config.uncertainty.max_order
-    return [Task(f"{name}/{method}", method, models, unit, problem, noise, tuning_set(context, models), **settings) for method in ordered]
+    return [
+        Task(f"{name}/{method}", method, models, unit, problem, refusal, noise, tuning_set(context, models), **settings)
+        for method in ordered
+    ]
+
+
+def usable_problem(
+    models: ModelSet, unit: str, uncertain: UncertainModel, noise: Array, context: Context
+) -> tuple[ObserverProblem | None, str]:
+    """Return the synthesis problem of one kind of model, or None and why there is none."""
+    if uncertain.form is not Form.INVERSE_INPUT_MULTIPLICATIVE:
+        refusal = f"synthesis knows the inverse input multiplicative form only, and the study uses {uncertain.form.value}"
+    else:
+        problem = observer_problem(models, unit, uncertain, noise, context)
+        try:
+            problem.require_sound()
+            return problem, ""
+        except SynthesisError as error:
+            refusal = str(error)
+    log.warning("%s: there are no robust observers and no certificates: %s", models.name, refusal)
+    return None, refusal
 
 
 def observer_problem(models: ModelSet, unit: str, uncertain: UncertainModel, noise: Array, context: Context) -> ObserverProblem:
@@ -129,7 +144,7 @@ def certificate(task: Task, synthesis: Synthesis, problem: ObserverProblem | Non
     """Recompute what can be said about an observer, however it was made."""
     facts: dict[str, Any] = {"order": synthesis.controller.n_states, "spectral_radius_max": None, "worst_case_h2": None}
     if problem is None:
-        return facts
+        return facts | {"reason": task.refusal}
     problem = replace(problem, injection=synthesis.injection)
     loop = float(problem.error_system(synthesis.controller).spectral_radius())
     facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))

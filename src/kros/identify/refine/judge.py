@@ -13,7 +13,7 @@ from ...lifting import Lifting
 from ..free_run import free_run
 
 Array = npt.NDArray[np.float64]
-_AT_ONCE = 20_000_000  # numbers of recordings in memory
+_AT_ONCE = 4_000_000  # numbers of recordings in memory
 
 
 def free_run_errors(

@@ -12,12 +12,13 @@ which is quadratic below `level`; a power above one flattens the residual's peak
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
+Complex = npt.NDArray[Any]
 _DECADES_BELOW_NYQUIST = 6
 _POINTS = 100
 
@@ -65,7 +66,7 @@ class ResponsePrior:
         left = np.linalg.pinv(G / self.output_scale[:, None]) / self.output_scale
         E = left @ (G - G0)
         Z = np.concatenate([G, np.broadcast_to(np.diag(self.input_scale), (*G.shape[:2], m, m))], axis=-2)
-        return E, left @ Phi, self.T.T @ Z @ (np.eye(m) - E)
+        return np.asarray(E), np.asarray(left @ Phi), np.asarray(self.T.T @ Z @ (np.eye(m) - E))
 
     def normal(self, V: Array) -> Array:
         """Return ``[J r]^T [J r]`` with r = -E, weighted so that the gradient is that of the cost; shape (unit, P + 1, P + 1)."""

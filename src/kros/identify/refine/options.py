@@ -61,7 +61,7 @@ class RefineOptions:
     strengths: tuple[float, ...] = (1e3, 1e2, 1e1, 1.0, 1e-1)
     tolerance: float = 0.1
     balance: float = 0.5
-    starts: tuple[float, ...] = (0.5, 0.65, 0.8)
+    starts: tuple[float, ...] = (0.5, 0.8)
     level: float = 0.3
     power: int = 2
     pooled_segments: int = 240
@@ -81,7 +81,7 @@ class RefineOptions:
             "strengths": len(self.strengths) > 0 and min(self.strengths, default=0.0) > 0,
             "tolerance": self.tolerance >= 0,
             "balance": 0 <= self.balance <= 1,
-            "starts": len(self.starts) > 0 and 0 <= min(self.starts, default=-1.0) and max(self.starts) <= 1,
+            "starts": len(self.starts) > 0 and min(self.starts, default=-1.0) >= 0 and max(self.starts) <= 1,
             "level": self.level > 0,
             "power": self.power >= 1,
             "pooled_segments": self.pooled_segments >= 1,

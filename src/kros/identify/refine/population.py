@@ -117,7 +117,7 @@ def _check(
     pooled: npt.NDArray[np.bool_],
 ) -> None:
     width = 2 * lifting.n_lifted + len(population.inputs)
-    wrong = [name for name in lifting.parameters if np.shape(parameters.get(name)) != (len(keys),)]
+    wrong = [name for name in lifting.parameters if name not in parameters or np.shape(parameters[name]) != (len(keys),)]
     if factor.R.shape != (len(keys), width, width) or wrong or pooled.shape != (len(keys),) or not pooled.any():
         raise DimensionError(
             f"Refinement: {len(keys)} units with {lifting.n_lifted} lifted states and {len(population.inputs)} inputs need factors of shape "
@@ -246,9 +246,7 @@ def _with_prior(problem: Problem, common: Array, factor: Factor, rows: npt.NDArr
     """The problem of all units at the longest horizon, errors in units of those of the pooled model, with a prior around it."""
     edged = _normalised(_restrict(problem, rows), common[None], options)
     model = _matrices(common, problem.T, problem.lifting.n_lifted)
-    prior = ResponsePrior(
-        model.A, model.B, problem.T, *_scales(factor, rows, problem.lifting), level=options.level, power=options.power
-    )
+    prior = ResponsePrior(model.A, model.B, problem.T, *_scales(factor, rows, problem.lifting), level=options.level, power=options.power)
     return replace(problem, sigma=edged.sigma, guard=options.guard, prior=prior)
 
 

@@ -125,7 +125,7 @@ class Problem:
     def admissible(self, V: Array) -> npt.NDArray[np.bool_]:
         """Tell which models are finite and stable as linear systems."""
         A = (V @ self.T.T)[..., : self.lifting.n_lifted]
-        finite = np.isfinite(A).all(axis=(-1, -2))
+        finite = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
         A = np.where(finite[..., None, None], A, 0.0)
         return np.asarray(finite & (np.abs(np.linalg.eigvals(A)).max(axis=-1) < 1 - self.margin))
 
@@ -147,7 +147,11 @@ class Problem:
         total = np.zeros((len(each), nl * p + 1, nl * p + 1))
         _add(total, normal.matrix, slice(0, n * p))
         for row in range(n, nl):
-            _add(total, _ROW_WEIGHT * normal.counts[:, None, None] * self.one_step.normal(each[:, row], row - n), slice(row * p, (row + 1) * p))
+            _add(
+                total,
+                _ROW_WEIGHT * normal.counts[:, None, None] * self.one_step.normal(each[:, row], row - n),
+                slice(row * p, (row + 1) * p),
+            )
         total = total.sum(axis=0, keepdims=True) if self.pooled else total
         if self.guard is not None:
             weight = self.residuals * (self.segments.n_units if self.pooled else 1)

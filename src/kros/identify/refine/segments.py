@@ -38,11 +38,19 @@ class Segments:
 
     def units(self, rows: npt.NDArray[Any]) -> Segments:
         """Return the segments of some units."""
-        return Segments(*(np.ascontiguousarray(a[..., rows, :]) for a in (self.states, self.inputs, self.valid)))
+        return Segments(
+            np.ascontiguousarray(self.states[..., rows, :]),
+            np.ascontiguousarray(self.inputs[..., rows, :]),
+            np.ascontiguousarray(self.valid[..., rows, :]),
+        )
 
     def first(self, count: int) -> Segments:
         """Return the first segments of every unit."""
-        return Segments(*(np.ascontiguousarray(a[..., :count]) for a in (self.states, self.inputs, self.valid)))
+        return Segments(
+            np.ascontiguousarray(self.states[..., :count]),
+            np.ascontiguousarray(self.inputs[..., :count]),
+            np.ascontiguousarray(self.valid[..., :count]),
+        )
 
     def cut(self, horizon: int) -> Segments:
         """Return pieces of `horizon` steps, as many as there are segments, spread evenly over them."""

@@ -1,0 +1,142 @@
+"""Refinement against systems whose matrices are known, and sensitivities against finite differences of an independent free run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kros.core import IdentificationError
+from kros.data import Channel, EpisodeKey, Population, Role, Unit
+from kros.identify import Factor, combine, free_run, lifted_factor, reduce_episode
+from kros.identify.refine import RefinedModels, RefineOptions, refine_population
+from kros.identify.refine.barrier import stability_barrier
+from kros.identify.refine.metric import ResponsePrior
+from kros.identify.refine.segments import Segments
+from kros.identify.refine.sensitivity import normal_equations
+from kros.lifting import Lifting
+
+KOOPMAN = Lifting(("x", "v"), ("sin(3*x + phase)",), ("phase",))
+LINEAR = Lifting(("x", "v"))
+A = np.array([[0.98, 0.10, 0.02], [-0.15, 0.90, 0.05]])
+B = np.array([[0.01], [0.2]])
+OPTIONS = RefineOptions(horizons=(5, 20, 80), segments=10, strengths=(1e2, 1.0, 1e-2))
+
+
+def simulated(lifting: Lifting, n_units: int, noise: float, seed: int, spread: float = 0.02) -> tuple:
+    """Population, keys, parameters, factors and the true rows of the states (unit, 2, n_lifted + 1)."""
+    rng = np.random.default_rng(seed)
+    phase = rng.uniform(0, 2 * np.pi, n_units)
+    W = np.concatenate([A[:, : lifting.n_lifted], B], axis=1) * (1 + spread * rng.standard_normal((n_units, 1, 1)) * [[[0], [1]]])
+    data = {}
+    for row in range(n_units):
+        for episode in range(4):
+            u = np.repeat(rng.normal(size=(60, 1)), 10, axis=0)
+            own = {"phase": phase[[row]]} if lifting.parameters else {}
+            full = np.zeros((1, lifting.n_lifted, lifting.n_lifted + 1))
+            full[0, :2] = W[row]
+            x = free_run(full[..., :-1], full[..., -1:], lifting, own, rng.normal(size=(1, 2)), u[None])[0]
+            data[EpisodeKey(f"u{row}", "default", str(episode))] = np.hstack([x + noise * rng.standard_normal(x.shape), u])
+    channels = (Channel("x", Role.STATE), Channel("v", Role.STATE), Channel("u", Role.INPUT))
+    units = tuple(Unit(f"u{row}") for row in range(n_units))
+    population = Population(channels, 0.01, units, tuple(data), data.__getitem__)
+    keys = {unit.id: population.keys(unit.id) for unit in units}
+    parameters = {"phase": phase} if lifting.parameters else {}
+    reduced = [combine(stack([reduce_episode(data[k][:, :2], data[k][:, 2:], lifting) for k in ks])) for ks in keys.values()]
+    return population, keys, parameters, lifted_factor(stack(reduced), lifting, parameters, lifting), W
+
+
+def stack(factors: list[Factor]) -> Factor:
+    return Factor(*(np.stack([getattr(f, name) for f in factors]) for name in ("R", "peak", "n_samples")))
+
+
+def rows(models: RefinedModels) -> np.ndarray:
+    return np.concatenate([models.units.A, models.units.B], axis=-1)[:, :2]
+
+
+@pytest.mark.parametrize("lifting", [KOOPMAN, LINEAR], ids=["koopman", "linear"])
+def test_known_matrices_are_recovered_through_measurement_noise(lifting: Lifting) -> None:
+    """Noise on the states biases one-step least squares; the free-run error does not suffer from it."""
+    population, keys, parameters, factor, W = simulated(lifting, 3, 0.2, seed=3)
+    models = refine_population(population, keys, lifting, parameters, factor, options=OPTIONS)
+    p = lifting.n_lifted + 1
+    R = factor.R
+    one_step = np.swapaxes(np.linalg.solve(R[:, :p, :p], R[:, :p, p : p + 2]), 1, 2)
+    assert np.abs(rows(models) - W).max() < 0.02
+    assert np.abs(rows(models) - W).max() < 0.5 * np.abs(one_step - W).max()
+
+
+@pytest.mark.parametrize("lifting", [KOOPMAN, LINEAR], ids=["koopman", "linear"])
+def test_exact_data_give_exact_models(lifting: Lifting) -> None:
+    population, keys, parameters, factor, W = simulated(lifting, 2, 0.0, seed=5, spread=0.0)
+    models = refine_population(population, keys, lifting, parameters, factor, options=OPTIONS)
+    np.testing.assert_allclose(rows(models), W, atol=1e-6)
+
+
+def test_gradient_of_free_runs_is_that_of_finite_differences() -> None:
+    rng = np.random.default_rng(0)
+    units, segments, length = 2, 3, 12
+    V = np.concatenate([A, B], axis=1) + 0.02 * rng.normal(size=(units, 2, 4))
+    T = np.eye(4) + 0.1 * rng.normal(size=(4, 4))
+    sigma, phase = np.array([0.5, 2.0]), np.array([0.3, 1.2])
+    data = Segments(
+        rng.normal(size=(length, 2, units, segments)),
+        rng.normal(size=(length, 1, units, segments)),
+        np.ones((length, units, segments), bool),
+    )
+    data.valid[9:, 1, 2] = False
+
+    def cost(V: np.ndarray) -> np.ndarray:
+        total = np.zeros(units)
+        for i in range(units):
+            W = np.zeros((3, 4))
+            W[:2] = V[i] @ T.T
+            for s in range(segments):
+                x = free_run(W[:, :3], W[:, 3:], KOOPMAN, {"phase": phase[[i]]}, data.states[:1, :, i, s], data.inputs[None, :, :, i, s])[0]
+                error = (data.states[:, :, i, s] - x) / sigma
+                total[i] += np.sum(error[data.valid[:, i, s]] ** 2)
+        return total
+
+    normal = normal_equations(V, T, KOOPMAN, {"phase": phase}, data, sigma)
+    np.testing.assert_allclose(normal.cost, cost(V), rtol=1e-10)
+    numeric = np.zeros((units, 8))
+    for k in range(8):
+        step = np.zeros(8)
+        step[k] = 1e-6
+        numeric[:, k] = (cost(V + step.reshape(2, 4)) - cost(V - step.reshape(2, 4))) / 2e-6
+    np.testing.assert_allclose(-2 * normal.matrix[:, :-1, -1], numeric, rtol=1e-5, atol=1e-5)
+
+
+def test_gradient_of_barrier_and_prior_is_that_of_finite_differences() -> None:
+    rng = np.random.default_rng(1)
+    T = np.eye(3) + 0.1 * rng.normal(size=(3, 3))
+    W = np.array([[[0.95, 0.2, 0.3], [-0.2, 0.93, 1.0]]]) + 0.01 * rng.normal(size=(1, 2, 3))
+    V = np.linalg.solve(T, np.swapaxes(W, 1, 2)).swapaxes(1, 2)
+    square = np.array([[[0.5, 0.1, 0.3, 0.2], [-0.2, 0.6, 0.1, 1.0]]])
+    prior = ResponsePrior(square[0, :, :2], square[0, :, 2:], np.eye(4), np.array([1.0, 2.0]), np.array([1.0, 3.0]))
+    cases = [(lambda V: stability_barrier(V, T, 0.2, 3.0), V), (prior.normal, square * 1.03)]
+    for evaluate, at in cases:
+        numeric = np.zeros(at.size)
+        for k in range(at.size):
+            step = np.zeros(at.size)
+            step[k] = 1e-6
+            high, low = (evaluate(at + sign * step.reshape(at.shape))[0, -1, -1] for sign in (1, -1))
+            numeric[k] = (high - low) / 2e-6
+        np.testing.assert_allclose(-2 * evaluate(at)[0, :-1, -1], numeric, rtol=1e-4, atol=1e-6)
+
+
+def test_stronger_priors_bring_units_closer_together() -> None:
+    population, keys, parameters, factor, _ = simulated(KOOPMAN, 3, 0.02, seed=4)
+    models = refine_population(population, keys, KOOPMAN, parameters, factor, options=replace(OPTIONS, strengths=(1e5, 1.0)))
+    peaks = [row.peak_db for row in models.trade_off]
+    assert peaks[0] == -np.inf
+    assert peaks[1] < peaks[2] - 3
+    assert models.strength in (1e5, 1.0)
+
+
+def test_diverging_free_runs_name_unit_and_episode() -> None:
+    population, keys, parameters, factor, _ = simulated(KOOPMAN, 2, 0.02, seed=6)
+    tight = Factor(factor.R, factor.peak * 1e-3, factor.n_samples)
+    with pytest.raises(IdentificationError, match=r"episode 0 of unit u0 .* reaches"):
+        refine_population(population, keys, KOOPMAN, parameters, tight, options=RefineOptions(horizons=(5, 20), segments=4, bound=1.0))

@@ -1,0 +1,84 @@
+"""Pieces of the refinement: options, segments, search, stability."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kros.core import ConfigError, DataError, DimensionError
+from kros.data import Channel, EpisodeKey, Population, Role, Unit
+from kros.identify import Factor
+from kros.identify.refine import RefineOptions, refine_population
+from kros.identify.refine.barrier import stability_barrier
+from kros.identify.refine.marquardt import minimise
+from kros.identify.refine.segments import Segments, held_segments, read_segments
+from kros.lifting import Lifting
+
+
+@pytest.mark.parametrize("wrong", [{"horizons": ()}, {"horizons": (20, 5)}, {"segments": 0}, {"strengths": (0.0,)}, {"balance": 1.5}])
+def test_options_out_of_range_are_refused(wrong: dict) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        RefineOptions(**wrong)
+
+
+def population(lengths: list[int]) -> tuple[Population, dict]:
+    """One unit whose episode e counts up from 1000 e."""
+    data = {EpisodeKey("u", "default", str(e)): (1000.0 * e + np.arange(n))[:, None] * [1.0, -1.0] for e, n in enumerate(lengths)}
+    made = Population((Channel("x", Role.STATE), Channel("u", Role.INPUT)), 1.0, (Unit("u"),), tuple(data), data.__getitem__)
+    return made, {"u": tuple(data)}
+
+
+def test_segments_hold_the_last_episode_at_the_end() -> None:
+    made, keys = population([50, 50, 50, 50])
+    segments = read_segments(made, keys, horizon=10, count=8, seed=0)
+    episodes = segments.states[0, 0, 0] // 1000
+    assert held_segments(8, keys) == 2
+    np.testing.assert_array_equal(episodes, [0, 1, 2, 0, 1, 2, 3, 3])
+    np.testing.assert_array_equal(np.diff(segments.states[:, 0, 0], axis=0), 1.0)
+    np.testing.assert_array_equal(segments.inputs, -segments.states)
+
+
+def test_short_episodes_are_padded_and_marked() -> None:
+    made, keys = population([6, 50])
+    segments = read_segments(made, keys, horizon=10, count=2, seed=0)
+    np.testing.assert_array_equal(segments.valid[:, 0, 0], np.arange(11) < 6)
+    assert segments.valid[:, 0, 1].all()
+
+
+def test_pieces_are_stretches_of_the_segments() -> None:
+    states = np.arange(40.0).reshape(20, 1, 1, 2)
+    pieces = Segments(states, states, np.ones((20, 1, 2), bool)).cut(4)
+    assert pieces.states.shape == (5, 1, 1, 2)
+    np.testing.assert_array_equal(np.diff(pieces.states, axis=0), 2.0)
+
+
+def test_unit_without_training_episodes_is_named() -> None:
+    made, _ = population([50])
+    with pytest.raises(DataError, match="unit u has no training episode"):
+        read_segments(made, {"u": ()}, 5, 2, 0)
+
+
+def test_factors_of_another_size_are_refused() -> None:
+    made, keys = population([50, 50])
+    wrong = Factor(np.zeros((1, 4, 4)), np.ones((1, 2)), np.array([98]))
+    with pytest.raises(DimensionError, match="lifted_factor"):
+        refine_population(made, keys, Lifting(("x",)), {}, wrong)
+
+
+def test_search_stays_within_the_constraint_and_finds_both_minima() -> None:
+    """min (v - t)^2 for t = 1 and 5, with v <= 2."""
+    target = np.array([1.0, 5.0])
+
+    def evaluate(V: np.ndarray) -> np.ndarray:
+        rest = target - V[:, 0, 0]
+        J = np.stack([np.ones(2), rest], axis=1)
+        return J[:, :, None] * J[:, None, :]
+
+    solution = minimise(evaluate, lambda V: V[:, 0, 0] <= 2.0, np.zeros((2, 1, 1)), 60, 1e-12)
+    assert solution.V[0, 0, 0] == pytest.approx(1.0, abs=1e-6)
+    assert 1.5 < solution.V[1, 0, 0] <= 2.0
+
+
+def test_barrier_is_silent_inside() -> None:
+    V = np.array([[[0.5, 0.1, 1.0], [0.0, 0.7, 1.0]]])
+    assert np.all(stability_barrier(V, np.eye(3), 0.01, 1.0) == 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,9 @@ from ...core.errors import IdentificationError
 from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
 from ..free_run import free_run
+from .model import TradeOff
+from .pooled import matrices_of
+from .problem import Problem
 
 Array = npt.NDArray[np.float64]
 _AT_ONCE = 4_000_000  # numbers of recordings in memory
@@ -108,3 +112,42 @@ def require_bounded(
                 f"Refinement: the free run over {part[which][1]} reaches {reached[0, which, state]:.3g} in {lifting.states[state]!r}, "
                 f"beyond {limit[state]:.3g}; use a stronger prior, longer horizons, or functions that stay bounded."
             )
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Scores models on the last training episode of every pooled unit."""
+
+    population: Population
+    keys: Mapping[str, Sequence[EpisodeKey]]
+    lifting: Lifting
+    parameters: Mapping[str, Array]
+    rows: npt.NDArray[np.int64]
+    problem: Problem
+    scales: tuple[Array, Array]
+
+    def trade_off(self, V: Sequence[Array], strengths: Sequence[float]) -> tuple[TradeOff, ...]:
+        """Return accuracy and uncertainty of models (unit, n_lifted, p), or of one for all units."""
+        full = np.stack([np.broadcast_to(v, (len(self.keys), *v.shape[-2:]))[self.rows] for v in V])
+        models = matrices_of(full, self.problem.T, self.lifting.n_lifted)
+        last = [episodes[-1] for episodes in self.keys.values()]
+        own = {name: values[self.rows] for name, values in self.parameters.items()}
+        rms, top, _ = free_run_errors(models.A, models.B, self.lifting, own, self.population, [last[row] for row in self.rows])
+        percent = np.median(100 * rms / np.maximum(top, np.finfo(float).tiny), axis=1)
+        score = np.mean((rms / self.problem.sigma) ** 2, axis=(1, 2))
+        return tuple(
+            TradeOff(float(s), tuple(percent[i].tolist()), float(score[i]), self._peak_db(models.A[i], models.B[i]))
+            for i, s in enumerate(strengths)
+        )
+
+    def _peak_db(self, A: Array, B: Array) -> float:
+        """Peak residual for the best nominal; the identical models of the pooled row have none."""
+        if len(A) < 2:
+            return float("nan")
+        output, entry = self.scales
+        z = np.exp(1j * np.pi * np.logspace(-6, 0, 200))
+        G = np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j) * entry / output[:, None]
+        inverse = np.linalg.pinv(G)
+        peaks = [np.linalg.norm(inverse @ (G[row] - G), ord=2, axis=(-2, -1)).max() for row in range(len(G))]
+        with np.errstate(divide="ignore"):
+            return float(20 * np.log10(min(peaks)))

@@ -82,7 +82,9 @@ def minimise(
 
 def _step(matrix: Array, mu: Array) -> Array:
     """Solve the damped normal equations in parameters scaled to a unit diagonal."""
-    H, g = matrix[:, :-1, :-1], matrix[:, :-1, -1]
+    fine = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))  # a run that diverges gives no direction
+    H = np.where(fine[:, None, None], matrix[:, :-1, :-1], np.eye(matrix.shape[-1] - 1))
+    g = np.where(fine[:, None], matrix[:, :-1, -1], 0.0)
     diagonal = np.diagonal(H, axis1=1, axis2=2)
     scale = 1 / np.sqrt(np.maximum(diagonal, np.finfo(float).eps ** 2 * diagonal.max(axis=1, keepdims=True) + np.finfo(float).tiny))
     scaled = H * scale[:, :, None] * scale[:, None, :] + mu[:, None, None] * np.eye(H.shape[-1])

@@ -50,8 +50,8 @@ class RefinedModels:
         One row for every strength that was tried, strongest first, and a first one for the pooled model alone (strength infinite).
     sigma : ndarray, shape (n_states,)
         Errors that count as one.
-    status : tuple of str
-        Per unit ``ok``, or what to know about its fit.
+    converged : ndarray of bool, shape (unit,)
+        Whether the last step gained less than `RefineOptions.least_gain`; the others ran out of iterations, and are no less valid.
     information : ndarray, shape (unit, P, P)
         Gauss-Newton matrix of every unit's cost, prior included, for parameters V with ``[A B] = V T^T``.
     whitening : ndarray, shape (p, p)
@@ -65,7 +65,7 @@ class RefinedModels:
     strength: float
     trade_off: tuple[TradeOff, ...]
     sigma: Array
-    status: tuple[str, ...]
+    converged: npt.NDArray[np.bool_]
     information: Array
     whitening: Array
     spectral_radius: Array

@@ -58,7 +58,7 @@ class RefineOptions:
 
     horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)
     segments: int = 24
-    strengths: tuple[float, ...] = (1e3, 1e2, 1e1, 1.0, 1e-1)
+    strengths: tuple[float, ...] = (1e3, 1e2, 1e1, 3.0, 1.0)
     tolerance: float = 0.1
     balance: float = 0.5
     starts: tuple[float, ...] = (0.5, 0.8)

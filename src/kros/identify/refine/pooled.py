@@ -1,0 +1,146 @@
+"""The pooled model: EDMD on all units together, then free-run error at growing horizons, from several weighings of the states."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import IdentificationError
+from ...core.linalg import qr_triangle
+from ...lifting import Lifting
+from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
+from ..factors import Factor
+from .marquardt import minimise
+from .options import RefineOptions
+from .problem import OneStep, Problem
+from .segments import Segments
+
+log = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
+_LEAST_ERROR = 1e-6  # relative to a state's range: exact data have no error to scale by
+
+
+def start_pooled(
+    lifting: Lifting,
+    parameters: Mapping[str, Array],
+    factor: Factor,
+    segments: Segments,
+    rows: npt.NDArray[np.int64],
+    options: RefineOptions,
+) -> tuple[Array, Problem, Array, Array]:
+    """Pooled EDMD in whitened parameters (1, n_lifted, p), the problem of all units without a prior, errors and ranges of states."""
+    nl, n = lifting.n_lifted, lifting.n_states
+    R = qr_triangle(factor.R[rows].reshape(-1, factor.R.shape[-1]))
+    p = R.shape[-1] - nl
+    alpha = options.alpha_factor * smallest_stabilising_alpha([(R[None], nl)], options.margin)
+    matrices = edmd(R, nl, alpha)
+    T = _whitening(R[:p, :p], int(factor.n_samples[rows].sum()))
+    V = np.linalg.solve(T, np.concatenate([matrices.A, matrices.B], axis=-1).T).T[None]
+    one_step = OneStep.of(factor.R, T, n, nl, factor.n_samples, rows)
+    problem = Problem(lifting, parameters, segments, T, np.ones(n), one_step, options.margin)
+    normal = restrict(problem, rows).run(V)
+    with np.errstate(invalid="ignore"):
+        error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())
+    span = ranges(factor, rows, lifting)[0][:n]
+    error = np.clip(np.where(np.isfinite(error), error, span), _LEAST_ERROR * span, span)
+    return V, replace(problem, sigma=_sigma(error, span, options.balance)), error, span
+
+
+def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, options: RefineOptions) -> Array:
+    """Fit one model to all units, horizons growing; shape (n_lifted, p).
+
+    The free-run error has several minima, so the search is made once for every way of weighing the states in `options.starts`, and
+    the ends are finished and compared in the weighing asked for. On the way a model may be unstable: kept stable from the start, the
+    search runs into the edge of stability and stops there, far from the optimum.
+    """
+    few = replace(problem, segments=problem.segments.first(max(2, -(-options.pooled_segments // problem.segments.n_units))))
+    found: list[tuple[float, Array, Array]] = []
+    for balance in options.starts:
+        grown = _grow(V, replace(few, sigma=_sigma(error, span, balance)), options, few.finite)
+        if grown is None:
+            continue
+        end = minimise(few.evaluate, few.finite, grown, options.iterations, options.least_gain)
+        stable = _shorten(end.V, problem, options.guard)
+        if stable is not None and np.isfinite(end.cost).all():
+            edged = normalised(problem, stable, options) if not found else replace(problem, sigma=found[0][2], guard=options.guard)
+            final = minimise(edged.evaluate, edged.admissible, stable, options.iterations, options.least_gain)
+            found.append((float(final.cost[0]), final.V[0], edged.sigma))
+            log.debug("pooled model from balance %g: cost %.6g", balance, final.cost[0])
+    if not found:
+        log.warning("refinement of the pooled model: the best models are unstable, so it is sought among the stable ones")
+        grown = _grow(V, problem, options, problem.admissible)
+        if grown is None:
+            raise IdentificationError(
+                f"Refinement of the pooled model: free runs over {max(options.horizons)} samples diverge from every start; add shorter "
+                "horizons, or leave out lifting functions that grow."
+            )
+        return np.asarray(grown[0])
+    return min(found, key=lambda pair: pair[0])[1]
+
+
+def _grow(V: Array, problem: Problem, options: RefineOptions, admissible: Callable[[Array], npt.NDArray[np.bool_]]) -> Array | None:
+    """Minimise at growing horizons; None where free runs diverge."""
+    V = V.copy()
+    V[:, problem.lifting.n_states :] = problem.one_step.rows if admissible == problem.finite else V[:, problem.lifting.n_states :]
+    for horizon in options.horizons:
+        now = problem.at(horizon)
+        solution = minimise(now.evaluate, admissible, V, options.iterations, options.least_gain)
+        if not np.isfinite(solution.cost).all():
+            return None
+        V = solution.V
+    return V
+
+
+def normalised(problem: Problem, V: Array, options: RefineOptions) -> Problem:
+    """The problem with errors in units of those that a pooled model V leaves, and with a soft edge of stability."""
+    normal = problem.run(V)
+    size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, _LEAST_ERROR**2))
+    return replace(problem, sigma=problem.sigma * size, guard=options.guard)
+
+
+def _shorten(V: Array, problem: Problem, guard: float) -> Array | None:
+    """Scale the rows of lifted functions by the largest of a few factors that makes the model stable, off the edge where it can be."""
+    n = problem.lifting.n_states
+    for margin in (max(guard, problem.margin), problem.margin):
+        for factor in np.linspace(1.0, 0.0, 21):
+            trial = V.copy()
+            trial[:, n:] *= factor
+            if replace(problem, margin=margin).admissible(trial).all():
+                return trial
+    return None
+
+
+def restrict(problem: Problem, rows: npt.NDArray[np.int64]) -> Problem:
+    """The problem of one model for some units."""
+    own = {name: values[rows] for name, values in problem.parameters.items()}
+    one_step = replace(problem.one_step, matrix=problem.one_step.matrix[rows], least=problem.one_step.least[rows])
+    return replace(problem, parameters=own, segments=problem.segments.units(rows), one_step=one_step, pooled=True)
+
+
+def ranges(factor: Factor, rows: npt.NDArray[np.int64], lifting: Lifting) -> tuple[Array, Array]:
+    """Ranges of lifted states and inputs over the pooled units."""
+    peak = factor.peak[rows].max(axis=0)
+    peak = np.where(peak > 0, peak, 1.0)
+    return peak[: lifting.n_lifted], peak[lifting.n_lifted :]
+
+
+def matrices_of(V: Array, T: Array, n_lifted: int) -> KoopmanMatrices:
+    """Return A and B of whitened parameters."""
+    W = V @ T.T
+    return KoopmanMatrices(W[..., :n_lifted], W[..., n_lifted:])
+
+
+def _sigma(error: Array, span: Array, balance: float) -> Array:
+    return np.asarray(error**balance * span ** (1 - balance))
+
+
+def _whitening(R11: Array, n_samples: int) -> Array:
+    """T with ``(R11 T)^T (R11 T) = n_samples I``; a direction that the data do not excite keeps its size."""
+    size = np.maximum(np.linalg.norm(R11, axis=0), np.finfo(float).tiny)
+    _, values, right = np.linalg.svd(R11 / size)
+    values = np.maximum(values, len(values) * np.finfo(float).eps * values[0])
+    return np.asarray((right.T / values) * np.sqrt(n_samples) / size[:, None])

@@ -130,3 +130,13 @@ def test_the_report_can_be_written_again_from_the_run_folder_alone(kros, demo, t
     assert len((demo / "report.html").read_bytes()) == pytest.approx(len(page), rel=0.02)
     assert kros("figures", demo, tmp_path / "figures").exit_code == 0
     assert len(list((tmp_path / "figures").glob("*.png"))) >= 8
+
+
+def test_refined_models_come_first_where_they_are_asked_for(kros, study, tmp_path):
+    out = tmp_path / "refined"
+    result = kros("run", study(), "--out", out, "--until", "identify", "--set", "identify.refine=true", "--workers", 1)
+    assert result.exit_code == 0, result.output
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert list(metrics["models"]) == ["koopman", "linear", "koopman_edmd", "linear_edmd"]
+    assert all(m["spectral_radius_max"] < 1 for m in metrics["models"].values())
+    assert metrics["study"]["alpha"] > 0

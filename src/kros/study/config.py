@@ -76,10 +76,12 @@ class IdentifyConfig(_Section):
     """Regularisation; ``auto`` is `alpha_factor` times the smallest coefficient that stabilises every model.
 
     At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the population is finite.
+    `refine` adds models that are refined on their free-run error, the population first, then each unit.
     """
 
     alpha: float | Literal["auto"] = "auto"
     alpha_factor: float = Field(4.0, ge=1)
+    refine: bool = False
     margin: float = Field(0.0, ge=0, lt=1)
 
     @field_validator("alpha")

@@ -36,7 +36,7 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
         "sample_period_s": context.population.sample_period_s,
     }
     if Stage.IDENTIFY in done:
-        study["alpha"] = context.models(context.model_names[0]).alpha
+        study["alpha"] = context.models(context.edmd_names[0]).alpha
     if Stage.SYNTHESIZE in done:
         study["deployed"] = _observers_record(context)["deployed"]
     return study
@@ -115,7 +115,9 @@ def _observers(context: Context) -> dict[str, Any]:
         if folder.exists():
             synthesis = Synthesis.load(folder)
             entry |= {"status": synthesis.status, "solve_s": synthesis.solve_s}
-            entry |= {key: getattr(synthesis, key) for key in ("lower_bound", "gap_percent", "h2_norm", "hinf_norm")}
+            entry |= {key: getattr(synthesis, key) for key in ("h2_norm", "hinf_norm")}
+            if synthesis.worst_case_h2 is not None:  # a Kalman filter's own optimum bounds nothing in the worst case
+                entry |= {key: getattr(synthesis, key) for key in ("lower_bound", "gap_percent")}
         entries[name] = entry
     return entries
 

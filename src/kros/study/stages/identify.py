@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +14,18 @@ import numpy.typing as npt
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import IdentificationError
 from ...data.population import EpisodeKey, Population
-from ...identify import Factor, ModelSet, combine, edmd, lifted_factor, reduce_episode, residual_covariance, smallest_stabilising_alpha
+from ...identify import (
+    Factor,
+    KoopmanMatrices,
+    ModelSet,
+    combine,
+    edmd,
+    lifted_factor,
+    reduce_episode,
+    residual_covariance,
+    smallest_stabilising_alpha,
+)
+from ...identify.refine import RefineOptions, refine_population
 from ...lifting import Lifting
 from ..context import Context
 from . import calibrate
@@ -42,7 +56,10 @@ def run(context: Context) -> list[Path]:
         whole = [combine(f) for f in episodes]
         factor = Factor(*(np.stack([getattr(f, name) for f in whole]) for name in ("R", "peak", "n_samples")))
         parameters = {} if calibration is None else {calibration.spec.parameter: np.array([calibration.units[u].phase_rad for u in units])}
-        for models in identify_models(context, condition, units, factor, parameters):
+        found = identify_models(context, condition, units, factor, parameters)
+        if context.config.identify.refine and condition == facts.identify_on:
+            found += refine_models(context, units, factor, parameters, found)
+        for models in found:
             folder = context.model_folder(models.name, condition)
             models.save(folder)
             files += [folder / "model.json", folder / "arrays.npz"]
@@ -51,7 +68,7 @@ def run(context: Context) -> list[Path]:
 
 def identify_models(context: Context, condition: str, units: list[str], factor: Factor, parameters: dict[str, Array]) -> list[ModelSet]:
     """Identify every kind of model of one condition with one common regularisation."""
-    kinds = {name: context.lifting if name.startswith("koopman") else Lifting(context.lifting.states) for name in context.model_names}
+    kinds = {name: context.lifting if name.startswith("koopman") else Lifting(context.lifting.states) for name in context.edmd_names}
     factors = {name: lifted_factor(factor, context.lifting, parameters, lifting) for name, lifting in kinds.items()}
     pooled = np.array([u in context.facts.pooled for u in units])
     config = context.config.identify
@@ -69,6 +86,49 @@ def identify_models(context: Context, condition: str, units: list[str], factor: 
         for found in models:
             require_stable(found, pooled)
     return models
+
+
+def refine_models(
+    context: Context, units: list[str], factor: Factor, parameters: dict[str, Array], starts: list[ModelSet]
+) -> list[ModelSet]:
+    """Refine every kind of model on free-run error, the population first, then each unit with a prior centred on it."""
+    facts = context.facts
+    keys = {u: facts.keys("train", u, facts.identify_on) for u in units}
+    pooled = np.array([u in facts.pooled for u in units])
+    options = RefineOptions(margin=max(context.config.identify.margin, RefineOptions().margin))
+    work = [
+        partial(
+            refine_population,
+            context.population,
+            keys,
+            start.lifting,
+            start.parameters,
+            lifted_factor(factor, context.lifting, parameters, start.lifting),
+            pooled,
+            options,
+        )
+        for start in starts
+    ]
+    refined = context.map("identify (refine)", _call, work)
+    return [with_matrices(start, found.units, factor, context, parameters) for start, found in zip(starts, refined, strict=True)]
+
+
+def _call(task: Any) -> Any:
+    return task()
+
+
+def with_matrices(start: ModelSet, matrices: KoopmanMatrices, factor: Factor, context: Context, parameters: dict[str, Array]) -> ModelSet:
+    """Return a refined model set with the names, scales and phases of the one it started from."""
+    lifted = lifted_factor(factor, context.lifting, parameters, start.lifting)
+    return replace(
+        start,
+        name=start.name.removesuffix("_edmd"),
+        A=matrices.A,
+        B=matrices.B,
+        residual_covariance=residual_covariance(lifted.R, start.lifting.n_lifted, matrices, lifted.n_samples),
+        alpha=None,
+        status=("ok",) * len(start.unit_ids),
+    )
 
 
 def require_stable(models: ModelSet, pooled: npt.NDArray[np.bool_]) -> None:

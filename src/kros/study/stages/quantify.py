@@ -96,7 +96,7 @@ def scaled_responses(models: ModelSet, units: list[str], freqs_hz: Array) -> Arr
 
 def score_units(context: Context) -> tuple[list[Path], set[str]]:
     """Score every unit against the others in every condition, whatever group it is filed under."""
-    name = context.model_names[0]
+    name = context.edmd_names[0]
     folder = context.store.path("outliers")
     rows: list[dict[str, Any]] = []
     files: list[Path] = []

@@ -156,3 +156,13 @@ def test_commands_on_something_that_is_not_a_run(kros, tmp_path, command):
     result = kros(command, tmp_path, *arguments)
     assert result.exit_code == 2
     assert "study.json" in result.stderr
+
+
+def test_bad_recordings_leave_an_earlier_run_as_it_was(kros, study, tmp_path, raw):
+    path, out = study(source=raw, reader="motor-drive-raw"), tmp_path / "run"
+    assert kros("run", path, "--out", out, "--until", "calibrate", "--workers", 1).exit_code == 0
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    edit(first_csv(raw), lambda lines: lines[:2000] + lines[2010:])
+    result = kros("run", path, "--out", out, "--until", "calibrate", "--workers", 1)
+    assert result.exit_code == 2
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from .context import Context, Progress, Silent
 from .executors import open_executor
 from .metrics import collect_metrics
 from .stages import calibrate, evaluate, identify, quantify, read, report, synthesize
-from .store import Store, code_key, hash_of, source_key
+from .store import Store, code_key, hash_of, remove_tree, source_key
 
 log = logging.getLogger(__name__)
 
@@ -86,22 +85,23 @@ def run_study(
     """
     began = time.perf_counter()
     out = Path(out)
-    existed = out.exists()
-    if existed and not out.is_dir():
+    if out.exists() and not out.is_dir():
         raise ConfigError(f"Output {out}: is a file; name a folder.")
-    if existed and any(out.iterdir()) and not (out / "study.json").exists():
+    fresh = not out.exists() or not any(out.iterdir())
+    if not fresh and not (out / "study.json").exists():
         raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
     read.check_source(config, single_allowed=list(Stage).index(until) <= list(Stage).index(Stage.IDENTIFY))
     store = Store(out)
     try:
         with open_executor(workers, scheduler) as executor:
             context = Context(config, store, executor, progress or Silent())
-            write_json(store.path("study.json"), config.dump())
-            (out / "metrics.json").unlink(missing_ok=True)
+            if fresh:
+                write_json(store.path("study.json"), config.dump())
             _run_steps(context, until)
     except (ConfigError, DataError, DimensionError):
-        if not existed and not store.record(Stage.READ):
-            shutil.rmtree(out, ignore_errors=True)
+        remove_tree(store.path(read.PARTIAL))
+        if fresh and not store.record(Stage.READ):
+            remove_tree(out)
         raise
     metrics = collect_metrics(context, until, time.perf_counter() - began)
     write_json(store.path("metrics.json"), metrics)
@@ -116,18 +116,35 @@ def _run_steps(context: Context, until: Stage) -> None:
             record = context.store.record(step.stage) or {}
             context.progress.finish(step.stage.value, record["seconds"], skipped=True)
         else:
-            for later in STEPS[position:]:
-                context.store.clear(later.stage)
             began = time.perf_counter()
             context.progress.start(step.stage.value, None)
-            files = step.run(context)
+            files = _perform(context, position)
             seconds = time.perf_counter() - began
             context.store.finish(step.stage, key, seconds, files)
             context.progress.finish(step.stage.value, seconds, skipped=False)
             log.info("%s: %.2f s", step.stage.value, seconds)
+        if step.stage is Stage.READ:
+            write_json(context.store.path("study.json"), context.config.dump())
+            context.store.path("metrics.json").unlink(missing_ok=True)
         key = hash_of([key, context.store.output_key(step.stage)])
         if step.stage is until:
             return
+
+
+def _perform(context: Context, position: int) -> list[Path]:
+    """Run a stage in place of its earlier result and of all that follow from it."""
+    step = STEPS[position]
+    if step.stage is not Stage.READ:
+        _clear(context, position)
+        return step.run(context)
+    files = step.run(context)  # before anything is cleared: recordings that turn out bad leave an earlier run as it was
+    _clear(context, position + 1)
+    return files
+
+
+def _clear(context: Context, position: int) -> None:
+    for step in STEPS[position:]:
+        context.store.clear(step.stage)
 
 
 def _key(context: Context, step: Step, upstream: str) -> str:

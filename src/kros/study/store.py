@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -97,7 +96,7 @@ def code_key() -> str:
     return hash_of([[str(f.relative_to(root)), fingerprint(f)] for f in files])
 
 
-def remove_tree(folder: Path, keep: Mapping[str, Any] | None = None) -> None:
+def remove_tree(folder: Path) -> None:
     """Remove a folder of our own making."""
     if folder.exists():
         shutil.rmtree(folder)

@@ -26,8 +26,10 @@ from ...data.writers import GroupRecord
 from ..config import StudyConfig
 from ..context import Context
 from ..presets import resolve_lifting, resolve_phase
+from ..store import remove_tree
 
 PARQUET = "parquet"
+PARTIAL = ".recordings.partial"
 
 
 @dataclass(frozen=True)
@@ -99,17 +101,21 @@ def run(context: Context) -> list[Path]:
     """Read everything once."""
     config, population = context.config, open_source(context.config)
     in_place = config.data.reader == PARQUET and not config.data.prepare
-    folder = None if in_place else context.store.path("recordings")
+    folder = None if in_place else context.store.path(PARTIAL)
     if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
+        remove_tree(folder)
+        folder.mkdir(parents=True)
     tasks = [GroupTask(population.select([u], [c]), u, c, folder, config.data.on_nan) for u, c, _ in population.groups()]
     found = list(context.map("read", read_group, tasks))
     files = []
     if folder is not None:
         records = [f.record for f in found if f.record is not None]
         write_index(population, records, folder)
-        files = [folder / "population.json", *(folder / r.file for r in records)]
-        kept = read_parquet(folder)
+        final = context.store.path("recordings")
+        remove_tree(final)
+        folder.rename(final)
+        files = [final / "population.json", *(final / r.file for r in records)]
+        kept = read_parquet(final)
     else:
         present = {(f.unit, f.condition, e) for f in found for e in f.episodes}
         kept = population

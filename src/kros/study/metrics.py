@@ -109,7 +109,7 @@ def _observers_record(context: Context) -> dict[str, Any]:
 def _observers(context: Context) -> dict[str, Any]:
     entries: dict[str, Any] = {}
     record = _observers_record(context)
-    for name in record["names"]:
+    for name in record["facts"]:
         entry = dict(record["facts"][name])
         folder = context.store.path("synthesis", name)
         if folder.exists():

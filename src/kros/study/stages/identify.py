@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact, save_artifact
+from ...core.artifacts import save_artifact
 from ...core.errors import IdentificationError
 from ...data.population import EpisodeKey, Population
 from ...identify import (
@@ -190,9 +190,3 @@ def _save_factors(context: Context, condition: str, units: list[str], episodes: 
     }
     save_artifact(folder, "factors", {**content, "rows": keys}, arrays)
     return [folder / "factors.json", folder / "arrays.npz"]
-
-
-def load_factors(folder: Path) -> tuple[list[tuple[str, str]], Factor]:
-    """Read per-episode factors: the (unit, episode) of every row, and the batch."""
-    content, arrays = load_artifact(folder, "factors")
-    return [tuple(row) for row in content["rows"]], Factor(**arrays)

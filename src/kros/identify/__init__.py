@@ -5,6 +5,7 @@ from .factors import Factor, combine, lifted_factor, reduce_episode
 from .free_run import free_run
 from .model_set import ModelSet
 from .phase import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
+from .scores import Scores, predict_ahead, score
 
 __all__ = [
     "Factor",
@@ -12,6 +13,7 @@ __all__ = [
     "ModelSet",
     "PhaseCalibration",
     "PhaseSpec",
+    "Scores",
     "Segment",
     "UnitPhase",
     "combine",
@@ -19,9 +21,11 @@ __all__ = [
     "find_segments",
     "free_run",
     "lifted_factor",
+    "predict_ahead",
     "reduce_episode",
     "residual_covariance",
     "resolve_branches",
+    "score",
     "smallest_stabilising_alpha",
     "unit_phase",
 ]

@@ -154,6 +154,25 @@ def score(
     >>> float(score(model, Lifting(("x",)), {}, [(x, u)], horizons=(1, 10)).percent.max())
     0.0
     """
+    scores = score_long_enough(models, lifting, parameters, episodes, horizons, stride)
+    for horizon, counted in zip(scores.horizons, scores.counts.any(axis=0).tolist(), strict=True):
+        if not counted:
+            raise DataError(
+                f"Scores: horizon {horizon} needs episodes of {(horizon or 1) + 1} samples or more, the longest has "
+                f"{max(len(x) for x, _ in episodes)}; ask for a shorter horizon."
+            )
+    return scores
+
+
+def score_long_enough(
+    models: KoopmanMatrices,
+    lifting: Lifting,
+    parameters: Mapping[str, npt.ArrayLike],
+    episodes: Sequence[tuple[Array, Array]],
+    horizons: Sequence[Horizon],
+    stride: int = 1,
+) -> Scores:
+    """Score as `score` does, and leave a horizon uncounted where no episode is long enough."""
     horizons = tuple(horizons)
     _check(models, lifting, episodes, horizons, stride)
     n, many = lifting.n_states, len(episodes)
@@ -167,16 +186,9 @@ def score(
     short = np.argwhere(counts == 0)
     for row, column in short:
         log.info("episode %d of %d has %d samples, too few for horizon %s", row, many, len(episodes[row][0]), horizons[column])
-    if len(short) and not counts.any(axis=0).all():
-        column = int(np.argmin(counts.any(axis=0)))
-        longest = max(len(x) for x, _ in episodes)
-        raise DataError(
-            f"Scores: horizon {horizons[column]} needs episodes of {(horizons[column] or 0) + 1} samples or more, the longest has {longest}; "
-            "ask for a shorter horizon."
-        )
-    short_ = counts[..., None] == 0
+    skipped = counts[..., None] == 0
     peak = np.array([np.abs(x).max(axis=0, initial=0.0) for x, _ in episodes])
-    return Scores(lifting.states, horizons, np.where(short_, 0.0, squares), np.where(short_, 0.0, spread), counts, peak)
+    return Scores(lifting.states, horizons, np.where(skipped, 0.0, squares), np.where(skipped, 0.0, spread), counts, peak)
 
 
 def predict_ahead(

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ..core.errors import DataError
 from ..data.population import EpisodeKey, Population
+from ..lifting import Lifting
 
 Array = npt.NDArray[np.float64]
 
@@ -44,6 +45,28 @@ class EpisodeBatch:
             values[: len(episode), i] = episode
             values[len(episode) :, i] = episode[-1]
         return cls(tuple(keys), lengths, values[..., :n], np.ascontiguousarray(values[..., n:]))
+
+    def first_states(self, lifting: Lifting) -> Array:
+        """Return what a free run starts from: the first states of every episode, and those that the lifting's delays need.
+
+        Returns
+        -------
+        ndarray, shape (batch, n), or (batch, history + 1, n) for a lifting with delays
+
+        Raises
+        ------
+        DataError
+            When an episode is shorter than the history.
+        """
+        h = lifting.history
+        if not h:
+            return self.states[0]
+        for key, length in zip(self.keys, self.lengths, strict=True):
+            if length < h + 1:
+                raise DataError(
+                    f"Free run over {key}: needs {h + 1} samples for delays of up to {h}, found {length}; leave the episode out."
+                )
+        return np.swapaxes(self.states[: h + 1], 0, 1)
 
     def parameters(self, units: Mapping[str, Mapping[str, float]]) -> dict[str, Array]:
         """Return lifting parameters for every episode from those of its unit."""

@@ -1,18 +1,20 @@
 """Triangular factors: each episode is reduced once, all least squares after that is algebra on small matrices.
 
-The factor of an episode is R of the QR decomposition of ``[x g u | x+ g+]``: states, parameter-free lifted functions and inputs at
-k, states and functions at k + 1. Factors of several episodes combine by stacking and another QR (TSQR), so memory does not
-grow with the recording and the condition number is never squared, as it is in (32)-(33).
+The factor of an episode is R of the QR decomposition of ``[x g u v | x+ g+]``: states, parameter-free lifted functions, inputs and
+parameter-free input functions at k, states and functions at k + 1. With delays the first k is the lifting's history. Factors of several
+episodes combine by stacking and another QR (TSQR), so memory does not grow with the recording and the condition number is never
+squared, as it is in (32)-(33).
 
 Symbols
 -------
 x, u : states (n_samples, n) and inputs (n_samples, m)
-g    : parameter-free functions, sigma(x; q) = M(q) g(x) (see `lifting.Separation`)
+g, v : parameter-free functions, sigma(w; q) = M(q) g(w) and gamma(u, w; q) = N(q) v(u, w) (see `lifting.Separation`)
 R    : upper triangular factor, (n_columns, n_columns)
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,14 +34,24 @@ class Factor:
     Parameters
     ----------
     R : ndarray, shape (..., n_columns, n_columns)
-    peak : ndarray, shape (..., n + n_basis + m)
+    peak : ndarray, shape (..., n + n_basis + m + n_input_basis)
         Largest magnitude of every column at k.
     n_samples : ndarray, shape (...)
+    input_range : ndarray, shape (..., 2, m), optional
+        Smallest and largest value of every recorded input.
     """
 
     R: Array
     peak: Array
     n_samples: npt.NDArray[np.int64]
+    input_range: Array | None = None
+
+    @classmethod
+    def stack(cls, factors: Sequence[Factor]) -> Factor:
+        """Stack factors along a new first axis."""
+        ranges = [f.input_range for f in factors if f.input_range is not None]
+        R, peak, n_samples = (np.stack([getattr(f, name) for f in factors]) for name in ("R", "peak", "n_samples"))
+        return cls(R, peak, n_samples, np.stack(ranges) if len(ranges) == len(factors) else None)
 
 
 def reduce_episode(x: Array, u: Array, lifting: Lifting) -> Factor:
@@ -54,12 +66,21 @@ def reduce_episode(x: Array, u: Array, lifting: Lifting) -> Factor:
     Returns
     -------
     Factor
+
+    Raises
+    ------
+    DataError
+        When the episode is too short for the lifting's history and one step.
     """
-    g = lifting.separation.evaluate(x)
-    now = np.concatenate([x, g, u], axis=1)
+    lifting.window.require(len(x), beyond=1)
+    window = lifting.windows(x, u)
+    x, u = x[lifting.history :], u[lifting.history :]
+    g = lifting.separation.evaluate(window)
+    v = lifting.input_separation.evaluate(window, u) if lifting.input_functions else u[:, :0]
+    now = np.concatenate([x, g, u, v], axis=1)
     after = now[1:, : x.shape[1] + g.shape[1]]
     data = np.concatenate([now[:-1], after], axis=1)
-    return Factor(triangular(data), np.abs(now).max(axis=0), np.asarray(len(data)))
+    return Factor(triangular(data), np.abs(now).max(axis=0), np.asarray(len(data)), np.stack([u.min(axis=0), u.max(axis=0)]))
 
 
 def triangular(rows: Array) -> Array:
@@ -76,7 +97,9 @@ def combine(factors: Factor) -> Factor:
     """Combine a batch of factors over its last batch axis, shape (..., episode, n, n) to (..., n, n)."""
     *batch, episodes, width, _ = factors.R.shape
     stacked = factors.R.reshape(*batch, episodes * width, width)
-    return Factor(qr_triangle(stacked), factors.peak.max(axis=-2), factors.n_samples.sum(axis=-1))
+    ends = factors.input_range
+    span = None if ends is None else np.stack([ends[..., 0, :].min(axis=-2), ends[..., 1, :].max(axis=-2)], axis=-2)
+    return Factor(qr_triangle(stacked), factors.peak.max(axis=-2), factors.n_samples.sum(axis=-1), span)
 
 
 def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array], model: Lifting) -> Factor:
@@ -92,20 +115,45 @@ def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array]
     model : Lifting
         The model's lifting: that lifting itself, or the linear one with the same states.
     """
-    n, b = lifting.n_states, len(lifting.separation.basis)
-    n_inputs = factor.R.shape[-1] - 2 * (n + b)
+    n, b, r = lifting.n_states, len(lifting.separation.basis), len(lifting.input_separation.basis)
+    m = factor.R.shape[-1] - 2 * (n + b) - r
     batch = factor.R.shape[:-2]
     theta = np.zeros((*batch, n + b, model.n_lifted))  # columns of theta in terms of [x g]
     theta[..., range(n), range(n)] = 1.0
+    peak = [factor.peak[..., :n]]
     if model.functions:
         M = lifting.separation.matrix(parameters)
         theta[..., n:, n:] = np.swapaxes(M, -1, -2)
-    width = model.n_lifted + n_inputs
+        peak.append(_peaks(M, factor.peak[..., n : n + b]))
+    inputs = np.zeros((*batch, m + r, m + len(model.input_functions)))  # columns of the lifted inputs in terms of [u v]
+    inputs[..., range(m), range(m)] = 1.0
+    peak.append(factor.peak[..., n + b : n + b + m])
+    if model.input_functions:
+        N = lifting.input_separation.matrix(parameters)
+        inputs[..., m:, m:] = np.swapaxes(N, -1, -2)
+        peak.append(_peaks(N, factor.peak[..., n + b + m :]))
+    width = model.n_lifted + inputs.shape[-1]
     change = np.zeros((*batch, factor.R.shape[-1], width + model.n_lifted))
     change[..., : n + b, : model.n_lifted] = theta
-    change[..., n + b : n + b + n_inputs, model.n_lifted : width] = np.eye(n_inputs)
-    change[..., n + b + n_inputs :, width:] = theta
-    peak = np.concatenate([factor.peak[..., :n], np.ones((*batch, model.n_lifted - n)), factor.peak[..., n + b :]], axis=-1)
-    if model.functions:
-        peak[..., n : model.n_lifted] = np.einsum("...ij,...j->...i", np.abs(M), factor.peak[..., n : n + b])
-    return Factor(qr_triangle(factor.R @ change), peak, factor.n_samples)
+    change[..., n + b : n + b + m + r, model.n_lifted : width] = inputs
+    change[..., n + b + m + r :, width:] = theta
+    return Factor(qr_triangle(factor.R @ change), np.concatenate(peak, axis=-1), factor.n_samples, factor.input_range)
+
+
+def _peaks(M: Array, peak: Array) -> Array:
+    """Bounds of the magnitudes of functions from those of their basis, shape (..., p)."""
+    return np.asarray(np.einsum("...ij,...j->...i", np.abs(M), peak))
+
+
+def dependent_column(R: Array, n_columns: int) -> tuple[int, int] | None:
+    """Return unit and column of the first of `n_columns` that depends on those before it, or None.
+
+    Parameters
+    ----------
+    R : ndarray, shape (unit, p, p)
+    n_columns : int
+    """
+    part = R[..., :n_columns]
+    pivots = np.abs(np.diagonal(part, axis1=-2, axis2=-1)) / np.maximum(np.linalg.norm(part, axis=-2), np.finfo(float).tiny)
+    found = np.argwhere(pivots < n_columns * np.finfo(float).eps)
+    return (int(found[0, 0]), int(found[0, 1])) if len(found) else None

@@ -23,32 +23,67 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.
     ----------
     A : ndarray, shape (batch, n, n) or (n, n)
     B : ndarray, shape (batch, n, m) or (n, m)
+        With input functions, m counts them.
     lifting : Lifting
     parameters : mapping of str to array_like, shape (batch,)
-    x0 : ndarray, shape (batch, n_states)
+    x0 : ndarray, shape (batch, n_states), or (batch, history + 1, n_states) for a lifting with delays
+        The first recorded states.
     u : ndarray, shape (batch, n_samples, m)
+        Recorded inputs.
 
     Returns
     -------
     ndarray, shape (batch, n_samples, n_states)
-        The state at sample k follows from inputs up to k - 1; the first is `x0`. A run that diverges holds infinities or NaN.
+        The state at sample k follows from inputs up to k - 1; the first ones are `x0`. A run that diverges holds infinities or NaN.
+
+    Raises
+    ------
+    DimensionError
+        When shapes do not fit together.
+    DataError
+        When there are fewer samples than the history needs.
     """
     batch, n_samples, m = u.shape
-    n, n_lifted = lifting.n_states, lifting.n_lifted
-    if x0.shape != (batch, n) or A.shape[-1] != n_lifted or B.shape[-1] != m:
+    n, n_lifted, h = lifting.n_states, lifting.n_lifted, lifting.history
+    first = x0[:, None] if x0.ndim == 2 else x0
+    width = m + len(lifting.input_functions)
+    if first.shape != (batch, h + 1, n) or A.shape[-1] != n_lifted or B.shape[-1] != width:
+        past = f" with a history of {h} samples" if h else ""
         raise DimensionError(
-            f"Free run: inputs {u.shape}, first states {x0.shape}, A {A.shape} and B {B.shape} do not fit a lifting of {n} states to {n_lifted}."
+            f"Free run: inputs {u.shape}, first states {x0.shape}, A {A.shape} and B {B.shape} do not fit a lifting of {n} states to {n_lifted}"
+            f"{past} and {width} inputs."
         )
+    lifting.window.require(n_samples)
     step = np.ascontiguousarray(np.swapaxes(np.concatenate([A, B], axis=-1)[..., :n, :], -1, -2))  # (.., n_lifted + m, n)
-    psi = np.empty((batch, n_lifted + m))
+    psi = np.empty((batch, n_lifted + width))
     states = np.empty((n_samples, batch, n))
+    states[: h + 1] = np.swapaxes(first, 0, 1)
     inputs = np.ascontiguousarray(np.swapaxes(u, 0, 1))
-    psi[:, :n] = x0
+    psi[:, :n] = first[:, h]
     lifted = psi[:, :n_lifted]
+    advance = _multiply_all if step.ndim == 2 else _multiply_each
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(n_samples):
+        if not (h or lifting.input_functions):
+            for k in range(n_samples):
+                states[k] = psi[:, :n]
+                lifting.lift_into(lifted, parameters)
+                psi[:, n_lifted:] = inputs[k]
+                psi[:, :n] = advance(psi, step)
+            return np.swapaxes(states, 0, 1)
+        earlier = lifting.windows(first, u[:, : h + 1])[:, 0, n:]
+        for k in range(h, n_samples):
             states[k] = psi[:, :n]
-            lifting.lift_into(lifted, parameters)
-            psi[:, n_lifted:] = inputs[k]
-            psi[:, :n] = psi @ step if step.ndim == 2 else (psi[:, None, :] @ step)[:, 0, :]
+            window = np.concatenate([psi[:, :n], earlier], axis=-1)
+            lifting.lift_into(lifted, parameters, earlier)
+            psi[:, n_lifted:] = lifting.lift_inputs(inputs[k], window, parameters)
+            earlier = lifting.window.advance(window, inputs[k])
+            psi[:, :n] = advance(psi, step)
     return np.swapaxes(states, 0, 1)
+
+
+def _multiply_all(psi: Array, step: Array) -> Array:
+    return psi @ step
+
+
+def _multiply_each(psi: Array, step: Array) -> Array:
+    return np.asarray((psi[:, None, :] @ step)[:, 0, :])

@@ -61,9 +61,25 @@ class ModelSet:
     status: tuple[str, ...] = field(default=())
 
     @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs."""
+    def recorded_inputs(self) -> tuple[str, ...]:
+        """Names of the inputs that are recorded."""
         return tuple(c.name for c in self.channels if c.role is Role.INPUT)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the model's inputs, the columns of `B`: the recorded ones, then the lifting's input functions."""
+        return self.recorded_inputs + self.lifting.input_functions
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Physical units of the lifted states, empty where they are not known."""
+        return self.lifting.units({c.name: c.unit for c in self.channels})
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """Physical units of the model's inputs, empty where they are not known."""
+        known = {c.name: c.unit for c in self.channels}
+        return tuple(known[name] for name in self.recorded_inputs) + self.lifting.input_units(known)
 
     @property
     def measured(self) -> tuple[int, ...]:
@@ -99,8 +115,11 @@ class ModelSet:
             "unit_ids": self.unit_ids,
             "channels": self.channels,
             "states": self.lifting.states,
-            "inputs": self.inputs,
+            "inputs": self.recorded_inputs,
             "lifting": self.lifting.functions,
+            **self.lifting.extension(),
+            "units": self.units,
+            "input_units": self.input_units,
             "parameters": {k: dict(zip(self.unit_ids, v.tolist(), strict=True)) for k, v in self.parameters.items()},
             "sample_period_s": self.sample_period_s,
             "alpha": self.alpha,
@@ -117,7 +136,7 @@ class ModelSet:
         return cls(
             name=content["name"],
             condition=content["condition"],
-            lifting=Lifting(tuple(content["states"]), tuple(content["lifting"]), tuple(content["parameters"])),
+            lifting=Lifting.from_content(content),
             channels=tuple(Channel(c["name"], Role(c["role"]), c["unit"], c["measured"]) for c in content["channels"]),
             sample_period_s=content["sample_period_s"],
             unit_ids=tuple(content["unit_ids"]),

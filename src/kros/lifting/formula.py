@@ -1,14 +1,14 @@
-"""Formulas of states and parameters, such as ``sin(100*position + phase)``.
+"""Formulas of states and parameters, such as ``sin(100*position + phase)``, and of earlier values, such as ``position[-1]``.
 
 Text is read with `ast` against a whitelist and turned into SymPy nodes one by one; nothing is ever evaluated as Python.
-From the one SymPy tree come the vectorised evaluation, the derivative and the C expression.
+From the one SymPy tree come the vectorised evaluation, the derivative, the slope bounds and the C expression.
 """
 
 from __future__ import annotations
 
 import ast
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,27 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
-
-Values = Mapping[str, npt.NDArray[np.float64]]
-Evaluator = Callable[[Values], Any]
+from .evaluation import FUNCTIONS, Evaluator, compile_expression
 
 _BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv, ast.Pow: operator.pow}
 _UNARY: dict[type, Callable[[Any], Any]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
-_FUNCTIONS = {
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "exp": np.exp,
-    "log": np.log,
-    "sqrt": np.sqrt,
-    "tanh": np.tanh,
-    "Abs": np.abs,
-    "sign": np.sign,
-    "atan": np.arctan,
-}
 _SPELLINGS = {"abs": "Abs"}
 _MAX_LENGTH = 2000
 _MAX_EXPONENT = 64
+MAX_DELAY = 1000
 
 
 @dataclass(frozen=True)
@@ -50,19 +37,22 @@ class Formula:
         As written by the user.
     names : tuple of str
         Quantities that may appear.
+    delayed : tuple of str
+        Quantities of which earlier values may appear: ``position[-2]`` is the value two samples before.
     """
 
     text: str
     names: tuple[str, ...]
+    delayed: tuple[str, ...] = ()
 
     @cached_property
     def expression(self) -> Any:
         """SymPy tree of the formula."""
-        return parse(self.text, self.names)
+        return parse(self.text, self.names, self.delayed)
 
     @cached_property
     def used(self) -> frozenset[str]:
-        """Names that the formula depends on."""
+        """Names that the formula depends on; an earlier value has a name of its own."""
         return frozenset(symbol.name for symbol in self.expression.free_symbols)
 
     @cached_property
@@ -80,24 +70,41 @@ class Formula:
 
         return sp.diff(self.expression, sp.Symbol(name, real=True))
 
-    def c_expression(self) -> str:
-        """Return the formula as a C expression in double precision."""
+    def c_expression(self, pointers: Sequence[str] = ()) -> str:
+        """Return the formula as a C expression in double precision.
+
+        An earlier value ``position[-1]`` reads a pointer to the present one. Names in `pointers` are such pointers, and their present
+        value is written ``position[0]``.
+        """
         import sympy as sp
 
-        return str(sp.ccode(self.expression))
+        present = {sp.Symbol(name, real=True): sp.Symbol(f"{name}[0]", real=True) for name in pointers}
+        large = {n: sp.Float(n, 17) for n in self.expression.atoms(sp.Integer) if abs(n) >= 2**31}
+        return str(sp.ccode(self.expression.xreplace({**present, **large})))
 
 
-def parse(text: str, names: Sequence[str]) -> Any:
+def delayed_name(name: str, delay: int) -> str:
+    """Return the name of a quantity `delay` samples ago.
+
+    >>> delayed_name("position", 2)
+    'position[-2]'
+    """
+    return f"{name}[-{delay}]" if delay else name
+
+
+def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
     """Read a formula into a SymPy tree.
 
     Allowed are numbers, the given names, ``pi``, ``+ - * / **``, parentheses and the functions
-    sin, cos, tan, exp, log, sqrt, tanh, atan, abs, sign.
+    sin, cos, tan, exp, log, sqrt, tanh, atan, abs, sign; of the quantities in `delayed` also earlier values, ``position[-1]``.
 
     Raises
     ------
     ConfigError
         When the text holds anything else.
     """
+    import sympy as sp
+
     if len(text) > _MAX_LENGTH:
         raise ConfigError(f"Formula of {len(text)} characters: at most {_MAX_LENGTH} are read; split it into several functions.")
     try:
@@ -105,78 +112,69 @@ def parse(text: str, names: Sequence[str]) -> Any:
     except (SyntaxError, ValueError, RecursionError) as error:
         raise ConfigError(f"Formula {text!r}: not readable ({error}); write it like 'sin(100*position + phase)'.") from error
     try:
-        expression = _convert(tree.body, text, tuple(names))
+        expression = _Reader(text, tuple(names), tuple(delayed)).read(tree.body)
     except RecursionError as error:
         raise ConfigError(f"Formula {text!r}: nested too deeply; split it into several functions.") from error
-    if not expression.is_finite and expression.is_number:
-        raise ConfigError(f"Formula {text!r}: evaluates to {expression}; check for a division by zero.")
+    if expression.has(sp.oo, -sp.oo, sp.zoo, sp.nan, sp.I):
+        raise ConfigError(f"Formula {text!r}: evaluates to {expression}; check for a division by zero or a root of a negative number.")
     return expression
 
 
-def _convert(node: ast.AST, text: str, names: tuple[str, ...]) -> Any:
-    import sympy as sp
+@dataclass(frozen=True)
+class _Reader:
+    text: str
+    names: tuple[str, ...]
+    delayed: tuple[str, ...]
 
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        return sp.Integer(node.value) if isinstance(node.value, int) else sp.Float(node.value, 17)
-    if isinstance(node, ast.Name):
-        if node.id in names:
-            return sp.Symbol(node.id, real=True)
-        if node.id == "pi":
+    def read(self, node: ast.AST) -> Any:
+        import sympy as sp
+
+        if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+            return sp.Integer(node.value) if isinstance(node.value, int) else sp.Float(node.value, 17)
+        if isinstance(node, ast.Name):
+            return self._name(node.id)
+        if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Name):
+            return self._earlier(node.value.id, node.slice)
+        if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
+            left, right = self.read(node.left), self.read(node.right)
+            if isinstance(node.op, ast.Pow) and not (right.is_number and abs(right) <= _MAX_EXPONENT):
+                raise self._error(f"the exponent {right} should be a number of magnitude at most {_MAX_EXPONENT}.")
+            return _BINARY[type(node.op)](left, right)
+        if isinstance(node, ast.UnaryOp) and type(node.op) in _UNARY:
+            return _UNARY[type(node.op)](self.read(node.operand))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) == 1 and not node.keywords:
+            function = _SPELLINGS.get(node.func.id, node.func.id)
+            if function in FUNCTIONS:
+                return getattr(sp, function)(self.read(node.args[0]))
+            raise self._error(f"unknown function {node.func.id!r}; known are {', '.join(sorted(FUNCTIONS))}.")
+        raise self._error(f"{ast.unparse(node)!r} is not allowed; use numbers, names, + - * / ** and functions of one argument.")
+
+    def _name(self, name: str) -> Any:
+        import sympy as sp
+
+        if name in self.names:
+            return sp.Symbol(name, real=True)
+        if name == "pi":
             return sp.pi
-        raise ConfigError(f"Formula {text!r}: unknown name {node.id!r}; known are {', '.join(names)} and pi.")
-    if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
-        left, right = _convert(node.left, text, names), _convert(node.right, text, names)
-        if isinstance(node.op, ast.Pow) and not (right.is_number and abs(right) <= _MAX_EXPONENT):
-            raise ConfigError(f"Formula {text!r}: the exponent {right} should be a number of magnitude at most {_MAX_EXPONENT}.")
-        return _BINARY[type(node.op)](left, right)
-    if isinstance(node, ast.UnaryOp) and type(node.op) in _UNARY:
-        return _UNARY[type(node.op)](_convert(node.operand, text, names))
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) == 1 and not node.keywords:
-        function = _SPELLINGS.get(node.func.id, node.func.id)
-        if function in _FUNCTIONS:
-            return getattr(sp, function)(_convert(node.args[0], text, names))
-        raise ConfigError(f"Formula {text!r}: unknown function {node.func.id!r}; known are {', '.join(sorted(_FUNCTIONS))}.")
-    raise ConfigError(
-        f"Formula {text!r}: {ast.unparse(node)!r} is not allowed; use numbers, names, + - * / ** and functions of one argument."
-    )
+        raise self._error(f"unknown name {name!r}; known are {', '.join(self.names)} and pi.")
 
+    def _earlier(self, name: str, index: ast.expr) -> Any:
+        import sympy as sp
 
-def compile_expression(expression: Any) -> Evaluator:
-    """Turn a SymPy tree into nested closures over NumPy ufuncs; no code is generated."""
-    import sympy as sp
+        if name not in self.delayed:
+            known = f"only {', '.join(self.delayed)} have earlier values" if self.delayed else "nothing here has earlier values"
+            raise self._error(f"there is no {name}[{ast.unparse(index)}]; {known}.")
+        negative = isinstance(index, ast.UnaryOp) and isinstance(index.op, ast.USub)
+        amount = index.operand if isinstance(index, ast.UnaryOp) else index
+        if not isinstance(amount, ast.Constant) or type(amount.value) is not int:
+            raise self._error(f"the delay in {name}[{ast.unparse(index)}] should be a whole number of samples, such as {name}[-1].")
+        if not negative or amount.value == 0:
+            raise self._error(
+                f"{name}[{ast.unparse(index)}] is not an earlier value; write {name}[-1] for one sample before, {name} for the present."
+            )
+        if amount.value > MAX_DELAY:
+            raise self._error(f"the delay in {name}[-{amount.value}] is too deep; at most {MAX_DELAY} samples are kept.")
+        return sp.Symbol(delayed_name(name, amount.value), real=True)
 
-    if expression.is_Symbol:
-        name = expression.name
-        return lambda values: values[name]
-    if expression.is_number:
-        number = float(expression)
-        return lambda values: number
-    children = [compile_expression(argument) for argument in expression.args]
-    if isinstance(expression, sp.Add):
-        return _fold(np.add, children)
-    if isinstance(expression, sp.Mul):
-        return _fold(np.multiply, children)
-    if isinstance(expression, sp.Pow):
-        base, exponent = children
-        if expression.exp == -1:
-            return lambda values: 1.0 / base(values)
-        return lambda values: np.power(base(values), exponent(values))
-    function = _FUNCTIONS.get(type(expression).__name__)
-    if function is None:
-        raise ConfigError(
-            f"Formula node {expression!r}: no numerical evaluation is known; write the formula with {', '.join(sorted(_FUNCTIONS))}."
-        )
-    (child,) = children
-    return lambda values: function(child(values))
-
-
-def _fold(combine: Callable[[Any, Any], Any], children: list[Evaluator]) -> Evaluator:
-    first, *rest = children
-
-    def evaluate(values: Values) -> Any:
-        result = first(values)
-        for child in rest:
-            result = combine(result, child(values))
-        return result
-
-    return evaluate
+    def _error(self, problem: str) -> ConfigError:
+        return ConfigError(f"Formula {self.text!r}: {problem}")

@@ -1,10 +1,13 @@
-"""The lifting of a population: original states first, lifted functions after them.
+"""The lifting of a population: original states first, lifted functions after them; inputs may have functions of their own.
 
 Symbols
 -------
 x         : states, (..., n)
-theta(x)  : lifted states [x; sigma(x)], (..., n + p)           (25)
-sigma     : lifted functions, formulas of states and per-unit parameters
+w         : window, the states and the earlier values that formulas name, (..., n_window); x itself without delays
+theta(w)  : lifted states [x; sigma(w)], (..., n + p)           (25)
+sigma     : lifted functions, formulas of states, earlier values and per-unit parameters
+u         : recorded inputs, (..., m)
+gamma     : input functions, formulas of inputs, states, earlier values and per-unit parameters; lifted inputs [u; gamma(u, w)]
 """
 
 from __future__ import annotations
@@ -18,7 +21,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
-from .formula import Evaluator, Formula, compile_expression
+from .evaluation import Columns
+from .formula import Formula
+from .intervals import Box, bounds_of
+from .separation import Separation
+from .units import unit_of
+from .window import Window
 
 Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, npt.ArrayLike]
@@ -26,48 +34,100 @@ Parameters = Mapping[str, npt.ArrayLike]
 
 @dataclass(frozen=True)
 class Lifting:
-    """Lifting functions of the state, with per-unit parameters.
+    """Lifting functions of the state, with per-unit parameters, delays and functions of the inputs.
 
     Parameters
     ----------
     states : tuple of str
     functions : tuple of str
-        Formulas of the states and the parameters; empty for a linear model.
+        Formulas of the states, of earlier values such as ``position[-1]`` or ``voltage[-2]``, and of the parameters; empty for a linear model.
     parameters : tuple of str
         Names of quantities that every unit has a value of its own for, such as ``phase``.
+    inputs : tuple of str
+        Names of the recorded inputs; needed where formulas name an input, otherwise any number of inputs passes through.
+    input_functions : tuple of str
+        Formulas that stand behind the inputs as further inputs of the model, such as ``current*voltage``.
 
     Raises
     ------
     ConfigError
-        When a formula cannot be read, is repeated, or depends on no state.
+        When a formula cannot be read, is repeated, or depends on no state (an input function: on no input).
     """
 
     states: tuple[str, ...]
     functions: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+    input_functions: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        clash = set(self.states) & set(self.parameters)
-        if clash or len(set(self.states)) != len(self.states):
+        everything = (*self.states, *self.parameters, *self.inputs)
+        clash = {name for name in everything if everything.count(name) > 1}
+        if clash:
             raise ConfigError(
-                f"Lifting: names of states and parameters must differ, found states {self.states} and parameters {self.parameters}; rename {clash}."
+                f"Lifting: names of states and parameters must differ, and of inputs too, found states {self.states}, parameters {self.parameters} and "
+                f"inputs {self.inputs}; rename {clash}."
             )
-        if len(set(self.functions)) != len(self.functions):
-            raise ConfigError(f"Lifting: functions {list(self.functions)} repeat one of them; every lifted function must be listed once.")
+        _refuse_repeated(self.formulas, self.states)
+        _refuse_repeated(self.input_formulas, self.inputs)
         for formula in self.formulas:
-            if not formula.used & set(self.states):
+            present = sorted(formula.used & set(self.inputs))
+            if present:
+                raise ConfigError(
+                    f"Lifting: {formula.text!r} reads the present input {', '.join(present)}, which the next lifted state would need from the future; "
+                    f"make it an input function, or read {present[0]}[-1]."
+                )
+            if not formula.used - set(self.parameters):
                 raise ConfigError(
                     f"Lifting: {formula.text!r} depends on no state ({', '.join(self.states)}); a constant cannot be lifted, remove it."
+                )
+        for formula in self.input_formulas:
+            if not {name.partition("[")[0] for name in formula.used} & set(self.inputs):
+                raise ConfigError(
+                    f"Lifting: the input function {formula.text!r} depends on no input ({', '.join(self.inputs) or 'none are named'}); "
+                    "a function of states alone belongs to the lifted functions."
                 )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Rebuild from the texts in a worker process: compiled formulas do not travel."""
-        return Lifting, (self.states, self.functions, self.parameters)
+        return Lifting, (self.states, self.functions, self.parameters, self.inputs, self.input_functions)
+
+    @classmethod
+    def from_content(cls, content: Mapping[str, Any]) -> Lifting:
+        """Rebuild a lifting from an artifact: ``states``, ``lifting``, ``parameters`` and, where there are any, those of `extension`."""
+        return cls(
+            tuple(content["states"]),
+            tuple(content["lifting"]),
+            tuple(content["parameters"]),
+            tuple(content.get("lifting_inputs", ())),
+            tuple(content.get("input_functions", ())),
+        )
+
+    def extension(self) -> dict[str, Any]:
+        """Return what an artifact has to hold besides states, functions and parameters; nothing for a plain lifting."""
+        return {"lifting_inputs": self.inputs, "input_functions": self.input_functions} if self.inputs else {}
 
     @cached_property
     def formulas(self) -> tuple[Formula, ...]:
         """Parsed lifted functions."""
-        return tuple(Formula(text, self.states + self.parameters) for text in self.functions)
+        names, delayed = self.states + self.parameters + self.inputs, self.states + self.inputs
+        return tuple(Formula(text, names, delayed) for text in self.functions)
+
+    @cached_property
+    def input_formulas(self) -> tuple[Formula, ...]:
+        """Parsed input functions."""
+        names, delayed = self.states + self.parameters + self.inputs, self.states + self.inputs
+        return tuple(Formula(text, names, delayed) for text in self.input_functions)
+
+    @cached_property
+    def window(self) -> Window:
+        """Which earlier values the formulas read."""
+        return Window.of(self.states, self.inputs, [name for f in self.formulas + self.input_formulas for name in f.used])
+
+    @property
+    def history(self) -> int:
+        """Deepest delay in samples; 0 for functions of the present state alone."""
+        return self.window.history
 
     @property
     def n_states(self) -> int:
@@ -84,12 +144,27 @@ class Lifting:
         """Names of the lifted states."""
         return self.states + self.functions
 
+    def units(self, known: Mapping[str, str]) -> tuple[str, ...]:
+        """Return the physical unit of every lifted state, empty where it does not follow.
+
+        Parameters
+        ----------
+        known : mapping of str to str
+            Units of states and inputs, such as ``rad/s``.
+        """
+        return tuple(known.get(state, "") for state in self.states) + tuple(unit_of(f.expression, known) for f in self.formulas)
+
+    def input_units(self, known: Mapping[str, str]) -> tuple[str, ...]:
+        """Return the physical unit of every input function."""
+        return tuple(unit_of(f.expression, known) for f in self.input_formulas)
+
     def lift(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the lifted states.
 
         Parameters
         ----------
-        x : array_like, shape (..., n)
+        x : array_like, shape (..., n_window)
+            Windows (see `windows`); states alone, shape (..., n), for a lifting without delays.
         parameters : mapping of str to array_like
             Values that broadcast against ``x[..., 0]``.
 
@@ -97,125 +172,175 @@ class Lifting:
         -------
         ndarray, shape (..., n + p)
         """
-        x = np.asarray(x, dtype=float)
-        if x.shape[-1] != self.n_states:
-            raise DimensionError(f"Lifting: expected {self.n_states} states {self.states} on the last axis, found shape {x.shape}.")
+        x = self._windows(x)
         lifted = np.empty((*x.shape[:-1], self.n_lifted))
-        lifted[..., : self.n_states] = x
-        self.lift_into(lifted, parameters)
+        lifted[..., : self.n_states] = x[..., : self.n_states]
+        self.lift_into(lifted, parameters, x[..., self.n_states :])
         return lifted
 
-    def lift_into(self, lifted: Array, parameters: Parameters | None = None) -> None:
-        """Fill the lifted functions behind states that are already in place, shape (..., n + p)."""
-        values = self._values(lifted, parameters)
-        for i, formula in enumerate(self.formulas):
-            lifted[..., self.n_states + i] = formula.evaluator(values)
+    def lift_into(self, lifted: Array, parameters: Parameters | None = None, earlier: Array | None = None) -> None:
+        """Fill the lifted functions behind states that are already in place, shape (..., n + p).
+
+        Earlier values, shape (..., n_earlier), are needed where the lifting has delays.
+        """
+        self._columns.fill(self._values(lifted, parameters, earlier), lifted)
+
+    def lift_inputs(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
+        """Return the inputs with the input functions behind them.
+
+        Parameters
+        ----------
+        u : array_like, shape (..., m)
+        window : array_like, shape (..., n_window)
+        parameters : mapping of str to array_like
+
+        Returns
+        -------
+        ndarray, shape (..., m + r)
+        """
+        u = np.asarray(u, dtype=float)
+        self.window.require_inputs(u)
+        if not self.input_functions:
+            return u
+        window = self._windows(window)
+        out = np.empty((*u.shape[:-1], u.shape[-1] + len(self.input_functions)))
+        out[..., : u.shape[-1]] = u
+        values = {**self._values(window, parameters, window[..., self.n_states :]), **{q: u[..., i] for i, q in enumerate(self.inputs)}}
+        self._input_columns.fill(values, out)
+        return out
+
+    def windows(self, x: Array, u: Array) -> Array:
+        """Return the windows of a recording, shape (..., n_samples - history, n_window), the first one at sample `history`.
+
+        Raises
+        ------
+        DataError
+            When the recording is shorter than the history.
+        """
+        self.window.require_inputs(u)
+        return self.window.slide(x, u)
 
     def retract(self, lifted: npt.ArrayLike) -> Array:
         """Return the original states, a slice of the lifted ones."""
         return np.asarray(lifted, dtype=float)[..., : self.n_states]
 
     def jacobian(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the derivative of the lifted states, shape (..., n + p, n)."""
-        x = np.asarray(x, dtype=float)
-        jacobian = np.zeros((*x.shape[:-1], self.n_lifted, self.n_states))
-        jacobian[..., range(self.n_states), range(self.n_states)] = 1.0
-        values = self._values(x, parameters)
-        for i, row in enumerate(self._derivatives):
-            for j, evaluator in enumerate(row):
-                jacobian[..., self.n_states + i, j] = evaluator(values)
+        """Return the derivative of the lifted states by every entry of the window, shape (..., n + p, n_window)."""
+        x = self._windows(x)
+        n, width = self.n_states, x.shape[-1]
+        jacobian = np.zeros((*x.shape[:-1], self.n_lifted, width))
+        jacobian[..., range(n), range(n)] = 1.0
+        slopes = np.empty((*x.shape[:-1], len(self.functions) * width))
+        self._derivatives.fill(self._values(x, parameters, x[..., n:]), slopes)
+        jacobian[..., n:, :] = slopes.reshape(*x.shape[:-1], len(self.functions), width)
         return jacobian
 
-    @cached_property
-    def _derivatives(self) -> list[list[Evaluator]]:
-        return [[compile_expression(formula.derivative(state)) for state in self.states] for formula in self.formulas]
+    def value_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
+        """Return bounds of every lifted function over an operating box, each of shape (p,).
 
-    def _values(self, x: Array, parameters: Parameters | None) -> dict[str, Array]:
-        given = dict(parameters or {})
+        Parameters
+        ----------
+        box : mapping of str to (lower, upper) or number
+            Ranges of states and inputs; what is not named may be anything. An earlier value has the range of its quantity.
+        parameters : mapping of str to number or (lower, upper)
+            A parameter that is not named may be anything.
+        """
+        lower, upper = bounds_of([f.expression for f in self.formulas], {**(box or {}), **(parameters or {})})
+        return lower, upper
+
+    def slope_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
+        """Return bounds of the slopes of every lifted function by every entry of the window over an operating box.
+
+        Interval arithmetic on the derivatives: the bounds hold everywhere in the box, and are infinite where a slope is.
+        Rounding is covered by a relative widening of 1e-12, not by directed rounding.
+
+        Parameters
+        ----------
+        box : mapping of str to (lower, upper) or number
+            Ranges of states and inputs; what is not named may be anything. An earlier value has the range of its quantity.
+        parameters : mapping of str to number or (lower, upper)
+            A parameter that is not named may be anything.
+
+        Returns
+        -------
+        lower, upper : ndarray, shape (p, n_window)
+
+        Examples
+        --------
+        >>> Lifting(("position",), ("sin(100*position + phase)",), ("phase",)).slope_bounds()[1].round(6)
+        array([[100.]])
+        """
+        given = {**(box or {}), **(parameters or {})}
+        lower, upper = bounds_of([f.derivative(name) for f in self.formulas for name in self.window.names], given)
+        shape = (len(self.functions), len(self.window.names))
+        return lower.reshape(shape), upper.reshape(shape)
+
+    def c_expressions(self) -> tuple[str, ...]:
+        """Return every lifted function as a C expression.
+
+        Quantities with delays are pointers to the present value in an array of values: ``position[0]``, ``position[-1]``; all others are
+        numbers.
+        """
+        return tuple(formula.c_expression([q for q, _ in self.window.depths]) for formula in self.formulas)
+
+    def c_input_expressions(self) -> tuple[str, ...]:
+        """Return every input function as a C expression, with the same pointers as `c_expressions`."""
+        return tuple(formula.c_expression([q for q, _ in self.window.depths]) for formula in self.input_formulas)
+
+    @cached_property
+    def separation(self) -> Separation:
+        """The functions as parameter-dependent combinations of parameter-free ones."""
+        return Separation.of(self.formulas, self.window, self.parameters)
+
+    @cached_property
+    def input_separation(self) -> Separation:
+        """The same for the input functions."""
+        return Separation.of(self.input_formulas, self.window, self.parameters)
+
+    @cached_property
+    def _columns(self) -> Columns:
+        return Columns.of([formula.expression for formula in self.formulas], first=self.n_states)
+
+    @cached_property
+    def _input_columns(self) -> Columns:
+        return Columns.of([formula.expression for formula in self.input_formulas], first=len(self.inputs))
+
+    @cached_property
+    def _derivatives(self) -> Columns:
+        return Columns.of([formula.derivative(name) for formula in self.formulas for name in self.window.names])
+
+    def _windows(self, x: npt.ArrayLike) -> Array:
+        x = np.asarray(x, dtype=float)
+        names = self.window.names
+        if x.shape[-1:] != (len(names),):
+            what = "states" if names == self.states else "entries of a window"
+            raise DimensionError(f"Lifting: expected {len(names)} {what} {names} on the last axis, found shape {x.shape}.")
+        return x
+
+    def _values(self, x: Array, parameters: Parameters | None, earlier: Array | None = None) -> dict[str, Array]:
+        given = parameters if parameters is not None else {}
         missing = [name for name in self.parameters if name not in given]
         if missing:
             raise DimensionError(f"Lifting: parameter values for {missing} are missing, found {sorted(given)}; calibrate the unit first.")
         values = {name: np.asarray(given[name], dtype=float) for name in self.parameters}
         values.update({name: x[..., i] for i, name in enumerate(self.states)})
+        if earlier is not None:
+            values.update({name: earlier[..., i] for i, name in enumerate(self.window.earlier)})
+        elif self.window.depths:
+            raise DimensionError(f"Lifting: the earlier values {self.window.earlier} are missing; pass them, or lift windows.")
         return values
 
-    @cached_property
-    def separation(self) -> Separation:
-        """The functions as parameter-dependent combinations of parameter-free ones."""
-        return Separation.of(self)
 
-
-@dataclass(frozen=True)
-class Separation:
-    """Lifted functions written as ``sigma(x; q) = M(q) g(x)``.
-
-    For ``sin(100*position + phase)`` the basis is sin and cos of ``100*position``, so a new phase needs no second pass over the data.
-    """
-
-    lifting: Lifting
-    basis: tuple[Any, ...]
-    terms: tuple[tuple[tuple[int, Any], ...], ...]
-
-    @classmethod
-    def of(cls, lifting: Lifting) -> Separation:
-        """Separate every function of a lifting; a function that does not separate raises ConfigError."""
-        import sympy as sp
-
-        parameters = [sp.Symbol(name, real=True) for name in lifting.parameters]
-        basis: list[Any] = []
-        rows = []
-        for formula in lifting.formulas:
-            row = []
-            for term in sp.Add.make_args(sp.expand(_split_angles(formula.expression, set(parameters)), trig=False)):
-                coefficient, function = term.as_independent(*(s for s in term.free_symbols if s not in parameters), as_Add=False)
-                if function.free_symbols & set(parameters):
-                    raise ConfigError(
-                        f"Lifting function {formula.text!r}: parameters {lifting.parameters} must enter as factors or as phases of sin and cos; rewrite it."
-                    )
-                if function not in basis:
-                    basis.append(function)
-                row.append((basis.index(function), coefficient))
-            rows.append(tuple(row))
-        return cls(lifting, tuple(basis), tuple(rows))
-
-    @cached_property
-    def _evaluators(self) -> list[Evaluator]:
-        return [compile_expression(function) for function in self.basis]
-
-    def evaluate(self, x: Array) -> Array:
-        """Return the parameter-free functions at states (..., n), shape (..., n_basis)."""
-        values = {name: x[..., i] for i, name in enumerate(self.lifting.states)}
-        columns = [np.broadcast_to(evaluator(values), x.shape[:-1]) for evaluator in self._evaluators]
-        return np.stack(columns, axis=-1) if columns else np.zeros((*x.shape[:-1], 0))
-
-    def matrix(self, parameters: Parameters) -> Array:
-        """Return M(q) for parameter values of any common shape, shape (..., p, n_basis)."""
-        values = {name: np.asarray(parameters[name], dtype=float) for name in self.lifting.parameters}
-        shape = np.broadcast_shapes(*(v.shape for v in values.values())) if values else ()
-        matrix = np.zeros((*shape, len(self.terms), len(self.basis)))
-        for i, row in enumerate(self.terms):
-            for j, coefficient in row:
-                matrix[..., i, j] += compile_expression(coefficient)(values)
-        return matrix
-
-
-def _split_angles(expression: Any, parameters: set[Any]) -> Any:
-    """Apply the angle sum formulas to ``sin(data + parameter)`` and ``cos(data + parameter)`` only."""
+def _refuse_repeated(formulas: tuple[Formula, ...], originals: tuple[str, ...]) -> None:
     import sympy as sp
 
-    def split(argument: Any) -> tuple[Any, Any]:
-        own: list[Any] = []
-        data: list[Any] = []
-        for term in sp.Add.make_args(argument):
-            (own if term.free_symbols and term.free_symbols <= parameters else data).append(term)
-        return sp.Add(*data), sp.Add(*own)
-
-    def sine(argument: Any) -> Any:
-        data, own = split(argument)
-        return sp.sin(data) * sp.cos(own) + sp.cos(data) * sp.sin(own)
-
-    def cosine(argument: Any) -> Any:
-        data, own = split(argument)
-        return sp.cos(data) * sp.cos(own) - sp.sin(data) * sp.sin(own)
-
-    return expression.replace(sp.sin, sine).replace(sp.cos, cosine) if parameters else expression
+    known: dict[Any, str] = {}
+    for formula in formulas:
+        original = next((name for name in originals if formula.expression == sp.Symbol(name, real=True)), None)
+        if original is not None:
+            raise ConfigError(f"Lifting: {formula.text!r} is {original!r} itself, which is there already; remove it.")
+        if formula.expression in known:
+            raise ConfigError(
+                f"Lifting: functions repeat one of them, {formula.text!r} is {known[formula.expression]!r}; every lifted function must be listed once."
+            )
+        known[formula.expression] = formula.text

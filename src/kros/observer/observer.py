@@ -8,7 +8,8 @@
               y^c  = C^c x^c + D^c nu
 
 The correction enters through the state as drawn, or through the input, ``B (u + y^c)``, as in the paper. The observer is a
-one-step predictor: the estimate for k + 1 uses data up to k.
+one-step predictor: the estimate for k + 1 uses data up to k. Where the lifting has delays, theta reads earlier estimates and inputs too;
+before the start these are taken to equal the first ones. Where it has input functions, u stands for the lifted inputs.
 """
 
 from __future__ import annotations
@@ -39,9 +40,11 @@ class Observer:
     lifting : Lifting
     A : ndarray, shape (n_lifted, n_lifted)
     B : ndarray, shape (n_lifted, m)
+        With input functions, m counts them.
     measured : tuple of int
         Indices of the measured states.
     inputs : tuple of str
+        Recorded inputs.
     controller : StateSpace
         From innovation (q) to correction: (m) for input injection, (n_lifted) for state injection.
     injection : Injection
@@ -62,6 +65,11 @@ class Observer:
     parameters: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if self.B.shape[1] != len(self.inputs) + len(self.lifting.input_functions):
+            raise DimensionError(
+                f"Observer {self.name}: {len(self.inputs)} inputs {self.inputs} and {len(self.lifting.input_functions)} functions of them need as many "
+                f"columns of B, found {self.B.shape[1]}."
+            )
         width = self.B.shape[1] if self.injection is Injection.INPUT else self.A.shape[0]
         K = self.controller
         if (K.n_inputs, K.n_outputs) != (len(self.measured), width):
@@ -107,6 +115,7 @@ class Observer:
             "name": self.name,
             "states": self.lifting.states,
             "lifting": self.lifting.functions,
+            **self.lifting.extension(),
             "parameters": {k: self.parameters.get(k) for k in self.lifting.parameters},
             "inputs": self.inputs,
             "measured": self.measured,
@@ -123,8 +132,8 @@ class Observer:
         content = read_json(path)
         if not isinstance(content, dict) or (content.get("schema"), content.get("kind")) != (1, "observer"):
             raise DataError(f"Loading an observer from {path}: not an observer file of schema 1; write it again with this version of kros.")
-        lifting = Lifting(tuple(content["states"]), tuple(content["lifting"]), tuple(content["parameters"]))
-        n, m, q = lifting.n_lifted, len(content["inputs"]), len(content["measured"])
+        lifting = Lifting.from_content(content)
+        n, m, q = lifting.n_lifted, len(content["inputs"]) + len(lifting.input_functions), len(content["measured"])
         injection, dt = Injection(content["injection"]), content["sample_period_s"]
         width = m if injection is Injection.INPUT else n
         raw = {key: np.asarray(value, dtype=float) for key, value in content["controller"].items()}
@@ -173,6 +182,7 @@ class RunningObserver:
 
     def reset(self, y: npt.ArrayLike) -> None:
         """Start again at a measurement, shape (q,)."""
+        self._earlier: Array | None = None
         self._state = np.concatenate(
             [self.observer.initial(np.atleast_1d(np.asarray(y, dtype=float))), np.zeros(self.observer.controller.n_states)]
         )
@@ -189,7 +199,12 @@ class RunningObserver:
         -------
         ndarray, shape (n,)
         """
-        n = self.observer.lifting.n_states
-        theta = self.observer.lifting.lift(self._state[:n], self.parameters)
-        self._state = self._map @ np.concatenate([theta, self._state[n:], np.atleast_1d(u), np.atleast_1d(y)])
+        lifting = self.observer.lifting
+        n, u = lifting.n_states, np.atleast_1d(np.asarray(u, dtype=float))
+        if self._earlier is None:
+            self._earlier = lifting.window.hold(self._state[:n], u)
+        window = np.concatenate([self._state[:n], self._earlier])
+        theta, lifted_u = lifting.lift(window, self.parameters), lifting.lift_inputs(u, window, self.parameters)
+        self._state = self._map @ np.concatenate([theta, self._state[n:], lifted_u, np.atleast_1d(y)])
+        self._earlier = lifting.window.advance(window, u)
         return self.estimate

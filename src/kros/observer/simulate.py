@@ -34,7 +34,9 @@ def run_observer(observer: Observer, y: Array, u: Array, parameters: Mapping[str
             f"Running observer {observer.name}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch)."
         )
     lifting, n_samples, batch = observer.lifting, *y.shape[:2]
-    n, n_lifted, order, m = lifting.n_states, lifting.n_lifted, observer.controller.n_states, u.shape[2]
+    n, n_lifted, order, m = lifting.n_states, lifting.n_lifted, observer.controller.n_states, observer.B.shape[1]
+    if u.shape[2] != len(observer.inputs):
+        raise DimensionError(f"Running observer {observer.name}: expected inputs {observer.inputs}, found shape {u.shape}.")
     values = {**observer.parameters, **(parameters or {})}
     step = np.ascontiguousarray(observer.one_step.T)
     # One row a machine: [theta, x^c, u, y]. The product gives [x_hat+, x^c+].
@@ -43,11 +45,19 @@ def run_observer(observer: Observer, y: Array, u: Array, parameters: Mapping[str
     row[:, :n] = observer.initial(y[0])
     estimates = np.empty((n_samples, batch, n))
     following = np.empty((batch, n + order))
+    plain = not (lifting.history or lifting.input_functions)
+    earlier = lifting.window.hold(row[:, :n], u[0])
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(n_samples):
             estimates[k] = row[:, :n]
-            lifting.lift_into(lifted, values)
-            row[:, n_lifted + order : n_lifted + order + m] = u[k]
+            if plain:
+                lifting.lift_into(lifted, values)
+                row[:, n_lifted + order : n_lifted + order + m] = u[k]
+            else:
+                window = np.concatenate([row[:, :n], earlier], axis=-1)
+                lifting.lift_into(lifted, values, earlier)
+                row[:, n_lifted + order : n_lifted + order + m] = lifting.lift_inputs(u[k], window, values)
+                earlier = lifting.window.advance(window, u[k])
             row[:, n_lifted + order + m :] = y[k]
             np.matmul(row, step, out=following)
             row[:, :n] = following[:, :n]

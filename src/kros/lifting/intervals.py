@@ -1,0 +1,194 @@
+"""Interval arithmetic on SymPy trees: bounds that hold everywhere in a box.
+
+Intervals are pairs of arrays, one entry a piece of the box: the box is cut along its finite sides, and the bounds of a tree are the union
+over the pieces, which makes them tight where a quantity appears several times. Rounding is covered by a relative widening at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError
+
+Array = npt.NDArray[np.float64]
+Interval = tuple[Array, Array]
+Box = Mapping[str, Any]
+
+_PIECES = 4096
+_WIDENING = 1e-12
+_REALS = (-np.inf, np.inf)
+
+
+def bounds_of(expressions: Sequence[Any], box: Box) -> tuple[Array, Array]:
+    """Return lower and upper bounds of expressions over a box, each of shape (len(expressions),).
+
+    Parameters
+    ----------
+    expressions : sequence of SymPy trees
+    box : mapping of str to (lower, upper) or number
+        Ranges of quantities; what is not named may be anything. An earlier value, ``position[-1]``, has the range of its quantity.
+
+    Raises
+    ------
+    ConfigError
+        When a range is empty or not a number.
+    """
+    ranges = {name: _range(name, value) for name, value in box.items()}
+    with np.errstate(all="ignore"):
+        found = [_bounds(expression, ranges) for expression in expressions]
+    lower, upper = np.array([f[0] for f in found]), np.array([f[1] for f in found])
+    return lower - _WIDENING * np.abs(np.where(np.isfinite(lower), lower, 0.0)), upper + _WIDENING * np.abs(
+        np.where(np.isfinite(upper), upper, 0.0)
+    )
+
+
+def _range(name: str, value: Any) -> tuple[float, float]:
+    low, high = (float(v) for v in (value if np.ndim(value) else (value, value)))
+    if not low <= high:
+        raise ConfigError(f"Bounds: the range of {name!r} is [{low:g}, {high:g}]; give a lower and an upper number in this order.")
+    return low, high
+
+
+def _bounds(expression: Any, ranges: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
+    names = sorted(symbol.name for symbol in expression.free_symbols)
+    sides = {name: ranges.get(name, ranges.get(name.partition("[")[0], _REALS)) for name in names}
+    low, high = _walk(expression, _pieces(sides))
+    return float(np.min(low)), float(np.max(high))
+
+
+def _pieces(sides: Mapping[str, tuple[float, float]]) -> dict[str, Interval]:
+    """Cut a box along its finite sides; entries of the result have the shape (pieces,)."""
+    finite = [name for name, (low, high) in sides.items() if np.isfinite([low, high]).all() and low < high]
+    count = max(2, int(_PIECES ** (1 / len(finite)))) if 0 < len(finite) <= np.log2(_PIECES) else 1
+    grid = np.indices((count,) * len(finite)).reshape(len(finite), count ** len(finite))
+    pieces: dict[str, Interval] = {}
+    for name, (low, high) in sides.items():
+        if name in finite:
+            edges = np.linspace(low, high, count + 1)
+            cell = grid[finite.index(name)]
+            pieces[name] = edges[cell], edges[cell + 1]
+        else:
+            pieces[name] = np.full(1, low), np.full(1, high)
+    return pieces
+
+
+def _walk(expression: Any, values: Mapping[str, Interval]) -> Interval:
+    import sympy as sp
+
+    if expression.is_Symbol:
+        return values[expression.name]
+    if expression.is_number:
+        number = np.full(1, float(expression))
+        return number, number
+    if isinstance(expression, sp.Add | sp.Mul):
+        combine = _add if isinstance(expression, sp.Add) else _multiply
+        result, *rest = (_walk(argument, values) for argument in expression.args)
+        for other in rest:
+            result = combine(result, other)
+        return result
+    if isinstance(expression, sp.Pow) and expression.exp.is_number:
+        return _power(_walk(expression.base, values), expression.exp)
+    function = _FUNCTIONS.get(type(expression).__name__)
+    if function is None:
+        raise ConfigError(f"Bounds of {expression}: nothing is known about {type(expression).__name__}; use functions that formulas know.")
+    return function(*_walk(expression.args[0], values))
+
+
+def _add(a: Interval, b: Interval) -> Interval:
+    return _or_reals(a[0] + b[0], a[1] + b[1])
+
+
+def _multiply(a: Interval, b: Interval) -> Interval:
+    products = [np.where((x == 0) | (y == 0), 0.0, x * y) for x in a for y in b]
+    return np.minimum.reduce(products), np.maximum.reduce(products)
+
+
+def _power(base: Interval, exponent: Any) -> Interval:
+    if exponent.is_negative:
+        return _reciprocal(_power(base, -exponent))
+    low, high = base
+    if exponent == int(exponent):
+        a, b = low ** int(exponent), high ** int(exponent)
+        if int(exponent) % 2:
+            return a, b
+        return np.where((low <= 0) & (high >= 0), 0.0, np.minimum(a, b)), np.maximum(a, b)
+    # A root exists for positive numbers only; where there are none, nothing is promised.
+    p = float(exponent)
+    return _where_defined(high >= 0, np.maximum(low, 0.0) ** p, np.maximum(high, 0.0) ** p)
+
+
+def _reciprocal(a: Interval) -> Interval:
+    low, high = a
+    through = (low < 0) & (high > 0)
+    lower = np.where(through | (high == 0), -np.inf, 1 / np.where(high == 0, 1.0, high))
+    upper = np.where(through | (low == 0), np.inf, 1 / np.where(low == 0, 1.0, low))
+    return np.where((low == 0) & (high == 0), -np.inf, lower), np.where((low == 0) & (high == 0), np.inf, upper)
+
+
+def _or_reals(low: Array, high: Array) -> Interval:
+    """Replace bounds that are not numbers, as of inf - inf, by no bound."""
+    return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+
+
+def _where_defined(defined: npt.NDArray[np.bool_], low: Array, high: Array) -> Interval:
+    return np.where(defined, low, -np.inf), np.where(defined, high, np.inf)
+
+
+def _sine(low: Array, high: Array) -> Interval:
+    def touches(phase: float) -> npt.NDArray[np.bool_]:
+        """Whether the interval holds phase + 2 pi k for some k; a hair wider than it is."""
+        slack = 1e-15 * (np.abs(low) + np.abs(high)) + 1e-15
+        turns = np.floor((high + slack - phase) / (2 * np.pi))
+        return ~(turns < np.ceil((low - slack - phase) / (2 * np.pi)))
+
+    ends = np.sin(np.where(np.isfinite(low), low, 0.0)), np.sin(np.where(np.isfinite(high), high, 0.0))
+    endless = ~(np.isfinite(low) & np.isfinite(high))
+    return (
+        np.where(endless | touches(-np.pi / 2), -1.0, np.minimum(*ends)),
+        np.where(endless | touches(np.pi / 2), 1.0, np.maximum(*ends)),
+    )
+
+
+def _cosine(low: Array, high: Array) -> Interval:
+    return _sine(low + np.pi / 2, high + np.pi / 2)
+
+
+def _tangent(low: Array, high: Array) -> Interval:
+    branch = np.floor(low / np.pi + 0.5), np.floor(high / np.pi + 0.5)
+    inside = (branch[0] == branch[1]) & np.isfinite(low) & np.isfinite(high) & (np.tan(low) <= np.tan(high))
+    return _where_defined(inside, np.tan(low), np.tan(high))
+
+
+def _logarithm(low: Array, high: Array) -> Interval:
+    return _where_defined(high > 0, np.log(np.maximum(low, 0.0)), np.log(np.maximum(high, np.finfo(float).tiny)))
+
+
+def _magnitude(low: Array, high: Array) -> Interval:
+    return np.where((low <= 0) & (high >= 0), 0.0, np.minimum(np.abs(low), np.abs(high))), np.maximum(np.abs(low), np.abs(high))
+
+
+def _spike(low: Array, high: Array) -> Interval:
+    """Slope of a jump: zero away from it, unbounded at it."""
+    return np.zeros_like(low), np.where((low <= 0) & (high >= 0), np.inf, 0.0)
+
+
+def _rising(function: Callable[[Array], Array]) -> Callable[[Array, Array], Interval]:
+    return lambda low, high: (function(low), function(high))
+
+
+_FUNCTIONS: dict[str, Callable[[Array, Array], Interval]] = {
+    "sin": _sine,
+    "cos": _cosine,
+    "tan": _tangent,
+    "exp": _rising(np.exp),
+    "log": _logarithm,
+    "tanh": _rising(np.tanh),
+    "atan": _rising(np.arctan),
+    "sign": _rising(np.sign),
+    "Abs": _magnitude,
+    "DiracDelta": _spike,
+}

@@ -1,0 +1,320 @@
+"""Delays and input functions: windows, free runs, observers and factors against plain loops over samples."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError, DataError, DimensionError
+from kros.core.lti import StateSpace
+from kros.data import Channel, Role, from_arrays
+from kros.evaluate import EpisodeBatch
+from kros.identify import ModelSet, combine, edmd, free_run, lifted_factor, reduce_episode
+from kros.identify.factors import Factor
+from kros.lifting import Lifting
+from kros.observer import Observer, run_observer
+from kros.synthesis import Injection
+
+STATES, INPUTS = ("position", "current"), ("voltage", "target")
+DELAYED = Lifting(
+    STATES,
+    ("sin(3*position + phase)", "position[-2]", "current[-1]*voltage[-3]"),
+    ("phase",),
+    INPUTS,
+    ("current*voltage", "cos(position[-1] + phase)*target"),
+)
+
+
+def by_hand(x, u, k, phase):
+    """Lifted states and lifted inputs at sample k, written out."""
+    theta = [*x[k], np.sin(3 * x[k, 0] + phase), x[k - 2, 0], x[k - 1, 1] * u[k - 3, 0]]
+    return np.array(theta), np.array([*u[k], x[k, 1] * u[k, 0], np.cos(x[k - 1, 0] + phase) * u[k, 1]])
+
+
+def recording(n_samples=40, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(n_samples, 2)), rng.normal(size=(n_samples, 2))
+
+
+def test_windows_hold_what_the_formulas_read():
+    assert DELAYED.history == 3
+    assert DELAYED.window.names == (
+        *STATES,
+        "position[-1]",
+        "position[-2]",
+        "current[-1]",
+        "voltage[-1]",
+        "voltage[-2]",
+        "voltage[-3]",
+    )
+    x, u = recording()
+    windows = DELAYED.windows(x, u)
+    assert windows.shape == (37, 8)
+    for k in range(3, 40):
+        theta, lifted_u = by_hand(x, u, k, 0.4)
+        np.testing.assert_allclose(DELAYED.lift(windows[k - 3], {"phase": 0.4}), theta, rtol=1e-14)
+        np.testing.assert_allclose(DELAYED.lift_inputs(u[k], windows[k - 3], {"phase": 0.4}), lifted_u, rtol=1e-14)
+
+
+def test_advancing_a_window_is_sliding_it():
+    x, u = recording()
+    windows = DELAYED.windows(x, u)
+    for k in range(36):
+        np.testing.assert_array_equal(DELAYED.window.advance(windows[k], u[k + 3]), windows[k + 1, 2:])
+
+
+def test_a_plain_lifting_has_no_history_and_passes_inputs_through():
+    plain = Lifting(STATES, ("sin(position)",))
+    x, u = recording()
+    assert (plain.history, plain.window.names) == (0, STATES)
+    assert plain.windows(x, u) is x
+    assert plain.lift_inputs(u, x) is u
+
+
+def test_the_jacobian_has_a_column_for_every_entry_of_the_window():
+    x, u = recording()
+    windows = DELAYED.windows(x, u)[:5]
+    jacobian = DELAYED.jacobian(windows, {"phase": 0.1})
+    assert jacobian.shape == (5, 5, 8)
+    for j in range(8):
+        step = 1e-6 * np.eye(8)[j]
+        slope = (DELAYED.lift(windows + step, {"phase": 0.1}) - DELAYED.lift(windows - step, {"phase": 0.1})) / 2e-6
+        np.testing.assert_allclose(jacobian[..., j], slope, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_free_run_equals_a_plain_loop(shared):
+    rng = np.random.default_rng(1)
+    A, B = 0.3 * rng.normal(size=(3, 5, 5)), 0.3 * rng.normal(size=(3, 5, 4))
+    if shared:
+        A, B = A[0], B[0]
+    x0, u, phases = rng.normal(size=(3, 4, 2)), rng.normal(size=(3, 30, 2)), np.array([0.0, 1.0, 2.0])
+    found = free_run(A, B, DELAYED, {"phase": phases}, x0, u)
+    for i in range(3):
+        x = np.zeros((30, 2))
+        x[:4] = x0[i]
+        for k in range(3, 29):
+            theta, lifted_u = by_hand(x, u[i], k, phases[i])
+            x[k + 1] = ((A if shared else A[i]) @ theta + (B if shared else B[i]) @ lifted_u)[:2]
+        np.testing.assert_allclose(found[i], x, rtol=1e-11, atol=1e-12)
+
+
+def test_a_free_run_needs_the_history():
+    A, B = np.eye(5), np.ones((5, 4))
+    with pytest.raises(DimensionError, match="with a history of 3 samples and 4 inputs"):
+        free_run(A, B, DELAYED, {"phase": 0.0}, np.zeros((1, 2)), np.zeros((1, 9, 2)))
+    with pytest.raises(DimensionError, match="and 4 inputs"):
+        free_run(A, B[:, :2], DELAYED, {"phase": 0.0}, np.zeros((1, 4, 2)), np.zeros((1, 9, 2)))
+    with pytest.raises(DataError, match="at least 4 samples for the delay of 3 in 'voltage', found 3"):
+        free_run(A, B, DELAYED, {"phase": 0.0}, np.zeros((1, 4, 2)), np.zeros((1, 3, 2)))
+
+
+def test_factors_give_the_models_of_plain_least_squares():
+    """Two units of two episodes each, one of them as long as the history allows."""
+    rng = np.random.default_rng(2)
+    phases = np.array([0.3, 2.0])
+    episodes = [[recording(60, seed=10 * i + j) for j in range(2)] + [recording(5, seed=99 + i)] for i in range(2)]
+    reduced = [[reduce_episode(x, u, DELAYED) for x, u in unit] for unit in episodes]
+    factor = Factor.stack([combine(Factor.stack(unit)) for unit in reduced])
+    lifted = lifted_factor(factor, DELAYED, {"phase": phases}, DELAYED)
+    alpha = float(rng.uniform(0.1, 1))
+    found = edmd(lifted.R, 5, alpha)
+    linear = edmd(lifted_factor(factor, DELAYED, {"phase": phases}, Lifting(STATES)).R, 2)
+    assert factor.n_samples.tolist() == [2 * 56 + 1] * 2
+    for i, unit in enumerate(episodes):
+        rows, after, plain, plain_after = [], [], [], []
+        for x, u in unit:
+            for k in range(3, len(x) - 1):
+                rows.append(np.concatenate(by_hand(x, u, k, phases[i])))
+                after.append(by_hand(x, u, k + 1, phases[i])[0])
+                plain.append([*x[k], *u[k]])
+                plain_after.append(x[k + 1])
+        Psi = np.array(rows)
+        U = np.linalg.solve(Psi.T @ Psi + alpha * np.eye(9), Psi.T @ np.array(after)).T
+        np.testing.assert_allclose(np.hstack([found.A[i], found.B[i]]), U, rtol=1e-9, atol=1e-10)
+        assert np.all(lifted.peak[i] >= np.abs(Psi).max(axis=0) - 1e-12)
+        L = np.linalg.lstsq(np.array(plain), np.array(plain_after), rcond=None)[0].T
+        np.testing.assert_allclose(np.hstack([linear.A[i], linear.B[i]]), L, rtol=1e-9, atol=1e-10)
+        u_all = np.concatenate([u[3:] for _, u in unit])
+        np.testing.assert_array_equal(factor.input_range[i], [u_all.min(axis=0), u_all.max(axis=0)])
+
+
+def test_an_episode_shorter_than_the_history_is_refused():
+    x, u = recording(4)
+    with pytest.raises(DataError, match="at least 5 samples for the delay of 3 in 'voltage', found 4"):
+        reduce_episode(x, u, DELAYED)
+    with pytest.raises(DimensionError, match=r"expected 2 inputs \('voltage', 'target'\)"):
+        reduce_episode(*recording(9)[:1], np.zeros((9, 3)), DELAYED)
+
+
+def test_a_bilinear_system_with_a_delay_is_found_exactly():
+    """x+ = 0.9 x + 0.1 sin(x[-2]) + 0.2 u + 0.3 x u: the model is the system, and its free run is the recording."""
+    rng = np.random.default_rng(3)
+    u = rng.uniform(-1, 1, size=(300, 1))
+    x = np.zeros((300, 1))
+    x[:3, 0] = [0.5, -0.2, 0.1]
+    for k in range(2, 299):
+        x[k + 1] = 0.9 * x[k] + 0.1 * np.sin(x[k - 2]) + 0.2 * u[k] + 0.3 * x[k] * u[k]
+    lifting = Lifting(("x",), ("sin(x[-2])",), (), ("u",), ("x*u",))
+    model = edmd(lifted_factor(reduce_episode(x, u, lifting), lifting, {}, lifting).R, 2)
+    np.testing.assert_allclose(model.A[0], [0.9, 0.1], atol=1e-12)
+    np.testing.assert_allclose(model.B[0], [0.2, 0.3], atol=1e-12)
+    np.testing.assert_allclose(free_run(model.A, model.B, lifting, {}, x[None, :3], u[None])[0], x, atol=1e-11)
+
+
+def observer(injection=Injection.STATE, order=2, seed=0):
+    rng = np.random.default_rng(seed)
+    width = 5 if injection is Injection.STATE else 4
+    K = StateSpace(
+        0.3 * rng.normal(size=(order, order)),
+        rng.normal(size=(order, 1)),
+        rng.normal(size=(width, order)),
+        0.1 * rng.normal(size=(width, 1)),
+        0.01,
+    )
+    A, B = 0.2 * rng.normal(size=(5, 5)), 0.3 * rng.normal(size=(5, 4))
+    return Observer("koopman/test", DELAYED, A, B, (0,), INPUTS, K, injection, 0.01, {"phase": 0.3})
+
+
+@pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
+@pytest.mark.parametrize("order", [0, 2])
+def test_batched_and_single_observers_equal_the_equations(injection, order):
+    o = observer(injection, order)
+    rng = np.random.default_rng(1)
+    y, u, phases = rng.normal(size=(30, 3, 1)), rng.normal(size=(30, 3, 2)), np.array([0.0, 1.0, 2.0])
+    batched = run_observer(o, y, u, {"phase": phases})
+    for i, phase in enumerate(phases):
+        # Before the start, states and inputs are those of the start: three samples are put in front.
+        x = np.zeros((33, 2))
+        x[:4, 0] = y[0, i, 0]
+        held = np.concatenate([np.repeat(u[:1, i], 3, axis=0), u[:, i]])
+        xc = np.zeros(order)
+        for k in range(3, 32):
+            nu = y[k - 3, i] - x[k, :1]
+            yc = o.controller.C @ xc + o.controller.D @ nu
+            theta, lifted_u = by_hand(x, held, k, phase)
+            following = o.A @ theta + (o.B @ (lifted_u + yc) if injection is Injection.INPUT else o.B @ lifted_u + yc)
+            xc = o.controller.A @ xc + o.controller.B @ nu
+            x[k + 1] = following[:2]
+        np.testing.assert_allclose(batched[:, i], x[3:], rtol=1e-10, atol=1e-10)
+        running = o.start(y[0, i], {"phase": phase})
+        stepped = [running.estimate] + [running.step(y[k, i], u[k, i]) for k in range(29)]
+        np.testing.assert_allclose(stepped, x[3:], rtol=1e-10, atol=1e-10)
+
+
+def test_reset_forgets_the_history():
+    o = observer()
+    running = o.start([0.5])
+    first = [running.step([0.4], [1.0, 2.0]), running.step([0.1], [0.0, 1.0])]
+    running.reset([0.5])
+    np.testing.assert_array_equal([running.step([0.4], [1.0, 2.0]), running.step([0.1], [0.0, 1.0])], first)
+
+
+@pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
+def test_the_observer_file_holds_delays_and_input_functions(tmp_path, injection):
+    o = observer(injection)
+    o.save(tmp_path / "o.json")
+    again = Observer.load(tmp_path / "o.json")
+    assert (again.lifting, again.inputs) == (DELAYED, INPUTS)
+    y, u = np.random.default_rng(5).normal(size=(20, 2, 1)), np.random.default_rng(6).normal(size=(20, 2, 2))
+    np.testing.assert_array_equal(run_observer(again, y, u), run_observer(o, y, u))
+
+
+def test_observers_refuse_inputs_that_do_not_fit():
+    o = observer()
+    with pytest.raises(DimensionError, match="expected inputs"):
+        run_observer(o, np.zeros((5, 1, 1)), np.zeros((5, 1, 4)))
+    with pytest.raises(DimensionError, match="2 functions of them need as many columns of B, found 2"):
+        Observer("x", DELAYED, o.A, o.B[:, :2], (0,), INPUTS, o.controller, Injection.STATE, 0.01)
+
+
+def test_models_survive_the_disk(tmp_path):
+    channels = (
+        Channel("position", Role.STATE, "rad", True),
+        Channel("current", Role.STATE, "A"),
+        Channel("voltage", Role.INPUT, "V"),
+        Channel("target", Role.INPUT, "rad"),
+    )
+    rng = np.random.default_rng(7)
+    models = ModelSet(
+        name="koopman_edmd",
+        condition="noload",
+        lifting=DELAYED,
+        channels=channels,
+        sample_period_s=0.01,
+        unit_ids=("1",),
+        A=rng.normal(size=(1, 5, 5)),
+        B=rng.normal(size=(1, 5, 4)),
+        parameters={"phase": np.array([0.4])},
+        residual_covariance=np.eye(5)[None],
+        output_scale=np.ones(5),
+        input_scale=np.ones(4),
+    )
+    models.save(tmp_path)
+    again = ModelSet.load(tmp_path)
+    assert again.lifting == DELAYED
+    assert again.recorded_inputs == INPUTS
+    assert again.inputs == (*INPUTS, "current*voltage", "cos(position[-1] + phase)*target")
+    assert again.units == ("rad", "A", "1", "rad", "A·V")
+    assert again.input_units == ("V", "rad", "A·V", "rad")
+    assert again.systems().n_inputs == 4
+    assert pickle.loads(pickle.dumps(DELAYED)) == DELAYED
+
+
+def test_free_runs_start_from_the_first_recorded_samples():
+    rng = np.random.default_rng(8)
+    channels = [Channel(n, Role.STATE, "", True) for n in STATES] + [Channel(n, Role.INPUT) for n in INPUTS]
+    values = {str(i): rng.normal(size=(length, 4)) for i, length in enumerate((30, 20))}
+    population = from_arrays({"1": {"default": values}}, channels, 0.01)
+    batch = EpisodeBatch.read(population, population.episodes)
+    np.testing.assert_array_equal(batch.first_states(DELAYED)[1], values["1"][:4, :2])
+    np.testing.assert_array_equal(batch.first_states(Lifting(STATES)), batch.states[0])
+    short = EpisodeBatch.read(population, population.episodes, 3)
+    with pytest.raises(DataError, match=r"episode 0 of unit 1 .*: needs 4 samples for delays of up to 3, found 3"):
+        short.first_states(DELAYED)
+
+
+@pytest.mark.parametrize(
+    ("functions", "message"),
+    [
+        (("position[1]",), "is not an earlier value"),
+        (("position[0]",), "is not an earlier value"),
+        (("position[-0]",), "is not an earlier value"),
+        (("position[-1.5]",), "whole number of samples"),
+        (("position[-True]",), "whole number of samples"),
+        (("position[phase]",), "whole number of samples"),
+        (("position[-1:]",), "whole number of samples"),
+        (("position[-1001]",), "too deep; at most 1000"),
+        (("phase[-1]",), "only position, current, voltage, target have earlier values"),
+        (("speed[-1]",), "there is no speed"),
+        (("sin(position)[-1]",), "is not allowed"),
+        (("voltage*position",), "present input voltage"),
+        (("position[-1]", "1*position[-1]"), "repeat"),
+        (("position*position", "position**2"), "repeat"),
+        (("position",), "is 'position' itself"),
+        (("position[-1] - position[-1]",), "depends on no state"),
+    ],
+)
+def test_bad_delays_are_refused(functions, message):
+    with pytest.raises(ConfigError, match=message.replace("(", r"\(")):
+        Lifting(STATES, functions, ("phase",), INPUTS)
+
+
+def test_bad_input_functions_are_refused():
+    with pytest.raises(ConfigError, match="depends on no input"):
+        Lifting(STATES, (), (), INPUTS, ("position**2",))
+    with pytest.raises(ConfigError, match="is 'voltage' itself"):
+        Lifting(STATES, (), (), INPUTS, ("voltage",))
+    with pytest.raises(ConfigError, match="repeat"):
+        Lifting(STATES, (), (), INPUTS, ("voltage*position", "position*voltage"))
+    with pytest.raises(ConfigError, match="unknown name 'voltage'"):
+        Lifting(STATES, (), (), (), ("voltage*position",))
+    with pytest.raises(ConfigError, match="rename"):
+        Lifting(STATES, (), (), ("position",))
+
+
+def test_missing_earlier_values_are_named():
+    with pytest.raises(DimensionError, match=r"earlier values \('position\[-1\]'"):
+        DELAYED.lift_into(np.zeros((2, 5)), {"phase": 0.0})
+    with pytest.raises(DimensionError, match="expected 8 entries of a window"):
+        DELAYED.lift(np.zeros((2, 2)), {"phase": 0.0})

@@ -1,1 +1,44 @@
-"""Bridges to pykoop, scikit-learn and python-control."""
+"""Bridges to scikit-learn, pykoop and python-control. Each is imported when one of its names is first used."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .control import UncertaintyForControl, from_control, models_to_control, to_control, uncertainty_to_control
+    from .pykoop import AdoptedModel, from_pykoop, models_from_pykoop
+    from .sklearn_estimator import KoopmanRegressor, one_step_pairs
+
+_HOME = {
+    **dict.fromkeys(("UncertaintyForControl", "from_control", "models_to_control", "to_control", "uncertainty_to_control"), "control"),
+    **dict.fromkeys(("AdoptedModel", "from_pykoop", "models_from_pykoop"), "pykoop"),
+    **dict.fromkeys(("KoopmanRegressor", "one_step_pairs"), "sklearn_estimator"),
+}
+
+__all__ = [
+    "AdoptedModel",
+    "KoopmanRegressor",
+    "UncertaintyForControl",
+    "from_control",
+    "from_pykoop",
+    "models_from_pykoop",
+    "models_to_control",
+    "one_step_pairs",
+    "to_control",
+    "uncertainty_to_control",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the module behind a public name when it is first asked for."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f".{_HOME[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,426 @@
+"""Identification of one Koopman model as a scikit-learn regressor, for pipelines, grid searches and cross-validation.
+
+    rows (x_k, u_k) ──► lifting ──► [theta(x_k) u_k] ──► [A B] ──► x_{k+1}          predict: one row, one step
+                           ▲                               │
+                           └───────────── x ◄──────────────┘                        predict_trajectory: retract and re-lift
+
+One model is fitted to all rows, of whatever unit. A batch of units with a model each, and the uncertainty between them, is what
+`kros.data.Population` and the stages after it are for.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError, DataError, IdentificationError, MissingDependencyError
+from ..core.lti import StateSpace
+from ..identify import edmd, free_run
+from ..identify.factors import triangular
+from ..lifting import Lifting
+from .rows import Columns, episode_edges, finite, is_whole, log_forgotten_episodes, split_columns
+
+try:
+    from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+    from sklearn.metrics import r2_score
+    from sklearn.utils.validation import check_array, check_is_fitted, validate_data
+except ImportError as error:
+    raise MissingDependencyError(
+        "KoopmanRegressor needs scikit-learn 1.6 or newer; install it (pip install 'kros[sklearn]'), or identify with kros.identify."
+    ) from error
+
+log = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
+
+_DEPENDENT = 1e-13  # columns that are sums of others left relative pivots of 1e-18 to 2e-15 over 10 to 100 000 rows
+_SCORED_ROWS = 2  # R2 compares with a mean
+
+
+class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """Koopman (or linear) model from rows of states and inputs to the next states.
+
+    EDMD with Tikhonov regularisation (30)-(33): ``min ||theta(x+) - [A B][theta(x); u]||^2 + alpha ||[A B]||^2``, with ``theta(x)`` the
+    states followed by the lifted functions. There is no intercept.
+
+    ===========================  ==================================================================================
+    ``X`` alone                  rows in order of time; each row is paired with the next one of its episode
+    ``X`` and ``y``              rows pair up: ``y[k]`` is the next state of ``X[k]``; their order means nothing
+    columns of an array          [episode,] states, inputs (as in pykoop)
+    columns of a DataFrame       states, inputs; a column named ``episode`` is the episode wherever it stands
+    ===========================  ==================================================================================
+
+    Episode ids are whole numbers or text. Rows of an episode have to stand together and are never sorted. Where `y` is given, episodes and
+    time are ignored.
+
+    Parameters
+    ----------
+    functions : sequence of str
+        Lifted functions as formulas of the states, such as ``"sin(100*position)"``; none for a linear model.
+    states : sequence of str, optional
+        Names of the states, which the formulas use. A DataFrame has to begin with columns of these names. Default: the names of the
+        DataFrame, else ``x0, x1, ...``.
+    n_inputs : int, optional
+        How many of the last columns are inputs. Default: what `states` leave over, else what the columns of `y` leave over, else none.
+    alpha : float
+        Tikhonov coefficient, added to the unnormalised Gram matrix; zero for plain least squares.
+    episode_feature : bool
+        Whether the first column of an array is the episode.
+    time : str or int, optional
+        Column of time, by name or by position in an array. Time is checked (increasing, in even steps), and is no state.
+    horizon : int or None
+        `score` compares predictions this many samples ahead, from every sample, with the recorded inputs; None: the free run of the
+        whole episode from its first state.
+
+    Attributes
+    ----------
+    A_ : ndarray, shape (n_lifted, n_lifted)
+    B_ : ndarray, shape (n_lifted, n_inputs)
+    lifting_ : Lifting
+    state_names_, input_names_ : tuple of str
+    n_pairs_ : int
+        Transitions that the model was fitted to.
+    n_features_in_ : int
+        Columns of `X`, episode and time included.
+    feature_names_in_ : ndarray of str
+        Column names of `X`, where it was a DataFrame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.interop import KoopmanRegressor
+    >>> x = [0.9]
+    >>> for _ in range(60):
+    ...     x.append(1.2 * np.sin(x[-1]) + 0.1 * x[-1])
+    >>> model = KoopmanRegressor(["sin(x0)"], horizon=None).fit(np.array(x)[:, None])
+    >>> model.A_[0].round(6)
+    array([0.1, 1.2])
+    >>> round(model.score(np.array(x)[:, None]), 9)
+    1.0
+    """
+
+    def __init__(
+        self,
+        functions: Sequence[str] = (),
+        *,
+        states: Sequence[str] | None = None,
+        n_inputs: int | None = None,
+        alpha: float = 0.0,
+        episode_feature: bool = False,
+        time: str | int | None = None,
+        horizon: int | None = 1,
+    ) -> None:
+        self.functions = functions
+        self.states = states
+        self.n_inputs = n_inputs
+        self.alpha = alpha
+        self.episode_feature = episode_feature
+        self.time = time
+        self.horizon = horizon
+
+    # ------------------------------------------------------------------------------------------------------- identification
+
+    def fit(self, X: Any, y: Any = None, groups: npt.ArrayLike | None = None) -> Self:
+        """Fit one model to all rows.
+
+        Parameters
+        ----------
+        X : array_like or DataFrame, shape (n_samples, n_columns)
+        y : array_like, shape (n_samples, n_states) or (n_samples,), optional
+            Next states. Default: the next row of the same episode.
+        groups : array_like, shape (n_samples,), optional
+            Ids of units; an episode ends where the unit changes. There is still one model for all.
+
+        Returns
+        -------
+        KoopmanRegressor
+            Itself.
+
+        Raises
+        ------
+        DataError
+            Rows that cannot be used as they are: NaN, ids that rounding may have merged, an interleaved or a too short episode,
+            unsorted time. Also a ValueError.
+        ConfigError
+            A parameter or a formula that is not valid.
+        IdentificationError
+            With ``alpha = 0``, a function or input that depends on the others or does not vary; the message names it.
+        """
+        self._check_parameters()
+        columns, values = self._read(X, reset=True)
+        target = None if y is None else self._read_target(y, len(values))
+        self._one_dimensional = target is not None and target.ndim == 1
+        target = None if target is None else target.reshape(len(values), -1)
+        self._name_columns(columns, values.shape[1], None if target is None else target.shape[1])
+        values = finite(values, self.state_names_ + self.input_names_, "Input X")
+        if target is None:
+            edges = episode_edges(columns, groups, len(values))
+            if columns.episodes is None:
+                log_forgotten_episodes(values, self.state_names_[0])
+            now = np.delete(np.arange(len(values)), edges[1:] - 1)
+            before, after = values[now], values[now + 1, : self._n_states]
+        else:
+            before, after = values, target
+        self._identify(before, after)
+        return self
+
+    def _identify(self, before: Array, after: Array) -> None:
+        n, n_lifted = self._n_states, self.lifting_.n_lifted
+        names = (*self.lifting_.names, *self.input_names_)
+        rows = np.concatenate([self._lift(before[:, :n]), before[:, n:], self._lift(after)], axis=1)
+        R = triangular(rows)
+        if self.alpha == 0:
+            _check_excitation(R[: len(names), : len(names)], names, len(self.state_names_), n_lifted, len(rows))
+        matrices = edmd(R, n_lifted, self.alpha)
+        self.A_, self.B_, self.n_pairs_ = matrices.A, matrices.B, len(rows)
+
+    def _lift(self, x: Array) -> Array:
+        with np.errstate(all="ignore"):
+            lifted = self.lifting_.lift(x)
+        return finite(lifted, self.lifting_.names, "A lifted function of X is not defined everywhere: the lifted X")
+
+    # ----------------------------------------------------------------------------------------------------------- prediction
+
+    def predict(self, X: Any) -> Array:
+        """Predict the next state of every row.
+
+        Parameters
+        ----------
+        X : array_like or DataFrame, shape (n_samples, n_columns)
+            Columns as in `fit`. Rows are taken one by one: neither their order nor their episodes matter.
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_states)
+            Row k is the state one step after row k. Of shape (n_samples,) where `fit` was given a `y` of one dimension.
+        """
+        check_is_fitted(self)
+        _, values = self._read(X, reset=False)
+        values = finite(values, self.state_names_ + self.input_names_, "Input X")
+        predicted = self._step(values[:, : self._n_states], values[:, self._n_states :])
+        return predicted[:, 0] if self._one_dimensional else predicted
+
+    def predict_trajectory(self, X: Any, groups: npt.ArrayLike | None = None) -> Array:
+        """Predict whole episodes from their first state and the recorded inputs.
+
+        Parameters
+        ----------
+        X : array_like or DataFrame, shape (n_samples, n_columns)
+            Of the states only the first row of each episode is used; the state is retracted and lifted again at every step.
+        groups : array_like, shape (n_samples,), optional
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_states)
+            Row k belongs to row k of `X` (not to the one after it). A run that diverges holds infinities or NaN.
+        """
+        check_is_fitted(self)
+        columns, values = self._read(X, reset=False)
+        values = finite(values, self.state_names_ + self.input_names_, "Input X")
+        return self._free_run(values, episode_edges(columns, groups, len(values)))
+
+    def score(self, X: Any, y: Any = None) -> float:
+        """Return R2 of the prediction `horizon` samples ahead, the mean over the states.
+
+        Parameters
+        ----------
+        X : array_like or DataFrame, shape (n_samples, n_columns)
+        y : array_like, shape (n_samples, n_states), optional
+            Next states, only for ``horizon = 1``. Default: the rows of `X` themselves, later in the same episode.
+
+        Returns
+        -------
+        float
+            One for an exact model; minus infinity where the prediction diverges. Episodes of `horizon` samples and less add nothing.
+
+        Raises
+        ------
+        DataError
+            Fewer than two samples to compare with.
+        """
+        check_is_fitted(self)
+        self._check_parameters()
+        if y is not None:
+            if self.horizon != 1:
+                raise DataError(
+                    f"score: pairs of rows (X, y) allow one step, the horizon is {self.horizon}; leave out y, or set horizon = 1."
+                )
+            predicted = self.predict(X)
+            return _r2(self._read_target(y, len(predicted)), predicted)
+        columns, values = self._read(X, reset=False)
+        values = finite(values, self.state_names_ + self.input_names_, "Input X")
+        edges = episode_edges(columns, None, len(values))
+        truth = values[:, : self._n_states]
+        if self.horizon is None:
+            later = np.delete(np.arange(len(values)), edges[:-1])
+            return _r2(truth[later], self._free_run(values, edges)[later])
+        lengths = np.diff(edges)
+        start = np.flatnonzero(np.repeat(edges[1:], lengths) - np.arange(len(values)) > self.horizon)
+        x = truth[start]
+        for k in range(self.horizon):  # all rows at once
+            x = self._step(x, values[start + k, self._n_states :])
+        return _r2(truth[start + self.horizon], x)
+
+    def system(self, sample_period_s: float) -> StateSpace:
+        """Return the model as a linear system from inputs to lifted states."""
+        check_is_fitted(self)
+        n, m = self.B_.shape
+        return StateSpace(self.A_, self.B_, np.eye(n), np.zeros((n, m)), sample_period_s)
+
+    def _step(self, x: Array, u: Array) -> Array:
+        n = self._n_states
+        with np.errstate(all="ignore"):
+            return self.lifting_.lift(x) @ self.A_[:n].T + u @ self.B_[:n].T
+
+    def _free_run(self, values: Array, edges: npt.NDArray[np.int64]) -> Array:
+        """Run all episodes as one batch, the shorter ones on with zero inputs and then cut."""
+        n, lengths = self._n_states, np.diff(edges)
+        inside = np.arange(lengths.max()) < lengths[:, None]
+        inputs = np.zeros((*inside.shape, len(self.input_names_)))
+        inputs[inside] = values[:, n:]
+        return free_run(self.A_, self.B_, self.lifting_, {}, values[edges[:-1], :n], inputs)[inside]
+
+    # --------------------------------------------------------------------------------------------------------------- checks
+
+    @property
+    def _n_states(self) -> int:
+        return len(self.state_names_)
+
+    def _check_parameters(self) -> None:
+        for name, value in (("functions", self.functions), ("states", self.states)):
+            if isinstance(value, str):
+                raise ConfigError(f"KoopmanRegressor: {name} should be a list of texts, found the text {value!r}; write [{value!r}].")
+        if not isinstance(self.alpha, (int, float, np.number)) or not 0 <= float(self.alpha) < np.inf:
+            raise ConfigError(f"KoopmanRegressor: alpha should be a number of at least zero, found {self.alpha!r}.")
+        if self.n_inputs is not None and (not is_whole(self.n_inputs) or self.n_inputs < 0):
+            raise ConfigError(f"KoopmanRegressor: n_inputs should be a whole number of at least zero, found {self.n_inputs!r}.")
+        if self.horizon is not None and (not is_whole(self.horizon) or self.horizon < 1):
+            raise ConfigError(f"KoopmanRegressor: horizon should be a whole number of samples, or None, found {self.horizon!r}.")
+
+    def _read(self, X: Any, *, reset: bool) -> tuple[Columns, Array]:
+        """Return ids and numbers, after the checks that scikit-learn makes of every estimator."""
+        options = {"dtype": np.float64, "ensure_all_finite": False, "estimator": self, "input_name": "X"}
+        if (not self.episode_feature and self.time is None and not hasattr(X, "iloc")) or hasattr(X, "toarray"):
+            values = validate_data(self, X, reset=reset, dtype=np.float64, ensure_all_finite=False)
+            return Columns(values, None), values
+        columns = split_columns(X, episode_feature=self.episode_feature, time=self.time)
+        validate_data(self, X if hasattr(X, "iloc") else np.asarray(X), reset=reset, skip_check_array=True)
+        return columns, check_array(columns.values, **options)
+
+    def _read_target(self, y: Any, n_samples: int) -> Array:
+        target = check_array(y, dtype=np.float64, ensure_2d=False, ensure_all_finite=False, input_name="y", estimator=self)
+        if len(target) != n_samples:
+            raise DataError(f"X has {n_samples} rows and y has {len(target)}; y holds the next state of every row of X.")
+        rows = target.reshape(len(target), -1)
+        finite(rows, [str(i) for i in range(rows.shape[1])], "Target y")
+        return target
+
+    def _name_columns(self, columns: Columns, n_columns: int, n_targets: int | None) -> None:
+        n_states = self._count_states(n_columns, n_targets)
+        names = columns.names or tuple([f"x{i}" for i in range(n_states)] + [f"u{i}" for i in range(n_columns - n_states)])
+        if self.states is not None:
+            wanted = tuple(self.states)
+            if columns.names is not None and columns.names[:n_states] != wanted:
+                raise DataError(
+                    f"The states are {wanted}, the frame has the columns {columns.names}; reorder it so that the states come first and "
+                    "the inputs after them."
+                )
+            names = wanted + names[n_states:]
+        self.state_names_, self.input_names_ = names[:n_states], names[n_states:]
+        self.lifting_ = Lifting(self.state_names_, tuple(self.functions))
+
+    def _count_states(self, n_columns: int, n_targets: int | None) -> int:
+        """Return the number of states on which everything that was said agrees."""
+        said = {
+            f"n_inputs = {self.n_inputs}": None if self.n_inputs is None else n_columns - int(self.n_inputs),
+            f"states = {self.states}": None if self.states is None else len(self.states),
+            f"y with {n_targets} columns (next states)": n_targets,
+        }
+        counts = {text: count for text, count in said.items() if count is not None} or {"no inputs": n_columns}
+        found = set(counts.values())
+        count = min(found)
+        if len(found) > 1 or not 1 <= count <= n_columns:
+            raise DataError(
+                f"X has {n_columns} columns of states and inputs, which does not agree with {' and '.join(counts)}; "
+                "states and inputs should add up to the columns, without those of episode and time, and at least one is a state."
+            )
+        if n_targets is not None and self.n_inputs is None and self.states is None and count < n_columns:
+            log.info("the columns of y leave %d of the %d columns of X, which are taken as inputs", n_columns - count, n_columns)
+        return count
+
+    def __sklearn_tags__(self) -> Any:
+        """Return scikit-learn's facts about the estimator: no target is needed."""
+        tags = super().__sklearn_tags__()
+        tags.target_tags.required = False
+        return tags
+
+
+def _check_excitation(R: Array, names: Sequence[str], n_states: int, n_lifted: int, n_pairs: int) -> None:
+    """Name the first column that plain least squares cannot tell from those before it."""
+    if n_pairs < len(names):
+        raise DataError(
+            f"Found n_samples = {n_pairs} transitions for {len(names)} unknowns of every row of [A B] "
+            f"({', '.join(names)}); record more, lift less, or use alpha > 0."
+        )
+    norms = np.linalg.norm(R, axis=0)
+    dependent = np.flatnonzero(np.abs(np.diagonal(R)) <= _DEPENDENT * norms)
+    if dependent.size:
+        j = int(dependent[0])
+        kind = "state" if j < n_states else "lifted function" if j < n_lifted else "input"
+        why = "is zero throughout" if norms[j] == 0 else f"depends on the columns before it ({', '.join(names[:j])})"
+        raise IdentificationError(
+            f"With alpha = 0 the {kind} {names[j]!r} cannot be identified: it {why}; remove it, excite it, or use alpha > 0."
+        )
+
+
+def _r2(truth: Array, predicted: Array) -> float:
+    if len(truth) < _SCORED_ROWS:
+        raise DataError(
+            f"score: found {len(truth)} samples to compare with, R2 needs {_SCORED_ROWS}; pass longer episodes, or lower the horizon."
+        )
+    if not np.isfinite(predicted).all():
+        return -np.inf
+    return float(r2_score(truth, predicted))
+
+
+def one_step_pairs(
+    X: Any, *, n_inputs: int = 0, episode_feature: bool = False, time: str | int | None = None
+) -> tuple[Any, Array, npt.NDArray[np.int64]]:
+    """Return rows, their next states and their episode, which any splitter of scikit-learn may divide and shuffle.
+
+    Splitting the rows of a recording cuts episodes, and joins what is left across the cut; pairs have no such seam.
+
+    Parameters
+    ----------
+    X : array_like or DataFrame, shape (n_samples, n_columns)
+        As in `KoopmanRegressor.fit`.
+    n_inputs : int
+    episode_feature : bool
+    time : str or int, optional
+
+    Returns
+    -------
+    now : ndarray or DataFrame, shape (n_pairs, n_states + n_inputs)
+        Without the columns of episode and time.
+    after : ndarray, shape (n_pairs, n_states)
+    episode : ndarray, shape (n_pairs,)
+        Number of the episode, for splitters that take groups.
+
+    Raises
+    ------
+    DataError
+        As `KoopmanRegressor.fit`.
+    """
+    columns = split_columns(X, episode_feature=episode_feature, time=time)
+    values = check_array(columns.values, dtype=np.float64, ensure_all_finite=False, input_name="X")
+    n_states = values.shape[1] - n_inputs
+    if n_inputs < 0 or n_states < 1:
+        raise DataError(f"one_step_pairs: {values.shape[1]} columns cannot have {n_inputs} inputs; at least one column is a state.")
+    finite(values, columns.names or [str(i) for i in range(values.shape[1])], "Input X")
+    edges = episode_edges(columns, None, len(values))
+    now = np.delete(np.arange(len(values)), edges[1:] - 1)
+    rows = columns.values.iloc[now] if hasattr(columns.values, "iloc") else values[now]
+    return rows, values[now + 1, :n_states], np.searchsorted(edges, now, side="right") - 1

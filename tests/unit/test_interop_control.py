@@ -1,0 +1,143 @@
+"""Systems to and from python-control: numbers, batches, names, and what cannot be taken over."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import control
+import numpy as np
+import pytest
+
+from kros.core import DimensionError, StateSpace
+from kros.data import Channel, Role
+from kros.identify import ModelSet
+from kros.interop import from_control, models_to_control, to_control, uncertainty_to_control
+from kros.lifting import Lifting
+from kros.uncertainty import quantify
+
+DT = 0.01
+FREQS_HZ = np.array([0.1, 3.0, 40.0])
+
+
+def random_batch(*batch: int) -> StateSpace:
+    rng = np.random.default_rng(1)
+    A = 0.3 * rng.normal(size=(*batch, 3, 3))
+    return StateSpace(A, rng.normal(size=(*batch, 3, 2)), rng.normal(size=(*batch, 4, 3)), rng.normal(size=(*batch, 4, 2)), DT)
+
+
+def models(n_units: int = 3) -> ModelSet:
+    lifting = Lifting(("position", "velocity"), ("sin(0.5*position + phase)",), ("phase",))
+    rng = np.random.default_rng(2)
+    A = np.array([[0.9, 0.1, 0.0], [0.0, 0.7, 0.1], [0.0, 0.0, 0.5]]) + 0.01 * rng.normal(size=(n_units, 3, 3))
+    return ModelSet(
+        name="koopman",
+        condition="default",
+        lifting=lifting,
+        channels=(Channel("position", Role.STATE, measured=True), Channel("velocity", Role.STATE), Channel("target", Role.INPUT)),
+        sample_period_s=DT,
+        unit_ids=tuple(f"unit.{i}" for i in range(n_units)),
+        A=A,
+        B=np.array([[0.0], [1.0], [0.3]]) + 0.01 * rng.normal(size=(n_units, 3, 1)),
+        parameters={"phase": np.zeros(n_units)},
+        residual_covariance=np.broadcast_to(np.eye(3), A.shape),
+        output_scale=np.array([1.0, 2.0, 1.0]),
+        input_scale=np.array([3.0]),
+    )
+
+
+def test_a_system_keeps_its_response_both_ways() -> None:
+    system = random_batch()
+    there = to_control(system, name="drive", states=["a", "b", "c"], inputs=["u", "v"], outputs=["p", "q", "r", "s"])
+    response = there.frequency_response(2 * np.pi * FREQS_HZ).frdata
+    assert np.allclose(np.moveaxis(response, -1, 0), system.frequency_response(FREQS_HZ), rtol=1e-12, atol=0)
+    assert (there.name, there.dt) == ("drive", DT)
+    assert (there.state_labels, there.input_labels, there.output_labels) == (["a", "b", "c"], ["u", "v"], ["p", "q", "r", "s"])
+    back = from_control(there)
+    assert all(np.array_equal(getattr(back, name), getattr(system, name)) for name in "ABCD")
+    assert back.dt == DT
+
+
+def test_python_control_gets_copies() -> None:
+    system = random_batch()
+    to_control(system).A[0, 0] = 99.0
+    there = to_control(system)
+    from_control(there).A[0, 0] = 99.0
+    assert system.A[0, 0] != 99.0
+    assert there.A[0, 0] != 99.0
+
+
+def test_a_batch_becomes_nested_lists() -> None:
+    system = random_batch(2, 3)
+    lists = to_control(system)
+    assert [len(row) for row in lists] == [3, 3]
+    assert np.array_equal(lists[1][2].A, system.A[1, 2])
+
+
+def test_matrices_shared_by_a_batch_are_repeated() -> None:
+    batch = random_batch(2)
+    shared = StateSpace(batch.A, batch.B, np.eye(3), np.zeros((3, 2)), DT)
+    assert [s.C.tolist() for s in to_control(shared)] == [np.eye(3).tolist()] * 2
+
+
+def test_states_that_do_nothing_and_gains_survive() -> None:
+    idle = StateSpace(np.zeros((2, 2)), np.zeros((2, 1)), np.zeros((1, 2)), [[1.0]], DT)
+    assert to_control(idle).nstates == 2
+    static = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((2, 0)), np.ones((2, 1)), DT)
+    back = from_control(to_control(static))
+    assert (back.n_states, back.D.tolist(), back.dt) == (0, [[1.0], [1.0]], DT)
+
+
+def test_a_continuous_system_goes_out_but_not_in() -> None:
+    continuous = to_control(StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]], 0.0))
+    assert continuous.dt == 0
+    with pytest.raises(DimensionError, match=r"continuous.*control\.sample_system"):
+        from_control(continuous)
+    assert from_control(control.sample_system(continuous, DT)).A[0, 0] == pytest.approx(np.exp(-DT))
+
+
+@pytest.mark.parametrize("dt", [None, True])
+def test_an_unknown_sampling_period_is_refused(dt: bool | None) -> None:
+    with pytest.raises(DimensionError, match=f"not known .dt = {dt}"):
+        from_control(control.StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], dt))
+
+
+def test_a_transfer_function_is_refused() -> None:
+    with pytest.raises(DimensionError, match=r"TransferFunction; convert it with control\.ss"):
+        from_control(control.tf([1.0], [1.0, -0.5], DT))
+
+
+@pytest.mark.parametrize("names", [["a", "b"], ["a", "a", "b"], "abc"])
+def test_wrong_names_are_refused(names: list[str] | str) -> None:
+    with pytest.raises(DimensionError, match="3 states need as many different names"):
+        to_control(random_batch(), states=names)
+
+
+def test_models_carry_the_names_of_their_signals() -> None:
+    population = models()
+    systems = models_to_control(population)
+    assert list(systems) == ["unit.0", "unit.1", "unit.2"]
+    labels = ["position", "velocity", "sin(0·5*position + phase)"]
+    assert all(s.state_labels == labels and s.output_labels == labels and s.input_labels == ["target"] for s in systems.values())
+    assert systems["unit.1"].name == "unit·1"
+    assert np.array_equal(systems["unit.1"].A, population.A[1])
+    assert list(models_to_control(population, ["unit.2"])) == ["unit.2"]
+
+
+@pytest.mark.parametrize("units", [["unit.7"], "unit.1"])
+def test_unknown_units_are_refused(units: list[str] | str) -> None:
+    with pytest.raises(DimensionError, match="the models are of"):
+        models_to_control(models(), units)
+
+
+def test_weights_cover_the_residuals_in_python_control_too() -> None:
+    population = models()
+    model = quantify(population, form="additive", freqs_hz=np.geomspace(0.1, 45.0, 20))
+    out = uncertainty_to_control(model)
+    for unit in population.unit_ids:
+        other = dataclasses.replace(model, nominal_system=population.systems([unit])[0]).scaled_nominal()
+        difference = to_control(other) - out.scaled_nominal
+        E = np.moveaxis(difference.frequency_response(2 * np.pi * FREQS_HZ).frdata, -1, 0)
+        left = np.moveaxis(out.left.frequency_response(2 * np.pi * FREQS_HZ).frdata, -1, 0)
+        right = np.moveaxis(out.right.frequency_response(2 * np.pi * FREQS_HZ).frdata, -1, 0)
+        covered = np.linalg.solve(left, E) @ np.linalg.inv(right)
+        assert np.linalg.norm(covered, 2, axis=(-2, -1)).max() <= 1 + 1e-6

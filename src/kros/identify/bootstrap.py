@@ -1,0 +1,245 @@
+"""Uncertainty of the estimate itself: models of resampled episodes, from what each episode was reduced to.
+
+    per-episode factors --draw episodes--> weighted restacking --EDMD--> samples of (A, B)
+    per-episode normal equations of a finished refinement --draw episodes--> one Gauss-Newton step --> samples of (A, B)
+
+Samples of one episode depend on each other, episodes do not, so whole episodes are drawn. Of E episodes E - 1 are drawn with replacement and
+each counts E / (E - 1) times as often as it was drawn: drawing E of E would give (E - 1) / E of the variance, too little with few episodes
+(Rao and Wu, *Resampling Inference with Complex Survey Data*, J. Am. Stat. Assoc. 83, 1988).
+
+What is resampled is what was random from episode to episode. The prior, its centre, `alpha` and the calibrated parameters stay as they are,
+and so does a bias that all episodes share (regularisation, least squares on noisy or closed-loop recordings): no resampling sees it.
+
+Symbols
+-------
+w : weights of the episodes, (unit, draw, episode)
+N : ``[J r]^T [J r]`` of one episode, (P + 1, P + 1); H and g its blocks J^T J and J^T r
+V : parameters, [A B] = V T^T
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError, DimensionError
+from ..core.linalg import qr_triangle
+from .edmd import KoopmanMatrices, edmd
+
+Array = npt.NDArray[np.float64]
+_AT_ONCE = 16_000_000  # numbers in memory
+_LEAST_INFORMATION = 1e-13  # relative eigenvalue of scaled normal equations below which a direction is unknown
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSamples:
+    """Models of resampled episodes around an estimate.
+
+    Parameters
+    ----------
+    unit_ids : tuple of str
+    estimate : KoopmanMatrices
+        A (unit, n, n) and B (unit, n, m).
+    samples : KoopmanMatrices
+        A (unit, draw, n, n) and B (unit, draw, n, m).
+    """
+
+    unit_ids: tuple[str, ...]
+    estimate: KoopmanMatrices
+    samples: KoopmanMatrices
+
+    @property
+    def n_draws(self) -> int:
+        """Number of samples of every unit."""
+        return self.samples.A.shape[1]
+
+    def covariance(self) -> Array:
+        """Return the covariance of the entries of [A B], row after row, about the mean of the samples; shape (unit, n p, n p)."""
+        W = np.concatenate([self.samples.A, self.samples.B], axis=-1)
+        flat = W.reshape(*W.shape[:2], -1)
+        centred = flat - flat.mean(axis=1, keepdims=True)
+        return np.asarray(np.swapaxes(centred, 1, 2) @ centred / (self.n_draws - 1))
+
+    def standard_error(self) -> KoopmanMatrices:
+        """Return the standard deviation of every entry of A and B over the samples."""
+        return KoopmanMatrices(self.samples.A.std(axis=1, ddof=1), self.samples.B.std(axis=1, ddof=1))
+
+    def unstable_share(self) -> Array:
+        """Return the share of samples with a spectral radius of one or more, shape (unit,)."""
+        return np.asarray((self.samples.spectral_radius() >= 1).mean(axis=1))
+
+
+def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
+    """Draw episodes with replacement, E - 1 of E, and return how much each counts.
+
+    Parameters
+    ----------
+    n_episodes : sequence of int
+        Episodes of every unit, at least two.
+    draws : int
+        At least two.
+    seed : int
+        A unit's draws depend on the seed and its row alone.
+
+    Returns
+    -------
+    ndarray, shape (unit, draw, max(n_episodes))
+        Zero where a unit has fewer episodes; each draw sums to the unit's number of episodes.
+
+    Raises
+    ------
+    DataError
+        With fewer than two episodes or draws.
+    """
+    counts = [int(e) for e in n_episodes]
+    if not counts or min(counts) < 2 or draws < 2:
+        raise DataError(
+            f"Resampling episodes: needs at least two episodes of every unit and two draws, found {min(counts, default=0)} episodes of unit "
+            f"number {int(np.argmin(counts)) if counts else 0} and {draws} draws; record more, or leave the unit out."
+        )
+    weights = np.zeros((len(counts), draws, max(counts)))
+    for row, E in enumerate(counts):
+        rng = np.random.default_rng([seed, row])
+        weights[row, :, :E] = rng.multinomial(E - 1, np.full(E, 1 / E), size=draws) * (E / (E - 1))
+    return weights
+
+
+def bootstrap_edmd(R: Array, n_lifted: int, alpha: float, weights: Array, unit_ids: Sequence[str] | None = None) -> ModelSamples:
+    """Return EDMD models of resampled episodes at a fixed alpha.
+
+    Parameters
+    ----------
+    R : ndarray, shape (unit, episode, p + n_lifted, p + n_lifted)
+        Factors of [Psi | Theta_plus] of every episode; zero where a unit has fewer episodes.
+    n_lifted : int
+    alpha : float
+    weights : ndarray, shape (unit, draw, episode)
+        See `episode_weights`.
+    unit_ids : sequence of str, optional
+        Numbers by default.
+
+    Returns
+    -------
+    ModelSamples
+
+    Raises
+    ------
+    DimensionError
+        When factors and weights do not fit together.
+    IdentificationError
+        When the episodes drawn leave a column dependent and `alpha` is zero.
+    """
+    units, episodes, width, _ = R.shape
+    if weights.shape[0] != units or weights.shape[2] != episodes:
+        raise DimensionError(f"Bootstrap: factors {R.shape} need weights of shape ({units}, draws, {episodes}), found {weights.shape}.")
+    p, draws = width - n_lifted, weights.shape[1]
+    W = np.empty((units, draws, n_lifted, p))
+    for row in range(units):
+        for part in _parts(draws, episodes * width * width):
+            stacked = (np.sqrt(weights[row, part])[..., None, None] * R[row]).reshape(-1, episodes * width, width)
+            model = edmd(qr_triangle(stacked), n_lifted, alpha)
+            W[row, part] = np.concatenate([model.A, model.B], axis=-1)
+    whole = edmd(qr_triangle(R.reshape(units, episodes * width, width)), n_lifted, alpha)
+    return ModelSamples(_named(unit_ids, units), whole, KoopmanMatrices(W[..., :n_lifted], W[..., n_lifted:]))
+
+
+def one_step_deviations(normal: Array, information: Array, weights: Array) -> Array:
+    """Return where one Gauss-Newton step on resampled episodes leads from the estimate.
+
+    The estimate is where the search ended, taken as the minimum; with weights w of the episodes the step is
+
+        H_w = information + sum_e (w_e - 1) H_e,     dV = H_w^-1 sum_e (w_e - 1) g_e
+
+    Parameters
+    ----------
+    normal : ndarray, shape (unit, episode, P + 1, P + 1)
+        N of every episode at the estimate, with r data minus model and J the model's derivative.
+    information : ndarray, shape (unit, P, P)
+        Of the whole cost: all episodes, prior, edge of stability.
+    weights : ndarray, shape (unit, draw, episode)
+
+    Returns
+    -------
+    ndarray, shape (unit, draw, P)
+        Zero in directions about which neither the episodes drawn nor the prior say anything.
+
+    Raises
+    ------
+    DimensionError
+        When the shapes do not fit together.
+    """
+    units, episodes, P = normal.shape[0], normal.shape[1], normal.shape[-1] - 1
+    if information.shape != (units, P, P) or weights.shape[0] != units or weights.shape[2] != episodes:
+        raise DimensionError(
+            f"One-step bootstrap: normal equations {normal.shape} need information of shape ({units}, {P}, {P}) and weights of shape "
+            f"({units}, draws, {episodes}), found {information.shape} and {weights.shape}."
+        )
+    draws = weights.shape[1]
+    deviations = np.empty((units, draws, P))
+    for row in range(units):
+        size = np.sqrt(np.maximum(np.diagonal(information[row]), np.finfo(float).tiny))
+        for part in _parts(draws, 4 * P * P):
+            change = np.tensordot(weights[row, part] - 1, normal[row, :, :-1], axes=1)  # (draw, P, P + 1)
+            H = (information[row] + change[..., :-1]) / (size[:, None] * size)
+            deviations[row, part] = _solve(H, change[..., -1] / size) / size
+    return deviations
+
+
+def bootstrap_refined(
+    units: KoopmanMatrices,
+    whitening: Array,
+    information: Array,
+    normal: Array,
+    weights: Array,
+    unit_ids: Sequence[str] | None = None,
+) -> ModelSamples:
+    """Return refined models of resampled episodes, one Gauss-Newton step from the finished ones.
+
+    Parameters
+    ----------
+    units : KoopmanMatrices
+        Of the finished models, as `RefinedModels.units`.
+    whitening : ndarray, shape (p, p)
+        T, as `RefinedModels.whitening`.
+    information : ndarray, shape (unit, P, P)
+        As `RefinedModels.information`.
+    normal : ndarray, shape (unit, episode, P + 1, P + 1)
+        From `refine.episodes.episode_normals`.
+    weights : ndarray, shape (unit, draw, episode)
+    unit_ids : sequence of str, optional
+
+    Returns
+    -------
+    ModelSamples
+        A sample is not checked for stability (see `ModelSamples.unstable_share`).
+    """
+    n, p = units.A.shape[-1], len(whitening)
+    dV = one_step_deviations(normal, information, weights).reshape(len(units.A), -1, n, p)
+    dW = dV @ whitening.T
+    samples = KoopmanMatrices(units.A[:, None] + dW[..., :n], units.B[:, None] + dW[..., n:])
+    return ModelSamples(_named(unit_ids, len(units.A)), units, samples)
+
+
+def _solve(H: Array, g: Array) -> Array:
+    """Symmetric least squares of scaled normal equations, batched."""
+    values, vectors = np.linalg.eigh((H + np.swapaxes(H, -1, -2)) / 2)
+    known = values > _LEAST_INFORMATION * np.maximum(values[..., -1:], np.finfo(float).tiny)
+    along = np.einsum("...ji,...j->...i", vectors, g)
+    along = np.divide(along, values, out=np.zeros_like(along), where=known)
+    return np.asarray(np.einsum("...ij,...j->...i", vectors, along))
+
+
+def _parts(count: int, size: int) -> Iterator[slice]:
+    """Slices of a range whose items hold `size` numbers each."""
+    step = max(1, _AT_ONCE // size)
+    return (slice(start, start + step) for start in range(0, count, step))
+
+
+def _named(unit_ids: Sequence[str] | None, units: int) -> tuple[str, ...]:
+    ids = tuple(str(row) for row in range(units)) if unit_ids is None else tuple(unit_ids)
+    if len(ids) != units:
+        raise DimensionError(f"Bootstrap: {units} units need as many names, found {len(ids)}.")
+    return ids

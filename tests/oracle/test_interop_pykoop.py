@@ -20,10 +20,6 @@ with warnings.catch_warnings():
     import pykoop
     from sklearn import preprocessing
 
-needs_input_functions = pytest.mark.skipif(
-    "input_functions" not in Lifting.__dataclass_fields__, reason="liftings have no functions of inputs"
-)
-
 
 def recording(offset: float = 0.0, gain: float = 1.0, seed: int = 0) -> np.ndarray:
     """Three episodes of a nonlinear system with two states and one input, in pykoop's layout."""
@@ -107,7 +103,6 @@ def test_both_predict_the_same(functions: list[Any], offset: float) -> None:
     agrees(functions, offset)
 
 
-@needs_input_functions
 @pytest.mark.parametrize("functions", LIFTED_INPUTS.values(), ids=LIFTED_INPUTS.keys())
 def test_both_predict_the_same_with_lifted_inputs(functions: list[Any]) -> None:
     agrees(functions, 1.0)
@@ -219,6 +214,13 @@ def test_one_pipeline_for_each_unit_gives_the_models_of_a_population() -> None:
         lifted = models.lifting.lift(X[:, :2])
         assert np.all(np.abs(lifted).max(axis=0) <= models.output_scale)
     assert quantify(models, form="additive").cover_max <= 1
+
+
+def test_lifted_inputs_are_inputs_of_the_models() -> None:
+    pipelines, population = batch([("b", pykoop.BilinearInputLiftingFn())])
+    models = models_from_pykoop(pipelines, population)
+    assert models.inputs == ("voltage", "angle*voltage", "rate*voltage")
+    assert (models.B.shape, models.input_scale.shape) == ((4, 2, 3), (3,))
 
 
 def test_a_population_needs_one_lifting_without_offsets_and_known_units() -> None:

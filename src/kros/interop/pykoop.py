@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import keyword
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -88,7 +88,7 @@ class AdoptedModel:
                 f"AdoptedModel: states of shape {xi.shape} need a row each of the inputs {self.inputs}, found shape {mu.shape}."
             )
         mu = mu - self.input_offset
-        return self.lifting.lift_inputs(mu, xi) if getattr(self.lifting, "input_functions", ()) else mu
+        return self.lifting.lift_inputs(mu, xi)
 
     def free_run(self, x0: npt.ArrayLike, u: npt.ArrayLike) -> Array:
         """Simulate from first states with recorded inputs, retracted and re-lifted at every step.
@@ -224,7 +224,7 @@ def _translate(pipeline: Any, names: tuple[str, ...], input_names: tuple[str, ..
     V_float = np.array(V.tolist(), dtype=float).reshape(len(affine), len(u))
     whole = np.concatenate([B @ V_float, coefficients[np.ix_(kept, [p + j for j in other])] @ G], axis=1)
     model = AdoptedModel(
-        lifting=_lifting(names, functions, input_names, gamma),
+        lifting=Lifting(names, functions, (), input_names if gamma else (), gamma),
         inputs=input_names,
         A=P @ A @ T,
         B=P @ whole,
@@ -320,14 +320,6 @@ def _input_functions(columns: list[Any], u: list[Any]) -> tuple[tuple[str, ...],
     return tuple(order), G
 
 
-def _lifting(states: tuple[str, ...], functions: tuple[str, ...], inputs: tuple[str, ...], gamma: tuple[str, ...]) -> Lifting:
-    if not gamma:
-        return Lifting(states, functions)
-    if "input_functions" not in {field.name for field in fields(Lifting)}:
-        raise ConfigError(f"from_pykoop: the pipeline lifts inputs by {', '.join(gamma)}, which kros's liftings do not have.")
-    return Lifting(states, functions, inputs=inputs, input_functions=gamma)  # type: ignore[call-arg,unused-ignore]
-
-
 def _verified(model: AdoptedModel, pipeline: Any, reading: _Reading, seed: int) -> AdoptedModel:
     """Return the model with its disagreement in lifted and in original states, or refuse it."""
     import pykoop
@@ -386,7 +378,7 @@ def models_from_pykoop(
     DataError
         A unit that the population does not have in this condition.
     ConfigError
-        Pipelines with different lifting functions, with lifted inputs, or with offsets.
+        Pipelines with different lifting functions, or with offsets.
     """
     condition = population.conditions[0] if condition is None else condition
     adopted = {unit: from_pykoop(p, states=population.states, inputs=population.inputs) for unit, p in pipelines.items()}
@@ -398,14 +390,12 @@ def models_from_pykoop(
         )
     models = list(adopted.values())
     lifting = models[0].lifting
-    lifted_inputs: Sequence[str] = getattr(lifting, "input_functions", [])
     odd = [unit for unit, model in adopted.items() if model.lifting != lifting]
     centred = [unit for unit, model in adopted.items() if np.any(model.state_offset) or np.any(model.input_offset)]
-    if odd or centred or lifted_inputs:
+    if odd or centred:
         raise ConfigError(
-            f"models_from_pykoop: models of a population share one lifting of states, in the channels as they are; units {odd} have other "
-            f"functions than {next(iter(adopted))}, units {centred} are centred, input functions are {list(lifted_inputs)}; "
-            "scale with MaxAbsScaler (or with_mean=False), or fit the scaler once and transform the recordings before."
+            f"models_from_pykoop: models of a population share one lifting, of the channels as they are; units {odd} have other functions than "
+            f"{next(iter(adopted))}, units {centred} are centred; scale with MaxAbsScaler (or with_mean=False), or transform the recordings before."
         )
     facts = [_facts(model, population, unit, condition) for unit, model in adopted.items()]
     n = lifting.n_lifted
@@ -432,9 +422,9 @@ def _facts(model: AdoptedModel, population: Population, unit: str, condition: st
     peaks, total, count = [], np.zeros_like(model.A), 0
     for key in population.keys(unit, condition):
         x, u = population.read_parts(key)
-        lifted = model.lifting.lift(x)
-        residual = lifted[1:] - lifted[:-1] @ model.A.T - u[:-1] @ model.B.T
-        peaks.append(np.abs(np.concatenate([lifted, u], axis=1)).max(axis=0))
+        lifted, inputs = model.lifting.lift(x), model.lifting.lift_inputs(u, x)
+        residual = lifted[1:] - lifted[:-1] @ model.A.T - inputs[:-1] @ model.B.T
+        peaks.append(np.abs(np.concatenate([lifted, inputs], axis=1)).max(axis=0))
         total += residual.T @ residual
         count += len(residual)
     return np.max(peaks, axis=0), total / max(count, 1)

@@ -59,7 +59,10 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     Parameters
     ----------
     functions : sequence of str
-        Lifted functions as formulas of the states, such as ``"sin(100*position)"``; none for a linear model.
+        Lifted functions as formulas of the states, such as ``"sin(100*position)"``; none for a linear model. Rows stand by themselves, so
+        there are no delays (``position[-1]``): put earlier samples into columns of their own.
+    input_functions : sequence of str
+        Formulas of inputs and states that stand behind the inputs, such as ``"current*voltage"``.
     states : sequence of str, optional
         Names of the states, which the formulas use. A DataFrame has to begin with columns of these names. Default: the names of the
         DataFrame, else ``x0, x1, ...``.
@@ -78,7 +81,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     Attributes
     ----------
     A_ : ndarray, shape (n_lifted, n_lifted)
-    B_ : ndarray, shape (n_lifted, n_inputs)
+    B_ : ndarray, shape (n_lifted, n_inputs + n_input_functions)
     lifting_ : Lifting
     state_names_, input_names_ : tuple of str
     n_pairs_ : int
@@ -106,6 +109,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         functions: Sequence[str] = (),
         *,
+        input_functions: Sequence[str] = (),
         states: Sequence[str] | None = None,
         n_inputs: int | None = None,
         alpha: float = 0.0,
@@ -114,6 +118,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         horizon: int | None = 1,
     ) -> None:
         self.functions = functions
+        self.input_functions = input_functions
         self.states = states
         self.n_inputs = n_inputs
         self.alpha = alpha
@@ -169,18 +174,22 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _identify(self, before: Array, after: Array) -> None:
         n, n_lifted = self._n_states, self.lifting_.n_lifted
-        names = (*self.lifting_.names, *self.input_names_)
-        rows = np.concatenate([self._lift(before[:, :n]), before[:, n:], self._lift(after)], axis=1)
+        names = (*self.lifting_.names, *self.input_names_, *self.lifting_.input_functions)
+        rows = np.concatenate([self._psi(before[:, :n], before[:, n:]), self._lift(after)], axis=1)
+        finite(rows, (*names, *self.lifting_.names), "A lifted function of X is not defined everywhere: the lifted X")
         R = triangular(rows)
         if self.alpha == 0:
-            _check_excitation(R[: len(names), : len(names)], names, len(self.state_names_), n_lifted, len(rows))
+            _check_excitation(R[: len(names), : len(names)], names, n, n_lifted, len(rows))
         matrices = edmd(R, n_lifted, self.alpha)
         self.A_, self.B_, self.n_pairs_ = matrices.A, matrices.B, len(rows)
 
     def _lift(self, x: Array) -> Array:
         with np.errstate(all="ignore"):
-            lifted = self.lifting_.lift(x)
-        return finite(lifted, self.lifting_.names, "A lifted function of X is not defined everywhere: the lifted X")
+            return self.lifting_.lift(x)
+
+    def _psi(self, x: Array, u: Array) -> Array:
+        with np.errstate(all="ignore"):
+            return np.concatenate([self._lift(x), self.lifting_.lift_inputs(u, x)], axis=1)
 
     # ----------------------------------------------------------------------------------------------------------- prediction
 
@@ -273,7 +282,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _step(self, x: Array, u: Array) -> Array:
         n = self._n_states
         with np.errstate(all="ignore"):
-            return self.lifting_.lift(x) @ self.A_[:n].T + u @ self.B_[:n].T
+            return np.asarray(self._psi(x, u) @ np.concatenate([self.A_[:n], self.B_[:n]], axis=1).T)
 
     def _free_run(self, values: Array, edges: npt.NDArray[np.int64]) -> Array:
         """Run all episodes as one batch, the shorter ones on with zero inputs and then cut."""
@@ -281,7 +290,8 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         inside = np.arange(lengths.max()) < lengths[:, None]
         inputs = np.zeros((*inside.shape, len(self.input_names_)))
         inputs[inside] = values[:, n:]
-        return free_run(self.A_, self.B_, self.lifting_, {}, values[edges[:-1], :n], inputs)[inside]
+        with np.errstate(all="ignore"):
+            return free_run(self.A_, self.B_, self.lifting_, {}, values[edges[:-1], :n], inputs)[inside]
 
     # --------------------------------------------------------------------------------------------------------------- checks
 
@@ -290,7 +300,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return len(self.state_names_)
 
     def _check_parameters(self) -> None:
-        for name, value in (("functions", self.functions), ("states", self.states)):
+        for name, value in (("functions", self.functions), ("input_functions", self.input_functions), ("states", self.states)):
             if isinstance(value, str):
                 raise ConfigError(f"KoopmanRegressor: {name} should be a list of texts, found the text {value!r}; write [{value!r}].")
         if not isinstance(self.alpha, (int, float, np.number)) or not 0 <= float(self.alpha) < np.inf:
@@ -330,7 +340,12 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 )
             names = wanted + names[n_states:]
         self.state_names_, self.input_names_ = names[:n_states], names[n_states:]
-        self.lifting_ = Lifting(self.state_names_, tuple(self.functions))
+        self.lifting_ = Lifting(self.state_names_, tuple(self.functions), (), self.input_names_, tuple(self.input_functions))
+        if self.lifting_.history:
+            raise ConfigError(
+                f"KoopmanRegressor: the functions read {', '.join(self.lifting_.window.earlier)}, but rows stand by themselves; put earlier samples "
+                "into columns of their own, or identify recordings with kros.identify."
+            )
 
     def _count_states(self, n_columns: int, n_targets: int | None) -> int:
         """Return the number of states on which everything that was said agrees."""

@@ -78,18 +78,11 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         `score` compares predictions this many samples ahead, from every sample, with the recorded inputs; None: the free run of the
         whole episode from its first state.
 
-    Attributes
-    ----------
-    A_ : ndarray, shape (n_lifted, n_lifted)
-    B_ : ndarray, shape (n_lifted, n_inputs + n_input_functions)
-    lifting_ : Lifting
-    state_names_, input_names_ : tuple of str
-    n_pairs_ : int
-        Transitions that the model was fitted to.
-    n_features_in_ : int
-        Columns of `X`, episode and time included.
-    feature_names_in_ : ndarray of str
-        Column names of `X`, where it was a DataFrame.
+    Notes
+    -----
+    `fit` sets ``A_``, shape (n_lifted, n_lifted), and ``B_``, shape (n_lifted, n_inputs + n_input_functions); ``lifting_``, ``state_names_`` and
+    ``input_names_``; ``n_pairs_``, the number of transitions; ``n_features_in_``, the number of columns with episode and time; and
+    ``feature_names_in_``, their names, where `X` was a DataFrame.
 
     Examples
     --------

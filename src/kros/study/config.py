@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from ..core.errors import ConfigError
+from ..lifting import check_family
 
 FORMS = Literal[
     "additive",
@@ -56,10 +57,22 @@ class SplitConfig(_Section):
 
 
 class LiftingConfig(_Section):
-    """Lifted functions of the Koopman model; ``None`` takes what suits the plant that the reader names."""
+    """Lifted functions of the Koopman model; where none are declared, those that suit the plant that the reader names.
+
+    `families` are tables, each with a ``kind``, whose formulas stand behind `functions`; `input_functions` are further inputs of the model.
+    """
 
     functions: tuple[str, ...] | None = None
+    families: tuple[dict[str, Any], ...] = ()
+    input_functions: tuple[str, ...] = ()
     parameters: tuple[str, ...] | None = None
+
+    @field_validator("families")
+    @classmethod
+    def _known(cls, value: tuple[dict[str, Any], ...]) -> tuple[dict[str, Any], ...]:
+        for table in value:
+            check_family(table)
+        return value
 
 
 class CalibrateConfig(_Section):

@@ -2,27 +2,57 @@
 
 from __future__ import annotations
 
+import re
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
 from ..core.errors import ConfigError
-from ..data.population import Population
+from ..data.population import Population, split_episodes
 from ..identify import PhaseSpec
-from ..lifting import Lifting
+from ..lifting import Formula, Lifting, concatenate, family
 from .config import StudyConfig
 
+Array = npt.NDArray[np.float64]
 HARMONIC_DRIVE = "harmonic-drive"
 PHASE = "phase"
+_SAMPLED_EPISODES = 40
+_SAMPLES = 5000
 
 
 def resolve_lifting(config: StudyConfig, population: Population) -> Lifting:
     """Return the lifting that the study declares, or the plant's own (35)."""
     declared = config.lifting
-    if declared.functions is not None:
-        parameters = (
-            declared.parameters if declared.parameters is not None else ((PHASE,) if any(PHASE in f for f in declared.functions) else ())
-        )
-        return Lifting(population.states, declared.functions, parameters)
-    if population.metadata.get("plant") == HARMONIC_DRIVE:
-        return Lifting(population.states, (f"sin({_ratio(config, population):g}*position + {PHASE})",), (PHASE,))
-    return Lifting(population.states)
+    inputs = declared.input_functions
+    if declared.functions is None and not declared.families:
+        if population.metadata.get("plant") == HARMONIC_DRIVE:
+            functions: tuple[str, ...] = (f"sin({_ratio(config, population):g}*position + {PHASE})",)
+        else:
+            functions = ()
+    else:
+        sample = partial(_sample, config, population)
+        functions = concatenate(declared.functions or (), *(family(table, sample) for table in declared.families))
+    parameters = declared.parameters
+    if parameters is None:
+        parameters = (PHASE,) if any(re.search(rf"\b{PHASE}\b", f) for f in functions + inputs) else ()
+    lifting = Lifting(population.states, functions, parameters, population.inputs, inputs)
+    return lifting if lifting.history or inputs else Lifting(population.states, functions, parameters)
+
+
+def _sample(config: StudyConfig, population: Population, names: tuple[str, ...]) -> Array:
+    """Values of formulas on training episodes, one of every unit and condition, thinned to some thousand samples."""
+    keys = [split.train[0] for split in split_episodes(population, config.split.test).values()]
+    keys = keys[:: max(1, -(-len(keys) // _SAMPLED_EPISODES))]
+    known = population.states + population.inputs
+    rows = []
+    for key in keys:
+        values = population.read(key)
+        values = values[:: max(1, len(values) * len(keys) // _SAMPLES)]
+        columns = {name: values[:, i] for i, name in enumerate(known)}
+        evaluated = [np.broadcast_to(Formula(name, known).evaluator(columns), len(values)) for name in names]
+        rows.append(np.stack(evaluated, axis=-1))
+    return np.concatenate(rows)
 
 
 def resolve_phase(config: StudyConfig, population: Population, lifting: Lifting) -> PhaseSpec | None:

@@ -1,0 +1,139 @@
+"""One suite over all families: C computes what NumPy does, derivatives are finite differences, bounds hold every sample."""
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError
+from kros.lifting import (
+    Lifting,
+    concatenate,
+    delays,
+    formulas,
+    fourier_features,
+    harmonics,
+    latin_hypercube_centres,
+    polynomials,
+    products,
+    radial,
+)
+
+STATES, INPUTS = ("position", "velocity"), ("voltage",)
+CENTRES = latin_hypercube_centres([[-2, 2], [-2, 2]], 5, 0)
+FAMILIES = {
+    "harmonics": harmonics("position", 100, [1, 2, 5], "phase"),
+    "polynomials": polynomials(STATES, 4),
+    "gaussian": radial(STATES, CENTRES, [0.3, 1.7]),
+    "multiquadric": radial(STATES, CENTRES, 0.9, "multiquadric"),
+    "inverse multiquadric": radial(STATES, CENTRES, 0.9, "inverse_multiquadric"),
+    "thin plate": radial(STATES, CENTRES, 0.9, "thin_plate"),
+    "fourier": fourier_features(STATES, 6, 0.8, 1),
+    "laplacian": fourier_features(STATES, 6, 0.8, 1, "laplacian"),
+    "delays": delays((*STATES, *INPUTS), 3),
+    "free": formulas(
+        [
+            "tanh(velocity/0.05)*phase",
+            "abs(velocity)*velocity - sign(position[-2])/3",
+            "atan(position)*sqrt(1 + velocity[-1]**2)",
+            "log(2 + sin(position)) + tan(position/4)",
+            "exp(-position**2)*velocity**-2",
+            "12345678901234*position/98765432109876 + 10000000000000000000000*velocity",
+        ]
+    ),
+    "of functions": polynomials(["sin(3*position)", "velocity[-1]"], 3),
+}
+FAMILIES["all"] = concatenate(*FAMILIES.values())
+INPUT_FUNCTIONS = products(["position", "velocity[-1]"], ["voltage"])
+BOX = {"position": (-1.5, 1.2), "velocity": (0.1, 2.0), "voltage": (-3.0, 3.0)}
+PHASE = (0.2, 0.9)
+
+
+@pytest.fixture(params=FAMILIES, name="lifting")
+def _lifting(request):
+    return Lifting(STATES, FAMILIES[request.param], ("phase",), INPUTS, INPUT_FUNCTIONS)
+
+
+def samples(lifting, n, seed=0):
+    """Random windows, inputs and phases within the box, its corners among them."""
+    rng = np.random.default_rng(seed)
+    ends = np.array([BOX[name.partition("[")[0]] for name in (*lifting.window.names, *INPUTS)] + [PHASE])
+    share = rng.uniform(size=(n, len(ends)))
+    share[: n // 4] = rng.integers(0, 2, size=(n // 4, len(ends)))
+    drawn = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    return drawn[:, :-2], drawn[:, -2:-1], drawn[:, -1]
+
+
+def test_c_computes_what_numpy_does(lifting, tmp_path):
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("no C compiler on this machine")
+    windows, u, phase = samples(lifting, 60)
+    depth = lifting.history
+    lines = []
+    pointers = dict(lifting.window.depths)
+    for name in (*STATES, *INPUTS):
+        slot = f"row[{lifting.window.names.index(name) if name in STATES else windows.shape[1]}]"
+        if name in pointers:
+            earlier = [f"row[{lifting.window.names.index(f'{name}[-{d}]')}]" for d in range(pointers[name], 0, -1)]
+            lines.append(
+                f"const double {name}_all[]={{{','.join([*earlier, slot])}}};const double *{name}={name}_all+{pointers[name]};(void){name};"
+            )
+        else:
+            lines.append(f"const double {name}={slot};(void){name};")
+    lines += [f'printf("%.17g\\n",(double)({expression}));' for expression in lifting.c_expressions() + lifting.c_input_expressions()]
+    width = windows.shape[1] + 2
+    source = (
+        f"#include <math.h>\n#include <stdio.h>\nint main(void){{double row[{width}];for(;;){{for(int i=0;i<{width};i++)"
+        f'if(scanf("%lf",row+i)!=1)return 0;const double phase=row[{width - 1}];(void)phase;{"".join(lines)}}}}}\n'
+    )
+    (tmp_path / "f.c").write_text(source)
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run([compiler, *flags, str(tmp_path / "f.c"), "-o", str(tmp_path / "f"), "-lm"], check=True)
+    rows = np.column_stack([windows, u, phase])
+    text = "\n".join(" ".join(f"{v:.17g}" for v in row) for row in rows)
+    out = subprocess.run([str(tmp_path / "f")], input=text, check=True, capture_output=True, text=True).stdout
+    found = np.array(out.split(), dtype=float).reshape(60, -1)
+    p = len(lifting.functions)
+    np.testing.assert_allclose(found[:, :p], lifting.lift(windows, {"phase": phase})[:, 2:], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(found[:, p:], lifting.lift_inputs(u, windows, {"phase": phase})[:, 1:], rtol=1e-12, atol=1e-12)
+    assert depth == max(pointers.values())
+
+
+def test_retraction_undoes_lifting(lifting):
+    windows, _, phase = samples(lifting, 20)
+    np.testing.assert_array_equal(lifting.retract(lifting.lift(windows, {"phase": phase})), windows[:, :2])
+
+
+def test_derivatives_are_finite_differences(lifting):
+    windows, _, phase = samples(lifting, 40)
+    windows = windows[10:]  # corners apart: a sign may jump there
+    phase = phase[10:]
+    jacobian = lifting.jacobian(windows, {"phase": phase})
+    step = 1e-6
+    for j in range(windows.shape[1]):
+        moved = step * np.eye(windows.shape[1])[j]
+        slope = (lifting.lift(windows + moved, {"phase": phase}) - lifting.lift(windows - moved, {"phase": phase})) / (2 * step)
+        scale = np.maximum(np.abs(lifting.lift(windows, {"phase": phase})), 1)
+        # rounding of the difference: eps/step in units of the value; curvature: the fifth harmonic has third derivatives of 500**3
+        tolerance = 1e-9 * scale + 1e-6 * np.abs(jacobian[..., j]) + 5e-5
+        assert np.all(np.abs(slope - jacobian[..., j]) <= tolerance)
+
+
+def test_bounds_hold_every_sample(lifting):
+    windows, _, phase = samples(lifting, 4000)
+    values, slopes = lifting.lift(windows, {"phase": phase})[:, 2:], lifting.jacobian(windows, {"phase": phase})[:, 2:]
+    for found, (lower, upper) in (
+        (values, lifting.value_bounds(BOX, {"phase": PHASE})),
+        (slopes, lifting.slope_bounds(BOX, {"phase": PHASE})),
+    ):
+        assert lower.shape == found.shape[1:]
+        assert np.all((found >= lower) & (found <= upper))
+        wider = [lifting.value_bounds({}), lifting.slope_bounds({})][found is slopes]
+        assert np.all((wider[0] <= lower) & (wider[1] >= upper))
+
+
+def test_a_family_that_does_not_separate_says_so():
+    with pytest.raises(ConfigError, match="must enter as factors or as phases"):
+        _ = Lifting(("position",), radial(["position + phase"], [[0.0]], 1.0), ("phase",)).separation

@@ -1,0 +1,219 @@
+"""Families: the formulas that they write, that their values are those of the definitions, and what they refuse."""
+
+import re
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError
+from kros.lifting import (
+    Lifting,
+    concatenate,
+    delays,
+    family,
+    formulas,
+    fourier_features,
+    grid_centres,
+    harmonics,
+    kmeans_centres,
+    latin_hypercube_centres,
+    polynomials,
+    products,
+    radial,
+    random_centres,
+)
+from kros.lifting.families import number
+
+STATES = ("position", "velocity", "current")
+RNG = np.random.default_rng(0)
+X = RNG.normal(size=(200, 3))
+
+
+def values(functions, parameters=None):
+    lifting = Lifting(STATES, functions, tuple(parameters or ()))
+    return lifting.lift(X, parameters)[:, 3:]
+
+
+@pytest.mark.parametrize("value", [0.1, 1 / 3, -2.5e-300, 1e22, 123456789.0, 5e-324, -0.0, np.pi, 1e15, np.nextafter(1, 2)])
+def test_numbers_survive_their_text(value):
+    found = float(Lifting(("x",), (f"x*({number(value)})",)).lift([[1.0]])[0, 1]) if value else float(number(value))
+    assert found == value
+
+
+def test_harmonics_of_an_angle_with_a_phase():
+    functions = harmonics("position", 100, [1, 3], "phase")
+    assert functions == (
+        "sin(100*position + phase)",
+        "cos(100*position + phase)",
+        "sin(3*(100*position + phase))",
+        "cos(3*(100*position + phase))",
+    )
+    angle = 100 * X[:, 0] + 0.7
+    expected = [np.sin(angle), np.cos(angle), np.sin(3 * angle), np.cos(3 * angle)]
+    np.testing.assert_allclose(values(functions, {"phase": 0.7}), np.transpose(expected), atol=1e-11)
+    separation = Lifting(STATES, functions, ("phase",)).separation
+    assert len(separation.basis) == 4
+
+
+@pytest.mark.parametrize(("degree", "n_terms"), [(2, 6), (3, 16), (4, 31)])
+def test_polynomials_have_every_monomial_once(degree, n_terms):
+    functions = polynomials(STATES, degree)
+    assert len(set(functions)) == n_terms  # (3 + d choose d) - 1 - 3
+    exponents = [[f.count(f"{s}**{k}") * k for s in STATES for k in range(2, 5)] for f in functions]
+    assert max(map(max, exponents)) == degree
+    found = values(functions)
+    for f, column in zip(functions, found.T, strict=True):
+        expected = np.ones(200)
+        for factor in f.replace("**", "^").split("*"):
+            name, _, power = factor.partition("^")
+            expected *= X[:, STATES.index(name)] ** int(power or 1)
+        np.testing.assert_allclose(column, expected, rtol=1e-12)
+    assert polynomials(STATES[:2], 3, cross=False) == ("position**2", "velocity**2", "position**3", "velocity**3")
+
+
+def test_families_work_on_the_values_of_other_functions():
+    functions = polynomials(["sin(position)", "velocity"], 2)
+    assert functions == ("(sin(position))**2", "(sin(position))*velocity", "velocity**2")
+    s, v = np.sin(X[:, 0]), X[:, 1]
+    np.testing.assert_allclose(values(functions), np.stack([s * s, s * v, v * v], axis=1), rtol=1e-13)
+    (bump,) = radial(["position - velocity"], [[0.25]], 0.5)
+    np.testing.assert_allclose(values((bump,))[:, 0], np.exp(-(((X[:, 0] - v - 0.25) / 0.5) ** 2) / 2), rtol=1e-12)
+
+
+RADIAL = {
+    "gaussian": lambda s: np.exp(-(s**2) / 2),
+    "multiquadric": lambda s: np.sqrt(1 + s**2),
+    "inverse_multiquadric": lambda s: 1 / np.sqrt(1 + s**2),
+    "thin_plate": lambda s: s**2 * np.log(s),
+}
+
+
+@pytest.mark.parametrize("function", RADIAL)
+@pytest.mark.parametrize("length", [0.3, (0.2, 1.0, 3.5)])
+def test_radial_functions_are_functions_of_the_scaled_distance(function, length):
+    centres = RNG.uniform(-1, 1, size=(12, 3))
+    found = values(radial(STATES, centres, length, function))
+    distance = np.linalg.norm((X[:, None] - centres) / np.asarray(length), axis=-1)
+    np.testing.assert_allclose(found, RADIAL[function](distance), rtol=1e-11, atol=1e-13)
+
+
+def test_the_thin_plate_is_zero_and_flat_at_its_centre():
+    lifting = Lifting(STATES, radial(STATES, [[0.5, -0.25, 0]], 0.1, "thin_plate"))
+    centre = np.array([0.5, -0.25, 0.0])
+    np.testing.assert_allclose(lifting.lift(centre)[3:], 0, atol=1e-25)
+    np.testing.assert_allclose(lifting.jacobian(centre)[3:], 0, atol=1e-25)
+
+
+def test_centres_lie_where_they_should():
+    ranges = [[-1, 1], [0, 10]]
+    np.testing.assert_array_equal(grid_centres(ranges, [3, 2]), [[-1, 0], [-1, 10], [0, 0], [0, 10], [1, 0], [1, 10]])
+    np.testing.assert_array_equal(grid_centres(ranges, [1, 1]), [[0, 5]])
+    for centres in (latin_hypercube_centres(ranges, 20, 3), random_centres(ranges, 20, 3)):
+        assert centres.shape == (20, 2)
+        assert np.all((centres >= [-1, 0]) & (centres <= [1, 10]))
+    np.testing.assert_array_equal(latin_hypercube_centres(ranges, 20, 3), latin_hypercube_centres(ranges, 20, 3))
+    slices = np.sort(np.floor((latin_hypercube_centres(ranges, 20, 3) - [-1, 0]) / [2, 10] * 20), axis=0)
+    np.testing.assert_array_equal(slices, np.arange(20)[:, None] * [1, 1])
+    assert not np.array_equal(random_centres(ranges, 20, 3), random_centres(ranges, 20, 4))
+
+
+def test_kmeans_finds_separate_clusters_in_any_units():
+    rng = np.random.default_rng(5)
+    means = np.array([[0, 0], [1, 1000], [-1, 2000.0]])
+    data = np.concatenate([m + rng.normal(size=(100, 2)) * [0.01, 10] for m in means])
+    found = kmeans_centres(data, 3, 0)
+    np.testing.assert_allclose(found[np.argsort(found[:, 1])], means[[0, 1, 2]], atol=5)
+    np.testing.assert_allclose(np.sort(found[:, 0]), [-1, 0, 1], atol=0.005)
+    np.testing.assert_array_equal(found, kmeans_centres(data, 3, 0))
+
+
+@pytest.mark.parametrize("kernel", ["gaussian", "laplacian"])
+def test_fourier_features_approximate_their_kernel(kernel):
+    """The error of n features has a standard deviation of at most n**-0.5."""
+    n, length = 40_000, np.array([0.8, 2.0])
+    x = np.random.default_rng(6).normal(size=(15, 2))
+    texts = fourier_features(["a", "b"], n, length, 7, kernel)
+    numbers = np.array([re.findall(r"-?[\d.]+(?:e[-+]?\d+)?", text) for text in texts], dtype=float)  # size, w_a, w_b, b
+    features = numbers[:, 0] * np.cos(x @ numbers[:, 1:3].T + numbers[:, 3])
+    offset = (x[:, None] - x) / length
+    expected = np.exp(-(offset**2).sum(-1) / 2) if kernel == "gaussian" else np.exp(-np.abs(offset).sum(-1))
+    assert np.abs(features @ features.T - expected).max() < 5 / np.sqrt(n)
+    few = fourier_features(["a", "b"], 5, length, 7, kernel)
+    few_numbers = np.array([re.findall(r"-?[\d.]+(?:e[-+]?\d+)?", text) for text in few], dtype=float)
+    by_hand = few_numbers[:, 0] * np.cos(x @ few_numbers[:, 1:3].T + few_numbers[:, 3])
+    np.testing.assert_allclose(Lifting(("a", "b"), few).lift(x)[:, 2:], by_hand, atol=1e-12)
+
+
+def test_delays_and_products():
+    assert delays(["position", "voltage"], 2) == ("position[-1]", "voltage[-1]", "position[-2]", "voltage[-2]")
+    assert products(["position", "sin(position)"], ["voltage"]) == ("position*voltage", "(sin(position))*voltage")
+
+
+def test_a_large_lifting_shares_its_passes():
+    functions = concatenate(
+        harmonics("position", 100, [1, 2], "phase"),
+        polynomials(STATES, 2),
+        radial(STATES, latin_hypercube_centres([[-1, 1]] * 3, 85, 1), 0.5),
+    )
+    lifting = Lifting(STATES, functions, ("phase",))
+    assert len(functions) == 95
+    assert [len(lifting.lift(X, {"phase": 0.1})[0]), len(lifting.separation.basis)] == [98, 95]
+    assert max(np.size(np.arange(98)[columns]) for columns, _ in lifting._columns.blocks) == 85
+    for i in (0, 3, 9, 40, 94):
+        alone = lifting.formulas[i](**{s: X[:, j] for j, s in enumerate(STATES)}, phase=0.1)
+        np.testing.assert_allclose(lifting.lift(X, {"phase": 0.1})[:, 3 + i], alone, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: harmonics("position", 0, [1]), "ratio is 0"),
+        (lambda: harmonics("position", 1, [0]), "at least 1"),
+        (lambda: harmonics("position", 1, [1, 1]), "different whole numbers"),
+        (lambda: harmonics("position", np.inf, [1]), "finite"),
+        (lambda: polynomials("position", 2), "list of names"),
+        (lambda: polynomials(["a", "a"], 2), "repeat a name"),
+        (lambda: polynomials(["a"], 1), "at least 2"),
+        (lambda: radial(["a", "b"], [[0.0]], 1.0), r"shape \(n, 2\), found shape \(1, 1\)"),
+        (lambda: radial(["a"], [[0.0]], 0.0), "length = 0.0 should be a positive number"),
+        (lambda: radial(["a"], [[0.0]], [1.0, 2.0]), "one for each quantity"),
+        (lambda: radial(["a"], [[np.nan]], 1.0), "finite"),
+        (lambda: radial(["a"], [[0.0]], 1.0, "cubic"), "known are gaussian"),
+        (lambda: fourier_features(["a"], 0, 1.0, 0), "at least 1"),
+        (lambda: fourier_features(["a"], 3, -1.0, 0), "positive"),
+        (lambda: fourier_features(["a"], 3, 1.0, 0, "cubic"), "known are gaussian, laplacian"),
+        (lambda: delays(["a"], 0), "at least 1"),
+        (lambda: delays(["a"], 1001), "too deep"),
+        (lambda: grid_centres([[1, -1]], [3]), "lower and an upper"),
+        (lambda: grid_centres([[-1, 1]], [3, 3]), "one whole number"),
+        (lambda: latin_hypercube_centres([[-1, 1]], 0, 0), "at least 1"),
+        (lambda: kmeans_centres(np.zeros((50, 2)), 2, 0), "different samples, found 1"),
+        (lambda: concatenate(polynomials(["a"], 2), formulas(["a**2"])), r"'a\*\*2' appears more than once"),
+        (lambda: family({"kind": "wavelets"}), "known are harmonics"),
+        (lambda: family({"kind": "delays", "names": ["a"], "depths": 2}), "unknown key 'depths', 'depth' is missing"),
+        (lambda: family({"kind": "radial", "names": ["a"], "centres": {"kind": "spiral"}, "length": 1}), "known are grid"),
+        (
+            lambda: family({"kind": "radial", "names": ["a"], "centres": {"kind": "kmeans", "n": 3, "seed": 0}, "length": 1}),
+            "'data' is missing",
+        ),
+        (lambda: family({"kind": "radial", "names": ["a"], "centres": "here", "length": 1}), "could not convert"),
+        (lambda: Lifting(("a",), polynomials(["a", "b"], 2)), "unknown name 'b'"),
+        (lambda: Lifting(("a",), ("+".join(["sin(1.2345678*a)"] * 200),)), "at most 2000"),
+    ],
+)
+def test_what_cannot_be_built_is_refused(build, message):
+    with pytest.raises(ConfigError, match=message):
+        build()
+
+
+def test_families_as_tables():
+    table = {"kind": "radial", "names": ["position"], "centres": {"kind": "grid", "ranges": [[0, 1]], "counts": [2]}, "length": 0.5}
+    assert family(table) == radial(["position"], [[0], [1]], 0.5)
+    asked = []
+
+    def sample(names):
+        asked.append(names)
+        return np.array([[0.0], [0.0], [1.0], [1.0]])
+
+    found = family({**table, "centres": {"kind": "kmeans", "n": 2, "seed": 0}}, sample)
+    assert (set(found), asked) == (set(radial(["position"], [[0], [1]], 0.5)), [("position",)])

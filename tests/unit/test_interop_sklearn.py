@@ -152,6 +152,23 @@ def test_the_system_is_the_model() -> None:
     assert (system.n_states, system.n_inputs, system.dt) == (3, 1, 0.01)
 
 
+def test_a_state_that_does_not_vary_is_no_loss() -> None:
+    X, y, _ = one_step_pairs(recording(), n_inputs=1, episode_feature=True)
+    load = np.full((len(X), 1), 0.3)
+    model = KoopmanRegressor(["sin(x0)"], n_inputs=1)
+    X, y = np.concatenate([X[:, :2], load, X[:, 2:]], axis=1), np.concatenate([y, load], axis=1)
+    model.fit(X, y)
+    assert abs(1 - model.score(X, y)) < 1e-12
+    assert model.score(X, y + np.array([0, 0, 1e-3])) == pytest.approx(2 / 3, abs=1e-12)
+
+
+def test_a_target_of_another_width_is_refused() -> None:
+    X, y, _ = one_step_pairs(recording(), n_inputs=1, episode_feature=True)
+    model = regressor(episode_feature=False).fit(X, y)
+    with pytest.raises(DataError, match="y has 1 columns, the model has 2 states"):
+        model.score(X, y[:, 0])
+
+
 def test_a_diverging_prediction_scores_minus_infinity() -> None:
     growth = np.array([[1e-3], [0.1], [10.0], [1000.0], [1e5]])
     model = KoopmanRegressor(["x0**9"], alpha=1e-9).fit(growth)
@@ -174,6 +191,10 @@ def test_episodes_are_not_joined() -> None:
 def test_groups_end_episodes() -> None:
     X = recording()
     assert is_exact(regressor(episode_feature=False).fit(X[:, 1:], groups=[f"unit {i:.0f}" for i in X[:, 0]]))
+    units = X[:, 0].astype(int)
+    exact = regressor(episode_feature=False, horizon=None).fit(X[:, 1:], groups=units)
+    assert abs(1 - exact.score(X[:, 1:], groups=units)) < 1e-12
+    assert exact.score(X[:, 1:]) < 0.99  # joined, the first state of each unit after the first is not the next of the last
     with pytest.raises(DataError, match="150 rows, found 3"):
         regressor(episode_feature=False).fit(X[:, 1:], groups=["a", "b", "c"])
 
@@ -304,6 +325,9 @@ def test_ids_that_rounding_may_have_merged_are_refused() -> None:
     refuses(X, DataError, r"Episode id 9007199254740994 in row 60 .* beyond 2\*\*53.*int64 or text")
     refuses(frame((2.0**60, 1.0, 2.0)), DataError, r"beyond 2\*\*53")
     refuses(with_ids(2.0**53, 1, 2), DataError, r"beyond 2\*\*53")
+    single = recording().astype(np.float32)
+    single[:, 0] += 2.0**24
+    refuses(single, DataError, r"Episode id 16777216 in row 0 is a float32 beyond 2\*\*24")
     mixed = [[LARGE, 0.1, 0.2, 0.0], [LARGE + 1, 0.1, 0.2, 0.0]]  # a list of numbers becomes an array of floats
     refuses(mixed, DataError, r"beyond 2\*\*53")
 

@@ -263,13 +263,14 @@ def _shift(A: Array, B: Array, V: Any, d: Any, rest: Array) -> tuple[Array, list
     centre = list((V.T * V).LUsolve(-V.T * d)) if n_inputs else []
     left = d + V * _column(centre) if n_inputs else d
     constant = rest + B @ np.array([float(value) for value in left]) if len(left) else rest
-    size = np.abs(A).sum(axis=1).max(initial=1.0)
-    if np.abs(constant).max(initial=0.0) <= _NOTHING * size:
+    if not constant.any():
         return np.zeros(len(A)), centre
     matrix = np.concatenate([np.eye(len(A)) - A, -B @ V_float], axis=1)
     solution = np.linalg.lstsq(matrix, constant, rcond=None)[0]
     missing = np.abs(matrix @ solution - constant).max()
     if missing > 1e-10 * np.abs(constant).max():
+        if np.abs(constant).max() <= _NOTHING * np.abs(A).sum(axis=1).max():
+            return np.zeros(len(A)), centre
         raise IdentificationError(
             f"from_pykoop: the pipeline adds a constant of {np.abs(constant).max():.3g} to the lifted states at every step, and no shift of states "
             f"and inputs removes it ({missing:.3g} is left); leave out the constant lifting function, or scale before lifting."

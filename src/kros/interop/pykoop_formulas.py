@@ -73,10 +73,10 @@ def _translators() -> dict[type, Callable[[Any, LiftedColumns, str], LiftedColum
 
 
 def exact(value: Any) -> Any:
-    """Return a float as the fraction that it is."""
+    """Return a float as the fraction that it is; fractions stay."""
     import sympy as sp
 
-    return sp.Rational(float(value))
+    return value if isinstance(value, sp.Rational) else sp.Rational(float(value))
 
 
 def _split(function: Any, columns: LiftedColumns, place: str) -> LiftedColumns:

@@ -23,7 +23,7 @@ Array = npt.NDArray[np.float64]
 Objects = npt.NDArray[Any]
 
 EPISODE = "episode"
-_EXACT = 2**53  # from here on neighbouring whole numbers share a float64
+_BITS = 53  # from 2**53 on neighbouring whole numbers share a float64
 _STEP_TOLERANCE = 1e-3  # deviation of one time step from the median, relative
 
 
@@ -149,13 +149,14 @@ def whole_or_text(ids: npt.ArrayLike) -> Objects:
     Raises
     ------
     DataError
-        Ids that are missing, fractions, truth values, of mixed kinds, or floats of 2**53 and more, which may have been merged by rounding.
+        Ids that are missing, fractions, truth values, of mixed kinds, or floats so large (2**53 and more
+        for float64) that rounding may have merged them.
     """
     values = np.asarray(ids)
     if values.dtype.kind in "iu":
         return values
     if values.dtype.kind == "f":
-        _check_float_ids(values.astype(float))
+        _check_float_ids(values)
         return values.astype(np.int64)
     found = np.array([_one_id(value, row) for row, value in enumerate(values.tolist())], dtype=object)
     if len({isinstance(value, str) for value in found}) > 1:
@@ -165,17 +166,18 @@ def whole_or_text(ids: npt.ArrayLike) -> Objects:
     return found
 
 
-def _check_float_ids(values: Array) -> None:
+def _check_float_ids(values: npt.NDArray[np.floating[Any]]) -> None:
     bad = np.flatnonzero(~(np.isfinite(values) & (values == np.round(values))))
     if bad.size:
         raise DataError(
             f"Episode ids should be whole numbers or text, found {values[bad[0]]} in row {bad[0]} (NaN and inf are no ids either); "
             "correct the column, or set episode_feature = False where the first column is no episode."
         )
-    large = np.flatnonzero(np.abs(values) >= _EXACT)
+    bits = min(_BITS, np.finfo(values.dtype).nmant + 1)
+    large = np.flatnonzero(np.abs(values) >= 2**bits)
     if large.size:
         raise DataError(
-            f"Episode id {values[large[0]]:.17g} in row {large[0]} is a floating-point number beyond 2**53, where neighbouring ids become "
+            f"Episode id {values[large[0]]:.17g} in row {large[0]} is a {values.dtype} beyond 2**{bits}, where neighbouring ids become "
             "one; pass a DataFrame whose column of episodes is int64 or text."
         )
 
@@ -186,7 +188,7 @@ def _one_id(value: Any, row: int) -> int | str:
     if is_whole(value):
         return int(value)
     if isinstance(value, (float, np.floating)):
-        _check_float_ids(np.array([float(value)]))
+        _check_float_ids(np.array([value]))
         return int(value)
     raise DataError(f"Episode ids should be whole numbers or text, found {value!r} in row {row}; fill in or remove that row.")
 

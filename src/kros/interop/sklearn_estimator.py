@@ -26,7 +26,6 @@ from .rows import Columns, episode_edges, finite, is_whole, log_forgotten_episod
 
 try:
     from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
-    from sklearn.metrics import r2_score
     from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 except ImportError as error:
     raise MissingDependencyError(
@@ -38,6 +37,7 @@ Array = npt.NDArray[np.float64]
 
 _DEPENDENT = 1e-13  # columns that are sums of others left relative pivots of 1e-18 to 2e-15 over 10 to 100 000 rows
 _SCORED_ROWS = 2  # R2 compares with a mean
+_ROUNDING = 1e-12
 
 
 class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -53,8 +53,8 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     columns of a DataFrame       states, inputs; a column named ``episode`` is the episode wherever it stands
     ===========================  ==================================================================================
 
-    Episode ids are whole numbers or text. Rows of an episode have to stand together and are never sorted. Where `y` is given, episodes and
-    time are ignored.
+    Episode ids are whole numbers or text. Rows of an episode have to stand together and are never sorted. Where `y` is given, episodes,
+    units and time are ignored.
 
     Parameters
     ----------
@@ -224,14 +224,18 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         values = finite(values, self.state_names_ + self.input_names_, "Input X")
         return self._free_run(values, episode_edges(columns, groups, len(values)))
 
-    def score(self, X: Any, y: Any = None) -> float:
+    def score(self, X: Any, y: Any = None, groups: npt.ArrayLike | None = None) -> float:
         """Return R2 of the prediction `horizon` samples ahead, the mean over the states.
+
+        A state that does not vary counts one where it is predicted to rounding, else zero.
 
         Parameters
         ----------
         X : array_like or DataFrame, shape (n_samples, n_columns)
         y : array_like, shape (n_samples, n_states), optional
             Next states, only for ``horizon = 1``. Default: the rows of `X` themselves, later in the same episode.
+        groups : array_like, shape (n_samples,), optional
+            Ids of units, as in `fit`.
 
         Returns
         -------
@@ -254,7 +258,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             return _r2(self._read_target(y, len(predicted)), predicted)
         columns, values = self._read(X, reset=False)
         values = finite(values, self.state_names_ + self.input_names_, "Input X")
-        edges = episode_edges(columns, None, len(values))
+        edges = episode_edges(columns, groups, len(values))
         truth = values[:, : self._n_states]
         if self.horizon is None:
             later = np.delete(np.arange(len(values)), edges[:-1])
@@ -385,13 +389,21 @@ def _check_excitation(R: Array, names: Sequence[str], n_states: int, n_lifted: i
 
 
 def _r2(truth: Array, predicted: Array) -> float:
+    """Return the mean R2 over the states; one that does not vary counts one where it is predicted to rounding, else zero."""
+    truth, predicted = (values[:, None] if values.ndim == 1 else values for values in (truth, predicted))
+    if truth.shape != predicted.shape:
+        raise DataError(f"score: y has {truth.shape[1]} columns, the model has {predicted.shape[1]} states; y holds the next states.")
     if len(truth) < _SCORED_ROWS:
         raise DataError(
             f"score: found {len(truth)} samples to compare with, R2 needs {_SCORED_ROWS}; pass longer episodes, or lower the horizon."
         )
     if not np.isfinite(predicted).all():
         return -np.inf
-    return float(r2_score(truth, predicted))
+    varies = np.ptp(truth, axis=0) > 0
+    error = np.sum((predicted - truth) ** 2, axis=0)
+    spread = np.sum((truth - truth.mean(axis=0)) ** 2, axis=0)
+    rounding = len(truth) * (_ROUNDING * np.abs(truth).max(axis=0)) ** 2
+    return float(np.mean(np.where(varies, 1 - error / np.where(varies, spread, 1.0), error <= rounding)))
 
 
 def one_step_pairs(

@@ -2,6 +2,8 @@
 
     samples of (A, B) --> G* - G at every frequency --> quantiles over the draws of sigma_max (scaled) and of every entry's magnitude
 
+First-order samples (`ModelSamples.linear`) have first-order deviations, ``dG = Phi dW [G; I]`` with Phi = (zI - A)^-1 and W = [A B].
+
 A band is pointwise: the true response lies inside at a given frequency with the stated probability, and outside somewhere more often. It
 holds what recordings of the unit vary by; it is not the population's uncertainty, which the units' differences make.
 """
@@ -110,14 +112,27 @@ def response_bands(
     scale_out, scale_in = (_scale(s, size) for s, size in ((output_scale, n), (input_scale, m)))
     response = np.empty((units, len(freqs), n, m), dtype=complex)
     entry, spectral = np.empty((units, len(freqs), n, m)), np.empty((units, len(freqs)))
+    deviation = _linear_deviation if models.linear else _deviation
     for row in range(units):
+        estimate = KoopmanMatrices(models.estimate.A[row], models.estimate.B[row])
+        samples = KoopmanMatrices(A[row], B[row])
+        response[row] = _response(estimate, freqs, sample_period_s)
         for part in _parts(len(freqs), draws * n * (n + m)):
-            centre = _response(KoopmanMatrices(models.estimate.A[row], models.estimate.B[row]), freqs[part], sample_period_s)
-            off = _response(KoopmanMatrices(A[row], B[row]), freqs[part], sample_period_s) - centre  # (draw, frequency, n, m)
-            response[row, part] = centre
+            off = deviation(estimate, samples, response[row, part], freqs[part], sample_period_s)  # (draw, frequency, n, m)
             entry[row, part] = np.quantile(np.abs(off), level, axis=0)
             spectral[row, part] = np.quantile(_largest_gain(off * scale_in / scale_out[:, None]), level, axis=0)
     return Bands(models.unit_ids, freqs, level, response, entry, spectral, scale_out, scale_in)
+
+
+def _deviation(estimate: KoopmanMatrices, samples: KoopmanMatrices, G: Complex, freqs_hz: Array, sample_period_s: float) -> Complex:
+    return np.asarray(_response(samples, freqs_hz, sample_period_s) - G)
+
+
+def _linear_deviation(estimate: KoopmanMatrices, samples: KoopmanMatrices, G: Complex, freqs_hz: Array, sample_period_s: float) -> Complex:
+    """``dG = Phi dW [G; I]``."""
+    Phi = _response(KoopmanMatrices(estimate.A, np.eye(len(estimate.A))), freqs_hz, sample_period_s)
+    dA, dB = samples.A - estimate.A, samples.B - estimate.B
+    return np.asarray(Phi @ (dA[:, None] @ G + dB[:, None]))
 
 
 def _response(models: KoopmanMatrices, freqs_hz: Array, sample_period_s: float) -> Complex:

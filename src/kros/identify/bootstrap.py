@@ -45,11 +45,15 @@ class ModelSamples:
         A (unit, n, n) and B (unit, n, m).
     samples : KoopmanMatrices
         A (unit, draw, n, n) and B (unit, draw, n, m).
+    linear : bool
+        The samples are first-order steps: they have the right spread, but what follows from them nonlinearly, such as a response or an
+        eigenvalue, is to be taken to first order around the estimate as well (`response_bands` does).
     """
 
     unit_ids: tuple[str, ...]
     estimate: KoopmanMatrices
     samples: KoopmanMatrices
+    linear: bool = False
 
     @property
     def n_draws(self) -> int:
@@ -68,7 +72,7 @@ class ModelSamples:
         return KoopmanMatrices(self.samples.A.std(axis=1, ddof=1), self.samples.B.std(axis=1, ddof=1))
 
     def unstable_share(self) -> Array:
-        """Return the share of samples with a spectral radius of one or more, shape (unit,)."""
+        """Return the share of samples with a spectral radius of one or more, shape (unit,); of little meaning where they are `linear`."""
         return np.asarray((self.samples.spectral_radius() >= 1).mean(axis=1))
 
 
@@ -214,13 +218,15 @@ def bootstrap_refined(
     Returns
     -------
     ModelSamples
-        A sample is not checked for stability (see `ModelSamples.unstable_share`).
+        Marked `linear`: the prior keeps responses together along a curved set of (A, B), which a straight step leaves. Against full refits
+        of simulated drives, the spread of first-order responses was right to 20 percent, that of the steps' own responses up to 9 times too large.
+        The steps lead from a minimum, so a search that ran out of iterations far from it makes them too small or too large.
     """
     n, p = units.A.shape[-1], len(whitening)
     dV = one_step_deviations(normal, information, weights).reshape(len(units.A), -1, n, p)
     dW = dV @ whitening.T
     samples = KoopmanMatrices(units.A[:, None] + dW[..., :n], units.B[:, None] + dW[..., n:])
-    return ModelSamples(_named(unit_ids, len(units.A)), units, samples)
+    return ModelSamples(_named(unit_ids, len(units.A)), units, samples, linear=True)
 
 
 def _solve(H: Array, g: Array) -> Array:

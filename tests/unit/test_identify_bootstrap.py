@@ -1,0 +1,171 @@
+"""Edges of resampling: weights, missing episodes, bands on disk, segments by episode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kros.core import ConfigError, DataError, DimensionError, IdentificationError
+from kros.data import Channel, EpisodeKey, Population, Role, Unit
+from kros.identify import (
+    Bands,
+    KoopmanMatrices,
+    ModelSamples,
+    bands,
+    bootstrap,
+    bootstrap_edmd,
+    bootstrap_refined,
+    edmd,
+    episode_weights,
+    one_step_deviations,
+    response_bands,
+)
+from kros.identify.refine.episodes import segment_owners
+from kros.identify.refine.segments import read_segments
+
+
+def factors(units: int, episodes: int, seed: int = 0) -> np.ndarray:
+    return np.linalg.qr(np.random.default_rng(seed).normal(size=(units, episodes, 30, 5)), mode="r")
+
+
+def samples(units: int = 2, draws: int = 40, spread: float = 0.02) -> ModelSamples:
+    rng = np.random.default_rng(1)
+    A, B = np.array([[0.8, 0.1], [-0.2, 0.7]]), np.array([[0.1, 0.0], [1.0, 0.5]])
+    whole = KoopmanMatrices(np.tile(A, (units, 1, 1)), np.tile(B, (units, 1, 1)))
+    drawn = KoopmanMatrices(A + spread * rng.normal(size=(units, draws, 2, 2)), B + spread * rng.normal(size=(units, draws, 2, 2)))
+    return ModelSamples(tuple(f"u{i}" for i in range(units)), whole, drawn)
+
+
+def test_weights_keep_the_number_of_episodes_and_the_variance_of_a_mean() -> None:
+    """Mean 1 and, for E episodes, covariance 1 on and -1 / (E - 1) off the diagonal: that of an unbiased variance."""
+    weights = episode_weights([4, 7], 40_000, seed=0)
+    assert weights.shape == (2, 40_000, 7)
+    assert not weights[0, :, 4:].any()
+    np.testing.assert_allclose(weights.sum(axis=2), [[4.0] * 40_000, [7.0] * 40_000])
+    for row, E in ((0, 4), (1, 7)):
+        expected = (E * np.eye(E) - 1) / (E - 1)
+        np.testing.assert_allclose(np.cov(weights[row, :, :E].T), expected, atol=0.04)
+
+
+def test_a_units_draws_do_not_depend_on_the_units_after_it() -> None:
+    np.testing.assert_array_equal(episode_weights([5], 9, 3)[0], episode_weights([5, 5], 9, 3)[0])
+    assert not np.array_equal(episode_weights([5], 9, 3), episode_weights([5], 9, 4))
+
+
+@pytest.mark.parametrize(("episodes", "draws"), [([3, 1], 10), ([3, 3], 1), ([], 10)])
+def test_too_little_to_draw_from_is_refused(episodes: list[int], draws: int) -> None:
+    with pytest.raises(DataError, match="at least two episodes"):
+        episode_weights(episodes, draws, 0)
+
+
+def test_equal_weights_give_the_estimate_and_whole_weights_give_copies(monkeypatch: pytest.MonkeyPatch) -> None:
+    R = factors(2, 3)
+    weights = np.array([[[1.0, 1, 1], [2, 0, 1]]] * 2)
+    found = bootstrap_edmd(R, 2, 0.5, weights)
+    np.testing.assert_allclose(found.samples.A[:, 0], found.estimate.A, rtol=1e-10)
+    copies = edmd(np.linalg.qr(R[:, [0, 0, 2]].reshape(2, -1, 5), mode="r"), 2, 0.5)
+    np.testing.assert_allclose(found.samples.A[:, 1], copies.A, rtol=1e-9)
+    np.testing.assert_allclose(found.samples.B[:, 1], copies.B, rtol=1e-9)
+    monkeypatch.setattr(bootstrap, "_AT_ONCE", 1)
+    np.testing.assert_array_equal(bootstrap_edmd(R, 2, 0.5, weights).samples.A, found.samples.A)
+
+
+def test_a_unit_with_fewer_episodes_is_resampled_among_its_own() -> None:
+    R = factors(1, 3)
+    padded = np.concatenate([R, np.zeros((1, 2, 5, 5))], axis=1)
+    weights = episode_weights([3], 6, 0)
+    wide = np.concatenate([weights, np.zeros((1, 6, 2))], axis=2)
+    np.testing.assert_allclose(bootstrap_edmd(padded, 2, 0.0, wide).samples.A, bootstrap_edmd(R, 2, 0.0, weights).samples.A, rtol=1e-9)
+
+
+def test_sizes_that_do_not_fit_are_named() -> None:
+    with pytest.raises(DimensionError, match=r"weights of shape \(2, draws, 3\)"):
+        bootstrap_edmd(factors(2, 3), 2, 0.0, np.ones((2, 4, 5)))
+    with pytest.raises(DimensionError, match="One-step bootstrap"):
+        one_step_deviations(np.zeros((2, 3, 5, 5)), np.zeros((2, 5, 5)), np.ones((2, 4, 3)))
+    with pytest.raises(DimensionError, match="2 units need as many names"):
+        bootstrap_edmd(factors(2, 3), 2, 0.0, np.ones((2, 4, 3)), ["u"])
+    with pytest.raises(IdentificationError, match="depends on the others"):
+        bootstrap_edmd(np.zeros((1, 3, 5, 5)), 2, 0.0, np.ones((1, 2, 3)))
+
+
+def test_directions_without_information_do_not_move() -> None:
+    normal = np.zeros((1, 2, 3, 3))
+    normal[0, :, 0, 0], normal[0, 0, 0, 2], normal[0, 1, 0, 2] = 1.0, 0.5, -0.5
+    found = one_step_deviations(normal, np.diag([2.0, 0.0])[None], np.array([[[2.0, 0.0]]]))
+    np.testing.assert_allclose(found[0, 0], [0.5, 0.0])
+
+
+def test_steps_pass_through_the_whitening() -> None:
+    """[A B] = V T^T: a step of V in its first column moves the columns that the first column of T names."""
+    T = np.array([[2.0, 0.0], [1.0, 3.0]])
+    normal = np.zeros((1, 2, 3, 3))
+    normal[0, :, 0, 0], normal[0, :, 1, 1], normal[0, 0, 0, 2], normal[0, 1, 0, 2] = 0.5, 0.5, 0.25, -0.25
+    made = bootstrap_refined(
+        KoopmanMatrices(np.zeros((1, 1, 1)), np.zeros((1, 1, 1))), T, np.eye(2)[None], normal, np.array([[[2.0, 0.0]]])
+    )
+    assert made.linear
+    assert (made.samples.A.item(), made.samples.B.item()) == pytest.approx((1.0, 0.5))
+
+
+def test_covariance_and_standard_errors_agree() -> None:
+    made = samples()
+    spread = made.standard_error()
+    expected = np.concatenate([spread.A, spread.B], axis=-1).reshape(2, -1)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(made.covariance(), axis1=1, axis2=2)), expected, rtol=1e-10)
+    assert made.unstable_share().tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_bands_are_quantiles_of_the_deviations(linear: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = ModelSamples(*(getattr(samples(), name) for name in ("unit_ids", "estimate", "samples")), linear=linear)
+    out, into, freqs, dt = np.array([1.0, 4.0]), np.array([2.0, 0.5]), np.array([0.0, 3.0, 50.0]), 0.01
+    monkeypatch.setattr(bands, "_AT_ONCE", 200)
+    found = response_bands(made, freqs, dt, out, into, 0.8)
+    for unit in range(2):
+        for k, z in enumerate(np.exp(2j * np.pi * freqs * dt)):
+            A, B = made.estimate.A[unit], made.estimate.B[unit]
+            Phi = np.linalg.inv(z * np.eye(2) - A)
+            off = []
+            for As, Bs in zip(made.samples.A[unit], made.samples.B[unit], strict=True):
+                full = np.linalg.inv(z * np.eye(2) - As) @ Bs - Phi @ B
+                off.append(Phi @ ((As - A) @ Phi @ B + Bs - B) if linear else full)
+            np.testing.assert_allclose(found.response[unit, k], Phi @ B, rtol=1e-9)
+            np.testing.assert_allclose(found.entry[unit, k], np.quantile(np.abs(off), 0.8, axis=0), rtol=1e-7)
+            sizes = [np.linalg.norm(np.diag(1 / out) @ d @ np.diag(into), ord=2) for d in off]
+            np.testing.assert_allclose(found.spectral[unit, k], np.quantile(sizes, 0.8), rtol=1e-7)
+
+
+def test_small_steps_have_the_same_bands_to_first_order() -> None:
+    made = samples(spread=1e-5)
+    full, first = (response_bands(ModelSamples(made.unit_ids, made.estimate, made.samples, flag), [1.0], 0.01) for flag in (False, True))
+    np.testing.assert_allclose(full.spectral, first.spectral, rtol=1e-3)
+
+
+def test_bands_survive_the_disk(tmp_path: Path) -> None:
+    found = response_bands(samples(), [1.0, 10.0], 0.01, [1.0, 2.0], [3.0, 4.0])
+    found.save(tmp_path)
+    again = Bands.load(tmp_path)
+    assert (again.unit_ids, again.level) == (found.unit_ids, 0.95)
+    for name in ("freqs_hz", "response", "entry", "spectral", "output_scale", "input_scale"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
+
+
+def test_bands_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(ConfigError, match="between 0 and 1"):
+        response_bands(samples(), [1.0], 0.01, level=95)
+    with pytest.raises(ConfigError, match="Nyquist"):
+        response_bands(samples(), [100.0], 0.01)
+    with pytest.raises(DimensionError, match="2 positive numbers"):
+        response_bands(samples(), [1.0], 0.01, output_scale=[1.0, 0.0])
+
+
+@pytest.mark.parametrize("lengths", [[50, 50, 50, 50], [50, 50], [50]])
+def test_segments_are_told_apart_by_episode_as_they_were_drawn(lengths: list[int]) -> None:
+    data = {EpisodeKey("u", "default", str(e)): (1000.0 * e + np.arange(n))[:, None] * [1.0, -1.0] for e, n in enumerate(lengths)}
+    made = Population((Channel("x", Role.STATE), Channel("u", Role.INPUT)), 1.0, (Unit("u"),), tuple(data), data.__getitem__)
+    keys = {"u": tuple(data)}
+    drawn = read_segments(made, keys, horizon=10, count=9, seed=0)
+    np.testing.assert_array_equal(segment_owners(keys, 9)[0], drawn.states[0, 0, 0] // 1000)

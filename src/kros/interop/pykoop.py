@@ -23,9 +23,9 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DataError, DimensionError, IdentificationError, MissingDependencyError
 from ..core.lti import StateSpace
 from ..data import Population
-from ..identify import ModelSet
+from ..identify import ModelSet, free_run
 from ..lifting import Lifting
-from .pykoop_formulas import LiftedColumns, exact, text, walk
+from .pykoop_formulas import LiftedColumns, base_and_delay, exact, text, walk
 
 Array = npt.NDArray[np.float64]
 
@@ -65,50 +65,50 @@ class AdoptedModel:
 
         Parameters
         ----------
-        x : array_like, shape (..., n_states)
-            In the units of the recording, without any offset taken off.
-        u : array_like, shape (..., n_inputs), optional
+        x : array_like, shape (..., n_states), or (..., n_samples, n_states) for a lifting with delays
+            In the units of the recording, without any offset taken off. With delays: consecutive samples.
+        u : array_like, of the same shape but n_inputs, optional
             Not needed by models without inputs.
 
         Returns
         -------
-        ndarray, shape (..., n_states)
+        ndarray, shape (..., n_states), or (..., n_samples - history, n_states)
+            Samples one step later; with delays, the first one follows the first complete history.
         """
         x, n = np.asarray(x, dtype=float), self.lifting.n_states
-        u = np.zeros((*x.shape[:-1], 0)) if u is None else u
-        return np.asarray(
-            self.lifting.lift(x - self.state_offset) @ self.A[:n].T + self.lifted_inputs(x, u) @ self.B[:n].T + self.state_offset
-        )
+        theta, inputs = self.lift(x, np.zeros((*x.shape[:-1], 0)) if u is None else u)
+        return np.asarray(theta @ self.A[:n].T + inputs @ self.B[:n].T + self.state_offset)
 
-    def lifted_inputs(self, x: npt.ArrayLike, u: npt.ArrayLike) -> Array:
-        """Return input deviations with the input functions behind them, shape (..., n_lifted_inputs)."""
-        xi, mu = np.asarray(x, dtype=float) - self.state_offset, np.asarray(u, dtype=float)
+    def lift(self, x: npt.ArrayLike, u: npt.ArrayLike) -> tuple[Array, Array]:
+        """Return lifted states and lifted inputs of samples, as in `predict`; both are of deviations from the offsets."""
+        xi, mu = np.asarray(x, dtype=float), np.asarray(u, dtype=float)
         if mu.shape != (*xi.shape[:-1], len(self.inputs)):
             raise DimensionError(
                 f"AdoptedModel: states of shape {xi.shape} need a row each of the inputs {self.inputs}, found shape {mu.shape}."
             )
-        mu = mu - self.input_offset
-        return self.lifting.lift_inputs(mu, xi)
+        xi, mu, h = xi - self.state_offset, mu - self.input_offset, self.lifting.history
+        windows = self.lifting.windows(xi, mu)
+        return self.lifting.lift(windows), self.lifting.lift_inputs(mu[..., h:, :] if h else mu, windows)
 
     def free_run(self, x0: npt.ArrayLike, u: npt.ArrayLike) -> Array:
         """Simulate from first states with recorded inputs, retracted and re-lifted at every step.
 
         Parameters
         ----------
-        x0 : array_like, shape (..., n_states)
+        x0 : array_like, shape (..., n_states), or (..., history + 1, n_states) for a lifting with delays
         u : array_like, shape (..., n_samples, n_inputs)
 
         Returns
         -------
         ndarray, shape (..., n_samples, n_states)
-            The first sample is `x0`.
+            The first samples are `x0`.
         """
-        inputs = np.moveaxis(np.asarray(u, dtype=float), -2, 0)
-        run = [np.asarray(x0, dtype=float)]
-        with np.errstate(over="ignore", invalid="ignore"):
-            for now in inputs[:-1]:
-                run.append(self.predict(run[-1], now))
-        return np.stack(run, axis=-2)
+        inputs = np.asarray(u, dtype=float) - self.input_offset
+        first = np.asarray(x0, dtype=float) - self.state_offset
+        batch = inputs.shape[:-2]
+        first, inputs = first.reshape(-1, *first.shape[len(batch) :]), inputs.reshape(-1, *inputs.shape[-2:])
+        run = free_run(self.A, self.B, self.lifting, {}, first, inputs)
+        return np.asarray(run.reshape(*batch, *run.shape[1:]) + self.state_offset)
 
     def system(self, sample_period_s: float) -> StateSpace:
         """Return the model as a linear system from (lifted) input deviations to lifted states."""
@@ -119,8 +119,8 @@ class AdoptedModel:
 def from_pykoop(pipeline: Any, *, states: Sequence[str] | None = None, inputs: Sequence[str] | None = None, seed: int = 0) -> AdoptedModel:
     """Adopt a fitted `pykoop.KoopmanPipeline`.
 
-    Polynomials, radial basis functions, random Fourier features, constants and affine scalers have formulas, also inside a
-    `pykoop.SplitPipeline`. (To read pykoop's array of recordings, see `kros.data.from_pykoop`.)
+    Polynomials, radial basis functions, random Fourier features, delays, products with inputs, constants and affine scalers have formulas,
+    also inside a `pykoop.SplitPipeline`. (To read pykoop's array of recordings, see `kros.data.from_pykoop`.)
 
     Parameters
     ----------
@@ -218,9 +218,11 @@ def _translate(pipeline: Any, names: tuple[str, ...], input_names: tuple[str, ..
     c, u_offset = _shift(A, B, V, d, rest)
     inverse = S.inv()
     x_offset = list(inverse * (sp.Matrix([exact(value) for value in c[:n]]) - s0)) if n else []
-    moved = {**{s: s + o for s, o in zip(x, x_offset, strict=True)}, **{s: s + o for s, o in zip(u, u_offset, strict=True)}}
+    offsets = dict(zip((*names, *input_names), (*x_offset, *u_offset), strict=True))
+    everything = set().union(*(column.free_symbols for column in (*lifted.states, *lifted.inputs)))
+    moved = {symbol: symbol + offsets[base_and_delay(symbol.name)[0]] for symbol in everything}
     functions, T, P = _functions([lifted.states[i].xreplace(moved) - exact(c[k]) for k, i in enumerate(kept) if k >= n], S, inverse)
-    gamma, G = _input_functions([lifted.inputs[j].xreplace(moved) for j in other], u)
+    gamma, G = _input_functions([lifted.inputs[j].xreplace(moved) for j in other], input_names)
     V_float = np.array(V.tolist(), dtype=float).reshape(len(affine), len(u))
     whole = np.concatenate([B @ V_float, coefficients[np.ix_(kept, [p + j for j in other])] @ G], axis=1)
     model = AdoptedModel(
@@ -306,12 +308,13 @@ def _functions(columns: list[Any], S: Any, inverse: Any) -> tuple[tuple[str, ...
     return tuple(order), T, P
 
 
-def _input_functions(columns: list[Any], u: list[Any]) -> tuple[tuple[str, ...], Array]:
+def _input_functions(columns: list[Any], inputs: tuple[str, ...]) -> tuple[tuple[str, ...], Array]:
     """Return formulas of the inputs without factors or repetitions, and G with ``columns = G gamma``."""
     pairs = [column.as_coeff_Mul() for column in columns]
     formulas = [text(function) for _, function in pairs]
     order = list(dict.fromkeys(formulas))
-    idle = [formula for formula, (_, function) in zip(formulas, pairs, strict=True) if not function.free_symbols & set(u)]
+    read = [{base_and_delay(symbol.name)[0] for symbol in function.free_symbols} for _, function in pairs]
+    idle = [formula for formula, names in zip(formulas, read, strict=True) if not names & set(inputs)]
     if idle:
         raise ConfigError(
             f"from_pykoop: the pipeline takes {idle[0]!r}, which depends on no input, for an input; lift the states by themselves."
@@ -332,11 +335,15 @@ def _verified(model: AdoptedModel, pipeline: Any, reading: _Reading, seed: int) 
     rows = np.concatenate([np.zeros((_ROWS, first)), x, u], axis=1)
     with pykoop.config_context(skip_validation=True):  # with it, no pipeline that was fitted to a frame predicts anything (pykoop 2.0.1)
         lifted, predicted = pipeline.transform(rows), np.asarray(pipeline.predict(rows))[:, first:]
-    theta, after = model.lifting.lift(x - model.state_offset), pipeline.regressor_.predict(lifted)
+    after = pipeline.regressor_.predict(lifted)[:, first:]
+    theta, inputs = model.lift(x, u)
+    # With delays pykoop's prediction is read from delayed features, which hold the past, in all rows but the last.
+    last = slice(-1, None) if model.lifting.history else slice(None)
+    together = slice(-min(len(theta), len(lifted)), None)
     pairs = {
-        "lifted states": (theta, reading(lifted[:, first:])),
-        "lifted prediction": (theta @ model.A.T + model.lifted_inputs(x, u) @ model.B.T, reading(after[:, first:])),
-        "prediction": (model.predict(x, u), predicted),
+        "lifted states": (theta[together], reading(lifted[together, first:])),
+        "lifted prediction": ((theta @ model.A.T + inputs @ model.B.T)[together], reading(after[together])),
+        "prediction": (model.predict(x, u)[last], predicted[last]),
     }
     differences = {what: _difference(ours, theirs) for what, (ours, theirs) in pairs.items()}
     worst = max(differences, key=lambda what: differences[what])
@@ -422,8 +429,7 @@ def _facts(model: AdoptedModel, population: Population, unit: str, condition: st
     """Return the largest magnitude of every lifted state and input, and the covariance of the one-step residual."""
     peaks, total, count = [], np.zeros_like(model.A), 0
     for key in population.keys(unit, condition):
-        x, u = population.read_parts(key)
-        lifted, inputs = model.lifting.lift(x), model.lifting.lift_inputs(u, x)
+        lifted, inputs = model.lift(*population.read_parts(key))
         residual = lifted[1:] - lifted[:-1] @ model.A.T - inputs[:-1] @ model.B.T
         peaks.append(np.abs(np.concatenate([lifted, inputs], axis=1)).max(axis=0))
         total += residual.T @ residual

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import ConfigError
+from ..lifting.formula import delayed_name
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ def _translators() -> dict[type, Callable[[Any, LiftedColumns, str], LiftedColum
     return {
         pykoop.BilinearInputLiftingFn: _bilinear,
         pykoop.ConstantLiftingFn: _constant,
+        pykoop.DelayLiftingFn: _delays,
         pykoop.KernelApproxLiftingFn: _kernel,
         pykoop.KoopmanPipeline: lambda function, columns, place: walk(function.lifting_functions_, columns, f"{place}/"),
         pykoop.PolynomialLiftingFn: _polynomial,
@@ -102,6 +104,34 @@ def _constant(function: Any, columns: LiftedColumns, place: str) -> LiftedColumn
     import sympy as sp
 
     return LiftedColumns((*columns.states, sp.Integer(1)), columns.inputs)
+
+
+def _delays(function: Any, columns: LiftedColumns, place: str) -> LiftedColumns:
+    def delayed(block: tuple[Any, ...], depth: int) -> tuple[Any, ...]:
+        return tuple(_earlier(column, delay) for delay in range(depth + 1) for column in block)
+
+    return LiftedColumns(delayed(columns.states, function.n_delays_state), delayed(columns.inputs, function.n_delays_input))
+
+
+def _earlier(column: Any, delay: int) -> Any:
+    """Return a column as it was `delay` samples before."""
+    import sympy as sp
+
+    moved = {}
+    for symbol in column.free_symbols:
+        name, already = base_and_delay(symbol.name)
+        moved[symbol] = sp.Symbol(delayed_name(name, already + delay), real=True)
+    return column.xreplace(moved)
+
+
+def base_and_delay(name: str) -> tuple[str, int]:
+    """Return the quantity behind a name, and how many samples before it is meant.
+
+    >>> base_and_delay("angle[-2]"), base_and_delay("angle")
+    (('angle', 2), ('angle', 0))
+    """
+    base, _, index = name.partition("[")
+    return base, -int(index[:-1]) if index else 0
 
 
 def _affine(function: Any, columns: LiftedColumns, place: str) -> LiftedColumns:

@@ -454,12 +454,30 @@ def test_columns_that_do_not_add_up_are_refused() -> None:
     refuses(recording()[0], DataError, "Expected 2D array")
 
 
-def test_importing_kros_needs_no_scikit_learn() -> None:
+@pytest.mark.filterwarnings("ignore:X .* feature names:UserWarning")
+def test_rows_of_another_layout_than_in_fit_are_refused() -> None:
+    model = KoopmanRegressor(FUNCTIONS, n_inputs=1).fit(frame())
+    with pytest.raises(DataError, match=r"states and inputs \('angle', 'rate', 'voltage'\), found 4 columns"):
+        model.predict(recording())
+    arrays = KoopmanRegressor(n_inputs=1).fit(episode())
+    with pytest.raises(DataError, match=r"found \('angle', 'voltage'\)"):
+        arrays.predict(frame()[["episode", "angle", "voltage"]])
+
+
+@pytest.mark.parametrize(
+    ("package", "call"),
+    [
+        ("sklearn", "kros.interop.KoopmanRegressor"),
+        ("pykoop", "kros.interop.from_pykoop(None)"),
+        ("control", "kros.interop.to_control"),
+    ],
+)
+def test_what_is_not_installed_is_named_when_it_is_needed(package: str, call: str) -> None:
     code = (
-        "import sys; sys.modules['sklearn'] = None; sys.modules['sklearn.base'] = None\n"
+        f"import sys; sys.modules[{package!r}] = None\n"
         "import kros, kros.interop\n"
         "from kros.core import MissingDependencyError\n"
-        "try:\n    kros.interop.KoopmanRegressor\nexcept MissingDependencyError as error:\n    assert 'kros[sklearn]' in str(error)\n"
+        f"try:\n    {call}\nexcept MissingDependencyError as error:\n    assert {f'kros[{package}]'!r} in str(error)\n"
         "else:\n    raise SystemExit('no error')\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

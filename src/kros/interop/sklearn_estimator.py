@@ -200,8 +200,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Row k is the state one step after row k. Of shape (n_samples,) where `fit` was given a `y` of one dimension.
         """
         check_is_fitted(self)
-        _, values = self._read(X, reset=False)
-        values = finite(values, self.state_names_ + self.input_names_, "Input X")
+        _, values = self._read_fitted(X)
         predicted = self._step(values[:, : self._n_states], values[:, self._n_states :])
         return predicted[:, 0] if self._one_dimensional else predicted
 
@@ -220,8 +219,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Row k belongs to row k of `X` (not to the one after it). A run that diverges holds infinities or NaN.
         """
         check_is_fitted(self)
-        columns, values = self._read(X, reset=False)
-        values = finite(values, self.state_names_ + self.input_names_, "Input X")
+        columns, values = self._read_fitted(X)
         return self._free_run(values, episode_edges(columns, groups, len(values)))
 
     def score(self, X: Any, y: Any = None, groups: npt.ArrayLike | None = None) -> float:
@@ -256,8 +254,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 )
             predicted = self.predict(X)
             return _r2(self._read_target(y, len(predicted)), predicted)
-        columns, values = self._read(X, reset=False)
-        values = finite(values, self.state_names_ + self.input_names_, "Input X")
+        columns, values = self._read_fitted(X)
         edges = episode_edges(columns, groups, len(values))
         truth = values[:, : self._n_states]
         if self.horizon is None:
@@ -316,6 +313,18 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         columns = split_columns(X, episode_feature=self.episode_feature, time=self.time)
         validate_data(self, X if hasattr(X, "iloc") else np.asarray(X), reset=reset, skip_check_array=True)
         return columns, check_array(columns.values, **options)
+
+    def _read_fitted(self, X: Any) -> tuple[Columns, Array]:
+        """Read rows with the columns of those that the model was fitted to."""
+        columns, values = self._read(X, reset=False)
+        names = self.state_names_ + self.input_names_
+        if values.shape[1] != len(names):
+            found = columns.names or f"{values.shape[1]} columns"
+            raise DataError(
+                f"The model has the states and inputs {names}, found {found} besides episode and time; pass rows in the layout of `fit`, where an "
+                "array has the episode first (episode_feature = True) and a frame has it by name."
+            )
+        return columns, finite(values, names, "Input X")
 
     def _read_target(self, y: Any, n_samples: int) -> Array:
         target = check_array(y, dtype=np.float64, ensure_2d=False, ensure_all_finite=False, input_name="y", estimator=self)

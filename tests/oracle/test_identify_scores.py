@@ -52,6 +52,21 @@ def test_every_start_equals_a_plain_loop(horizon: int, stride: int) -> None:
     np.testing.assert_allclose(scores.r2[0, 0], 1 - np.sum(error**2, axis=0) / (len(error) * np.var(x[horizon::stride], axis=0)))
 
 
+def test_an_exact_model_with_delays_and_input_functions_scores_no_error() -> None:
+    """x+ = 0.6 x - 0.3 x[-2] + u x, stepped here without kros; a wrong start of the history by one sample shows in every number."""
+    lifting = Lifting(("x",), ("x[-1]", "x[-2]"), inputs=("u",), input_functions=("u*x",))
+    u = 0.3 * np.random.default_rng(7).normal(size=(60, 1))
+    x = np.ones((60, 1))
+    for k in range(2, 59):
+        x[k + 1] = 0.6 * x[k] - 0.3 * x[k - 2] + u[k] * x[k]
+    shift = np.array([[0.6, 0.0, -0.3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    model = KoopmanMatrices(shift, np.array([[0.0, 1.0], [0.0, 0.0], [0.0, 0.0]]))
+    found = score(model, lifting, {}, [(x, u)], (1, 9, None))
+    assert found.counts.tolist() == [[57, 49, 60]]
+    np.testing.assert_allclose(found.percent, 0.0, atol=1e-12)
+    np.testing.assert_allclose(predict_ahead(model, lifting, {}, x, u, 9, stride=4), x[11::4], atol=1e-12)
+
+
 def of_pykoop(noise: float) -> tuple[object, np.ndarray, np.ndarray, Scores]:
     pykoop = pytest.importorskip("pykoop")
     x, u = exact(LINEAR, 100, 2)

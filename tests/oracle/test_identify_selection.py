@@ -112,3 +112,19 @@ def test_a_model_of_the_other_units_is_worse_than_an_own_one(clear: Selection) -
     made, keys, phase = population(4, 6, 150, 0.02, seed=3)
     pooled = cross_validate(made, keys, CANDIDATES, (0.0,), {"phase": phase}, "units", horizons=(1, None))
     assert pooled.best(horizon=1).value > clear.best(horizon=1).value
+
+
+def test_the_delay_that_made_the_data_is_chosen() -> None:
+    """Second-order dynamics of one recorded state: without the earlier value they cannot be told, with a third one nothing is gained."""
+    rng, data = np.random.default_rng(8), {}
+    for episode in range(6):
+        u, x = rng.normal(size=(200, 1)), np.zeros((200, 1))
+        for k in range(1, 199):
+            x[k + 1] = 1.5 * x[k] - 0.8 * x[k - 1] + u[k] + 0.05 * rng.normal()
+        data[EpisodeKey("p", "default", str(episode))] = np.hstack([x, u])
+    made = Population((Channel("x", Role.STATE), Channel("u", Role.INPUT)), 0.01, (Unit("p"),), tuple(data), data.__getitem__)
+    candidates = {"none": Lifting(("x",)), "one": Lifting(("x",), ("x[-1]",)), "two": Lifting(("x",), ("x[-1]", "x[-2]"))}
+    found = cross_validate(made, {"p": made.keys("p")}, candidates, (1e-6,), horizons=(1, 20), stride=2)
+    assert found.best(horizon=1, one_standard_error=True).candidate == "one"
+    percent = found.values("percent", 20)[:, 0].mean(axis=(1, 2))
+    assert percent[0] > 2 * percent[1]

@@ -1,7 +1,9 @@
 """Scores of lifted models against recordings: one step ahead, at stated horizons, and over whole free runs.
 
     horizon h:  x_hat_{k+h} from x_k and inputs k .. k+h-1, compared with x_{k+h}, for every (or every s-th) k
-    free run:   x_hat from the first state of the episode and its inputs, compared at every sample, the first included
+    free run:   x_hat from the first state of the episode and its inputs, compared at every sample, the given ones included
+
+With delays a prediction starts from x_k and the lifting's history before it, and a free run from the first samples that hold one.
 
 Both retract and re-lift at every step. A prediction of sample k + h is compared with the recording at k + h and no other sample, so that an
 exact model has error 0 and R^2 = 1. (The scorer of pykoop 2 predicts from unshifted data and compares with shifted data, one sample late.)
@@ -137,7 +139,7 @@ def score(
     Returns
     -------
     Scores
-        Where an episode has fewer than ``horizon + 1`` samples its count is zero, which is logged.
+        Where an episode has fewer than ``history + horizon + 1`` samples its count is zero, which is logged.
 
     Raises
     ------
@@ -155,10 +157,10 @@ def score(
     0.0
     """
     scores = score_long_enough(models, lifting, parameters, episodes, horizons, stride)
-    for horizon, counted in zip(scores.horizons, scores.counts.any(axis=0).tolist(), strict=True):
-        if not counted:
+    for column, horizon in enumerate(scores.horizons):
+        if not scores.counts[:, column].any():
             raise DataError(
-                f"Scores: horizon {horizon} needs episodes of {(horizon or 1) + 1} samples or more, the longest has "
+                f"Scores: horizon {horizon} needs episodes of {lifting.history + (horizon or 1) + 1} samples or more, the longest has "
                 f"{max(len(x) for x, _ in episodes)}; ask for a shorter horizon."
             )
     return scores
@@ -210,19 +212,20 @@ def predict_ahead(
     Returns
     -------
     ndarray, shape (n_starts, n)
-        Row i is the prediction of sample ``i * stride + horizon``, to be compared with ``x[horizon::stride]``.
+        Row i is the prediction of sample ``history + i * stride + horizon``, to be compared with ``x[history + horizon::stride]``.
     """
-    first = x[: max(0, len(x) - horizon) : stride]
-    if not len(first):
+    past = lifting.history
+    if len(x) <= past + horizon:
         return np.zeros((0, x.shape[1]))
-    windows = np.lib.stride_tricks.sliding_window_view(u, horizon + 1, axis=0)[::stride]  # (start, m, horizon + 1)
-    step = max(1, _AT_ONCE // ((horizon + 1) * (x.shape[1] + u.shape[1])))
-    ends = np.empty_like(first)
-    for start in range(0, len(first), step):
+    view = np.lib.stride_tricks.sliding_window_view
+    starts = np.moveaxis(view(x[: len(x) - horizon], past + 1, axis=0)[::stride], -1, 1)  # (start, past + 1, n)
+    inputs = np.moveaxis(view(u, past + horizon + 1, axis=0)[::stride], -1, 1)  # (start, past + horizon + 1, m)
+    step = max(1, _AT_ONCE // (inputs.shape[1] * (x.shape[1] + u.shape[1])))
+    ends = np.empty((len(starts), x.shape[1]))
+    for start in range(0, len(starts), step):
         part = slice(start, start + step)
-        x0 = np.ascontiguousarray(first[part])
-        own = {name: np.full(len(x0), float(np.asarray(parameters[name]))) for name in lifting.parameters}
-        ends[part] = free_run(models.A, models.B, lifting, own, x0, np.swapaxes(windows[part], 1, 2))[:, -1]
+        own = {name: np.full(len(starts[part]), float(np.asarray(parameters[name]))) for name in lifting.parameters}
+        ends[part] = free_run(models.A, models.B, lifting, own, np.ascontiguousarray(starts[part]), inputs[part])[:, -1]
     return ends
 
 
@@ -231,17 +234,17 @@ def _ahead(
 ) -> Iterator[tuple[int, Array, Array]]:
     """Yield row, prediction and truth of every episode that is long enough."""
     for row, (x, u) in enumerate(episodes):
-        if len(x) > horizon:
+        if len(x) > lifting.history + horizon:
             model = models if models.A.ndim == 2 else KoopmanMatrices(models.A[row], models.B[row])
             values = {name: value[row] for name, value in own.items()}
-            yield row, predict_ahead(model, lifting, values, x, u, horizon, stride), x[horizon::stride]
+            yield row, predict_ahead(model, lifting, values, x, u, horizon, stride), x[lifting.history + horizon :: stride]
 
 
 def _free(
     models: KoopmanMatrices, lifting: Lifting, own: Mapping[str, Array], episodes: Sequence[tuple[Array, Array]]
 ) -> Iterator[tuple[int, Array, Array]]:
     """Yield row, free run and truth of every episode; episodes of like length run side by side."""
-    order = sorted((row for row, (x, _) in enumerate(episodes) if len(x) > 1), key=lambda row: -len(episodes[row][0]))
+    order = sorted((row for row, (x, _) in enumerate(episodes) if len(x) > lifting.history + 1), key=lambda row: -len(episodes[row][0]))
     while order:
         longest, width = len(episodes[order[0]][0]), sum(part.shape[1] for part in episodes[order[0]])
         count = max(1, _AT_ONCE // (longest * width))
@@ -250,7 +253,7 @@ def _free(
         for i, row in enumerate(rows):
             u[i, : len(episodes[row][1])] = episodes[row][1]
         A, B = (models.A, models.B) if models.A.ndim == 2 else (models.A[rows], models.B[rows])
-        x0 = np.stack([episodes[row][0][0] for row in rows])
+        x0 = np.stack([episodes[row][0][: lifting.history + 1] for row in rows])
         run = free_run(A, B, lifting, {name: value[rows] for name, value in own.items()}, x0, u)
         for i, row in enumerate(rows):
             x = episodes[row][0]
@@ -283,7 +286,7 @@ def _check(
             f"Scores: need episodes, horizons of at least one sample and a stride of at least 1, found {len(episodes)} episodes, horizons "
             f"{horizons}, stride {stride}."
         )
-    batch, m = models.A.shape[:-2], models.B.shape[-1]
+    batch, m = models.A.shape[:-2], models.B.shape[-1] - len(lifting.input_functions)
     wrong = [i for i, (x, u) in enumerate(episodes) if x.shape[1:] != (lifting.n_states,) or u.shape != (len(x), m)]
     if batch not in ((), (len(episodes),)) or models.A.shape[-1] != lifting.n_lifted or wrong:
         raise DimensionError(

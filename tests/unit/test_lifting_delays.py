@@ -5,12 +5,14 @@ import pickle
 import numpy as np
 import pytest
 
-from kros.core.errors import ConfigError, DataError, DimensionError
+from kros.core.errors import ConfigError, DataError, DimensionError, IdentificationError
 from kros.core.lti import StateSpace
 from kros.data import Channel, Role, from_arrays
 from kros.evaluate import EpisodeBatch
 from kros.identify import ModelSet, combine, edmd, free_run, lifted_factor, reduce_episode
+from kros.identify.excitation import require_excitation, require_independent
 from kros.identify.factors import Factor
+from kros.identify.refine import refine_population
 from kros.lifting import Lifting
 from kros.observer import Observer, run_observer
 from kros.synthesis import Injection
@@ -318,3 +320,32 @@ def test_missing_earlier_values_are_named():
         DELAYED.lift_into(np.zeros((2, 5)), {"phase": 0.0})
     with pytest.raises(DimensionError, match="expected 8 entries of a window"):
         DELAYED.lift(np.zeros((2, 2)), {"phase": 0.0})
+
+
+def test_refinement_refuses_what_it_does_not_know():
+    x, u = recording()
+    reduced = Factor.stack([reduce_episode(x, u, DELAYED)])
+    factor = lifted_factor(reduced, DELAYED, {"phase": np.zeros(1)}, DELAYED)
+    channels = [Channel(n, Role.STATE, "", True) for n in STATES] + [Channel(n, Role.INPUT) for n in INPUTS]
+    population = from_arrays({"1": {"default": {"0": np.hstack([x, u]), "1": np.hstack([x, u])}}}, channels, 0.01)
+    with pytest.raises(IdentificationError, match="delays of up to 3 samples and 2 input functions"):
+        refine_population(population, {"1": population.episodes}, DELAYED, {"phase": np.zeros(1)}, factor)
+
+
+def test_what_recordings_do_not_show_is_named(caplog):
+    x, u = recording()
+    still = u * [1.0, 0.0] + [0.0, 2.0]
+    lifting = Lifting(STATES, ("position**2", "3*position**2 + current"))
+    factor = Factor.stack([reduce_episode(x, u, lifting), reduce_episode(x, still, lifting)])
+    with pytest.raises(IdentificationError, match=r"unit b \(load\): input 'target' is constant \(2\) .* use alpha > 0"):
+        require_excitation(factor, INPUTS, ("a", "b"), "load")
+    require_excitation(factor, INPUTS, ("a", "b"), "load", alpha=1.0)
+    assert "unit b (load): input 'target' is constant (2)" in caplog.text
+    silent = Factor.stack([reduce_episode(x, u * [1.0, 0.0], lifting)] * 2)
+    with pytest.raises(IdentificationError, match="declare it as another role"):
+        require_excitation(silent, INPUTS, ("a", "b"), "load", alpha=1.0)
+    lifted = lifted_factor(factor, lifting, {}, lifting)
+    with pytest.raises(IdentificationError, match=r"unit a \(load\): '3\*position\*\*2 \+ current' follows from"):
+        require_independent(lifted, lifting.names + INPUTS, ("a", "b"), "load")
+    good = Lifting(STATES, ("position**2",))
+    require_independent(lifted_factor(Factor.stack([reduce_episode(x, u, good)]), good, {}, good), good.names + INPUTS, ("a",), "load")

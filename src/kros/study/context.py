@@ -92,13 +92,13 @@ class Context:
     @property
     def model_names(self) -> tuple[str, ...]:
         """Kinds of models that the study identifies; the one that others follow comes first."""
-        kinds = ("koopman", "linear") if self.lifting.functions else ("linear",)
+        kinds = ("koopman", "linear") if self.lifting.functions + self.lifting.input_functions else ("linear",)
         return (kinds if self.config.identify.refine else ()) + self.edmd_names
 
     @property
     def edmd_names(self) -> tuple[str, ...]:
         """The paper's kinds of models, identified in every condition; the first one scores outliers."""
-        return ("koopman_edmd", "linear_edmd") if self.lifting.functions else ("linear_edmd",)
+        return ("koopman_edmd", "linear_edmd") if self.lifting.functions + self.lifting.input_functions else ("linear_edmd",)
 
     def models(self, name: str, condition: str | None = None) -> ModelSet:
         """Load the models of one kind, in the condition that feeds the synthesis or another."""

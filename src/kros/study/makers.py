@@ -52,7 +52,7 @@ class Task:
             A=models.A[row],
             B=models.B[row],
             measured=models.measured,
-            inputs=models.inputs,
+            inputs=models.recorded_inputs,
             controller=synthesis.controller,
             injection=synthesis.injection,
             sample_period_s=models.sample_period_s,

@@ -116,6 +116,11 @@ def _check(
     factor: Factor,
     pooled: npt.NDArray[np.bool_],
 ) -> None:
+    if lifting.history or lifting.input_functions:
+        raise IdentificationError(
+            f"Refinement: knows functions of the present state only, and this lifting has delays of up to {lifting.history} samples and "
+            f"{len(lifting.input_functions)} input functions; set identify.refine = false, or leave these out."
+        )
     width = 2 * lifting.n_lifted + len(population.inputs)
     wrong = [name for name in lifting.parameters if name not in parameters or np.shape(parameters[name]) != (len(keys),)]
     if factor.R.shape != (len(keys), width, width) or wrong or pooled.shape != (len(keys),) or not pooled.any():

@@ -45,11 +45,13 @@ def evaluate_observer(
 def evaluate_model(
     models: ModelSet, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
 ) -> Outcome:
-    """Run every unit's own model freely from the true first state."""
+    """Run every unit's own model freely from the true first state, with delays from the first recorded ones."""
     batch = EpisodeBatch.read(population, keys)
     rows = [models.index(k.unit) for k in keys]
     parameters = batch.parameters(units) if models.lifting.parameters else {}
-    states = free_run(models.A[rows], models.B[rows], models.lifting, parameters, batch.states[0], np.swapaxes(batch.inputs, 0, 1))
+    states = free_run(
+        models.A[rows], models.B[rows], models.lifting, parameters, batch.first_states(models.lifting), np.swapaxes(batch.inputs, 0, 1)
+    )
     return _outcome(np.swapaxes(states, 0, 1), batch, population.sample_period_s, shown)
 
 

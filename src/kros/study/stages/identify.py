@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.artifacts import save_artifact
-from ...core.errors import IdentificationError
+from ...core.errors import DataError, IdentificationError
 from ...data.population import EpisodeKey, Population
 from ...identify import (
     Factor,
@@ -25,6 +25,7 @@ from ...identify import (
     residual_covariance,
     smallest_stabilising_alpha,
 )
+from ...identify.excitation import require_excitation, require_independent
 from ...identify.refine import RefineOptions, refine_population
 from ...lifting import Lifting
 from ..context import Context
@@ -38,8 +39,13 @@ Task = tuple[Population, tuple[EpisodeKey, ...], Lifting]
 def reduce_episodes(task: Task) -> Factor:
     """Reduce every episode of a task to its factor, stacked on the first axis."""
     population, keys, lifting = task
-    factors = [reduce_episode(*population.read_parts(key), lifting) for key in keys]
-    return Factor(*(np.stack([getattr(f, name) for f in factors]) for name in ("R", "peak", "n_samples")))
+    factors = []
+    for key in keys:
+        try:
+            factors.append(reduce_episode(*population.read_parts(key), lifting))
+        except DataError as error:
+            raise DataError(f"Identifying from {key}: {error}") from error
+    return Factor.stack(factors)
 
 
 def run(context: Context) -> list[Path]:
@@ -54,7 +60,7 @@ def run(context: Context) -> list[Path]:
         episodes = list(context.map(f"identify ({condition})", reduce_episodes, tasks))
         files += _save_factors(context, condition, units, episodes)
         whole = [combine(f) for f in episodes]
-        factor = Factor(*(np.stack([getattr(f, name) for f in whole]) for name in ("R", "peak", "n_samples")))
+        factor = Factor.stack(whole)
         parameters = {} if calibration is None else {calibration.spec.parameter: np.array([calibration.units[u].phase_rad for u in units])}
         found = identify_models(context, condition, units, factor, parameters)
         if context.config.identify.refine and condition == facts.identify_on:
@@ -78,6 +84,7 @@ def identify_models(context: Context, condition: str, units: list[str], factor: 
         edge = smallest_stabilising_alpha(shared, config.margin)
         alpha = config.alpha_factor * edge
         log.info("%s: alpha = %.4g, %g times the smallest that stabilises every model", condition, alpha, config.alpha_factor)
+    require_excitation(factor, context.population.inputs, units, condition, float(alpha))
     models = [
         fit(name, condition, kinds[name], context, units, factors[name], parameters if kinds[name].parameters else {}, float(alpha), pooled)
         for name in kinds
@@ -154,6 +161,8 @@ def fit(
 ) -> ModelSet:
     """Fit the models of one kind in one condition."""
     n = lifting.n_lifted
+    if alpha == 0:
+        require_independent(factor, lifting.names + context.population.inputs + lifting.input_functions, units, condition)
     matrices = edmd(factor.R, n, alpha)
     scale = factor.peak[pooled if pooled.any() else slice(None)].max(axis=0)
     limit = 1 - context.config.identify.margin
@@ -187,6 +196,7 @@ def _save_factors(context: Context, condition: str, units: list[str], episodes: 
         "states": context.lifting.states,
         "functions": context.lifting.functions,
         "inputs": context.population.inputs,
+        "input_functions": context.lifting.input_functions,
     }
     save_artifact(folder, "factors", {**content, "rows": keys}, arrays)
     return [folder / "factors.json", folder / "arrays.npz"]

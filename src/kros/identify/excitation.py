@@ -1,0 +1,78 @@
+"""What the recordings do not show: inputs that never move, and lifted functions that depend on others, named by unit and function."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..core.errors import IdentificationError
+from .factors import Factor, dependent_column
+
+log = logging.getLogger(__name__)
+
+
+def require_excitation(factor: Factor, inputs: Sequence[str], units: Sequence[str], where: str, alpha: float = 0.0) -> None:
+    """Refuse inputs that are constant over all training episodes of a unit.
+
+    The response to such an input cannot be told from an offset. Without regularisation that is an error. With it the column of B is that of
+    the offset, or zero where the input is, and a warning is logged; an input that is zero for every unit has no range and is always refused.
+
+    Parameters
+    ----------
+    factor : Factor
+        Batch over units, with `input_range`.
+    inputs : sequence of str
+        Recorded inputs.
+    units : sequence of str
+    where : str
+        Condition, for the message.
+    alpha : float
+        Tikhonov coefficient.
+
+    Raises
+    ------
+    IdentificationError
+        Names the first unit and input.
+    """
+    if factor.input_range is None:
+        return
+    low, high = factor.input_range[..., 0, :], factor.input_range[..., 1, :]
+    still = low == high
+    dead = [name for name, zero in zip(inputs, np.all(still & (low == 0), axis=0), strict=True) if zero]
+    for i, j in np.argwhere(still):
+        problem = f"unit {units[i]} ({where}): input {inputs[j]!r} is {'zero' if low[i, j] == 0 else 'constant'} ({low[i, j]:g}) over all training episodes"
+        if not alpha or inputs[j] in dead:
+            remedy = (
+                "declare it as another role or drop the channel" if inputs[j] in dead else "excite it, drop the channel, or use alpha > 0"
+            )
+            raise IdentificationError(f"Identifying {problem}, so the response to it is not in the recordings; {remedy}.")
+        log.warning("%s; its column of B is that of an offset, shrunk by alpha = %g", problem, alpha)
+
+
+def require_independent(factor: Factor, names: Sequence[str], units: Sequence[str], where: str) -> None:
+    """Refuse lifted data in which one column follows from those before it.
+
+    Parameters
+    ----------
+    factor : Factor
+        Of ``[Psi | Theta_plus]``, batch over units.
+    names : sequence of str
+        Lifted states and inputs, the columns of Psi.
+    units : sequence of str
+    where : str
+        Condition, for the message.
+
+    Raises
+    ------
+    IdentificationError
+        Names unit and function.
+    """
+    found = dependent_column(factor.R, len(names))
+    if found is not None:
+        unit, column = found
+        raise IdentificationError(
+            f"Identifying unit {units[unit]} ({where}): {names[column]!r} follows from the lifted states and inputs before it ({', '.join(names[:column])}) "
+            "on its training episodes; remove it, excite it, or use alpha > 0."
+        )

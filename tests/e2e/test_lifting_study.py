@@ -1,0 +1,164 @@
+"""Studies with families, delays and input functions, from a TOML file to metrics.json, and what they refuse."""
+
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from kros.data import Channel, Role, from_arrays, write_parquet
+from kros.identify import ModelSet
+from kros.observer import Observer
+
+LIFTING = """
+[lifting]
+functions = ["sin(100*position + phase)"]
+input_functions = ["current[-1]*target_velocity"]
+
+[[lifting.families]]
+kind = "delays"
+names = ["current", "target_velocity"]
+depth = 2
+
+[[lifting.families]]
+kind = "radial"
+names = ["velocity"]
+centres = { kind = "kmeans", n = 2, seed = 1 }
+length = 5.0
+
+[uncertainty]
+n_freqs = 200
+max_order = 2
+
+[synthesis]
+input_weight = 3.0
+methods = ["worst_case_h2"]
+
+[observer]
+baselines = ["open_loop", "kalman_white"]
+"""
+INPUTS = ("target_position", "target_velocity")
+GIVEN = (
+    "sin(100*position + phase)",
+    "current[-1]",
+    "target_velocity[-1]",
+    "current[-2]",
+    "target_velocity[-2]",
+)
+INPUT_FUNCTIONS = ("current[-1]*target_velocity",)
+
+
+@pytest.fixture(scope="module")
+def run(kros, recorded, tmp_path_factory):
+    """A finished study of a lifting with everything in it."""
+    folder = tmp_path_factory.mktemp("lifting")
+    (folder / "study.toml").write_text(f'[data]\nsource = "{recorded}"\nreader = "parquet"\n{LIFTING}')
+    result = kros("run", folder / "study.toml", "--out", folder / "run", "--workers", 1)
+    assert result.exit_code == 0, result.output
+    return folder / "run"
+
+
+def test_models_carry_the_whole_lifting(run):
+    models = ModelSet.load(run / "models" / "koopman_edmd")
+    assert models.lifting.functions[:5] == GIVEN
+    assert all(f.startswith("exp(") for f in models.lifting.functions[5:])
+    assert (models.lifting.history, models.inputs) == (2, (*INPUTS, *INPUT_FUNCTIONS))
+    assert (models.A.shape[1:], models.B.shape[1:]) == ((10, 10), (10, 3))
+    content = json.loads((run / "models" / "koopman_edmd" / "model.json").read_text())
+    assert content["units"][3:] == ["1", content["units"][2], "rad/s", content["units"][2], "rad/s", "1", "1"]
+    linear = ModelSet.load(run / "models" / "linear_edmd")
+    assert (linear.lifting.history, linear.inputs, linear.B.shape[1:]) == (0, INPUTS, (3, 2))
+
+
+def test_observers_run_with_it(run, kros, recorded, tmp_path):
+    metrics = json.loads((run / "metrics.json").read_text())
+    free = metrics["models"]["koopman_edmd"]
+    assert free["order"] == 10
+    assert all(np.isfinite(e["worst"]) for e in free["freerun_error_percent"].values())
+    made = [name for name, o in metrics["observers"].items() if name.startswith("koopman_edmd/") and o.get("status") != "failed"]
+    assert "koopman_edmd/open_loop" in made
+    observer = Observer.load(run / "observers" / "koopman_edmd" / "open_loop.json")
+    assert (observer.inputs, observer.lifting.input_functions, observer.lifting.history) == (INPUTS, INPUT_FUNCTIONS, 2)
+    result = kros("estimate", run, recorded, tmp_path / "estimates.parquet")
+    assert result.exit_code == 0, result.output
+    assert len(pq.read_table(tmp_path / "estimates.parquet")) > 0
+    result = kros("check", run, recorded)
+    assert result.exit_code in (0, 3), result.output
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        ("[[lifting.families]]\nkind = 'wavelets'", ("wavelets", "known are harmonics")),
+        ("[[lifting.families]]\nkind = 'delays'\nnames = ['current']", ("'depth' is missing",)),
+        ("[[lifting.families]]\nkind = 'polynomials'\nnames = ['speed']\ndegree = 2", ("unknown name 'speed'",)),
+        (
+            "[lifting]\nfunctions = ['current[-1]']\n[[lifting.families]]\nkind = 'delays'\nnames = ['current']\ndepth = 1",
+            ("appears more than once",),
+        ),
+        (
+            "[[lifting.families]]\nkind = 'radial'\nnames = ['current']\nlength = 0.0\ncentres = [[0.0]]",
+            ("should be a positive number",),
+        ),
+        ("[lifting]\nfunctions = ['current[-2000]']", ("too deep",)),
+        ("[lifting]\ninput_functions = ['current*voltage']", ("unknown name 'voltage'",)),
+        ("[lifting]\ninput_functions = ['current**2']", ("depends on no input",)),
+    ],
+)
+def test_bad_liftings_end_with_a_reason_and_leave_nothing(study, kros, tmp_path, extra, words):
+    result = kros("run", study(extra), "--out", tmp_path / "run")
+    assert result.exit_code == 2
+    assert all(word in result.stderr.replace("\n", " ") for word in words), result.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_dependent_function_is_named_with_its_unit(study, kros, tmp_path):
+    extra = "[lifting]\nfunctions = ['velocity**2', '3*velocity**2 + current']\n[identify]\nalpha = 0.0"
+    result = kros("run", study(extra), "--out", tmp_path / "run", "--until", "identify", "--workers", 1)
+    assert result.exit_code == 1
+    text = " ".join(result.stderr.split())
+    assert "unit 000" in text
+    assert "'3*velocity**2 + current' follows from the lifted states" in text
+
+
+def machines(n_samples, still_input=False):
+    """Recordings of three linear machines, an episode of given length each time."""
+    rng = np.random.default_rng(0)
+    channels = [
+        Channel("x", Role.STATE, "m", True),
+        Channel("v", Role.STATE, "m/s"),
+        Channel("u", Role.INPUT, "N"),
+        Channel("w", Role.INPUT, "N"),
+    ]
+    data = {}
+    for unit in "123":
+        data[unit] = {"default": {}}
+        for number, length in enumerate(n_samples):
+            u = rng.normal(size=(length, 2))
+            if still_input and unit == "2" and number < len(n_samples) - 1:  # it moves in the test episode only
+                u[:, 1] = 0
+            x = np.zeros((length, 2))
+            for k in range(length - 1):
+                x[k + 1] = [0.9 * x[k, 0] + 0.1 * x[k, 1], 0.8 * x[k, 1] + u[k].sum() * (1 + 0.1 * int(unit))]
+            data[unit]["default"][str(number)] = np.hstack([x, u])
+    return from_arrays(data, channels, 0.01)
+
+
+def test_an_episode_shorter_than_the_history_is_named(study, kros, tmp_path):
+    write_parquet(machines([400, 300, 400]), tmp_path / "data")
+    extra = "[lifting]\nfunctions = ['x[-350]']"
+    result = kros("run", study(extra, source=tmp_path / "data"), "--out", tmp_path / "run", "--until", "identify", "--workers", 1)
+    assert result.exit_code in (1, 2)
+    text = " ".join(result.stderr.split())
+    assert "episode 1 of unit 1 (default): Lifting a recording: needs at least 352 samples for the delay of 350 in 'x', found 300" in text
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1e-6])
+def test_an_input_without_excitation_is_named(study, kros, tmp_path, alpha, caplog):
+    write_parquet(machines([400, 400, 400], still_input=True), tmp_path / "data")
+    extra = f"[lifting]\nfunctions = ['x*v']\n[identify]\nalpha = {alpha}"
+    result = kros("run", study(extra, source=tmp_path / "data"), "--out", tmp_path / "run", "--until", "identify", "--workers", 1)
+    text = " ".join((result.stderr + caplog.text).split())
+    assert "unit 2 (default): input 'w' is zero (0) over all training episodes" in text
+    assert result.exit_code == (1 if alpha == 0 else 0)
+    assert ("excite it, drop the channel, or use alpha > 0" in text) == (alpha == 0)

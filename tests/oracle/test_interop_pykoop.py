@@ -11,7 +11,7 @@ import pytest
 from kros.core import ConfigError, DataError, DimensionError, IdentificationError
 from kros.data import Channel, EpisodeKey, Role, from_arrays
 from kros.identify import ModelSet
-from kros.interop import AdoptedModel, from_pykoop, models_from_pykoop
+from kros.interop import AdoptedModel, KoopmanRegressor, from_pykoop, models_from_pykoop
 from kros.lifting import Lifting
 from kros.uncertainty import quantify
 
@@ -131,6 +131,16 @@ def test_both_run_freely_alike_with_delays(functions: list[Any], offset: float) 
     ours = model.free_run(X[start - model.lifting.history - 1 : start, 1:3], X[start - model.lifting.history - 1 :, 3:])
     assert np.allclose(ours[-9:], theirs[-9:], rtol=1e-9, atol=1e-9)
     assert model.disagreement < 1e-12
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.3])
+def test_the_estimator_and_pykoop_identify_the_same(alpha: float) -> None:
+    X = recording()
+    model = KoopmanRegressor(["x0**2", "x0*x1", "x1**2"], n_inputs=1, episode_feature=True, alpha=alpha).fit(X)
+    coefficients = fitted([on_states(POLYNOMIAL)], X, alpha).regressor_.coef_.T
+    assert np.allclose(np.concatenate([model.A_, model.B_], axis=1), coefficients, rtol=1e-9, atol=1e-9)
+    adopted = from_pykoop(fitted([on_states(POLYNOMIAL)], X, alpha))
+    assert np.allclose(model.predict(X), adopted.predict(X[:, 1:3], X[:, 3:]), rtol=1e-9, atol=1e-9)
 
 
 def test_delays_are_formulas_of_earlier_values() -> None:

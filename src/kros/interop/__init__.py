@@ -6,14 +6,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .adopted import AdoptedModel
     from .control import UncertaintyForControl, from_control, models_to_control, to_control, uncertainty_to_control
-    from .pykoop import AdoptedModel, from_pykoop, models_from_pykoop
-    from .sklearn_estimator import KoopmanRegressor, one_step_pairs
+    from .pairs import one_step_pairs
+    from .pykoop import from_pykoop
+    from .pykoop_population import models_from_pykoop
+    from .sklearn_estimator import KoopmanRegressor
 
 _HOME = {
     **dict.fromkeys(("UncertaintyForControl", "from_control", "models_to_control", "to_control", "uncertainty_to_control"), "control"),
-    **dict.fromkeys(("AdoptedModel", "from_pykoop", "models_from_pykoop"), "pykoop"),
-    **dict.fromkeys(("KoopmanRegressor", "one_step_pairs"), "sklearn_estimator"),
+    "AdoptedModel": "adopted",
+    "KoopmanRegressor": "sklearn_estimator",
+    "from_pykoop": "pykoop",
+    "models_from_pykoop": "pykoop_population",
+    "one_step_pairs": "pairs",
 }
 
 __all__ = [

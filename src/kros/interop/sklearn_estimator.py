@@ -17,11 +17,12 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError, DataError, IdentificationError, MissingDependencyError
+from ..core.errors import ConfigError, DataError, MissingDependencyError
 from ..core.lti import StateSpace
 from ..identify import edmd, free_run
 from ..identify.factors import triangular
 from ..lifting import Lifting
+from .quality import check_excitation, r_squared
 from .rows import Columns, episode_edges, finite, is_whole, log_forgotten_episodes, split_columns
 
 try:
@@ -34,10 +35,6 @@ except ImportError as error:
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-
-_DEPENDENT = 1e-13  # columns that are sums of others left relative pivots of 1e-18 to 2e-15 over 10 to 100 000 rows
-_SCORED_ROWS = 2  # R2 compares with a mean
-_ROUNDING = 1e-12
 
 
 class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -172,7 +169,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         finite(rows, (*names, *self.lifting_.names), "A lifted function of X is not defined everywhere: the lifted X")
         R = triangular(rows)
         if self.alpha == 0:
-            _check_excitation(R[: len(names), : len(names)], names, n, n_lifted, len(rows))
+            check_excitation(R[: len(names), : len(names)], names, n, n_lifted, len(rows))
         matrices = edmd(R, n_lifted, self.alpha)
         self.A_, self.B_, self.n_pairs_ = matrices.A, matrices.B, len(rows)
 
@@ -253,19 +250,19 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                     f"score: pairs of rows (X, y) allow one step, the horizon is {self.horizon}; leave out y, or set horizon = 1."
                 )
             predicted = self.predict(X)
-            return _r2(self._read_target(y, len(predicted)), predicted)
+            return r_squared(self._read_target(y, len(predicted)), predicted)
         columns, values = self._read_fitted(X)
         edges = episode_edges(columns, groups, len(values))
         truth = values[:, : self._n_states]
         if self.horizon is None:
             later = np.delete(np.arange(len(values)), edges[:-1])
-            return _r2(truth[later], self._free_run(values, edges)[later])
+            return r_squared(truth[later], self._free_run(values, edges)[later])
         lengths = np.diff(edges)
         start = np.flatnonzero(np.repeat(edges[1:], lengths) - np.arange(len(values)) > self.horizon)
         x = truth[start]
         for k in range(self.horizon):  # all rows at once
             x = self._step(x, values[start + k, self._n_states :])
-        return _r2(truth[start + self.horizon], x)
+        return r_squared(truth[start + self.horizon], x)
 
     def system(self, sample_period_s: float) -> StateSpace:
         """Return the model as a linear system from inputs to lifted states."""
@@ -377,79 +374,3 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tags = super().__sklearn_tags__()
         tags.target_tags.required = False
         return tags
-
-
-def _check_excitation(R: Array, names: Sequence[str], n_states: int, n_lifted: int, n_pairs: int) -> None:
-    """Name the first column that plain least squares cannot tell from those before it."""
-    if n_pairs < len(names):
-        raise DataError(
-            f"Found n_samples = {n_pairs} transitions for {len(names)} unknowns of every row of [A B] "
-            f"({', '.join(names)}); record more, lift less, or use alpha > 0."
-        )
-    norms = np.linalg.norm(R, axis=0)
-    dependent = np.flatnonzero(np.abs(np.diagonal(R)) <= _DEPENDENT * norms)
-    if dependent.size:
-        j = int(dependent[0])
-        kind = "state" if j < n_states else "lifted function" if j < n_lifted else "input"
-        why = "is zero throughout" if norms[j] == 0 else f"depends on the columns before it ({', '.join(names[:j])})"
-        raise IdentificationError(
-            f"With alpha = 0 the {kind} {names[j]!r} cannot be identified: it {why}; remove it, excite it, or use alpha > 0."
-        )
-
-
-def _r2(truth: Array, predicted: Array) -> float:
-    """Return the mean R2 over the states; one that does not vary counts one where it is predicted to rounding, else zero."""
-    truth, predicted = (values[:, None] if values.ndim == 1 else values for values in (truth, predicted))
-    if truth.shape != predicted.shape:
-        raise DataError(f"score: y has {truth.shape[1]} columns, the model has {predicted.shape[1]} states; y holds the next states.")
-    if len(truth) < _SCORED_ROWS:
-        raise DataError(
-            f"score: found {len(truth)} samples to compare with, R2 needs {_SCORED_ROWS}; pass longer episodes, or lower the horizon."
-        )
-    if not np.isfinite(predicted).all():
-        return -np.inf
-    varies = np.ptp(truth, axis=0) > 0
-    error = np.sum((predicted - truth) ** 2, axis=0)
-    spread = np.sum((truth - truth.mean(axis=0)) ** 2, axis=0)
-    rounding = len(truth) * (_ROUNDING * np.abs(truth).max(axis=0)) ** 2
-    return float(np.mean(np.where(varies, 1 - error / np.where(varies, spread, 1.0), error <= rounding)))
-
-
-def one_step_pairs(
-    X: Any, *, n_inputs: int = 0, episode_feature: bool = False, time: str | int | None = None
-) -> tuple[Any, Array, npt.NDArray[np.int64]]:
-    """Return rows, their next states and their episode, which any splitter of scikit-learn may divide and shuffle.
-
-    Splitting the rows of a recording cuts episodes, and joins what is left across the cut; pairs have no such seam.
-
-    Parameters
-    ----------
-    X : array_like or DataFrame, shape (n_samples, n_columns)
-        As in `KoopmanRegressor.fit`.
-    n_inputs : int
-    episode_feature : bool
-    time : str or int, optional
-
-    Returns
-    -------
-    now : ndarray or DataFrame, shape (n_pairs, n_states + n_inputs)
-        Without the columns of episode and time.
-    after : ndarray, shape (n_pairs, n_states)
-    episode : ndarray, shape (n_pairs,)
-        Number of the episode, for splitters that take groups.
-
-    Raises
-    ------
-    DataError
-        As `KoopmanRegressor.fit`.
-    """
-    columns = split_columns(X, episode_feature=episode_feature, time=time)
-    values = check_array(columns.values, dtype=np.float64, ensure_all_finite=False, input_name="X")
-    n_states = values.shape[1] - n_inputs
-    if n_inputs < 0 or n_states < 1:
-        raise DataError(f"one_step_pairs: {values.shape[1]} columns cannot have {n_inputs} inputs; at least one column is a state.")
-    finite(values, columns.names or [str(i) for i in range(values.shape[1])], "Input X")
-    edges = episode_edges(columns, None, len(values))
-    now = np.delete(np.arange(len(values)), edges[1:] - 1)
-    rows = columns.values.iloc[now] if hasattr(columns.values, "iloc") else values[now]
-    return rows, values[now + 1, :n_states], np.searchsorted(edges, now, side="right") - 1

@@ -13,10 +13,9 @@ from kros.identify import (
     bootstrap_edmd,
     bootstrap_refined,
     combine,
+    episode_factors,
     episode_weights,
-    lifted_factor,
     one_step_deviations,
-    reduce_episode,
     response_bands,
 )
 from kros.identify.refine import RefinedModels, RefineOptions, refine_population
@@ -112,15 +111,9 @@ def drives() -> tuple[RefinedModels, Factor, np.ndarray, Problem]:
     population = simulated.population
     keys = {unit: population.keys(unit) for unit in population.unit_ids}
     phase = {"phase": simulated.truth.phase_rad}
-    reduced = [[reduce_episode(*population.read_parts(key), KOOPMAN) for key in own] for own in keys.values()]
-    free = [Factor(*(np.stack([getattr(f, name) for f in own]) for name in ("R", "peak", "n_samples"))) for own in reduced]
-    batch = Factor(*(np.stack([getattr(f, name) for f in free]) for name in ("R", "peak", "n_samples")))
-    whole = lifted_factor(combine(batch), KOOPMAN, phase, KOOPMAN)
+    factors = episode_factors(population, keys, KOOPMAN, phase)
+    whole = combine(factors)
     models = refine_population(population, keys, KOOPMAN, phase, whole, options=OPTIONS)
-    alone = lifted_factor(
-        Factor(*(np.swapaxes(getattr(batch, name), 0, 1) for name in ("R", "peak", "n_samples"))), KOOPMAN, phase, KOOPMAN
-    )
-    factors = Factor(*(np.swapaxes(getattr(alone, name), 0, 1) for name in ("R", "peak", "n_samples")))
     T, n_samples = models.whitening, whole.n_samples
     segments = read_segments(population, keys, max(OPTIONS.horizons), OPTIONS.segments, OPTIONS.seed)
     one_step = OneStep.of(whole.R, T, 3, 4, n_samples, np.arange(3))

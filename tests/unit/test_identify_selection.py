@@ -10,7 +10,7 @@ import pytest
 
 from kros.core import ConfigError, DataError, IdentificationError
 from kros.data import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
-from kros.identify import LeaveOut, Selection, cross_validate
+from kros.identify import Factor, LeaveOut, Selection, combine, cross_validate, episode_factors, lifted_factor, reduce_episode
 from kros.lifting import Lifting
 
 CHANNELS = (Channel("a", Role.STATE), Channel("b", Role.STATE), Channel("u", Role.INPUT))
@@ -120,3 +120,20 @@ def test_criteria_that_do_not_exist_are_refused() -> None:
         with pytest.raises(ConfigError, match="Selection"):
             rows.best(**wrong)
     assert replace(rows, horizons=(3,)).best(horizon=3).value == 1.0
+
+
+def test_factors_by_episode_combine_to_those_of_the_unit() -> None:
+    """A function with a factor and a phase, so that the parameter-free basis is not the lifting itself."""
+    made, keys = population({"p": [30] * 3, "q": [40] * 2})
+    lifting, phase = Lifting(("a", "b"), ("2*sin(a + phase)",), ("phase",)), np.array([0.3, 1.1])
+    found = episode_factors(made, keys, lifting, {"phase": phase})
+    assert found.n_samples.tolist() == [[29, 29, 29], [39, 39, 0]]
+    assert not found.R[1, 2].any()
+    for row, own in enumerate(keys.values()):
+        each = [reduce_episode(*made.read_parts(key), lifting) for key in own]
+        free = combine(Factor(*(np.stack([getattr(f, name) for f in each])[None] for name in ("R", "peak", "n_samples"))))
+        expected = lifted_factor(free, lifting, {"phase": phase[[row]]}, lifting).R[0]
+        R = combine(found).R[row]
+        np.testing.assert_allclose(R.T @ R, expected.T @ expected, rtol=1e-9, atol=1e-9)
+    with pytest.raises(DataError, match="without an episode"):
+        episode_factors(made, {"p": ()}, lifting, {"phase": phase})

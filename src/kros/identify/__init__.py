@@ -4,6 +4,7 @@ from .bands import Bands, response_bands
 from .bootstrap import ModelSamples, bootstrap_edmd, bootstrap_refined, episode_weights, one_step_deviations
 from .cross_validation import cross_validate
 from .edmd import KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
+from .episode_factors import episode_factors
 from .factors import Factor, combine, lifted_factor, reduce_episode
 from .free_run import free_run
 from .model_set import ModelSet
@@ -30,6 +31,7 @@ __all__ = [
     "combine",
     "cross_validate",
     "edmd",
+    "episode_factors",
     "episode_weights",
     "find_segments",
     "free_run",

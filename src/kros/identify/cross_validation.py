@@ -16,16 +16,16 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError, IdentificationError
 from ..core.linalg import qr_triangle
-from ..data.population import OUTLIERS, EpisodeKey, Population
+from ..data.population import OUTLIERS, Population
 from ..lifting import Lifting
 from .edmd import KoopmanMatrices, edmd
-from .factors import Factor, combine, lifted_factor, reduce_episode
+from .episode_factors import Keys, reduce_episodes
+from .factors import Factor, combine, lifted_factor
 from .scores import Horizon, score_long_enough
 from .selection import LeaveOut, Selection
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-Keys = Mapping[str, Sequence[EpisodeKey]]
 _AT_ONCE = 16_000_000  # numbers of recordings, times alphas, in memory
 
 
@@ -85,7 +85,7 @@ def cross_validate(
     keys = {ids[row]: tuple(keys[ids[row]]) for row in taking}
     own = {name: np.asarray(values, dtype=float)[taking] for name, values in parameters.items()}
     member = _membership(keys, leave_out, folds)
-    factors = _reduce(population, keys, candidates)
+    factors = reduce_episodes(population, keys, candidates)
     shape = (len(candidates), len(alphas), member.max() + 1, len(keys))
     full = (*shape, len(horizons), len(population.states))
     found = {name: np.full(full, np.nan) for name in ("percent", "rms", "r2")}
@@ -149,23 +149,6 @@ def _membership(keys: Keys, leave_out: LeaveOut, folds: int | None) -> npt.NDArr
     if not keys or (leave_out is LeaveOut.UNITS and len(keys) < 2):
         raise DataError(f"Cross-validation by {leave_out.value}: {len(keys)} units take part, which leaves none to fit; give more units.")
     return member
-
-
-def _reduce(population: Population, keys: Keys, candidates: Mapping[str, Lifting]) -> dict[str, Factor]:
-    """Read every episode once and reduce it for every candidate; batch (unit, episode), zero where there is no episode."""
-    most = max(len(episodes) for episodes in keys.values())
-    found: dict[str, Factor] = {}
-    for row, episodes in enumerate(keys.values()):
-        for column, key in enumerate(episodes):
-            x, u = population.read_parts(key)
-            for name, lifting in candidates.items():
-                one = reduce_episode(x, u, lifting)
-                if name not in found:
-                    batch = (len(keys), most)
-                    found[name] = Factor(np.zeros(batch + one.R.shape), np.zeros(batch + one.peak.shape), np.zeros(batch, dtype=np.int64))
-                whole = found[name]
-                whole.R[row, column], whole.peak[row, column], whole.n_samples[row, column] = one.R, one.peak, one.n_samples
-    return found
 
 
 def _fit(

@@ -54,8 +54,7 @@ def episode_normals(
     population, keys, lifting, parameters, options, pooled
         As in the call of `refine_population` that made the models.
     factors : Factor
-        Of ``[Psi | Theta_plus]`` of every episode, R of shape (unit, episode, p + n_lifted, p + n_lifted); zero where a unit has fewer
-        episodes than others.
+        Of ``[Psi | Theta_plus]`` of every episode, as `episode_factors` makes them.
 
     Returns
     -------

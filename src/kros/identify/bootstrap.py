@@ -219,8 +219,8 @@ def bootstrap_refined(
     -------
     ModelSamples
         Marked `linear`: the prior keeps responses together along a curved set of (A, B), which a straight step leaves. Against full refits
-        of simulated drives, the spread of first-order responses was right to 20 percent, that of the steps' own responses up to 9 times too large.
-        The steps lead from a minimum, so a search that ran out of iterations far from it makes them too small or too large.
+        of three simulated drives, first-order bands were right to about 20 percent, bands of the steps' own responses up to 12 times too wide.
+        The steps lead from a minimum: a search that ran out of iterations far from one makes them unreliable.
     """
     n, p = units.A.shape[-1], len(whitening)
     dV = one_step_deviations(normal, information, weights).reshape(len(units.A), -1, n, p)

@@ -2,6 +2,7 @@
 
 Intervals are pairs of arrays, one entry a piece of the box: the box is cut along its finite sides, and the bounds of a tree are the union
 over the pieces, which makes them tight where a quantity appears several times. Rounding is covered by a relative widening at the end.
+A box that reaches beyond the domain of a root or a logarithm has no bounds.
 """
 
 from __future__ import annotations
@@ -116,9 +117,8 @@ def _power(base: Interval, exponent: Any) -> Interval:
         if int(exponent) % 2:
             return a, b
         return np.where((low <= 0) & (high >= 0), 0.0, np.minimum(a, b)), np.maximum(a, b)
-    # A root exists for positive numbers only; where there are none, nothing is promised.
     p = float(exponent)
-    return _where_defined(high >= 0, np.maximum(low, 0.0) ** p, np.maximum(high, 0.0) ** p)
+    return _where_defined(low >= 0, np.maximum(low, 0.0) ** p, np.maximum(high, 0.0) ** p)
 
 
 def _reciprocal(a: Interval) -> Interval:
@@ -164,7 +164,7 @@ def _tangent(low: Array, high: Array) -> Interval:
 
 
 def _logarithm(low: Array, high: Array) -> Interval:
-    return _where_defined(high > 0, np.log(np.maximum(low, 0.0)), np.log(np.maximum(high, np.finfo(float).tiny)))
+    return _where_defined(low >= 0, np.log(np.maximum(low, 0.0)), np.log(np.maximum(high, 0.0)))
 
 
 def _magnitude(low: Array, high: Array) -> Interval:

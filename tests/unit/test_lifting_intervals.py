@@ -1,0 +1,147 @@
+"""Bounds of values and slopes: tight for simple functions, infinite where a function is, never below a sample."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kros.core.errors import ConfigError
+from kros.lifting import Formula, Lifting, radial
+from kros.lifting.intervals import bounds_of
+
+INF = np.inf
+
+
+def bounds(text, **box):
+    lower, upper = bounds_of([Formula(text, ("x", "y", "q")).expression], box)
+    return float(lower[0]), float(upper[0])
+
+
+@pytest.mark.parametrize(
+    ("text", "box", "expected"),
+    [
+        ("sin(x)", {}, (-1, 1)),
+        ("sin(x)", {"x": (0, 1)}, (0, np.sin(1))),
+        ("sin(x)", {"x": (1, 2)}, (np.sin(1), 1)),
+        ("sin(x)", {"x": (100, 101)}, (np.sin(100), np.sin(101))),
+        ("sin(x)", {"x": (98, 101)}, (-1, np.sin(101))),
+        ("cos(x)", {"x": (-1, 2)}, (np.cos(2), 1)),
+        ("cos(x)", {"x": (3, 4)}, (-1, np.cos(4))),
+        ("tan(x)", {"x": (-1, 1)}, (-np.tan(1), np.tan(1))),
+        ("tan(x)", {"x": (1, 2)}, (-INF, INF)),
+        ("tan(x)", {"x": (0, 10)}, (-INF, INF)),
+        ("exp(x)", {}, (0, INF)),
+        ("exp(-x**2)", {"x": (-1, 2)}, (np.exp(-4), 1)),
+        ("log(x)", {"x": (1, 3)}, (0, np.log(3))),
+        ("log(x)", {"x": (0, 3)}, (-INF, np.log(3))),
+        ("log(x)", {"x": (-2, -1)}, (-INF, INF)),
+        ("log(x)", {"x": (0, 0)}, (-INF, -INF)),
+        ("sqrt(x)", {"x": (4, 9)}, (2, 3)),
+        ("sqrt(x)", {"x": (-4, 9)}, (-INF, INF)),
+        ("tanh(x)", {}, (-1, 1)),
+        ("atan(x)", {}, (-np.pi / 2, np.pi / 2)),
+        ("abs(x)", {"x": (-3, 2)}, (0, 3)),
+        ("sign(x)", {"x": (-3, 2)}, (-1, 1)),
+        ("sign(x)", {"x": (1, 2)}, (1, 1)),
+        ("x**2", {"x": (-3, 2)}, (0, 9)),
+        ("x**3", {"x": (-3, 2)}, (-27, 8)),
+        ("x**-2", {"x": (-3, 2)}, (1 / 9, INF)),
+        ("1/x", {"x": (-3, 2)}, (-INF, INF)),
+        ("1/x", {"x": (0, 2)}, (0.5, INF)),
+        ("1/x", {"x": (-2, 0)}, (-INF, -0.5)),
+        ("x**1.5", {"x": (1, 4)}, (1, 8)),
+        ("x*y", {"x": (-3, 2), "y": (-1, 5)}, (-15, 10)),
+        ("x*y", {"x": 0}, (0, 0)),
+        ("x - y", {}, (-INF, INF)),
+        ("x/y", {"x": (1, 2), "y": (4, 8)}, (1 / 8, 1 / 2)),
+    ],
+)
+def test_simple_functions_have_tight_bounds(text, box, expected):
+    np.testing.assert_allclose(bounds(text, **box), expected, rtol=1e-9, atol=1e-15)
+
+
+def test_pieces_tighten_what_appears_twice():
+    low, high = bounds("x - x**2", x=(0, 1))  # the range is [0, 1/4]; without pieces [-1, 1]
+    assert -1e-3 < low <= 0
+    assert 0.25 <= high < 0.2505
+
+
+def test_slopes_of_the_gear_error_are_the_known_box():
+    """The slope box of section 9 of the method: sin(100 theta + phi) has slopes in [-100, 100], whatever angle and phase."""
+    lifting = Lifting(("position", "velocity"), ("sin(100*position + phase)", "position[-1]*velocity"), ("phase",))
+    lower, upper = lifting.slope_bounds({"velocity": (-2, 3)})
+    assert lifting.window.names == ("position", "velocity", "position[-1]")
+    np.testing.assert_allclose(lower, [[-100, 0, 0], [0, -INF, -2]], rtol=1e-11)
+    np.testing.assert_allclose(upper, [[100, 0, 0], [0, INF, 3]], rtol=1e-11)
+    lower, upper = lifting.slope_bounds({"position": (0, 0.01), "velocity": (-2, 3)}, {"phase": 0.0})
+    np.testing.assert_allclose([lower[0, 0], upper[0, 0]], [100 * np.cos(1), 100], rtol=1e-11)
+    np.testing.assert_allclose([lower[1, 1], upper[1, 1]], [0, 0.01], rtol=1e-11)  # an earlier position has the range of the position
+
+
+def test_slopes_of_a_radial_function_are_those_of_calculus():
+    """exp(-s**2/2) is steepest one length scale from its centre, exp(-1/2) per length scale."""
+    lower, upper = Lifting(("x",), radial(["x"], [[0.3]], 0.5)).slope_bounds({"x": (-5, 5)})
+    steepest = np.exp(-0.5) / 0.5
+    assert steepest <= upper[0, 0] <= 1.01 * steepest
+    assert -1.01 * steepest <= lower[0, 0] <= -steepest
+
+
+def test_jumps_and_roots_have_no_bound():
+    lifting = Lifting(("x",), ("sign(x)", "sqrt(x)", "abs(x)", "1/x"))
+    lower, upper = lifting.slope_bounds({"x": (-1, 1)})
+    assert upper[:2].tolist() == [[INF], [INF]]
+    assert (lower[2, 0], upper[2, 0]) == pytest.approx((-1, 1))
+    assert lower[3, 0] == -INF
+    assert lifting.slope_bounds({"x": (1, 2)})[1][0, 0] == 0
+
+
+def test_a_range_the_wrong_way_round_is_refused():
+    with pytest.raises(ConfigError, match=r"range of 'x' is \[1, -1\]"):
+        bounds("sin(x)", x=(1, -1))
+    with pytest.raises(ConfigError, match="range of 'x'"):
+        bounds("sin(x)", x=(np.nan, 1))
+
+
+LEAVES = st.sampled_from(["x", "y", "q", "0.5", "2", "-1.25", "3"])
+
+
+def grow(inner):
+    return st.one_of(
+        st.tuples(st.sampled_from(["sin", "cos", "tanh", "atan", "abs", "exp", "sign", "sqrt", "log", "tan"]), inner).map(
+            "{0[0]}({0[1]})".format
+        ),
+        st.tuples(inner, st.sampled_from(["+", "-", "*", "/"]), inner).map("({0[0]} {0[1]} {0[2]})".format),
+        st.tuples(inner, st.sampled_from(["2", "3", "-1", "-2", "0.5"])).map("({0[0]})**{0[1]}".format),
+    )
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    text=st.recursive(LEAVES, grow, max_leaves=5),
+    middle=st.tuples(*[st.floats(-3, 3)] * 3),
+    half=st.tuples(*[st.floats(0, 2)] * 3),
+)
+def test_no_sample_escapes(text, middle, half):
+    """Where a function is not a real number there is nothing to hold."""
+    try:
+        formula = Formula(text, ("x", "y", "q"))
+        _ = formula.expression, formula.evaluator
+    except ConfigError:
+        return
+    box = {name: (m - h, m + h) for name, m, h in zip("xyq", middle, half, strict=True)}
+    rng = np.random.default_rng(0)
+    values = {name: np.concatenate([rng.uniform(low, high, 300), [low, high]]) for name, (low, high) in box.items()}
+    derivatives = [formula.derivative(name) for name in "xyq"]
+    from kros.lifting.evaluation import compile_expression
+
+    for expression in [formula.expression, *derivatives]:
+        try:
+            evaluator = compile_expression(expression)
+        except ConfigError:
+            continue
+        with np.errstate(all="ignore"):
+            found = np.asarray(evaluator(values), dtype=float)
+        lower, upper = bounds_of([expression], box)
+        found = found[~np.isnan(found)]
+        slack = 1e-9 * np.maximum(1, np.abs(found))
+        assert np.all((found >= lower - slack) & (found <= upper + slack)), (text, expression)

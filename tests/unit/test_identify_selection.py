@@ -78,6 +78,8 @@ def test_what_is_missing_is_named() -> None:
         cross_validate(made, {"p": keys["p"]}, {"linear": LINEAR}, (0.0,), leave_out="units")
     with pytest.raises(ConfigError, match="'sine' needs 'phase'"):
         cross_validate(made, keys, {"sine": Lifting(("a", "b"), ("sin(a + phase)",), ("phase",))}, (0.0,))
+    with pytest.raises(ConfigError, match="episodes, units"):
+        cross_validate(made, keys, {"linear": LINEAR}, (0.0,), leave_out="samples")
     for wrong in ({"alphas": (-1.0,)}, {"candidates": {}}, {"folds": 1}):
         with pytest.raises(ConfigError, match="at least two folds"):
             cross_validate(made, keys, **{"candidates": {"linear": LINEAR}, "alphas": (0.0,), **wrong})

@@ -71,10 +71,12 @@ def cross_validate(
     Raises
     ------
     ConfigError
-        When candidates, alphas or folds are missing or out of range, or a parameter is not given.
+        When candidates, alphas, folds or `leave_out` are missing or out of range, or a parameter is not given.
     DataError
         When a unit has fewer than two episodes, no units are left to fit, or every episode is too short for a horizon.
     """
+    if leave_out not in list(LeaveOut):
+        raise ConfigError(f"Cross-validation: leave_out = {leave_out!r} is unknown; use one of {', '.join(x.value for x in LeaveOut)}.")
     leave_out, horizons = LeaveOut(leave_out), tuple(horizons)
     parameters = {} if parameters is None else parameters
     _check(keys, candidates, alphas, parameters, folds)

@@ -102,6 +102,7 @@ def test_observers_run_with_it(run, kros, recorded, tmp_path):
         ),
         ("[lifting]\nfunctions = ['current[-2000]']", ("too deep",)),
         ("[lifting]\ninput_functions = ['current*voltage']", ("unknown name 'voltage'",)),
+        ("[lifting]\nfunctions = ['tanh(current*phase)']", ("must enter as factors or as phases",)),
         ("[lifting]\ninput_functions = ['current**2']", ("depends on no input",)),
     ],
 )

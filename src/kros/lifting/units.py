@@ -12,7 +12,7 @@ UNKNOWN = ""
 Powers = dict[str, Fraction]
 _SUPERSCRIPT = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 _RAISE = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
-_FACTOR = re.compile(r"([^\W\d_%°]+|[%°]\w*)(?:\^|\*\*)?(-?\d+)?")
+_FACTOR = re.compile(r"([^\W\d_%°]+|[%°]\w*)\^?(-?\d+)?")
 
 
 def unit_of(expression: Any, known: Mapping[str, str]) -> str:
@@ -38,7 +38,7 @@ def read_unit(text: str) -> Powers | None:
     """
     powers: Powers = {}
     sign = 1
-    for part in re.split(r"(·|\*(?!\*)|/|\s+)", text.strip().translate(_SUPERSCRIPT)):
+    for part in re.split(r"(·|\*|/|\s+)", text.strip().replace("**", "^").translate(_SUPERSCRIPT)):
         if part == "/":
             sign = -1
         elif part.strip() and part not in ("·", "*"):

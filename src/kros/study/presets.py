@@ -37,6 +37,7 @@ def resolve_lifting(config: StudyConfig, population: Population) -> Lifting:
     if parameters is None:
         parameters = (PHASE,) if any(re.search(rf"\b{PHASE}\b", f) for f in functions + inputs) else ()
     lifting = Lifting(population.states, functions, parameters, population.inputs, inputs)
+    _ = lifting.separation, lifting.input_separation  # refused before anything is written
     return lifting if lifting.history or inputs else Lifting(population.states, functions, parameters)
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ...core.artifacts import load_artifact, save_artifact
 from ..edmd import KoopmanMatrices
 
 Array = npt.NDArray[np.float64]
@@ -19,6 +22,7 @@ class TradeOff:
     Parameters
     ----------
     strength : float
+        Infinite for the pooled model alone.
     held_out_percent : tuple of float
         Free-run error of every state on the held-out training episodes, ``100 rms / max|x|``, median over the pooled units.
     score : float
@@ -69,3 +73,39 @@ class RefinedModels:
     information: Array
     whitening: Array
     spectral_radius: Array
+
+    def save(self, folder: Path) -> list[Path]:
+        """Write ``refinement.json`` and ``arrays.npz``; an infinite strength becomes null."""
+        content: dict[str, Any] = {
+            "unit_ids": self.unit_ids,
+            "strength": self.strength,
+            "trade_off": [asdict(row) for row in self.trade_off],
+            "converged": dict(zip(self.unit_ids, self.converged.tolist(), strict=True)),
+        }
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        arrays |= {f"{which}_{m}": getattr(getattr(self, which), m) for which in ("units", "pooled") for m in "AB"}
+        save_artifact(folder, "refinement", content, arrays)
+        return [folder / "refinement.json", folder / "arrays.npz"]
+
+    @classmethod
+    def load(cls, folder: Path) -> RefinedModels:
+        """Read what `save` wrote."""
+        content, arrays = load_artifact(folder, "refinement")
+        return cls(
+            unit_ids=tuple(content["unit_ids"]),
+            units=KoopmanMatrices(arrays["units_A"], arrays["units_B"]),
+            pooled=KoopmanMatrices(arrays["pooled_A"], arrays["pooled_B"]),
+            strength=content["strength"],
+            trade_off=tuple(_row(row) for row in content["trade_off"]),
+            converged=np.array([content["converged"][unit] for unit in content["unit_ids"]]),
+            **{name: arrays[name] for name in _ARRAYS},
+        )
+
+
+_ARRAYS = ("sigma", "information", "whitening", "spectral_radius")
+
+
+def _row(row: dict[str, Any]) -> TradeOff:
+    """A row as it was: what JSON cannot say is null, and stands for a strength, an error or a peak without bound."""
+    unbounded = {name: np.inf if row[name] is None else row[name] for name in ("strength", "score", "peak_db")}
+    return TradeOff(held_out_percent=tuple(np.inf if v is None else v for v in row["held_out_percent"]), **unbounded)

@@ -25,8 +25,8 @@ class RefineOptions:
     balance : float
         A state's error counts in units of ``start**balance * range**(1 - balance)``, with `start` the free-run error of the EDMD
         model and `range` that of the state: 0 weighs states by their range, 1 asks every state for the same improvement.
-    starts : tuple of float
-        Weighings from which the pooled model is sought; the best end, in the weighing `balance`, is taken.
+    starts : tuple of (int, float)
+        First horizons and weighings from which the pooled model is sought; the best end, in the weighing `balance`, is taken.
     level : float
         Residual of the inverse input multiplicative form beyond which the prior bites.
     power : int
@@ -58,13 +58,13 @@ class RefineOptions:
 
     horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)
     segments: int = 24
-    strengths: tuple[float, ...] = (1e3, 1e2, 1e1, 3.0, 1.0)
+    strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0)
     tolerance: float = 0.1
-    balance: float = 0.5
-    starts: tuple[float, ...] = (0.5, 0.8)
+    balance: float = 0.65
+    starts: tuple[tuple[int, float], ...] = ((5, 0.8), (80, 0.8), (1000, 0.8))
     level: float = 0.3
     power: int = 2
-    pooled_segments: int = 240
+    pooled_segments: int = 120
     guard: float = 2e-3
     margin: float = 1e-5
     alpha_factor: float = 4.0
@@ -81,7 +81,7 @@ class RefineOptions:
             "strengths": len(self.strengths) > 0 and min(self.strengths, default=0.0) > 0,
             "tolerance": self.tolerance >= 0,
             "balance": 0 <= self.balance <= 1,
-            "starts": len(self.starts) > 0 and min(self.starts, default=-1.0) >= 0 and max(self.starts) <= 1,
+            "starts": len(self.starts) > 0 and all(0 <= balance <= 1 for _, balance in self.starts),
             "level": self.level > 0,
             "power": self.power >= 1,
             "pooled_segments": self.pooled_segments >= 1,

@@ -53,40 +53,47 @@ def start_pooled(
 def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, options: RefineOptions) -> Array:
     """Fit one model to all units, horizons growing; shape (n_lifted, p).
 
-    The free-run error has several minima, so the search is made once for every way of weighing the states in `options.starts`, and
-    the ends are finished and compared in the weighing asked for. On the way a model may be unstable: kept stable from the start, the
+    The free-run error has several minima, so the search is made once for every first horizon and way of weighing the states in
+    `options.starts`, and the ends are finished and compared in the weighing asked for. Growing the horizon from a few samples finds
+    the models of stiff velocity loops best, starting at a long one those of soft loops. On the way a model may be unstable: kept stable from the start, the
     search runs into the edge of stability and stops there, far from the optimum.
     """
     few = replace(problem, segments=problem.segments.first(max(2, -(-options.pooled_segments // problem.segments.n_units))))
-    found: list[tuple[float, Array, Array]] = []
-    for balance in options.starts:
-        grown = _grow(V, replace(few, sigma=_sigma(error, span, balance)), options, few.finite)
+    found: list[tuple[float, Array]] = []
+    sigma = problem.sigma
+    for first, balance in options.starts:
+        grown = _grow(V, replace(few, sigma=_sigma(error, span, balance)), options, few.finite, first)
         if grown is None:
             continue
         end = minimise(few.evaluate, few.finite, grown, options.iterations, options.least_gain)
         stable = _shorten(end.V, problem, options.guard)
         if stable is not None and np.isfinite(end.cost).all():
-            edged = normalised(problem, stable, options) if not found else replace(problem, sigma=found[0][2], guard=options.guard)
-            final = minimise(edged.evaluate, edged.admissible, stable, options.iterations, options.least_gain)
-            found.append((float(final.cost[0]), final.V[0], edged.sigma))
-            log.debug("pooled model from balance %g: cost %.6g", balance, final.cost[0])
+            sigma = sigma if found else normalised(few, stable, options).sigma
+            edged = replace(few, sigma=sigma, guard=options.guard)
+            kept = minimise(edged.evaluate, edged.admissible, stable, options.iterations, options.least_gain)
+            found.append((float(kept.cost[0]), kept.V))
+            log.debug("pooled model from horizon %d and balance %g: cost %.6g", first, balance, found[-1][0])
     if not found:
         log.warning("refinement of the pooled model: the best models are unstable, so it is sought among the stable ones")
-        grown = _grow(V, problem, options, problem.admissible)
+        grown = _grow(V, problem, options, problem.admissible, 1)
         if grown is None:
             raise IdentificationError(
                 f"Refinement of the pooled model: free runs over {max(options.horizons)} samples diverge from every start; add shorter "
                 "horizons, or leave out lifting functions that grow."
             )
         return np.asarray(grown[0])
-    return min(found, key=lambda pair: pair[0])[1]
+    edged = replace(problem, sigma=sigma, guard=options.guard)
+    best = min(found, key=lambda pair: pair[0])[1]
+    return np.asarray(minimise(edged.evaluate, edged.admissible, best, options.iterations, options.least_gain).V[0])
 
 
-def _grow(V: Array, problem: Problem, options: RefineOptions, admissible: Callable[[Array], npt.NDArray[np.bool_]]) -> Array | None:
-    """Minimise at growing horizons; None where free runs diverge."""
+def _grow(
+    V: Array, problem: Problem, options: RefineOptions, admissible: Callable[[Array], npt.NDArray[np.bool_]], first: int
+) -> Array | None:
+    """Minimise at growing horizons from the first one asked for, at most the longest; None where free runs diverge."""
     V = V.copy()
     V[:, problem.lifting.n_states :] = problem.one_step.rows if admissible == problem.finite else V[:, problem.lifting.n_states :]
-    for horizon in options.horizons:
+    for horizon in (h for h in options.horizons if h >= min(first, options.horizons[-1])):
         now = problem.at(horizon)
         solution = minimise(now.evaluate, admissible, V, options.iterations, options.least_gain)
         if not np.isfinite(solution.cost).all():

@@ -64,7 +64,8 @@ def run(context: Context) -> list[Path]:
         parameters = {} if calibration is None else {calibration.spec.parameter: np.array([calibration.units[u].phase_rad for u in units])}
         found = identify_models(context, condition, units, factor, parameters)
         if context.config.identify.refine and condition == facts.identify_on:
-            found += refine_models(context, units, factor, parameters, found)
+            refined, written = refine_models(context, units, factor, parameters, found)
+            found, files = found + refined, files + written
         for models in found:
             folder = context.model_folder(models.name, condition)
             models.save(folder)
@@ -97,8 +98,11 @@ def identify_models(context: Context, condition: str, units: list[str], factor: 
 
 def refine_models(
     context: Context, units: list[str], factor: Factor, parameters: dict[str, Array], starts: list[ModelSet]
-) -> list[ModelSet]:
-    """Refine every kind of model on free-run error, the population first, then each unit with a prior centred on it."""
+) -> tuple[list[ModelSet], list[Path]]:
+    """Refine every kind of model on free-run error, the population first, then each unit with a prior centred on it.
+
+    Beside the models, what the refinement found out (the pooled model, the trade-off, the information matrices) is written.
+    """
     facts = context.facts
     keys = {u: facts.keys("train", u, facts.identify_on) for u in units}
     pooled = np.array([u in facts.pooled for u in units])
@@ -116,8 +120,10 @@ def refine_models(
         )
         for start in starts
     ]
-    refined = context.map("identify (refine)", _call, work)
-    return [with_matrices(start, found.units, factor, context, parameters) for start, found in zip(starts, refined, strict=True)]
+    refined = list(context.map("identify (refine)", _call, work))
+    models = [with_matrices(start, found.units, factor, context, parameters) for start, found in zip(starts, refined, strict=True)]
+    files = [file for m, found in zip(models, refined, strict=True) for file in found.save(context.store.path("refinement", m.name))]
+    return models, files
 
 
 def _call(task: Any) -> Any:

@@ -184,6 +184,7 @@ def test_a_large_lifting_shares_its_passes():
         (lambda: fourier_features(["a"], 3, 1.0, 0, "cubic"), "known are gaussian, laplacian"),
         (lambda: delays(["a"], 0), "at least 1"),
         (lambda: delays(["a"], 1001), "too deep"),
+        (lambda: delays(["sin(a)"], 1), "only states and inputs have earlier values"),
         (lambda: grid_centres([[1, -1]], [3]), "lower and an upper"),
         (lambda: grid_centres([[-1, 1]], [3, 3]), "one whole number"),
         (lambda: latin_hypercube_centres([[-1, 1]], 0, 0), "at least 1"),

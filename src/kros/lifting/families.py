@@ -1,6 +1,6 @@
 """Families of lifting functions: each returns formulas, and a formula's text is all there is to a lifted function.
 
-Wherever a family takes names, it takes formulas too: the polynomials of ``("sin(position)", "velocity")`` are those of the values of these.
+Wherever a family takes names, it takes formulas too (delays apart): the polynomials of ``("sin(position)", "velocity")`` are those of the values of these.
 Numbers are written so that reading them gives the same number again.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
+from numbers import Integral
 
 from ..core.errors import ConfigError
 from .formula import MAX_DELAY, delayed_name
@@ -75,6 +76,9 @@ def delays(names: Sequence[str], depth: int) -> Formulas:
     """
     names = require_names("delays", names)
     _require_whole("delays", "depth", [depth], 1)
+    others = [name for name in names if not name.isidentifier()]
+    if others:
+        raise ConfigError(f"delays: only states and inputs have earlier values, found {others}; write the delay inside the formula.")
     if depth > MAX_DELAY:
         raise ConfigError(f"delays: depth = {depth} is too deep; at most {MAX_DELAY} samples are kept.")
     return tuple(delayed_name(name, d) for d in range(1, depth + 1) for name in names)
@@ -125,6 +129,6 @@ def require_names(family: str, names: Sequence[str]) -> Formulas:
 
 
 def _require_whole(family: str, option: str, values: Sequence[int], least: int) -> None:
-    wrong = [v for v in values if isinstance(v, bool) or not isinstance(v, int) or v < least]
+    wrong = [v for v in values if isinstance(v, bool) or not isinstance(v, Integral) or v < least]
     if wrong or not values or len(set(values)) != len(values):
         raise ConfigError(f"{family}: {option} = {list(values)} should be different whole numbers of at least {least}.")

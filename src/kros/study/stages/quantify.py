@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,13 @@ from ...core.errors import IdentificationError
 from ...core.frequency import log_grid
 from ...core.norms import hinf_norm
 from ...identify import ModelSet
-from ...uncertainty import OutlierScore, UncertainModel, quantify, residual, score_outliers, sigma_max
+from ...uncertainty import Form, OutlierScore, UncertainModel, choose_nominals, quantify, residual, score_outliers, sigma_max
 from ..config import UncertaintyConfig
 from ..context import Context
 
 log = logging.getLogger(__name__)
 _LARGEST_PRODUCT = 0.7  # of |W_R W_L|: an amplification by 3.3
+_LOOSEST = 3.0  # overbound in tolerances at which a diagonal weight is loose
 Array = npt.NDArray[Any]
 
 
@@ -32,29 +34,40 @@ def run(context: Context) -> list[Path]:
         raise IdentificationError(
             f"Uncertainty: {len(units)} units are left of {len(context.facts.pooled)}, at least two are needed; dropped are {sorted(dropped)}."
         )
-    nominal = context.config.uncertainty.nominal
     folder = context.store.path("uncertainty")
-    first: tuple[ModelSet, UncertainModel] | None = None
-    for name in context.model_names:
-        models = context.models(name)
-        uncertain = quantify_models(models, units, context.config.uncertainty, nominal)
-        first = first or (models, uncertain)
-        nominal = uncertain.nominal_id  # all kinds of models share the nominal unit of the first one, as in the paper
+    sets = {name: context.models(name) for name in context.model_names}
+    first = next(iter(sets.values()))
+    nominal = choose_nominal(first, units, context.config.uncertainty)
+    tasks = [partial(quantify_models, models, units, context.config.uncertainty, nominal) for models in sets.values()]
+    found = list(context.map("quantify", _call, tasks))
+    for name, uncertain in zip(sets, found, strict=True):
         uncertain.save(folder / name)
         files += sorted((folder / name).iterdir())
-    assert first is not None
-    save_artifact(folder, "choice", {"nominal": nominal, "worst_off_nominal": worst_off_nominal(*first), "dropped": sorted(dropped)})
+    choice = {"nominal": nominal, "worst_off_nominal": worst_off_nominal(first, found[0]), "dropped": sorted(dropped)}
+    save_artifact(folder, "choice", choice)
     return [*files, folder / "choice.json"]
 
 
-def quantify_models(models: ModelSet, units: list[str], config: UncertaintyConfig, nominal: str | None) -> UncertainModel:
+def _call(task: Any) -> Any:
+    return task()
+
+
+def choose_nominal(models: ModelSet, units: list[str], config: UncertaintyConfig) -> str:
+    """Return the nominal unit: the one asked for, else the best of the first kind of models, which all others share as in the paper."""
+    if config.nominal is None:
+        responses = scaled_responses(models, units, log_grid(models.sample_period_s, config.n_freqs))
+        return units[choose_nominals(responses)[Form(config.form)].index]
+    if config.nominal not in units:
+        raise IdentificationError(f"uncertainty.nominal = {config.nominal!r}: is not among the units {', '.join(units)}; name one of them.")
+    return config.nominal
+
+
+def quantify_models(models: ModelSet, units: list[str], config: UncertaintyConfig, nominal: str) -> UncertainModel:
     """Quantify one kind of model over the pooled units.
 
-    Diagonal weights are tighter than scalar ones channel by channel, but their product can be larger. Inverse forms pay for the product by
-    ``1 / (1 - |W_R W_L|)``, so where it comes near one the scalar weights are taken instead.
+    Diagonal weights are tighter than scalar ones channel by channel, but their product can be larger, for which inverse forms pay by
+    ``1 / (1 - |W_R W_L|)``, and they may bend too sharply to be fitted. Where either happens, scalar weights are taken instead.
     """
-    if nominal is not None and nominal not in units:
-        raise IdentificationError(f"uncertainty.nominal = {nominal!r}: is not among the units {', '.join(units)}; name one of them.")
 
     def attempt(structure: str) -> UncertainModel:
         return quantify(
@@ -74,10 +87,15 @@ def quantify_models(models: ModelSet, units: list[str], config: UncertaintyConfi
         return attempt(config.structure)
     diagonal = attempt("diagonal")
     inverse = config.form.startswith("inverse") and config.form != "inverse_additive"
-    if not inverse or hinf_norm(diagonal.weight.right @ diagonal.weight.left) < _LARGEST_PRODUCT:
+    amplified = inverse and hinf_norm(diagonal.weight.right @ diagonal.weight.left) >= _LARGEST_PRODUCT
+    if not amplified and diagonal.weight.overbound_db_max <= _LOOSEST * config.tolerance_db:
         return diagonal
-    log.info("%s: diagonal weights come close to an ill-posed set, scalar ones are taken", models.name)
-    return attempt("scalar")
+    scalar = attempt("scalar")
+    if not amplified and diagonal.weight.overbound_db_max <= scalar.weight.overbound_db_max:
+        return diagonal
+    reason = "come close to an ill-posed set" if amplified else f"exceed the optimal ones by {diagonal.weight.overbound_db_max:.1f} dB"
+    log.info("%s: diagonal weights %s, scalar ones are taken", models.name, reason)
+    return scalar
 
 
 def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:

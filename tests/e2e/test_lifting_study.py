@@ -26,6 +26,9 @@ names = ["velocity"]
 centres = { kind = "kmeans", n = 2, seed = 1 }
 length = 5.0
 
+[identify]
+refine = false
+
 [uncertainty]
 n_freqs = 200
 max_order = 2
@@ -103,6 +106,7 @@ def test_observers_run_with_it(run, kros, recorded, tmp_path):
         ("[lifting]\nfunctions = ['current[-2000]']", ("too deep",)),
         ("[lifting]\ninput_functions = ['current*voltage']", ("unknown name 'voltage'",)),
         ("[lifting]\nfunctions = ['tanh(current*phase)']", ("must enter as factors or as phases",)),
+        ("[lifting]\nfunctions = ['current[-1]']\n[identify]\nrefine = true", ("set identify.refine = false",)),
         ("[lifting]\ninput_functions = ['current**2']", ("depends on no input",)),
     ],
 )
@@ -114,7 +118,7 @@ def test_bad_liftings_end_with_a_reason_and_leave_nothing(study, kros, tmp_path,
 
 
 def test_a_dependent_function_is_named_with_its_unit(study, kros, tmp_path):
-    extra = "[lifting]\nfunctions = ['velocity**2', '3*velocity**2 + current']\n[identify]\nalpha = 0.0"
+    extra = "[lifting]\nfunctions = ['velocity**2', '3*velocity**2 + current']\n[identify]\nrefine = false\nalpha = 0.0"
     result = kros("run", study(extra), "--out", tmp_path / "run", "--until", "identify", "--workers", 1)
     assert result.exit_code == 1
     text = " ".join(result.stderr.split())
@@ -147,7 +151,7 @@ def machines(n_samples, still_input=False):
 
 def test_an_episode_shorter_than_the_history_is_named(study, kros, tmp_path):
     write_parquet(machines([400, 300, 400]), tmp_path / "data")
-    extra = "[lifting]\nfunctions = ['x[-350]']"
+    extra = "[lifting]\nfunctions = ['x[-350]']\n[identify]\nrefine = false"
     result = kros("run", study(extra, source=tmp_path / "data"), "--out", tmp_path / "run", "--until", "identify", "--workers", 1)
     assert result.exit_code in (1, 2)
     text = " ".join(result.stderr.split())
@@ -157,7 +161,7 @@ def test_an_episode_shorter_than_the_history_is_named(study, kros, tmp_path):
 @pytest.mark.parametrize("alpha", [0.0, 1e-6])
 def test_an_input_without_excitation_is_named(study, kros, tmp_path, alpha, caplog):
     write_parquet(machines([400, 400, 400], still_input=True), tmp_path / "data")
-    extra = f"[lifting]\nfunctions = ['x*v']\n[identify]\nalpha = {alpha}"
+    extra = f"[lifting]\nfunctions = ['x*v']\n[identify]\nrefine = false\nalpha = {alpha}"
     result = kros("run", study(extra, source=tmp_path / "data"), "--out", tmp_path / "run", "--until", "identify", "--workers", 1)
     text = " ".join((result.stderr + caplog.text).split())
     assert "unit 2 (default): input 'w' is zero (0) over all training episodes" in text

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
-from numbers import Integral
 
 from ..core.errors import ConfigError
 from .formula import MAX_DELAY, delayed_name
@@ -129,6 +128,6 @@ def require_names(family: str, names: Sequence[str]) -> Formulas:
 
 
 def _require_whole(family: str, option: str, values: Sequence[int], least: int) -> None:
-    wrong = [v for v in values if isinstance(v, bool) or not isinstance(v, Integral) or v < least]
+    wrong = [v for v in values if type(v) is bool or int(v) != v or v < least]
     if wrong or not values or len(set(values)) != len(values):
         raise ConfigError(f"{family}: {option} = {list(values)} should be different whole numbers of at least {least}.")

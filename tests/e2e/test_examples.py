@@ -11,8 +11,8 @@ import pytest
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def run_example(name, recordings, out):
-    command = [sys.executable, EXAMPLES / name / "run.py", "--out", out, "--workers", "1"]
+def run_example(name, recordings, out, *options):
+    command = [sys.executable, EXAMPLES / name / "run.py", "--out", out, "--workers", "1", *options]
     done = subprocess.run(command, env={**os.environ, "KROS_DATA": str(recordings)}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads((out / "metrics.json").read_text())
@@ -50,7 +50,15 @@ def test_quanser_qube(recordings, tmp_path):
     assert "evaluation" not in metrics
 
 
-@pytest.mark.parametrize("name", ["double_pendulum/run.py", "double_pendulum/builds.py", "quanser_qube/run.py"])
+def test_pneumatic_cylinders(recordings, tmp_path):
+    metrics = run_example("pneumatic", recordings, tmp_path / "run", "--until", "identify")
+    assert metrics["study"]["units"] == 9
+    assert metrics["study"]["sample_period_s"] == 0.02
+    assert list(metrics["models"]) == ["koopman", "linear", "koopman_edmd", "linear_edmd"]
+    assert all(m["spectral_radius_max"] < 1 for m in metrics["models"].values())
+
+
+@pytest.mark.parametrize("name", ["double_pendulum/run.py", "double_pendulum/builds.py", "quanser_qube/run.py", "pneumatic/run.py"])
 def test_without_recordings_it_says_what_to_do(name):
     environment = {k: v for k, v in os.environ.items() if k != "KROS_DATA"}
     done = subprocess.run([sys.executable, EXAMPLES / name], env=environment, capture_output=True, text=True)

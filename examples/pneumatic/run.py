@@ -1,0 +1,45 @@
+"""Run `study.toml` on the measured recordings: pneumatic_cc0 below the folder that the environment variable KROS_DATA names.
+
+Stroke is what the test bench imposes; its speed and the sign of it, which friction follows, are inputs as well. They are differences of
+samples that lie in the past, so that a running observer can take them. The mean of each signal over the first 70 % is taken off.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from kros.cli import app
+from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, read_csv_folder, write_parquet
+
+PIECES, PIECE, TRAINING, STEPS_BACK = 10, 310, 0.7, 5
+CREEP_MM_S = 0.5
+
+
+def prepared(raw: Population) -> Population:
+    """Return ten pieces of 6.2 s of every recording with speed and direction as inputs."""
+    episodes = {}
+    for key in raw.episodes:
+        values = raw.read(key)
+        values = values - values[: int(TRAINING * len(values))].mean(axis=0)
+        speed = (values[STEPS_BACK:, 2] - values[:-STEPS_BACK, 2]) / (STEPS_BACK * raw.sample_period_s)
+        whole = np.column_stack([values[STEPS_BACK:], speed, np.tanh(speed / CREEP_MM_S)])
+        for i, piece in enumerate(np.array_split(whole, PIECES)):
+            episodes[EpisodeKey(key.unit, key.condition, str(i))] = piece[:PIECE]
+    added = (Channel("speed", Role.INPUT, "mm/s"), Channel("direction", Role.INPUT))
+    return from_arrays(episodes, (*raw.channels, *added), raw.sample_period_s)
+
+
+if __name__ == "__main__":
+    here = Path(__file__).parent
+    if "KROS_DATA" not in os.environ:
+        sys.exit("Set KROS_DATA to the folder that holds pneumatic_cc0; study.toml says where it is published.")
+    recordings = read_csv_folder(Path(os.environ["KROS_DATA"]) / "pneumatic_cc0", here / "recordings.toml")
+    with tempfile.TemporaryDirectory() as folder:
+        write_parquet(prepared(recordings), Path(folder) / "recordings")
+        source = f"data.source={Path(folder) / 'recordings'}"
+        app(["run", str(here / "study.toml"), "--set", source, "--until", "report", *sys.argv[1:]])

@@ -66,7 +66,10 @@ def facts(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
     refined = {name: RefinedModels.load(context.store.path("refinement", name)) for name in ("koopman", "linear")}
     pooled = {name: percent(context, sets[name], found.pooled) for name, found in refined.items()}
     middle = {name: np.median(e, axis=0) for name, e in errors.items()}
-    found: dict[str, Any] = {"identify_s": round(metrics["timing_s"]["identify"], 1), "quantify_s": round(metrics["timing_s"]["quantify"], 1)}
+    found: dict[str, Any] = {
+        "identify_s": round(metrics["timing_s"]["identify"], 1),
+        "quantify_s": round(metrics["timing_s"]["quantify"], 1),
+    }
     found |= {name: rounded(value) for name, value in middle.items()}
     found |= {f"{name}/pooled": rounded(np.median(value, axis=0)) for name, value in pooled.items()}
     found["ratio"] = rounded(middle["koopman"] / middle["koopman_edmd"])

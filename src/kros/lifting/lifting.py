@@ -227,13 +227,18 @@ class Lifting:
     def jacobian(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the derivative of the lifted states by every entry of the window, shape (..., n + p, n_window)."""
         x = self._windows(x)
-        n, width = self.n_states, x.shape[-1]
-        jacobian = np.zeros((*x.shape[:-1], self.n_lifted, width))
+        n = self.n_states
+        jacobian = np.zeros((*x.shape[:-1], self.n_lifted, x.shape[-1]))
         jacobian[..., range(n), range(n)] = 1.0
-        slopes = np.empty((*x.shape[:-1], len(self.functions) * width))
-        self._derivatives.fill(self._values(x, parameters, x[..., n:]), slopes)
-        jacobian[..., n:, :] = slopes.reshape(*x.shape[:-1], len(self.functions), width)
+        jacobian[..., n:, :] = self.slopes(x, parameters)
         return jacobian
+
+    def slopes(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
+        """Return the derivative of the lifted functions alone by every entry of the window, shape (..., p, n_window)."""
+        x = self._windows(x)
+        slopes = np.empty((*x.shape[:-1], len(self.functions) * x.shape[-1]))
+        self._derivatives.fill(self._values(x, parameters, x[..., self.n_states :]), slopes)
+        return slopes.reshape(*x.shape[:-1], len(self.functions), x.shape[-1])
 
     def value_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
         """Return bounds of every lifted function over an operating box, each of shape (p,).

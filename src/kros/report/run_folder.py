@@ -18,6 +18,7 @@ import numpy.typing as npt
 from ..core.artifacts import load_artifact, read_arrays, read_json
 from ..data.population import Channel, EpisodeKey, Population
 from ..identify import ModelSet, PhaseCalibration
+from ..identify.refine import RefinedModels
 from ..observer import Observer
 from ..synthesis.result import Synthesis
 
@@ -128,6 +129,13 @@ class RunFolder:
             if "@" not in f.name
         }
         return dict(sorted(found.items(), key=lambda item: (not item[0].startswith("koopman"), item[0])))
+
+    @cached_property
+    def refined(self) -> dict[str, RefinedModels]:
+        """What the refinement found out, by kind of model."""
+        folders = self._folders("refinement", "refinement.json", "this study has no refined models")
+        found = {f.name: RefinedModels.load(f) for f in folders}
+        return dict(sorted(found.items(), key=lambda item: not item[0].startswith("koopman")))
 
     def condition_models(self, name: str, condition: str) -> ModelSet:
         """Return the models of one kind in a condition."""

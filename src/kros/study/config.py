@@ -94,7 +94,7 @@ class IdentifyConfig(_Section):
 
     alpha: float | Literal["auto"] = "auto"
     alpha_factor: float = Field(4.0, ge=1)
-    refine: bool = False
+    refine: bool = True
     margin: float = Field(0.0, ge=0, lt=1)
 
     @field_validator("alpha")

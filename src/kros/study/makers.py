@@ -15,7 +15,7 @@ from ..identify import ModelSet
 from ..observer import Observer, kalman_candidates, noise_covariances
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, worst_case_h2
 from ..uncertainty import fit_magnitude
-from .tuning import TuningSet
+from .tuning import TuningSet, rank
 
 Array = npt.NDArray[np.float64]
 IDENTITY, TUNED = "identity", "tuned"
@@ -113,14 +113,17 @@ def kalman_white(task: Task) -> Made:
 def kalman_tuned(task: Task) -> Made:
     """Kalman gains for the white process noise that does best on training episodes."""
     judge = task.tuning.read()
+    limit = judge.percent(task.observer(open_loop(task)[0]))
     candidates = kalman_candidates(
         task.dynamics, task.selector, task.models.output_scale, np.diag(task.noise**2), task.models.sample_period_s
     )
-    scored = [(judge.hidden_percent(task.observer(synthesis)), level, synthesis) for level, synthesis in candidates]
-    error, level, best = min(scored, key=lambda row: row[0])
-    if not np.isfinite(error):
+    scored = [
+        (rank(judge.percent(task.observer(synthesis)), limit, task.models.measured), level, synthesis) for level, synthesis in candidates
+    ]
+    (_, share), level, best = min(scored, key=lambda row: row[0])
+    if not np.isfinite(share):
         raise SynthesisError("Tuned Kalman filter: every candidate diverges on the training episodes.")
-    return best, {"process_noise_level": level, "training_error_percent": error}, task.problem
+    return best, {"process_noise_level": level, "training_error_to_open_loop": share}, task.problem
 
 
 def make_mixed(task: Task) -> Made:
@@ -133,7 +136,7 @@ def make_worst_case_h2(task: Task) -> Made:
     """Worst-case H2 in the surroundings asked for, or in those that do best on training episodes.
 
     How the inputs are spread over frequency and how much white noise there is nobody knows beforehand; the process noise of the tuned
-    Kalman filter is chosen on the same episodes. A candidate counts only if it does not spoil the measured states.
+    Kalman filter is chosen on the same episodes and by the same rule.
     """
     problem = task.require_problem()
     if task.input_weight != TUNED:
@@ -145,7 +148,7 @@ def make_worst_case_h2(task: Task) -> Made:
     best: tuple[tuple[bool, float], Surroundings, Synthesis] | None = None
     for surroundings in candidates(task.models.sample_period_s):
         synthesis = worst_case_h2(surroundings.of(problem), max_order=2, tolerance_db=3.0, refinements=0, fit=fit)
-        verdict = rank(judge.percent(task.observer(synthesis)), limit, list(task.models.measured))
+        verdict = rank(judge.percent(task.observer(synthesis)), limit, task.models.measured)
         if best is None or verdict < best[0]:
             best = (verdict, surroundings, synthesis)
     assert best is not None
@@ -155,14 +158,6 @@ def make_worst_case_h2(task: Task) -> Made:
     lower = max((b for b in (synthesis.lower_bound, accurate.lower_bound) if b is not None), default=None)
     gap = None if lower is None or synthesis.worst_case_h2 is None else 100 * (synthesis.worst_case_h2 / lower - 1)
     return replace(synthesis, lower_bound=lower, gap_percent=gap), surroundings.facts(), assumed
-
-
-def rank(percent: Array, limit: Array, measured: list[int]) -> tuple[bool, float]:
-    """Order candidates: first those whose measured states are no worse than in open loop, by the mean error of the hidden ones."""
-    excess = float(np.max(percent[measured] / limit[measured]))
-    if excess > 1 or len(measured) == len(percent):
-        return excess > 1, excess
-    return False, float(np.mean(np.delete(percent, measured)))
 
 
 def remembering(fit: Callable[..., Any]) -> Callable[..., Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ Array = npt.NDArray[np.float64]
 TUNING_UNITS = 12
 TUNING_EPISODES = 3
 TUNING_S = 10.0
+_ALLOWED = 1.02  # error of a state over that of the open loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +48,26 @@ class Judge:
         percent = error_percent(estimate, self.batch.states, self.batch.lengths).mean(axis=0)
         return np.where(np.isfinite(percent), percent, np.inf)
 
-    def hidden_percent(self, observer: Observer) -> float:
-        """Return the mean error over the states that are not measured (over all, where all are)."""
-        return float(np.mean(self.percent(observer)[hidden_states(observer)]))
 
+def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, float]:
+    """Order candidates: first those that are in no state (noticeably) worse than the open loop, by the error of the hidden states relative to it.
 
-def hidden_states(observer: Observer) -> list[int]:
-    """Return the indices of the states that are not measured; all, where all are."""
-    return [i for i in range(observer.lifting.n_states) if i not in observer.measured] or list(observer.measured)
+    Parameters
+    ----------
+    percent, limit : ndarray, shape (n,)
+        Errors of the candidate and of the open loop, percent of the range.
+    measured : sequence of int
+
+    Returns
+    -------
+    bool
+        Whether the candidate is worse than the open loop in some state.
+    float
+        Geometric mean of the hidden states' errors over those of the open loop; of the worst state where the candidate is worse.
+    """
+    ratio = percent / np.maximum(limit, np.finfo(float).tiny)
+    worst = float(ratio.max())
+    if not worst <= _ALLOWED:
+        return True, worst
+    hidden = [i for i in range(len(ratio)) if i not in measured] or list(measured)
+    return False, float(np.exp(np.mean(np.log(np.maximum(ratio[hidden], np.finfo(float).tiny)))))

@@ -35,6 +35,7 @@ _ROUNDS = 4
 _WORST = 20  # frequencies added in a round
 _SMOOTHING_DECADES = (0.12, 0.24)
 _GOOD = 2.0  # other choices are tried while the overbound exceeds this many tolerances
+_HOPELESS = 5.0  # and no more smoothing where it exceeds this many
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +146,8 @@ def _first(fitter: _Fitter, freqs_hz: Array, E: Array, best: Cover) -> Weight:
                 found = weight
             if found.overbound_db_max <= _GOOD * fitter.tolerance_db or fitter.structure is Structure.SCALAR:
                 return found
+        if found is not None and found.overbound_db_max > _HOPELESS * fitter.tolerance_db:
+            break
     assert found is not None
     return found
 

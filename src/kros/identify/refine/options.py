@@ -58,10 +58,10 @@ class RefineOptions:
 
     horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)
     segments: int = 24
-    strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0)
+    strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 2.0)
     tolerance: float = 0.1
     balance: float = 0.65
-    starts: tuple[tuple[int, float], ...] = ((5, 0.8), (80, 0.8), (1000, 0.8))
+    starts: tuple[tuple[int, float], ...] = ((5, 0.8), (80, 0.8))
     level: float = 0.3
     power: int = 2
     pooled_segments: int = 120

@@ -21,6 +21,7 @@ from .segments import Segments
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
+_COMPARED = 4  # steps within the edge of stability before starts are compared
 _LEAST_ERROR = 1e-6  # relative to a state's range: exact data have no error to scale by
 
 
@@ -70,7 +71,7 @@ def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, options
         if stable is not None and np.isfinite(end.cost).all():
             sigma = sigma if found else normalised(few, stable, options).sigma
             edged = replace(few, sigma=sigma, guard=options.guard)
-            kept = minimise(edged.evaluate, edged.admissible, stable, options.iterations, options.least_gain)
+            kept = minimise(edged.evaluate, edged.admissible, stable, _COMPARED, options.least_gain)
             found.append((float(kept.cost[0]), kept.V))
             log.debug("pooled model from horizon %d and balance %g: cost %.6g", first, balance, found[-1][0])
     if not found:

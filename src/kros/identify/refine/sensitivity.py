@@ -106,7 +106,7 @@ def _state_matrix(F: Array, W: Array, psi: Array, lifting: Lifting, parameters: 
     n, nl = lifting.n_states, lifting.n_lifted
     F[:] = W[:, :n]
     if lifting.functions:
-        slopes = lifting.jacobian(psi[:n].T, parameters)[:, n:]  # (batch, function, n)
+        slopes = lifting.slopes(psi[:n].T, parameters)  # (batch, function, n)
         F += np.einsum("afb,bfj->ajb", W[:, n:nl], slopes)
 
 

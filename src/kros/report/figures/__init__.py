@@ -20,6 +20,7 @@ FIGURES = (
     "bode",
     "free_run",
     "free_run_spectra",
+    "trade_off",
     "forms",
     "weights",
     "synthesis_bode",

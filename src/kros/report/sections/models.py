@@ -18,14 +18,22 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     text = "Every unit gets its own model of each kind; the linear one has the original states only, the Koopman one lifted functions beside them. "
     alpha = metrics["study"].get("alpha")
     if alpha is not None:
-        text += f"Tikhonov coefficient common to all of them: {number(alpha)}, the smallest that leaves every model stable unless the study sets one. "
+        text += (
+            f"Models named EDMD are the paper's recipe with one Tikhonov coefficient, {number(alpha)}, a multiple of the smallest that leaves "
+            "every model stable unless the study sets one. "
+        )
+    if any(not name.endswith("_edmd") for name in models):
+        text += (
+            "The others are refined on their free-run error: first one model for the whole population, then every unit's own, held near the common one "
+            "by a prior whose strength held-out training episodes choose. "
+        )
     lifted = next((m.lifting.functions for m in run.models.values() if m.lifting.functions), ())
     if lifted:
         text += f"Lifted functions: {', '.join(lifted)}."
     units = metrics.get("units", [])
     unstable = [f"{row['unit']} ({row['status']})" for row in units if row["status"] not in ("ok", "not calibrated")]
     paragraphs = [text] + ([f"Units with a remark: {'; '.join(unstable)}."] if unstable else [])
-    return Section("models", "Models", paragraphs, [_table(models)], ["models", "free_run", "free_run_spectra"])
+    return Section("models", "Models", paragraphs, [_table(models)], ["models", "free_run", "free_run_spectra", "trade_off"])
 
 
 def _table(models: Mapping[str, Any]) -> Table:

@@ -1,0 +1,63 @@
+"""What the prior of the refined models costs and brings: accuracy on held-out training episodes against uncertainty.
+
+Needs: refined models.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...identify.refine import RefinedModels
+from ..canvas import grid, legend
+from ..names import model_label, model_look, number
+from ..run_folder import RunFolder
+from ..theme import Tone
+from .drawing import Drawing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+NAME, TITLE = "trade_off", "Accuracy against uncertainty"
+
+
+def draw(run: RunFolder) -> Drawing:
+    """Draw one panel a hidden state, one line a kind of model, one point a strength of the prior."""
+    refined = run.refined
+    states = next(iter(run.models.values())).lifting.states
+    hidden = [i for i, name in enumerate(states) if name not in run.measured_states] or list(range(len(states)))
+    figure, axes = grid(1, len(hidden), 2.3)
+    for panel, state in zip(axes[0], hidden, strict=True):
+        for name, found in refined.items():
+            _line(panel, name, found, state)
+        panel.set_title(states[state].replace("_", " "))
+        panel.set_xlabel("peak residual (dB)")
+        panel.margins(0.12)
+        panel.set_ylim(bottom=0)
+    axes[0, 0].set_ylabel("free-run error (%)")
+    legend(figure, axes[0, 0])
+    chosen = "; ".join(f"{model_label(name)}: {number(found.strength)}" for name, found in refined.items())
+    return Drawing(
+        figure,
+        "Refined models at each strength of the prior that holds them near the model of the whole population: median free-run error over held-out "
+        "training episodes, against the largest residual (inverse input multiplicative) within the population. The strongest prior stands at the "
+        f"left of each line; the one chosen is filled ({chosen}). Dashed: the population's one model used on every unit.",
+    )
+
+
+def _line(panel: Axes, name: str, found: RefinedModels, state: int) -> None:
+    rows = [row for row in found.trade_off if np.isfinite(row.strength) and np.isfinite(row.peak_db)]
+    colour = model_look(name).colour
+    x, y = [row.peak_db for row in rows], [row.held_out_percent[state] for row in rows]
+    panel.plot(x, y, "o-", color=colour, mfc="none", ms=4, lw=1.0, label=model_label(name))
+    for row in rows:
+        if row.strength == found.strength:
+            panel.plot(row.peak_db, row.held_out_percent[state], "o", color=colour, ms=6)
+        place = (row.peak_db, row.held_out_percent[state])
+        panel.annotate(
+            number(row.strength, 1), place, xytext=(0, 5), textcoords="offset points", ha="center", size=7, color=Tone.SOFT.light
+        )
+    alone = [row.held_out_percent[state] for row in found.trade_off if np.isinf(row.strength)]
+    for value in alone:
+        panel.axhline(value, color=colour, lw=0.9, ls="--")

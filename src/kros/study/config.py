@@ -89,12 +89,14 @@ class IdentifyConfig(_Section):
     """Regularisation; ``auto`` is `alpha_factor` times the smallest coefficient that stabilises every model.
 
     At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the population is finite.
-    `refine` adds models that are refined on their free-run error, the population first, then each unit.
+    `refine` adds models that are refined on their free-run error, the population first, then each unit, held near the population's model by
+    a prior that is never so weak that the peak residual exceeds `largest_residual`. Spectral radii stay below ``1 - margin``.
     """
 
     alpha: float | Literal["auto"] = "auto"
     alpha_factor: float = Field(4.0, ge=1)
     refine: bool = True
+    largest_residual: float = Field(0.6, gt=0)
     margin: float = Field(0.0, ge=0, lt=1)
 
     @field_validator("alpha")

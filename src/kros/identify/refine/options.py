@@ -18,8 +18,11 @@ class RefineOptions:
     segments : int
         Stretches of recordings used of every unit, spread over its training episodes.
     strengths : tuple of float
-        Strengths of the prior to choose from. At 1 a residual of one at all frequencies costs as much as the free-run error of the
-        pooled model (with ``power = 1``; see `metric`).
+        Strengths of the prior to choose from, tried from the strongest on until weaker ones do not improve the held-out error. At 1 a
+        residual of one at all frequencies costs as much as the free-run error of the pooled model (with ``power = 1``; see `metric`).
+    largest_residual : float
+        Priors so weak that the peak residual within the population (inverse input multiplicative form) exceeds this are not chosen: the
+        set of models that covers such a population is too large for a robust observer.
     tolerance : float
         The strongest prior whose held-out error exceeds the lowest by no more than this share is chosen.
     balance : float
@@ -58,7 +61,8 @@ class RefineOptions:
 
     horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)
     segments: int = 24
-    strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 2.0)
+    strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)
+    largest_residual: float = 0.6
     tolerance: float = 0.1
     balance: float = 0.65
     starts: tuple[tuple[int, float], ...] = ((5, 0.8), (80, 0.8))
@@ -79,6 +83,7 @@ class RefineOptions:
             "horizons": len(self.horizons) > 0 and min(self.horizons, default=0) >= 1 and tuple(sorted(self.horizons)) == self.horizons,
             "segments": self.segments >= 1,
             "strengths": len(self.strengths) > 0 and min(self.strengths, default=0.0) > 0,
+            "largest_residual": self.largest_residual > 0,
             "tolerance": self.tolerance >= 0,
             "balance": 0 <= self.balance <= 1,
             "starts": len(self.starts) > 0 and all(0 <= balance <= 1 for _, balance in self.starts),

@@ -14,6 +14,7 @@ from ...core.linalg import qr_triangle
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor
+from .barrier import stability_barrier
 from .marquardt import minimise
 from .options import RefineOptions
 from .problem import OneStep, Problem
@@ -22,6 +23,7 @@ from .segments import Segments
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 _COMPARED = 4  # steps within the edge of stability before starts are compared
+_HEAVIER = 8  # decades over which the edge of stability grows
 _LEAST_ERROR = 1e-6  # relative to a state's range: exact data have no error to scale by
 
 
@@ -67,7 +69,7 @@ def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, options
         if grown is None:
             continue
         end = minimise(few.evaluate, few.finite, grown, options.iterations, options.least_gain)
-        stable = _shorten(end.V, problem, options.guard)
+        stable = _stabilise(end.V, few, options)
         if stable is not None and np.isfinite(end.cost).all():
             sigma = sigma if found else normalised(few, stable, options).sigma
             edged = replace(few, sigma=sigma, guard=options.guard)
@@ -110,16 +112,39 @@ def normalised(problem: Problem, V: Array, options: RefineOptions) -> Problem:
     return replace(problem, sigma=problem.sigma * size, guard=options.guard)
 
 
-def _shorten(V: Array, problem: Problem, guard: float) -> Array | None:
-    """Scale the rows of lifted functions by the largest of a few factors that makes the model stable, off the edge where it can be."""
+def _stabilise(V: Array, problem: Problem, options: RefineOptions) -> Array | None:
+    """Bring a model from outside the edge of stability to the inside; None where that fails.
+
+    The rows of lifted functions, which free runs do not see, are scaled by the largest of a few factors that makes the model stable,
+    off the edge where it can be. Where no factor does, the search goes on from outside with an edge that grows heavier.
+    """
     n = problem.lifting.n_states
-    for margin in (max(guard, problem.margin), problem.margin):
-        for factor in np.linspace(1.0, 0.0, 21):
-            trial = V.copy()
-            trial[:, n:] *= factor
+    shortened = []
+    for factor in np.linspace(1.0, 0.0, 21):
+        shortened.append(V.copy())
+        shortened[-1][:, n:] *= factor
+    for margin in (max(options.guard, problem.margin), problem.margin):
+        for trial in shortened:
             if replace(problem, margin=margin).admissible(trial).all():
                 return trial
+    V = min(shortened, key=lambda trial: _radius(trial, problem))
+    weight = problem.residuals * problem.segments.n_units
+    for heavier in 10.0 ** np.arange(_HEAVIER):
+
+        def evaluate(trial: Array, share: float = heavier) -> Array:
+            return problem.evaluate(trial) + share * stability_barrier(trial, problem.T, options.guard, weight)
+
+        found = minimise(evaluate, problem.finite, V, options.iterations, options.least_gain)
+        if not np.isfinite(found.cost).all():
+            return None
+        V = found.V
+        if problem.admissible(V).all():
+            return V
     return None
+
+
+def _radius(V: Array, problem: Problem) -> float:
+    return float(np.abs(np.linalg.eigvals((V @ problem.T.T)[..., : problem.lifting.n_lifted])).max())
 
 
 def restrict(problem: Problem, rows: npt.NDArray[np.int64]) -> Problem:

@@ -31,6 +31,7 @@ from .segments import held_segments, read_segments
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
+_PATIENCE = 3  # strengths over which the score must improve
 
 
 def refine_population(
@@ -81,13 +82,11 @@ def refine_population(
     start, problem, error, span = start_pooled(lifting, parameters, factor, fitted, rows, options)
     common = refine_pooled(start, restrict(problem, rows), error, span, options)
     prepared = _with_prior(problem, common, factor, rows, options)
-    path = _path(prepared, common, options)
-    judged = Judge(population, keys, lifting, parameters, rows, prepared, ranges(factor, rows, lifting))
-    trade_off = judged.trade_off([common, *path], (np.inf, *sorted(options.strengths, reverse=True)))
-    choice = _choose(trade_off[1:], options.tolerance)
-    strength = trade_off[1 + choice].strength
-    log.info("prior of strength %g chosen, held-out score %.4g", strength, trade_off[1 + choice].score)
-    final = _strengthen(replace(prepared, segments=segments), strength)
+    judge = Judge(population, keys, lifting, parameters, rows, prepared, ranges(factor, rows, lifting))
+    path, trade_off = _path(prepared, common, judge, options)
+    choice = _choose(trade_off, options)
+    log.info("prior of strength %g chosen, held-out score %.4g", trade_off[choice].strength, trade_off[choice].score)
+    final = _strengthen(replace(prepared, segments=segments), trade_off[choice].strength)
     solution = minimise(final.evaluate, final.admissible, path[choice], options.iterations, options.least_gain)
     units = matrices_of(solution.V, problem.T, lifting.n_lifted)
     radius = units.spectral_radius()
@@ -98,8 +97,8 @@ def refine_population(
         unit_ids=tuple(keys),
         units=units,
         pooled=matrices_of(common, problem.T, lifting.n_lifted),
-        strength=strength,
-        trade_off=trade_off,
+        strength=trade_off[choice].strength,
+        trade_off=(*judge.trade_off([common], (np.inf,)), *trade_off),
         sigma=prepared.sigma,
         converged=solution.converged,
         information=solution.matrix[:, :-1, :-1],
@@ -144,26 +143,40 @@ def _strengthen(problem: Problem, strength: float) -> Problem:
     return problem if problem.prior is None else replace(problem, prior=problem.prior.scaled(strength * problem.residuals))
 
 
-def _path(problem: Problem, common: Array, options: RefineOptions) -> Array:
-    """Fit all units at every strength, strongest first, each from the one before; shape (strength, unit, n_lifted, p)."""
+def _path(problem: Problem, common: Array, judge: Judge, options: RefineOptions) -> tuple[list[Array], list[TradeOff]]:
+    """Fit all units at falling strengths, each from the one before, until weaker ones bring nothing or too much uncertainty.
+
+    Returns models of shape (unit, n_lifted, p) and what they are worth, at every strength.
+    """
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
-    path = []
+    path: list[Array] = []
+    rows: list[TradeOff] = []
     for strength in sorted(options.strengths, reverse=True):
         now = _strengthen(problem, strength)
         V = minimise(now.evaluate, now.admissible, V, options.path_iterations, options.least_gain).V
         path.append(V)
-    return np.stack(path)
+        rows += judge.trade_off([V], (strength,))
+        log.debug("prior of strength %g: held-out score %.4g, peak residual %.1f dB", strength, rows[-1].score, rows[-1].peak_db)
+        idle = len(rows) > _PATIENCE and rows[-1].score > (1 - options.tolerance / 2) * rows[-1 - _PATIENCE].score
+        if idle or _too_uncertain(rows[-1], options):
+            break
+    return path, rows
 
 
-def _choose(rows: Sequence[TradeOff], tolerance: float) -> int:
-    """The strongest prior whose held-out score is as good as the best, within the tolerance."""
-    best = min(row.score for row in rows)
+def _too_uncertain(row: TradeOff, options: RefineOptions) -> bool:
+    return row.peak_db > 20 * np.log10(options.largest_residual)
+
+
+def _choose(rows: Sequence[TradeOff], options: RefineOptions) -> int:
+    """The strongest prior whose held-out score is as good as the best, within the tolerance; only the last may be too uncertain."""
+    usable = [row for row in rows if not _too_uncertain(row, options)] or list(rows)
+    best = min(row.score for row in usable)
     if not np.isfinite(best):
         raise IdentificationError(
             "Refinement: at every strength of the prior a free run over a held-out training episode diverges; add strengths above "
             f"{max(row.strength for row in rows):g}."
         )
-    return next(i for i, row in enumerate(rows) if row.score <= (1 + tolerance) * best)
+    return next(i for i, row in enumerate(rows) if row.score <= (1 + options.tolerance) * best)
 
 
 def _require_stable(unit_ids: Sequence[str], radius: Array, margin: float) -> None:

@@ -106,7 +106,8 @@ def refine_models(
     facts = context.facts
     keys = {u: facts.keys("train", u, facts.identify_on) for u in units}
     pooled = np.array([u in facts.pooled for u in units])
-    options = RefineOptions(margin=max(context.config.identify.margin, RefineOptions().margin))
+    config = context.config.identify
+    options = RefineOptions(margin=max(config.margin, RefineOptions().margin), largest_residual=config.largest_residual)
     work = [
         partial(
             refine_population,

@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from kros.identify import ModelSet
+from kros.identify.refine import RefinedModels
 
 STAGES = ["read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report"]
 FORMS = {
@@ -26,13 +27,13 @@ def test_metrics_keep_the_contract(metrics):
     study = metrics["study"]
     assert (study["units"], study["conditions"], study["identify_on"], study["sample_period_s"]) == (5, ["load", "noload"], "noload", 0.001)
     assert study["alpha"] > 0
-    assert study["deployed"] == "koopman_edmd/worst_case_h2"
+    assert study["deployed"] == "koopman/worst_case_h2"
     assert list(metrics["timing_s"]) == [*STAGES, "total"]
     assert {u["unit"]: u["group"] for u in metrics["units"]}["000000"] == "outliers"
     assert all(u["status"] == "ok" and 0.9 < u["concentration"] <= 1 for u in metrics["units"] if u["group"] != "outliers")
-    assert set(metrics["models"]) == {"koopman_edmd", "linear_edmd"}
+    assert list(metrics["models"]) == ["koopman", "linear", "koopman_edmd", "linear_edmd"]
     for name, model in metrics["models"].items():
-        assert model["order"] == {"koopman_edmd": 4, "linear_edmd": 3}[name]
+        assert model["order"] == {"koopman": 4, "linear": 3}[name.removesuffix("_edmd")]
         assert model["spectral_radius_max"] < 1
         assert set(model["freerun_error_percent"]) == CHANNELS
         assert all(0 < e["median"] <= e["worst"] < 60 for e in model["freerun_error_percent"].values())
@@ -41,7 +42,7 @@ def test_metrics_keep_the_contract(metrics):
         assert uncertain["weight"]["cover_max"] <= 1
         assert uncertain["weight"]["overbound_db_max"] <= 3
         assert [len(orders) for orders in uncertain["weight"]["orders"]] == [2, 2]
-    for name in ("koopman_edmd/worst_case_h2", "linear_edmd/worst_case_h2"):
+    for name in (f"{model}/worst_case_h2" for model in metrics["models"]):
         observer = metrics["observers"][name]
         assert 0 < observer["lower_bound"] <= observer["worst_case_h2"]
         assert observer["spectral_radius_max"] < 1
@@ -132,11 +133,19 @@ def test_the_report_can_be_written_again_from_the_run_folder_alone(kros, demo, t
     assert len(list((tmp_path / "figures").glob("*.png"))) >= 8
 
 
-def test_refined_models_come_first_where_they_are_asked_for(kros, study, tmp_path):
-    out = tmp_path / "refined"
-    result = kros("run", study(), "--out", out, "--until", "identify", "--set", "identify.refine=true", "--workers", 1)
+def test_what_the_refinement_found_out_is_kept(demo):
+    for name in ("koopman", "linear"):
+        found, models = RefinedModels.load(demo / "refinement" / name), ModelSet.load(demo / "models" / name)
+        np.testing.assert_array_equal(found.units.A, models.A)
+        assert found.pooled.A.shape == models.A.shape[1:]
+        assert np.isinf(found.trade_off[0].strength)
+        assert found.strength in [row.strength for row in found.trade_off]
+        assert all(a.strength > b.strength for a, b in zip(found.trade_off, found.trade_off[1:], strict=False))
+
+
+def test_the_papers_recipe_alone_can_be_asked_for(kros, study, tmp_path):
+    out = tmp_path / "recipe"
+    result = kros("run", study(), "--out", out, "--until", "identify", "--set", "identify.refine=false", "--workers", 1)
     assert result.exit_code == 0, result.output
     metrics = json.loads((out / "metrics.json").read_text())
-    assert list(metrics["models"]) == ["koopman", "linear", "koopman_edmd", "linear_edmd"]
-    assert all(m["spectral_radius_max"] < 1 for m in metrics["models"].values())
-    assert metrics["study"]["alpha"] > 0
+    assert list(metrics["models"]) == ["koopman_edmd", "linear_edmd"]

@@ -20,7 +20,8 @@ from kros.core.errors import ConfigError, DataError
 from kros.core.lti import StateSpace, gain
 from kros.data import from_arrays, write_parquet
 from kros.data.population import Channel, EpisodeKey, Population, Role, Unit
-from kros.identify import ModelSet, PhaseCalibration, PhaseSpec, UnitPhase
+from kros.identify import KoopmanMatrices, ModelSet, PhaseCalibration, PhaseSpec, UnitPhase
+from kros.identify.refine import RefinedModels, TradeOff
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.report import plot, render, write_figures
@@ -107,6 +108,25 @@ def write_read_stage(run: Path) -> None:
     save_artifact(run / "population", "facts", {**facts, "dropped": []})
 
 
+def refined(found: ModelSet) -> RefinedModels:
+    """What a refinement may say: weaker priors, better predictions, more uncertainty."""
+    rows = [TradeOff(s, (0.01, 0.2 + 0.1 * k, 5.0 + k), 1.0, db) for k, (s, db) in enumerate([(1.0, -6.0), (10.0, -12.0), (100.0, -20.0)])]
+    pooled = TradeOff(np.inf, (0.01, 0.6, 12.0), 2.0, -np.inf)
+    p = found.A.shape[-1] + found.B.shape[-1]
+    return RefinedModels(
+        unit_ids=UNITS,
+        units=KoopmanMatrices(found.A, found.B),
+        pooled=KoopmanMatrices(found.A[0], found.B[0]),
+        strength=10.0,
+        trade_off=(pooled, *rows[::-1]),
+        sigma=np.ones(3),
+        converged=np.ones(5, dtype=bool),
+        information=np.ones((5, 1, 1)),
+        whitening=np.eye(p),
+        spectral_radius=np.full(5, 0.9),
+    )
+
+
 def write_models(run: Path, uncertain: dict[str, UncertainModel]) -> None:
     phases = {u: UnitPhase(0.5 * i, -0.9 - 0.01 * i, 0.99 - 0.1 * (i == 2), 12) for i, u in enumerate(UNITS)}
     PhaseCalibration(PhaseSpec(), -0.9, phases).save(run / "calibration")
@@ -114,6 +134,7 @@ def write_models(run: Path, uncertain: dict[str, UncertainModel]) -> None:
         models(name, "noload", 1).save(run / "models" / name)
         models(name, "load", 2).save(run / "models" / f"{name}@load")
         uncertain[name].save(run / "uncertainty" / name)
+    refined(models("koopman_edmd", "noload", 1)).save(run / "refinement" / "koopman")
     save_artifact(run / "uncertainty", "choice", {"nominal": "001", "worst_off_nominal": "002", "dropped": []})
     rows = [
         {

@@ -149,3 +149,14 @@ def test_episodes_of_different_length_are_held_at_their_end():
     batch = EpisodeBatch.read(population, population.episodes)
     assert batch.lengths.tolist() == [30, 20]
     np.testing.assert_array_equal(batch.states[20:, 1], np.broadcast_to(batch.states[19, 1], (10, 1)))
+
+
+def test_spectra_of_short_and_long_episodes_share_their_frequencies() -> None:
+    """Zero padding: a batch with an episode shorter than a Welch segment can be averaged with any other."""
+    error = np.random.default_rng(0).normal(size=(2000, 2, 1))
+    short = summarise(error, 0 * error, np.array([2000, 300]), 1e-3)
+    long = summarise(error, 0 * error, np.array([2000, 2000]), 1e-3)
+    np.testing.assert_array_equal(short.freqs_hz, long.freqs_hz)
+    np.testing.assert_array_equal(short.spectra[0], long.spectra[0])
+    power = short.spectra[1].sum() * short.freqs_hz[1]
+    assert power == pytest.approx(1.0, abs=0.3)

@@ -51,11 +51,10 @@ def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt:
     ErrorSummary
         Not-a-number or infinite where the estimate diverged.
     """
-    segment = int(min(_SEGMENT, lengths.min()))
     spectra = []
     for i, length in enumerate(lengths):
         with np.errstate(over="ignore", invalid="ignore"):
-            freqs, density = error_spectrum(estimate[:length, i] - truth[:length, i], dt, segment)
+            freqs, density = error_spectrum(estimate[:length, i] - truth[:length, i], dt)
         spectra.append(density)
     rms = error_rms(estimate, truth, lengths)
     return ErrorSummary(rms, _of_range(rms, truth, lengths), np.array(spectra), freqs)
@@ -86,7 +85,7 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT) -> tuple[Ar
     error : ndarray, shape (n_samples, ...)
     dt : float, s
     segment : int
-        Samples of a segment.
+        Samples of a segment; shorter signals are padded with zeros, so that all spectra have the same frequencies.
 
     Returns
     -------
@@ -95,5 +94,5 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT) -> tuple[Ar
     """
     from scipy.signal import welch
 
-    freqs, density = welch(error, fs=1 / dt, nperseg=segment, axis=0)
+    freqs, density = welch(error, fs=1 / dt, nperseg=min(segment, len(error)), nfft=segment, axis=0)
     return freqs, density

@@ -153,9 +153,10 @@ def test_episodes_of_different_length_are_held_at_their_end():
 
 def test_spectra_of_short_and_long_episodes_share_their_frequencies() -> None:
     """Zero padding: a batch with an episode shorter than a Welch segment can be averaged with any other."""
-    error = np.random.default_rng(0).normal(size=(2000, 2, 1))
-    short = summarise(error, 0 * error, np.array([2000, 300]), 1e-3)
-    long = summarise(error, 0 * error, np.array([2000, 2000]), 1e-3)
+    truth = np.ones((2000, 2, 1))
+    estimate = truth + np.random.default_rng(0).normal(size=truth.shape)
+    short = summarise(estimate, truth, np.array([2000, 300]), 1e-3)
+    long = summarise(estimate, truth, np.array([2000, 2000]), 1e-3)
     np.testing.assert_array_equal(short.freqs_hz, long.freqs_hz)
     np.testing.assert_array_equal(short.spectra[0], long.spectra[0])
     power = short.spectra[1].sum() * short.freqs_hz[1]

@@ -96,7 +96,7 @@ class IdentifyConfig(_Section):
     alpha: float | Literal["auto"] = "auto"
     alpha_factor: float = Field(4.0, ge=1)
     refine: bool = True
-    largest_residual: float = Field(0.6, gt=0)
+    largest_residual: float = Field(0.5, gt=0)
     margin: float = Field(0.0, ge=0, lt=1)
 
     @field_validator("alpha")

@@ -62,7 +62,7 @@ class RefineOptions:
     horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)
     segments: int = 24
     strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)
-    largest_residual: float = 0.6
+    largest_residual: float = 0.5
     tolerance: float = 0.1
     balance: float = 0.65
     starts: tuple[tuple[int, float], ...] = ((5, 0.8), (80, 0.8))

@@ -150,10 +150,28 @@ def test_pykoop_both_ways() -> None:
     assert to_pykoop(population).shape == (72, 4)
 
 
-def test_pykoop_rows_of_an_episode_may_be_scattered() -> None:
+def test_pykoop_rows_of_an_episode_may_be_scattered(caplog: pytest.LogCaptureFixture) -> None:
     X = koopman_array()
     shuffled = X[np.argsort(np.tile(np.arange(12), 3), kind="stable")]  # sample by sample instead of episode by episode
-    np.testing.assert_array_equal(from_pykoop(shuffled, 1, 0.1).read(EpisodeKey("0", "default", "3")), values(3))
+    with caplog.at_level("WARNING", "kros"):
+        population = from_pykoop(shuffled, 1, 0.1)
+    np.testing.assert_array_equal(population.read(EpisodeKey("0", "default", "3")), values(3))
+    assert "rows of episode 0 of unit 0 do not stand together" in caplog.text
+
+
+def test_pykoop_episodes_that_are_text_or_huge_are_told_apart() -> None:
+    names = np.array([[2**53 + k // 12] for k in range(24)], dtype=object)
+    X = np.hstack([names, np.vstack([values(0), values(1)])])
+    assert [k.episode for k in from_pykoop(X, 1, 0.1).episodes] == [str(2**53), str(2**53 + 1)]
+    X[:12, 0], X[12:, 0] = "run 7", "run 07"
+    population = from_pykoop(X, 1, 0.1)
+    np.testing.assert_array_equal(population.read(EpisodeKey("0", "default", "run 07")), values(1))
+    with pytest.raises(DataError, match=r"below 2\*\*53.* found 9007199254740992\.0 in row 0 of unit 0"):
+        from_pykoop(np.column_stack([np.full(12, 2.0**53), values(0)]), 1, 0.1)
+    with pytest.raises(DataError, match=r"found 1\.5 in row 0"):
+        from_pykoop(np.hstack([np.full((12, 1), 1.5, dtype=object), values(0)]), 1, 0.1)
+    with pytest.raises(DataError, match="of unit 0 should be numbers"):
+        from_pykoop(np.full((12, 4), "a"), 1, 0.1)
 
 
 def test_pykoop_without_episode_column() -> None:
@@ -172,7 +190,7 @@ def test_pykoop_agrees_with_pykoop() -> None:
 def test_pykoop_refuses() -> None:
     half = koopman_array()
     half[4, 0] = 0.5
-    with pytest.raises(DataError, match=r"should number the episodes, found 0\.5 in row 4 of unit 0"):
+    with pytest.raises(DataError, match=r"should number the episodes .* found 0\.5 in row 4 of unit 0"):
         from_pykoop(half, 1, 0.1)
     for X, n_inputs in [(koopman_array(), 3), (koopman_array()[:, 0], 1), (koopman_array(), -1)]:
         with pytest.raises(DataError, match="check n_inputs"):

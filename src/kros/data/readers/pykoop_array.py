@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,9 @@ import numpy.typing as npt
 from ...core.errors import DataError
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit
 from .arrays import from_arrays
+
+log = logging.getLogger(__name__)
+_EXACT = 2.0**53
 
 
 def from_pykoop(
@@ -29,7 +33,9 @@ def from_pykoop(
     Parameters
     ----------
     X : array_like, shape (n_samples, 1 + n_states + n_inputs), or mapping from unit id to such arrays
-        First column the episode (whole numbers), then states, then inputs. One array is one unit, named ``0``.
+        First column the episode, then states, then inputs. One array is one unit, named ``0``. Episodes are whole numbers; in an array of
+        objects they may be text, in one of floating-point numbers they must be below 2^53, where these stop telling them apart.
+        Rows of an episode keep their order; where they do not stand together, as pykoop allows, a warning says so.
     n_inputs : int
         How many of the last columns are inputs.
     sample_period_s : float
@@ -50,7 +56,7 @@ def from_pykoop(
     DataError
         Wrong sizes, or episodes that are not whole numbers.
     """
-    arrays = {str(u): np.asarray(x, dtype=float) for u, x in X.items()} if isinstance(X, Mapping) else {"0": np.asarray(X, dtype=float)}
+    arrays = {str(u): np.asarray(x) for u, x in X.items()} if isinstance(X, Mapping) else {"0": np.asarray(X)}
     if not arrays:
         raise DataError("from_pykoop: the mapping is empty; give one array per unit.")
     widths = sorted({x.shape[-1] if x.ndim == 2 else -1 for x in arrays.values()})
@@ -100,17 +106,41 @@ def _default_channels(n_states: int, n_inputs: int) -> tuple[Channel, ...]:
     return (*states, *(Channel(f"u{i}", Role.INPUT) for i in range(n_inputs)))
 
 
-def _split(unit: str, x: npt.NDArray[np.float64], episode_feature: bool) -> Iterable[tuple[str, npt.NDArray[np.float64]]]:
-    """Yield (episode, samples); rows of an episode keep their order, wherever they stand, as in pykoop."""
+def _split(unit: str, x: npt.NDArray[Any], episode_feature: bool) -> Iterable[tuple[str, npt.NDArray[np.float64]]]:
+    """Yield (episode, samples) in the order in which episodes appear."""
+    values = _numbers(unit, x[:, 1:] if episode_feature else x)
     if not episode_feature:
-        yield "0", x
+        yield "0", values
         return
-    ids = x[:, 0]
-    if not np.all(np.isfinite(ids)) or np.any(ids != np.round(ids)):
-        bad = int(np.flatnonzero(~(np.isfinite(ids) & (ids == np.round(ids))))[0])
+    ids = _episodes(unit, x[:, 0])
+    starts = [name for i, name in enumerate(ids) if i == 0 or name != ids[i - 1]]
+    if len(starts) > len(set(starts)):
+        again = next(name for i, name in enumerate(starts) if name in starts[:i])
+        log.warning("from_pykoop: rows of episode %s of unit %s do not stand together; they are joined in their order", again, unit)
+    column = np.array(ids, dtype=object)
+    for name in dict.fromkeys(ids):
+        yield name, values[column == name]
+
+
+def _episodes(unit: str, column: npt.NDArray[Any]) -> list[str]:
+    """Names of the episodes, row by row; whole numbers are written without a point."""
+    if column.dtype.kind in "iu":
+        return [str(v) for v in column.tolist()]
+    if column.dtype.kind == "f":
+        good = np.isfinite(column) & (column == np.round(column)) & (np.abs(column) < _EXACT)
+    else:
+        good = np.array([isinstance(v, (str, int, np.integer)) and not isinstance(v, bool) for v in column])
+    if not good.all():
+        row = int(np.argmin(good))
         raise DataError(
-            f"from_pykoop: the first column should number the episodes, found {ids[bad]} in row {bad} of unit {unit}; "
-            "pass episode_feature=False without it."
+            f"from_pykoop: the first column should number the episodes (as floating-point numbers below 2**53), found {column[row : row + 1].tolist()[0]!r} in row "
+            f"{row} of unit {unit}; use an integer or object array, or pass episode_feature=False without the column."
         )
-    for number in np.unique(ids):
-        yield str(int(number)), x[ids == number, 1:]
+    return [str(int(v)) for v in column] if column.dtype.kind == "f" else [str(v) for v in column]
+
+
+def _numbers(unit: str, x: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    try:
+        return np.asarray(x, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"from_pykoop: states and inputs of unit {unit} should be numbers ({error}); convert them.") from error

@@ -34,7 +34,8 @@ def draw(run: RunFolder) -> Drawing:
     if not rows:
         raise NotShownError("outlier scores need at least three units in a condition")
     top = max(rows, key=lambda r: (bool(r["outlier"]), float(r["score"])))
-    models = run.condition_models(next(iter(run.models)), top["condition"])
+    scored = next((name for name in run.models if name.endswith("_edmd")), next(iter(run.models)))  # these exist in every condition
+    models = run.condition_models(scored, top["condition"])
     form = next(iter(run.uncertain.values())).form
     flagged = {r["unit"] for r in rows if r["outlier"] and r["condition"] == top["condition"]}
     others = [u for u in models.unit_ids if u != top["unit"] and u not in flagged][:_MOST]

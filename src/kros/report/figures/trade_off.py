@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 NAME, TITLE = "trade_off", "Accuracy against uncertainty"
+_APART_DB = 3.0  # labels nearer than this would overlap
 
 
 def draw(run: RunFolder) -> Drawing:
@@ -51,13 +52,16 @@ def _line(panel: Axes, name: str, found: RefinedModels, state: int) -> None:
     colour = model_look(name).colour
     x, y = [row.peak_db for row in rows], [row.held_out_percent[state] for row in rows]
     panel.plot(x, y, "o-", color=colour, mfc="none", ms=4, lw=1.0, label=model_label(name))
+    labelled = -np.inf
     for row in rows:
-        if row.strength == found.strength:
-            panel.plot(row.peak_db, row.held_out_percent[state], "o", color=colour, ms=6)
         place = (row.peak_db, row.held_out_percent[state])
-        panel.annotate(
-            number(row.strength, 1), place, xytext=(0, 5), textcoords="offset points", ha="center", size=7, color=Tone.SOFT.light
-        )
+        if row.strength == found.strength:
+            panel.plot(*place, "o", color=colour, ms=6)
+        if row.peak_db - labelled > _APART_DB:
+            panel.annotate(
+                f"{row.strength:g}", place, xytext=(0, 5), textcoords="offset points", ha="center", size=7, color=Tone.SOFT.light
+            )
+            labelled = row.peak_db
     alone = [row.held_out_percent[state] for row in found.trade_off if np.isinf(row.strength)]
     for value in alone:
         panel.axhline(value, color=colour, lw=0.9, ls="--")

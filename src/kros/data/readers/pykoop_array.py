@@ -132,8 +132,9 @@ def _episodes(unit: str, column: npt.NDArray[Any]) -> list[str]:
         good = np.array([isinstance(v, (str, int, np.integer)) and not isinstance(v, bool) for v in column])
     if not good.all():
         row = int(np.argmin(good))
+        found = column[row : row + 1].tolist()[0]
         raise DataError(
-            f"from_pykoop: the first column should number the episodes (as floating-point numbers below 2**53), found {column[row : row + 1].tolist()[0]!r} in row "
+            f"from_pykoop: the first column should number the episodes (as floating-point numbers below 2**53), found {found!r} in row "
             f"{row} of unit {unit}; use an integer or object array, or pass episode_feature=False without the column."
         )
     return [str(int(v)) for v in column] if column.dtype.kind == "f" else [str(v) for v in column]

@@ -15,7 +15,9 @@ from kros.identify.refine.segments import Segments, held_segments, read_segments
 from kros.lifting import Lifting
 
 
-@pytest.mark.parametrize("wrong", [{"horizons": ()}, {"horizons": (20, 5)}, {"segments": 0}, {"strengths": (0.0,)}, {"balance": 1.5}])
+@pytest.mark.parametrize(
+    "wrong", [{"horizons": ()}, {"horizons": (20, 5)}, {"segments": 0}, {"strengths": (0.0,)}, {"balance": 1.5}, {"judged": 1}]
+)
 def test_options_out_of_range_are_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         RefineOptions(**wrong)
@@ -50,6 +52,22 @@ def test_pieces_are_stretches_of_the_segments() -> None:
     pieces = Segments(states, states, np.ones((20, 1, 2), bool)).cut(4)
     assert pieces.states.shape == (5, 1, 1, 2)
     np.testing.assert_array_equal(np.diff(pieces.states, axis=0), 2.0)
+
+
+def test_segments_begin_with_the_history() -> None:
+    made, keys = population([50, 6])
+    segments = read_segments(made, keys, horizon=10, count=2, seed=0, history=3)
+    assert (segments.states.shape[0], segments.horizon, segments.compared.shape) == (14, 10, (10, 1, 2))
+    np.testing.assert_array_equal(np.diff(segments.states[:, 0, 0, 0]), 1.0)
+    np.testing.assert_array_equal(segments.compared[:, 0, 1], np.arange(10) < 2)  # six samples, four of them given
+    assert segments.first(1).history == segments.units(np.array([0])).history == 3
+
+
+def test_pieces_share_history_and_nothing_that_is_compared() -> None:
+    states = np.arange(22.0).reshape(22, 1, 1, 1).repeat(3, axis=3)
+    pieces = Segments(states, states, np.ones((22, 1, 3), bool), 2).cut(4)
+    np.testing.assert_array_equal(pieces.states[0, 0, 0], [0, 10, 15])  # of pieces from 0, 5, 10, 15 in every segment
+    assert (pieces.horizon, pieces.history) == (4, 2)
 
 
 def test_unit_without_training_episodes_is_named() -> None:

@@ -12,7 +12,6 @@ from kros.evaluate import EpisodeBatch
 from kros.identify import ModelSet, combine, edmd, free_run, lifted_factor, reduce_episode
 from kros.identify.excitation import require_excitation, require_independent
 from kros.identify.factors import Factor
-from kros.identify.refine import refine_population
 from kros.lifting import Lifting
 from kros.observer import Observer, run_observer
 from kros.synthesis import Injection
@@ -82,6 +81,18 @@ def test_the_jacobian_has_a_column_for_every_entry_of_the_window():
         step = 1e-6 * np.eye(8)[j]
         slope = (DELAYED.lift(windows + step, {"phase": 0.1}) - DELAYED.lift(windows - step, {"phase": 0.1})) / 2e-6
         np.testing.assert_allclose(jacobian[..., j], slope, rtol=1e-7, atol=1e-8)
+
+
+def test_input_functions_have_a_slope_by_every_entry_of_the_window():
+    x, u = recording()
+    windows, u, phase = DELAYED.windows(x, u)[:5], u[3:8], {"phase": 0.1}
+    slopes = DELAYED.input_slopes(u, windows, phase)
+    assert slopes.shape == (5, 2, 8)
+    for j in range(8):
+        step = 1e-6 * np.eye(8)[j]
+        numeric = (DELAYED.lift_inputs(u, windows + step, phase) - DELAYED.lift_inputs(u, windows - step, phase))[:, 2:] / 2e-6
+        np.testing.assert_allclose(slopes[..., j], numeric, rtol=1e-7, atol=1e-8)
+    assert Lifting(STATES).input_slopes(u, x[:5]).shape == (5, 0, 2)
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -320,16 +331,6 @@ def test_missing_earlier_values_are_named():
         DELAYED.lift_into(np.zeros((2, 5)), {"phase": 0.0})
     with pytest.raises(DimensionError, match="expected 8 entries of a window"):
         DELAYED.lift(np.zeros((2, 2)), {"phase": 0.0})
-
-
-def test_refinement_refuses_what_it_does_not_know():
-    x, u = recording()
-    reduced = Factor.stack([reduce_episode(x, u, DELAYED)])
-    factor = lifted_factor(reduced, DELAYED, {"phase": np.zeros(1)}, DELAYED)
-    channels = [Channel(n, Role.STATE, "", True) for n in STATES] + [Channel(n, Role.INPUT) for n in INPUTS]
-    population = from_arrays({"1": {"default": {"0": np.hstack([x, u]), "1": np.hstack([x, u])}}}, channels, 0.01)
-    with pytest.raises(IdentificationError, match="delays of up to 3 samples and 2 input functions"):
-        refine_population(population, {"1": population.episodes}, DELAYED, {"phase": np.zeros(1)}, factor)
 
 
 def test_what_recordings_do_not_show_is_named(caplog):

@@ -205,8 +205,7 @@ class Lifting:
         window = self._windows(window)
         out = np.empty((*u.shape[:-1], u.shape[-1] + len(self.input_functions)))
         out[..., : u.shape[-1]] = u
-        values = {**self._values(window, parameters, window[..., self.n_states :]), **{q: u[..., i] for i, q in enumerate(self.inputs)}}
-        self._input_columns.fill(values, out)
+        self._input_columns.fill(self._values(window, parameters, window[..., self.n_states :], u), out)
         return out
 
     def windows(self, x: Array, u: Array) -> Array:
@@ -239,6 +238,21 @@ class Lifting:
         slopes = np.empty((*x.shape[:-1], len(self.functions) * x.shape[-1]))
         self._derivatives.fill(self._values(x, parameters, x[..., self.n_states :]), slopes)
         return slopes.reshape(*x.shape[:-1], len(self.functions), x.shape[-1])
+
+    def input_slopes(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
+        """Return the derivative of the input functions by every entry of the window, the inputs held, shape (..., r, n_window).
+
+        Parameters
+        ----------
+        u : array_like, shape (..., m)
+        window : array_like, shape (..., n_window)
+        parameters : mapping of str to array_like
+        """
+        u, window = np.asarray(u, dtype=float), self._windows(window)
+        self.window.require_inputs(u)
+        slopes = np.empty((*window.shape[:-1], len(self.input_functions) * window.shape[-1]))
+        self._input_derivatives.fill(self._values(window, parameters, window[..., self.n_states :], u), slopes)
+        return slopes.reshape(*window.shape[:-1], len(self.input_functions), window.shape[-1])
 
     def value_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
         """Return bounds of every lifted function over an operating box, each of shape (p,).
@@ -314,6 +328,10 @@ class Lifting:
     def _derivatives(self) -> Columns:
         return Columns.of([formula.derivative(name) for formula in self.formulas for name in self.window.names])
 
+    @cached_property
+    def _input_derivatives(self) -> Columns:
+        return Columns.of([formula.derivative(name) for formula in self.input_formulas for name in self.window.names])
+
     def _windows(self, x: npt.ArrayLike) -> Array:
         x = np.asarray(x, dtype=float)
         names = self.window.names
@@ -322,7 +340,7 @@ class Lifting:
             raise DimensionError(f"Lifting: expected {len(names)} {what} {names} on the last axis, found shape {x.shape}.")
         return x
 
-    def _values(self, x: Array, parameters: Parameters | None, earlier: Array | None = None) -> dict[str, Array]:
+    def _values(self, x: Array, parameters: Parameters | None, earlier: Array | None = None, u: Array | None = None) -> dict[str, Array]:
         given = parameters if parameters is not None else {}
         missing = [name for name in self.parameters if name not in given]
         if missing:
@@ -333,6 +351,8 @@ class Lifting:
             values.update({name: earlier[..., i] for i, name in enumerate(self.window.earlier)})
         elif self.window.depths:
             raise DimensionError(f"Lifting: the earlier values {self.window.earlier} are missing; pass them, or lift windows.")
+        if u is not None:
+            values.update({name: u[..., i] for i, name in enumerate(self.inputs)})
         return values
 
 

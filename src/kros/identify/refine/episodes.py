@@ -76,7 +76,7 @@ def episode_normals(
         )
     W = np.concatenate([models.units.A, models.units.B], axis=-1)
     V = np.swapaxes(np.linalg.solve(T, np.swapaxes(W, -1, -2)), -1, -2)
-    segments = read_segments(population, keys, max(options.horizons), options.segments, options.seed)
+    segments = read_segments(population, keys, max(options.horizons), options.segments, options.seed, lifting.history)
     whole = combine(factors)
     rows = np.arange(units) if pooled is None else np.flatnonzero(pooled)
     own = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters}
@@ -110,7 +110,7 @@ def _free_runs(V: Array, problem: Problem) -> tuple[Array, Array]:
 def _one_by_one(segments: Segments) -> Segments:
     """Every segment as a unit of its own."""
     states, inputs = (a.reshape(*a.shape[:2], -1, 1) for a in (segments.states, segments.inputs))
-    return Segments(states, inputs, segments.valid.reshape(len(segments.valid), -1, 1))
+    return Segments(states, inputs, segments.valid.reshape(len(segments.valid), -1, 1), segments.history)
 
 
 def _add_one_step(total: Array, V: Array, factors: Factor, problem: Problem, share: Array) -> None:

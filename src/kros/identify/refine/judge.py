@@ -21,7 +21,13 @@ _AT_ONCE = 4_000_000  # numbers of recordings in memory
 
 
 def free_run_errors(
-    A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, Array], population: Population, keys: Sequence[EpisodeKey]
+    A: Array,
+    B: Array,
+    lifting: Lifting,
+    parameters: Mapping[str, Array],
+    population: Population,
+    keys: Sequence[EpisodeKey],
+    judged: int | None = None,
 ) -> tuple[Array, Array, Array]:
     """Return what the free runs of several models differ by from one episode of every unit.
 
@@ -34,6 +40,8 @@ def free_run_errors(
     population : Population
     keys : sequence of EpisodeKey
         One for every unit.
+    judged : int, optional
+        Samples of each episode that are run, those before a free run's start not counted; all by default.
 
     Returns
     -------
@@ -44,9 +52,9 @@ def free_run_errors(
     reached : ndarray, shape (model, unit, n)
         Largest magnitude of the free run.
     """
-    n, models = lifting.n_states, len(A)
+    n, h, models = lifting.n_states, lifting.history, len(A)
     rms, reached, top = np.full((models, len(keys), n), np.inf), np.full((models, len(keys), n), np.inf), np.zeros((len(keys), n))
-    episodes = [population.read(key) for key in keys]
+    episodes = [population.read(key)[: None if judged is None else h + judged] for key in keys]
     by_length: dict[int, list[int]] = {}
     for row, episode in enumerate(episodes):
         by_length.setdefault(len(episode), []).append(row)
@@ -62,7 +70,7 @@ def free_run_errors(
                 B[:, rows].reshape(-1, *B.shape[2:]),
                 lifting,
                 own,
-                np.tile(x[:, 0], (models, 1)),
+                np.tile(x[:, : h + 1], (models, 1, 1)),
                 np.tile(u, (models, 1, 1)),
             ).reshape(models, *x.shape)
             with np.errstate(over="ignore", invalid="ignore"):
@@ -80,8 +88,9 @@ def require_bounded(
     population: Population,
     keys: Mapping[str, Sequence[EpisodeKey]],
     limit: Array,
+    judged: int | None = None,
 ) -> None:
-    """Run every unit's model over all of its training episodes, and refuse one that leaves the limit.
+    """Run every unit's model over all of its training episodes, or their first `judged` samples, and refuse one that leaves the limit.
 
     Parameters
     ----------
@@ -93,6 +102,8 @@ def require_bounded(
     keys : mapping of str to sequence of EpisodeKey
     limit : ndarray, shape (n,)
         Largest magnitude of every state that is still bounded.
+    judged : int, optional
+        As in `free_run_errors`.
 
     Raises
     ------
@@ -104,7 +115,7 @@ def require_bounded(
     for part in (flat[i : i + width] for i in range(0, len(flat), width)):
         rows = [row for row, _ in part]
         own = {name: values[rows] for name, values in parameters.items()}
-        _, _, reached = free_run_errors(A[None, rows], B[None, rows], lifting, own, population, [key for _, key in part])
+        _, _, reached = free_run_errors(A[None, rows], B[None, rows], lifting, own, population, [key for _, key in part], judged)
         over = np.argwhere(~(reached[0] <= limit))
         if len(over):
             which, state = over[0]
@@ -116,7 +127,7 @@ def require_bounded(
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Scores models on the last training episode of every pooled unit."""
+    """Scores models on the last training episode of every pooled unit, or on its first `judged` samples."""
 
     population: Population
     keys: Mapping[str, Sequence[EpisodeKey]]
@@ -125,6 +136,7 @@ class Judge:
     rows: npt.NDArray[np.int64]
     problem: Problem
     scales: tuple[Array, Array]
+    judged: int | None = None
 
     def trade_off(self, V: Sequence[Array], strengths: Sequence[float]) -> tuple[TradeOff, ...]:
         """Return accuracy and uncertainty of models (unit, n_lifted, p), or of one for all units."""
@@ -132,8 +144,10 @@ class Judge:
         models = matrices_of(full, self.problem.T, self.lifting.n_lifted)
         last = [episodes[-1] for episodes in self.keys.values()]
         own = {name: values[self.rows] for name, values in self.parameters.items()}
-        rms, top, _ = free_run_errors(models.A, models.B, self.lifting, own, self.population, [last[row] for row in self.rows])
-        percent = np.median(100 * rms / np.maximum(top, np.finfo(float).tiny), axis=1)
+        ends = [last[row] for row in self.rows]
+        rms, top, _ = free_run_errors(models.A, models.B, self.lifting, own, self.population, ends, self.judged)
+        span = np.where(top > 0, top, self.scales[0][: self.lifting.n_states])  # a state may rest at zero in the last episode
+        percent = np.median(100 * rms / span, axis=1)
         score = np.mean((rms / self.problem.sigma) ** 2, axis=(1, 2))
         return tuple(
             TradeOff(float(s), tuple(percent[i].tolist()), float(score[i]), self._peak_db(models.A[i], models.B[i]))

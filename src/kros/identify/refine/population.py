@@ -75,14 +75,14 @@ def refine_population(
     pooled = np.ones(len(keys), dtype=bool) if pooled is None else np.asarray(pooled, dtype=bool)
     _check(population, keys, lifting, parameters, factor, pooled)
     parameters = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters}
-    segments = read_segments(population, keys, max(options.horizons), options.segments, options.seed)
+    segments = read_segments(population, keys, max(options.horizons), options.segments, options.seed, lifting.history)
     held = held_segments(options.segments, keys)
     fitted = segments.first(options.segments - held)
     rows = np.flatnonzero(pooled)
     start, problem, error, span = start_pooled(lifting, parameters, factor, fitted, rows, options)
     common = refine_pooled(start, restrict(problem, rows), error, span, options)
     prepared = _with_prior(problem, common, factor, rows, options)
-    judge = Judge(population, keys, lifting, parameters, rows, prepared, ranges(factor, rows, lifting))
+    judge = Judge(population, keys, lifting, parameters, rows, prepared, ranges(factor, rows, lifting), options.judged)
     path, trade_off = _path(prepared, common, judge, options)
     choice = _choose(trade_off, options)
     log.info("prior of strength %g chosen, held-out score %.4g", trade_off[choice].strength, trade_off[choice].score)
@@ -92,7 +92,7 @@ def refine_population(
     radius = units.spectral_radius()
     _require_stable(tuple(keys), radius, options.margin)
     limit = options.bound * factor.peak[rows, : lifting.n_states].max(axis=0)
-    require_bounded(units.A, units.B, lifting, parameters, population, keys, limit)
+    require_bounded(units.A, units.B, lifting, parameters, population, keys, limit, options.judged)
     return RefinedModels(
         unit_ids=tuple(keys),
         units=units,
@@ -115,16 +115,12 @@ def _check(
     factor: Factor,
     pooled: npt.NDArray[np.bool_],
 ) -> None:
-    if lifting.history or lifting.input_functions:
-        raise IdentificationError(
-            f"Refinement: knows functions of the present state only, and this lifting has delays of up to {lifting.history} samples and "
-            f"{len(lifting.input_functions)} input functions; set identify.refine = false, or leave these out."
-        )
-    width = 2 * lifting.n_lifted + len(population.inputs)
+    m = len(population.inputs) + len(lifting.input_functions)
+    width = 2 * lifting.n_lifted + m
     wrong = [name for name in lifting.parameters if name not in parameters or np.shape(parameters[name]) != (len(keys),)]
     if factor.R.shape != (len(keys), width, width) or wrong or pooled.shape != (len(keys),) or not pooled.any():
         raise DimensionError(
-            f"Refinement: {len(keys)} units with {lifting.n_lifted} lifted states and {len(population.inputs)} inputs need factors of shape "
+            f"Refinement: {len(keys)} units with {lifting.n_lifted} lifted states and {m} inputs need factors of shape "
             f"{(len(keys), width, width)}, found {factor.R.shape}, parameters of one value a unit (wrong: {wrong}) and at least one pooled "
             f"unit, found {int(pooled.sum())} of {pooled.size}; pass factors from lifted_factor for the same units."
         )

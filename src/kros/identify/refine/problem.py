@@ -27,7 +27,7 @@ from .sensitivity import Normal, normal_equations
 Array = npt.NDArray[np.float64]
 _SAMPLES = 64  # residuals of a state that a segment contributes, at least
 _ROW_WEIGHT = 0.1  # of a lifted function's one-step error against a state's free-run error
-_LEAST_VARIANCE = 1e-20  # of the one-step error, relative to the mean square of the function
+_LEAST_VARIANCE = 1e-10  # of the one-step error, relative to the mean square of the function; an earlier value is predicted exactly
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +111,12 @@ class Problem:
     @property
     def residuals(self) -> float:
         """Residuals that one unit's free runs contribute, on average."""
-        return self.lifting.n_states * float(self.segments.valid[1:].sum()) / self.segments.n_units / self.stride
+        return self.lifting.n_states * float(self.segments.compared.sum()) / self.segments.n_units / self.stride
 
     @property
     def stride(self) -> int:
         """Every how many steps the error counts."""
-        return max(1, (len(self.segments.valid) - 1) // _SAMPLES)
+        return max(1, self.segments.horizon // _SAMPLES)
 
     def at(self, horizon: int) -> Problem:
         """Return the same problem at a horizon up to that of the segments."""

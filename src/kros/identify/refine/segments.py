@@ -25,16 +25,29 @@ class Segments:
     inputs : ndarray, shape (n_samples, m, unit, segment)
     valid : ndarray of bool, shape (n_samples, unit, segment)
         False behind the end of an episode shorter than the others.
+    history : int
+        Samples before the one that a free run starts from; a lifting with delays reads them.
     """
 
     states: Array
     inputs: Array
     valid: npt.NDArray[np.bool_]
+    history: int = 0
 
     @property
     def n_units(self) -> int:
         """Number of units."""
         return self.valid.shape[1]
+
+    @property
+    def horizon(self) -> int:
+        """Steps of a free run."""
+        return len(self.valid) - 1 - self.history
+
+    @property
+    def compared(self) -> npt.NDArray[np.bool_]:
+        """Which samples a free run is compared with, shape (horizon, unit, segment)."""
+        return self.valid[self.history + 1 :]
 
     def units(self, rows: npt.NDArray[Any]) -> Segments:
         """Return the segments of some units."""
@@ -42,6 +55,7 @@ class Segments:
             np.ascontiguousarray(self.states[..., rows, :]),
             np.ascontiguousarray(self.inputs[..., rows, :]),
             np.ascontiguousarray(self.valid[..., rows, :]),
+            self.history,
         )
 
     def first(self, count: int) -> Segments:
@@ -50,22 +64,29 @@ class Segments:
             np.ascontiguousarray(self.states[..., :count]),
             np.ascontiguousarray(self.inputs[..., :count]),
             np.ascontiguousarray(self.valid[..., :count]),
+            self.history,
         )
 
     def cut(self, horizon: int) -> Segments:
-        """Return pieces of `horizon` steps, as many as there are segments, spread evenly over them."""
-        length = min(horizon + 1, len(self.valid))
-        pieces, n_segments = len(self.valid) // length, self.valid.shape[2]
+        """Return pieces of `horizon` steps, as many as there are segments, spread evenly over them.
+
+        Pieces of one segment share the history that they read, and no sample that they are compared with.
+        """
+        length = min(horizon, self.horizon) + 1
+        pieces, n_segments = (len(self.valid) - self.history) // length, self.valid.shape[2]
         keep = np.unique(np.linspace(0, pieces * n_segments - 1, n_segments).round().astype(int))
+        samples = np.arange(self.history + length)[:, None] + length * np.arange(pieces)  # (sample, piece)
 
         def fold(a: npt.NDArray[Any]) -> npt.NDArray[Any]:
-            moved = np.moveaxis(a[: pieces * length].reshape(pieces, length, *a.shape[1:]), 0, -1)  # (length, .., segment, piece)
+            moved = np.moveaxis(a[samples], 1, -1)  # (sample, .., segment, piece)
             return np.ascontiguousarray(moved.reshape(*moved.shape[:-2], -1)[..., keep])
 
-        return Segments(fold(self.states), fold(self.inputs), fold(self.valid))
+        return Segments(fold(self.states), fold(self.inputs), fold(self.valid), self.history)
 
 
-def read_segments(population: Population, keys: Mapping[str, Sequence[EpisodeKey]], horizon: int, count: int, seed: int) -> Segments:
+def read_segments(
+    population: Population, keys: Mapping[str, Sequence[EpisodeKey]], horizon: int, count: int, seed: int, history: int = 0
+) -> Segments:
     """Draw segments of every unit, those of its last episode at the end.
 
     Parameters
@@ -78,15 +99,23 @@ def read_segments(population: Population, keys: Mapping[str, Sequence[EpisodeKey
     count : int
         Segments of every unit; the first ``count - held_segments(count, keys)`` are from all episodes but the last.
     seed : int
+    history : int
+        Samples before the first of the `horizon` steps.
 
     Returns
     -------
     Segments
+
+    Raises
+    ------
+    DataError
+        When a unit has no episode, or an episode drawn from is too short for the history and one step.
     """
     held = held_segments(count, keys)
     n, width = len(population.states), len(population.channels)
-    values = np.empty((horizon + 1, width, len(keys), count))
-    valid = np.ones((horizon + 1, len(keys), count), dtype=bool)
+    length = history + horizon + 1
+    values = np.empty((length, width, len(keys), count))
+    valid = np.ones((length, len(keys), count), dtype=bool)
     for row, (unit, episodes) in enumerate(keys.items()):
         if not episodes:
             raise DataError(f"Refinement: unit {unit} has no training episode; leave the unit out or give it one.")
@@ -95,13 +124,18 @@ def read_segments(population: Population, keys: Mapping[str, Sequence[EpisodeKey
         owners = [earlier[i % len(earlier)] for i in range(count - held)] + [episodes[-1]] * held
         for key in dict.fromkeys(owners):
             samples = population.read(key)
+            if len(samples) < history + 2:
+                raise DataError(
+                    f"Refinement: {key} has {len(samples)} samples, and delays of up to {history} need at least {history + 2}; leave the episode "
+                    "out or use shorter delays."
+                )
             for column in (i for i, owner in enumerate(owners) if owner == key):
-                start = int(rng.integers(0, max(1, len(samples) - horizon)))
-                piece = samples[start : start + horizon + 1]
+                start = int(rng.integers(0, max(1, len(samples) - length + 1)))
+                piece = samples[start : start + length]
                 values[: len(piece), :, row, column] = piece
                 values[len(piece) :, :, row, column] = piece[-1]
                 valid[len(piece) :, row, column] = False
-    return Segments(np.ascontiguousarray(values[:, :n]), np.ascontiguousarray(values[:, n:]), valid)
+    return Segments(np.ascontiguousarray(values[:, :n]), np.ascontiguousarray(values[:, n:]), valid, history)
 
 
 def held_segments(count: int, keys: Mapping[str, Sequence[EpisodeKey]]) -> int:

@@ -1,21 +1,24 @@
 """Free runs with analytic sensitivities: how the run's states move with the model, batched over units and their segments.
 
-A model is ``x+ = W psi``, with ``psi = [x; sigma(x); u]``. Lifted states are re-lifted at every step, so that
+A model is ``x+ = W psi``, with ``psi = [x; sigma(w); u; v(w, u)]`` on the window w, the states x and the earlier values of states and inputs
+that the lifting reads. Lifted states are re-lifted at every step, so that
 
-    dx+/dV = F dx/dV + (dW/dV) psi,      F = W d psi/dx,      W = V T^T
+    dx+/dV = sum over d of F_d S_d + (dW/dV) psi,      F_d = W d psi/dx[-d],      W = V T^T
 
-where the columns of T whiten the data; all least squares is done in V, whose entries are of one size.
+where the columns of T whiten the data; all least squares is done in V, whose entries are of one size. Without delays d is 0 alone. Values
+that were recorded, all inputs and the states of the first window, do not move with the model.
 
 Symbols
 -------
-V       : free parameters, (unit, n, p), with p = n_lifted + m;   T : whitening, (p, p)
-S       : sensitivities dx/dV, (n, n p, batch), with the batch last so that every operation runs over contiguous memory
+V       : free parameters, (unit, n, p), with p = n_lifted + m, input functions counted;   T : whitening, (p, p)
+S_d     : sensitivities dx/dV of d samples ago, (n, n p, batch), the batch last so that every operation runs over contiguous memory
+F       : F_0, and behind it the columns of every F_d of the states that the lifting reads d samples ago, (n, n + q, batch)
 normal  : ``[J r]^T [J r]`` of every unit, (unit, n p + 1, n p + 1), over the residuals r = (x_data - x) / sigma
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +28,7 @@ from ...lifting import Lifting
 from .segments import Segments
 
 Array = npt.NDArray[np.float64]
+Past = tuple[int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,53 +76,76 @@ def normal_equations(
     -------
     Normal
     """
-    n, nl = lifting.n_states, lifting.n_lifted
+    n, nl, h = lifting.n_states, lifting.n_lifted, segments.history
     n_samples, m, units, per_unit = segments.inputs.shape
-    batch, p = units * per_unit, nl + m
+    batch, p = units * per_unit, V.shape[-1]
     own = {name: np.repeat(values, per_unit) for name, values in parameters.items()}
     W = np.repeat(np.moveaxis(V @ T.T, 0, -1), per_unit, axis=-1)  # (n, p, batch)
     x = segments.states.reshape(n_samples, n, batch)
     u = segments.inputs.reshape(n_samples, m, batch)
     valid = segments.valid.reshape(n_samples, batch)
-    psi, S, S_next = np.empty((p, batch)), np.zeros((n, n * p, batch)), np.empty((n, n * p, batch))
-    work, F = np.empty((n * p, batch)), np.empty((n, n, batch))
-    psi[:n] = x[0]
+    past = _moving_past(lifting)
+    psi, work, F = np.empty((p, batch)), np.empty((n * p, batch)), np.empty((n, n + len(past), batch))
+    S = [np.zeros((n, n * p, batch)) for _ in range(2 + max((d for _, _, d in past), default=0))]  # now, earlier, and space for the next
+    window = np.empty((len(lifting.window.names), batch)) if h else psi[:n]
+    window[:] = lifting.windows(x[: h + 1].transpose(2, 0, 1), u[: h + 1].transpose(2, 0, 1))[:, 0].T
+    psi[:n] = window[:n]
     matrix, squares, counts = np.zeros((units, n * p + 1, n * p + 1)), np.zeros((n, units)), np.zeros(units)
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(n_samples - 1):
-            lifting.lift_into(psi[:nl].T, own)
-            psi[nl:] = u[k]
-            _state_matrix(F, W, psi, lifting, own)
-            _advance(S_next, S, F, T.T @ psi, work)
-            S, S_next = S_next, S
-            psi[:n] = np.einsum("apb,pb->ab", W, psi)
-            if (k + 1) % stride == 0:
+        for k in range(h, n_samples - 1):
+            lifting.lift_into(psi[:nl].T, own, window[n:].T)
+            psi[nl:] = lifting.lift_inputs(u[k].T, window.T, own).T
+            _state_matrix(F, W, window, u[k], lifting, own, past)
+            _advance(S, F, T.T @ psi, work, past)
+            if h:
+                window[n:] = lifting.window.advance(window.T, u[k].T).T
+            psi[:n] = window[:n] = np.einsum("apb,pb->ab", W, psi)
+            S = [S[-1], *S[:-1]]
+            if (k + 1 - h) % stride == 0:
                 error = np.where(valid[k + 1], x[k + 1] - psi[:n], 0.0)
                 squares += (error**2).reshape(n, units, per_unit).sum(axis=-1)
                 counts += valid[k + 1].reshape(units, per_unit).sum(axis=-1)
-                _accumulate(matrix, S, error, valid[k + 1], sigma, units)
+                _accumulate(matrix, S[0], error, valid[k + 1], sigma, units)
     matrix[~np.isfinite(matrix).all(axis=(1, 2))] = np.inf
     return Normal(matrix, squares.T, counts)
 
 
-def _state_matrix(F: Array, W: Array, psi: Array, lifting: Lifting, parameters: Mapping[str, Array]) -> None:
-    """F = W d psi/dx, shape (n, n, batch)."""
+def _moving_past(lifting: Lifting) -> list[Past]:
+    """Earlier values of states that a formula reads: entry of the window, state and delay."""
+    read = {name for formula in (*lifting.formulas, *lifting.input_formulas) for name in formula.used}
+    found = []
+    for entry, name in enumerate(lifting.window.names):
+        state, _, delay = name.rstrip("]").partition("[")
+        if delay and name in read and state in lifting.states:
+            found.append((entry, lifting.states.index(state), -int(delay)))
+    return found
+
+
+def _state_matrix(
+    F: Array, W: Array, window: Array, u: Array, lifting: Lifting, parameters: Mapping[str, Array], past: Sequence[Past]
+) -> None:
+    """F = W d psi/dw, shape (n, n + q, batch)."""
     n, nl = lifting.n_states, lifting.n_lifted
-    F[:] = W[:, :n]
+    moving = [*range(n), *(entry for entry, _, _ in past)] if len(window) > n else slice(None)
+    F[:, :n], F[:, n:] = W[:, :n], 0.0
     if lifting.functions:
-        slopes = lifting.slopes(psi[:n].T, parameters)  # (batch, function, n)
+        slopes = lifting.slopes(window.T, parameters)[..., moving]  # (batch, function, n + q)
         F += np.einsum("afb,bfj->ajb", W[:, n:nl], slopes)
+    if lifting.input_functions:
+        slopes = lifting.input_slopes(u.T, window.T, parameters)[..., moving]
+        F += np.einsum("afb,bfj->ajb", W[:, nl + len(u) :], slopes)
 
 
-def _advance(S_next: Array, S: Array, F: Array, white: Array, work: Array) -> None:
-    """S_next = F S + (dV) white."""
-    n, p = len(F), len(white)
-    for a in range(n):
-        np.multiply(S[0], F[a, 0], out=S_next[a])
-        for b in range(1, n):
-            np.multiply(S[b], F[a, b], out=work)
-            np.add(S_next[a], work, out=S_next[a])
-        S_next[a, a * p : (a + 1) * p] += white
+def _advance(S: Sequence[Array], F: Array, white: Array, work: Array, past: Sequence[Past]) -> None:
+    """S_next = sum over d of F_d S_d + (dV) white, with S_next in the place of the oldest."""
+    p = len(white)
+    terms = [*S[0], *(S[delay][state] for _, state, delay in past)]
+    for a, into in enumerate(S[-1]):
+        np.multiply(terms[0], F[a, 0], out=into)
+        for b in range(1, len(terms)):
+            np.multiply(terms[b], F[a, b], out=work)
+            np.add(into, work, out=into)
+        into[a * p : (a + 1) * p] += white
 
 
 def _accumulate(matrix: Array, S: Array, error: Array, valid: npt.NDArray[np.bool_], sigma: Array, units: int) -> None:

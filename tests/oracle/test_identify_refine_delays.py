@@ -1,0 +1,163 @@
+"""Refinement of liftings with delays and input functions, against loops over samples and systems whose matrices are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kros.core import DataError, IdentificationError
+from kros.data import Channel, EpisodeKey, Population, Role, Unit
+from kros.identify import Factor, combine, free_run, lifted_factor, reduce_episode
+from kros.identify.episode_factors import episode_factors
+from kros.identify.refine import RefinedModels, RefineOptions, refine_population
+from kros.identify.refine.episodes import episode_normals
+from kros.identify.refine.judge import free_run_errors
+from kros.identify.refine.segments import Segments, read_segments
+from kros.identify.refine.sensitivity import normal_equations
+from kros.lifting import Lifting
+
+DELAYED = Lifting(
+    ("x", "i"),
+    ("sin(3*x + phase)", "x[-4]", "i[-1]*u[-3]"),
+    ("phase",),
+    ("u", "w"),
+    ("i*u", "cos(x[-2] + phase)*w"),
+)
+
+
+def run_by_hand(W: np.ndarray, x: np.ndarray, u: np.ndarray, phase: float) -> np.ndarray:
+    """Free run from the first five samples of x, written out."""
+    x = x.copy()
+    for k in range(4, len(x) - 1):
+        lifted = [*x[k], np.sin(3 * x[k, 0] + phase), x[k - 4, 0], x[k - 1, 1] * u[k - 3, 0]]
+        inputs = [*u[k], x[k, 1] * u[k, 0], np.cos(x[k - 2, 0] + phase) * u[k, 1]]
+        x[k + 1] = W @ [*lifted, *inputs]
+    return x
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_gradient_of_free_runs_with_delays_is_that_of_finite_differences(stride: int) -> None:
+    rng = np.random.default_rng(0)
+    units, segments, length, n, p = 2, 3, 22, 2, 9
+    V = 0.25 * rng.normal(size=(units, n, p))
+    T = np.eye(p) + 0.1 * rng.normal(size=(p, p))
+    sigma, phase = np.array([0.5, 2.0]), np.array([0.3, 1.2])
+    shape = (units, segments)
+    data = Segments(rng.normal(size=(length, n, *shape)), rng.normal(size=(length, 2, *shape)), np.ones((length, *shape), bool), 4)
+    data.valid[15:, 1, 2] = False
+    compared = np.arange(4 + stride, length, stride)
+
+    def cost(V: np.ndarray) -> np.ndarray:
+        total = np.zeros(units)
+        for i in range(units):
+            for s in range(segments):
+                x = run_by_hand(V[i] @ T.T, data.states[:, :, i, s], data.inputs[:, :, i, s], phase[i])
+                error = (data.states[:, :, i, s] - x) / sigma
+                total[i] += sum(np.sum(error[k] ** 2) for k in compared if data.valid[k, i, s])
+        return total
+
+    normal = normal_equations(V, T, DELAYED, {"phase": phase}, data, sigma, stride)
+    np.testing.assert_allclose(normal.cost, cost(V), rtol=1e-10)
+    assert normal.counts[0] == segments * len(compared)
+    numeric = np.zeros((units, n * p))
+    for k in range(n * p):
+        step = np.zeros((n, p))
+        step.flat[k] = 1e-6
+        numeric[:, k] = (cost(V + step) - cost(V - step)) / 2e-6
+    np.testing.assert_allclose(-2 * normal.matrix[:, :-1, -1], numeric, rtol=1e-5, atol=1e-5)
+
+
+BILINEAR = Lifting(("x", "v"), ("sin(2*x[-3])", "u[-1]"), (), ("u",), ("v*u",))
+W_TRUE = np.array([[0.97, 0.10, 0.03, 0.02, 0.01, 0.0], [-0.10, 0.88, -0.08, 0.10, 0.2, 0.15]])
+OPTIONS = RefineOptions(horizons=(5, 20, 80), segments=10, strengths=(1e2, 1.0, 1e-2))
+
+
+def machines(n_units: int, noise: float, seed: int, spread: float = 0.02) -> tuple:
+    """Population, keys, factors and the true rows of the states (unit, 2, 6) of systems that BILINEAR describes exactly."""
+    rng = np.random.default_rng(seed)
+    W = W_TRUE * (1 + spread * rng.standard_normal((n_units, 1, 1)) * [[[0], [1]]])
+    data = {}
+    for row in range(n_units):
+        for episode in range(4):
+            u = rng.normal(size=(600, 1))  # changes at every sample, which tells u and u[-1] apart
+            x = np.zeros((600, 2))
+            x[:4] = 0.3 * rng.normal(size=(4, 2))
+            for k in range(3, 599):
+                x[k + 1] = W[row] @ [*x[k], np.sin(2 * x[k - 3, 0]), u[k - 1, 0], u[k, 0], x[k, 1] * u[k, 0]]
+            data[EpisodeKey(f"u{row}", "default", str(episode))] = np.hstack([x + noise * rng.standard_normal(x.shape), u])
+    channels = (Channel("x", Role.STATE), Channel("v", Role.STATE), Channel("u", Role.INPUT))
+    units = tuple(Unit(f"u{row}") for row in range(n_units))
+    population = Population(channels, 0.01, units, tuple(data), data.__getitem__)
+    keys = {unit.id: population.keys(unit.id) for unit in units}
+    reduced = [combine(Factor.stack([reduce_episode(data[k][:, :2], data[k][:, 2:], BILINEAR) for k in ks])) for ks in keys.values()]
+    return population, keys, lifted_factor(Factor.stack(reduced), BILINEAR, {}, BILINEAR), W
+
+
+def rows(models: RefinedModels) -> np.ndarray:
+    return np.concatenate([models.units.A, models.units.B], axis=-1)[:, :2]
+
+
+def test_a_bilinear_system_with_delays_is_recovered_through_measurement_noise() -> None:
+    population, keys, factor, W = machines(3, 0.05, seed=3)
+    models = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
+    one_step = np.swapaxes(np.linalg.solve(factor.R[:, :6, :6], factor.R[:, :6, 6:8]), 1, 2)
+    found, biased = np.abs(rows(models) - W).max(), np.abs(one_step - W).max()
+    assert found < 0.02
+    assert found < 0.5 * biased
+
+
+def test_exact_recordings_give_the_exact_system_and_its_shift() -> None:
+    population, keys, factor, W = machines(2, 0.0, seed=5, spread=0.0)
+    models = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
+    np.testing.assert_allclose(rows(models), W, atol=1e-6)
+    shift = np.concatenate([models.units.A, models.units.B], axis=-1)[:, 3]
+    np.testing.assert_allclose(shift, np.broadcast_to([0, 0, 0, 0, 1, 0], shift.shape), atol=1e-6)  # u[-1] of the next sample is u
+    x = population.read(keys["u0"][0])
+    run = free_run(models.units.A[:1], models.units.B[:1], BILINEAR, {}, x[None, :4, :2], x[None, :, 2:])[0]
+    np.testing.assert_allclose(run, x[:, :2], atol=1e-5)
+
+
+def test_normal_equations_by_episode_add_up_with_delays() -> None:
+    population, keys, factor, _ = machines(2, 0.05, seed=8)
+    models = refine_population(population, keys, BILINEAR, {}, factor, options=replace(OPTIONS, strengths=(1.0,)))
+    by_episode = episode_normals(models, population, keys, BILINEAR, {}, episode_factors(population, keys, BILINEAR), OPTIONS)
+    segments = read_segments(population, keys, 80, OPTIONS.segments, OPTIONS.seed, BILINEAR.history)
+    W = np.concatenate([models.units.A, models.units.B], axis=-1)
+    V = np.swapaxes(np.linalg.solve(models.whitening, np.swapaxes(W, -1, -2)), -1, -2)
+    whole = normal_equations(V[:, :2], models.whitening, BILINEAR, {}, segments, models.sigma)
+    place = np.r_[0:12]
+    np.testing.assert_allclose(by_episode.sum(axis=1)[:, place[:, None], place], whole.matrix[:, :-1, :-1], rtol=1e-9, atol=1e-9)
+
+
+def test_only_the_samples_asked_for_are_judged() -> None:
+    """An input that jumps in the last samples throws the free run out of its limit; it is not run that far."""
+    population, keys, factor, _ = machines(2, 0.01, seed=9)
+    jumping = {key: population.read(key).copy() for key in population.episodes}
+    for values in jumping.values():
+        values[-2:, 2] = 1e4
+    broken = replace(population, source=jumping.__getitem__)
+    few = replace(OPTIONS, strengths=(1.0,), horizons=(5, 20), segments=4)
+    with pytest.raises(IdentificationError, match="reaches"):
+        refine_population(broken, keys, BILINEAR, {}, factor, options=few)
+    models = refine_population(broken, keys, BILINEAR, {}, factor, options=replace(few, judged=200))
+    whole = refine_population(population, keys, BILINEAR, {}, factor, options=few)
+    assert models.trade_off[0].score != whole.trade_off[0].score
+    last = [keys[unit][-1] for unit in keys]
+    A, B = models.units.A, models.units.B
+    rms, top, _ = free_run_errors(A[None], B[None], BILINEAR, {}, broken, last, 200)
+    for row, key in enumerate(last):
+        data = population.read(key)[:203]
+        run = data[:, :2].copy()
+        for k in range(3, 202):
+            u = data[:, 2]
+            run[k + 1] = np.hstack([A[row], B[row]])[:2] @ [*run[k], np.sin(2 * run[k - 3, 0]), u[k - 1], u[k], run[k, 1] * u[k]]
+        np.testing.assert_allclose(rms[0, row], np.sqrt(np.mean((run - data[:, :2]) ** 2, axis=0)), rtol=1e-9)
+        np.testing.assert_array_equal(top[row], np.abs(data[:, :2]).max(axis=0))
+
+
+def test_an_episode_that_is_too_short_is_named() -> None:
+    population, keys, _, _ = machines(1, 0.0, seed=1)
+    with pytest.raises(DataError, match=r"episode 0 of unit u0 .* has 600 samples, and delays of up to 599 need at least 601"):
+        read_segments(population, keys, 5, 4, 0, history=599)

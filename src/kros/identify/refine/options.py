@@ -23,6 +23,8 @@ class RefineOptions:
     largest_residual : float
         Priors so weak that the peak residual within the population (inverse input multiplicative form) exceeds this are not chosen: the
         set of models that covers such a population is too large for a robust observer.
+    negligible_residual : float
+        Peak residual up to which less uncertainty is worth nothing, so that accuracy alone decides.
     tolerance : float
         The strongest prior whose held-out error exceeds the lowest by no more than this share is chosen.
     balance : float
@@ -66,6 +68,7 @@ class RefineOptions:
     segments: int = 24
     strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)
     largest_residual: float = 0.5
+    negligible_residual: float = 0.1
     tolerance: float = 0.1
     balance: float = 0.65
     starts: tuple[tuple[int, float], ...] = ((5, 0.8), (80, 0.8))
@@ -88,6 +91,7 @@ class RefineOptions:
             "segments": self.segments >= 1,
             "strengths": len(self.strengths) > 0 and min(self.strengths, default=0.0) > 0,
             "largest_residual": self.largest_residual > 0,
+            "negligible_residual": self.negligible_residual > 0,
             "tolerance": self.tolerance >= 0,
             "balance": 0 <= self.balance <= 1,
             "starts": len(self.starts) > 0 and all(0 <= balance <= 1 for _, balance in self.starts),

@@ -164,7 +164,10 @@ def _too_uncertain(row: TradeOff, options: RefineOptions) -> bool:
 
 
 def _choose(rows: Sequence[TradeOff], options: RefineOptions) -> int:
-    """The strongest prior whose held-out score is as good as the best, within the tolerance; only the last may be too uncertain."""
+    """The strongest prior whose held-out score is as good as the best, within the tolerance, or a weaker and better one that costs nothing.
+
+    Uncertainty costs nothing while the peak residual is negligible. Only the last of the rows may be too uncertain.
+    """
     usable = [row for row in rows if not _too_uncertain(row, options)] or list(rows)
     best = min(row.score for row in usable)
     if not np.isfinite(best):
@@ -172,7 +175,10 @@ def _choose(rows: Sequence[TradeOff], options: RefineOptions) -> int:
             "Refinement: at every strength of the prior a free run over a held-out training episode diverges; add strengths above "
             f"{max(row.strength for row in rows):g}."
         )
-    return next(i for i, row in enumerate(rows) if row.score <= (1 + options.tolerance) * best)
+    choice = next(i for i, row in enumerate(rows) if row.score <= (1 + options.tolerance) * best)
+    negligible = 20 * np.log10(min(options.negligible_residual, options.largest_residual))
+    free = [i for i, row in enumerate(rows) if i >= choice and row.peak_db <= negligible]
+    return min(free, key=lambda i: rows[i].score, default=choice)
 
 
 def _require_stable(unit_ids: Sequence[str], radius: Array, margin: float) -> None:

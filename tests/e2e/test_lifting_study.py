@@ -106,7 +106,6 @@ def test_observers_run_with_it(run, kros, recorded, tmp_path):
         ("[lifting]\nfunctions = ['current[-2000]']", ("too deep",)),
         ("[lifting]\ninput_functions = ['current*voltage']", ("unknown name 'voltage'",)),
         ("[lifting]\nfunctions = ['tanh(current*phase)']", ("must enter as factors or as phases",)),
-        ("[lifting]\nfunctions = ['current[-1]']\n[identify]\nrefine = true", ("set identify.refine = false",)),
         ("[lifting]\ninput_functions = ['current**2']", ("depends on no input",)),
     ],
 )
@@ -156,6 +155,20 @@ def test_an_episode_shorter_than_the_history_is_named(study, kros, tmp_path):
     assert result.exit_code in (1, 2)
     text = " ".join(result.stderr.split())
     assert "episode 1 of unit 1 (default): Lifting a recording: needs at least 352 samples for the delay of 350 in 'x', found 300" in text
+
+
+def test_models_with_delays_and_input_functions_are_refined(study, kros, tmp_path):
+    write_parquet(machines([150, 150, 150]), tmp_path / "data")
+    extra = "[lifting]\nfunctions = ['tanh(v)', 'x[-2]']\ninput_functions = ['v*u']"
+    result = kros("run", study(extra, source=tmp_path / "data"), "--out", tmp_path / "run", "--until", "identify", "--workers", 1)
+    assert result.exit_code == 0, result.output
+    models, linear = (ModelSet.load(tmp_path / "run" / "models" / name) for name in ("koopman", "linear"))
+    assert (models.lifting.history, models.inputs) == (2, ("u", "w", "v*u"))
+    assert (models.A.shape, models.B.shape, linear.B.shape) == ((3, 4, 4), (3, 4, 3), (3, 2, 2))
+    assert (tmp_path / "run" / "refinement" / "koopman" / "refinement.json").is_file()
+    truth = np.array([[[0.9, 0.1, 0, 0], [0, 0.8, 1 + 0.1 * unit, 1 + 0.1 * unit]] for unit in (1, 2, 3)])
+    found = np.concatenate([models.A[:, :2, :2], models.B[:, :2, :2]], axis=2)
+    np.testing.assert_allclose(found, truth, atol=0.03)  # the prior draws units together whose gains differ by a tenth
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1e-6])

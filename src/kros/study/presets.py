@@ -38,14 +38,7 @@ def resolve_lifting(config: StudyConfig, population: Population) -> Lifting:
         parameters = (PHASE,) if any(re.search(rf"\b{PHASE}\b", f) for f in functions + inputs) else ()
     lifting = Lifting(population.states, functions, parameters, population.inputs, inputs)
     _ = lifting.separation, lifting.input_separation  # refused before anything is written
-    if not (lifting.history or inputs):
-        return Lifting(population.states, functions, parameters)
-    if config.identify.refine:
-        raise ConfigError(
-            f"Lifting: delays of up to {lifting.history} samples and {len(inputs)} input functions cannot be refined yet; set identify.refine = false, "
-            "or leave them out."
-        )
-    return lifting
+    return lifting if lifting.history or inputs else Lifting(population.states, functions, parameters)
 
 
 def _sample(config: StudyConfig, population: Population, names: tuple[str, ...]) -> Array:

@@ -52,13 +52,10 @@ def test_infinities_of_both_signs_and_huge_values() -> None:
     check_episode(np.sign(values()) * 1e308, KEY, CHANNELS)
 
 
-def test_constant_state_is_refused_and_resting_input_is_not() -> None:
+def test_states_and_inputs_may_rest_in_an_episode() -> None:
     rest = values()
-    rest[:, 2] = 0.0
+    rest[:, 1:] = 2.5, 0.0
     check_episode(rest, KEY, CHANNELS)
-    rest[:, 1] = 2.5
-    with pytest.raises(DataError, match=r"channel 'v' is a state and stays at 2\.5 in all 20 samples"):
-        check_episode(rest, KEY, CHANNELS)
 
 
 def test_short_and_misshapen() -> None:
@@ -109,6 +106,24 @@ def test_scan_refuses_an_input_that_never_moves() -> None:
     resting[1][:, 2] = 0.0
     with pytest.raises(DataError, match=r"Unit a \(default\): input 'u' stays at 0 in all 2 episodes"):
         scan_population(population({"a": resting[:2], "b": resting[2:]}))
+
+
+def test_scan_takes_a_state_that_rests_in_one_episode_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    resting = [values(i) for i in range(2)]
+    resting[0][:, 1] = 2.5
+    with caplog.at_level(logging.INFO):
+        assert len(scan_population(population({"a": resting})).episodes) == 2
+    assert [r.message for r in caplog.records] == ["Episode 0 of unit a (default): state 'v' rests at 2.5 in all 20 samples."]
+
+
+@pytest.mark.parametrize("later", [2.5, -1.0], ids=["same level", "another level"])
+def test_scan_refuses_a_state_that_rests_in_every_episode(later: float) -> None:
+    stuck = [values(i) for i in range(2)]
+    stuck[0][:, 1], stuck[1][:, 1] = 2.5, later
+    with pytest.raises(
+        DataError, match=r"Unit a \(default\): state 'v' stays where it is in each of 2 episodes, in the first at 2\.5; check the sensor"
+    ):
+        scan_population(population({"a": stuck}))
 
 
 def test_scan_accepts_an_input_held_at_different_levels() -> None:

@@ -55,7 +55,7 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
     NonFiniteError
         NaN or infinity.
     DataError
-        Wrong number of columns, too short, or a state that never changes. (An input may rest in one episode; see `check_inputs`.)
+        Wrong number of columns, or too short. (A state or an input may rest in one episode, not in all of them; see `InputWatch`.)
     """
     if values.ndim != 2 or values.shape[1] != len(channels):
         raise DataError(
@@ -68,12 +68,6 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
         )
     if not np.isfinite(values).all():
         check_finite(values, key, channels)
-    for column, channel in enumerate(channels):
-        if channel.role is Role.STATE and is_constant(values[:, column]):
-            raise DataError(
-                f"{title(key)}: channel {channel.name!r} is a state and stays at {values[0, column]:g} in all {len(values)} samples; "
-                "check the sensor and the column, or leave the episode out."
-            )
 
 
 def is_constant(column: npt.NDArray[np.float64]) -> bool:
@@ -112,28 +106,40 @@ def check_finite(
 
 
 class InputWatch:
-    """Notice inputs that never change over all episodes of one unit and condition."""
+    """Notice inputs and states that never change over all episodes of one unit and condition.
+
+    An input may be held at another level in every episode. A state may not: what moves it would be seen in no episode.
+    """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
-        self._columns = [(i, c.name) for i, c in enumerate(channels) if c.role is Role.INPUT]
+        self._columns = [(i, c.name, c.role) for i, c in enumerate(channels) if c.role in (Role.INPUT, Role.STATE)]
         self._resting: dict[int, float] = {}
         self._seen = 0
 
     def add(self, values: npt.NDArray[np.float64]) -> None:
         """Look at one more episode."""
-        resting = {i: float(values[0, i]) for i, _ in self._columns if is_constant(values[:, i])}
-        self._resting = resting if not self._seen else {i: v for i, v in self._resting.items() if resting.get(i) == v}
+        resting = {i: float(values[0, i]) for i, _, _ in self._columns if is_constant(values[:, i])}
+        if self._seen:
+            states = {i for i, _, role in self._columns if role is Role.STATE}
+            resting = {i: v for i, v in self._resting.items() if i in resting and (i in states or resting[i] == v)}
+        self._resting = resting
         self._seen += 1
 
     def check(self, unit: str, condition: str) -> None:
-        """Raise DataError where an input never changed."""
-        for i, name in self._columns:
-            if self._seen and i in self._resting:
+        """Raise DataError where an input or a state never changed."""
+        for i, name, role in self._columns:
+            if i not in self._resting:
+                continue
+            if role is Role.STATE:
                 raise DataError(
-                    f"Unit {unit} ({condition}): input {name!r} stays at {self._resting[i]:g} in all {self._seen} "
-                    "episodes, so nothing can be learned from it; "
-                    "check the column, or remove the channel."
+                    f"Unit {unit} ({condition}): state {name!r} stays where it is in each of {self._seen} episodes, in the first at "
+                    f"{self._resting[i]:g}; check the sensor and the column, or leave the unit out."
                 )
+            raise DataError(
+                f"Unit {unit} ({condition}): input {name!r} stays at {self._resting[i]:g} in all {self._seen} "
+                "episodes, so nothing can be learned from it; "
+                "check the column, or remove the channel."
+            )
 
 
 def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey]) -> None:
@@ -220,7 +226,7 @@ def scan_population(population: Population, min_samples: int = MIN_SAMPLES, on_n
 
 
 def read_or_drop(population: Population, key: EpisodeKey, on_nan: OnNan) -> npt.NDArray[np.float64] | None:
-    """Read and check for NaN; None where the episode is to be dropped, which is logged."""
+    """Read and check for NaN; None where the episode is to be dropped, which is logged, as are states that rest in it."""
     try:
         values = population.read(key)
         check_episode(values, key, population.channels)
@@ -229,4 +235,7 @@ def read_or_drop(population: Population, key: EpisodeKey, on_nan: OnNan) -> npt.
             raise
         logger.warning("Dropped, as data.on_nan asks: %s", error)
         return None
+    for column, channel in enumerate(population.channels):
+        if channel.role is Role.STATE and is_constant(values[:, column]):
+            logger.info("%s: state %r rests at %g in all %d samples.", title(key), channel.name, values[0, column], len(values))
     return values

@@ -71,7 +71,7 @@ class Scores:
 
     @property
     def r2(self) -> Array:
-        """R^2, shape (episode, horizon, n): nan for a constant state, minus infinity where a run diverged."""
+        """Coefficient of determination, of shape (episode, horizon, n); nan for a constant state, minus infinity where a run diverged."""
         return 1 - _divide(self.squares, self.spread)
 
     def pooled(self) -> Scores:

@@ -4,7 +4,7 @@ from .cover import Cover, Structure, cover_ratio, optimal_cover, optimal_left
 from .fit import FittedMagnitude, Side, fit_magnitude, invert
 from .forms import Form, existence, rebuild, residual, residual_shape
 from .model import UncertainModel, scale_system
-from .nominal import NominalChoice, choose_nominals
+from .nominal import Criterion, NominalChoice, choose_nominal, choose_nominals
 from .outliers import OutlierModel, OutlierScore, score_outliers
 from .quantify import quantify
 from .residuals import all_bounds, bounds, misfit, sigma_max
@@ -12,6 +12,7 @@ from .weights import Weight, fit_weight
 
 __all__ = [
     "Cover",
+    "Criterion",
     "FittedMagnitude",
     "Form",
     "NominalChoice",
@@ -23,6 +24,7 @@ __all__ = [
     "Weight",
     "all_bounds",
     "bounds",
+    "choose_nominal",
     "choose_nominals",
     "cover_ratio",
     "existence",

@@ -114,3 +114,23 @@ def pseudo_inverse_first(matrices: Array) -> Array:
     if weak.any():
         out[:, :, weak] = entries_first(np.linalg.pinv(np.moveaxis(columns[:, :, weak], -1, 0)))
     return out
+
+
+def triangle(pseudo_inverse: Array) -> Array:
+    """Return `lower_factor` of entries-first P of shape (r, s, ...), without a loop over matrices for one or two rows.
+
+    Two rows are orthogonalised twice, as accurate as QR; rows of zeros give zeros.
+    """
+    if pseudo_inverse.shape[0] > 2:
+        return lower_factor(pseudo_inverse)
+    size = np.sqrt(squared(pseudo_inverse[0]).sum(axis=0))
+    if pseudo_inverse.shape[0] == 1:
+        return size[None, None] + 0j
+    q = pseudo_inverse[0] / np.where(size > 0, size, 1.0)
+    along = (np.conj(q) * pseudo_inverse[1]).sum(axis=0)
+    rest = pseudo_inverse[1] - q * along
+    again = (np.conj(q) * rest).sum(axis=0)
+    rest -= q * again
+    out = np.zeros((2, 2, *size.shape), complex)
+    out[0, 0], out[1, 0], out[1, 1] = size, along + again, np.sqrt(squared(rest).sum(axis=0))
+    return out

@@ -161,3 +161,13 @@ def test_an_episode_that_is_too_short_is_named() -> None:
     population, keys, _, _ = machines(1, 0.0, seed=1)
     with pytest.raises(DataError, match=r"episode 0 of unit u0 .* has 600 samples, and delays of up to 599 need at least 601"):
         read_segments(population, keys, 5, 4, 0, history=599)
+
+
+def test_a_unit_may_rest_in_the_episode_that_judges() -> None:
+    """From rest, without an input, the free run stays there: the error is zero, and so is its share of the range."""
+    population, keys, factor, _ = machines(2, 0.01, seed=9)
+    resting = {key: population.read(key) * (key.episode != "3") for key in population.episodes}
+    still = replace(population, source=resting.__getitem__)
+    models = refine_population(still, keys, BILINEAR, {}, factor, options=replace(OPTIONS, strengths=(1.0,), horizons=(5, 20)))
+    assert models.trade_off[-1].held_out_percent == (0.0, 0.0)
+    assert np.abs(models.spectral_radius).max() < 1

@@ -36,6 +36,12 @@ class Solution:
         """Sum of squared residuals, shape (problem,)."""
         return self.matrix[:, -1, -1]
 
+    def updated(self, rows: npt.NDArray[np.int64], part: Solution) -> Solution:
+        """Return the solution with some problems as another search left them."""
+        V, matrix, converged = self.V.copy(), self.matrix.copy(), self.converged.copy()
+        V[rows], matrix[rows], converged[rows] = part.V, part.matrix, part.converged
+        return Solution(V, matrix, self.iterations + part.iterations, converged)
+
 
 def minimise(
     evaluate: Callable[[Array], Array],

@@ -21,7 +21,7 @@ from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
 from ..factors import Factor
 from .judge import Judge, require_bounded
-from .marquardt import minimise
+from .marquardt import Solution, minimise
 from .metric import ResponsePrior
 from .model import RefinedModels, TradeOff
 from .options import RefineOptions
@@ -31,6 +31,7 @@ from .segments import held_segments, read_segments
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
+_ROUNDS = 4  # in which units that have not converged go on
 _PATIENCE = 3  # strengths over which the score must improve
 
 
@@ -87,7 +88,7 @@ def refine_population(
     choice = _choose(trade_off, options)
     log.info("prior of strength %g chosen, held-out score %.4g", trade_off[choice].strength, trade_off[choice].score)
     final = _strengthen(replace(prepared, segments=segments), trade_off[choice].strength)
-    solution = minimise(final.evaluate, final.admissible, path[choice], options.iterations, options.least_gain)
+    solution = _settle(final, path[choice], options)
     units = matrices_of(solution.V, problem.T, lifting.n_lifted)
     radius = units.spectral_radius()
     _require_stable(tuple(keys), radius, options.margin)
@@ -157,6 +158,19 @@ def _path(problem: Problem, common: Array, judge: Judge, options: RefineOptions)
         if idle or _too_uncertain(rows[-1], options):
             break
     return path, rows
+
+
+def _settle(problem: Problem, V: Array, options: RefineOptions) -> Solution:
+    """Fit all units to the end: those that have not converged go on by themselves."""
+    solution = minimise(problem.evaluate, problem.admissible, V, options.iterations, options.least_gain)
+    for _ in range(_ROUNDS):
+        rows = np.flatnonzero(~solution.converged)
+        if not rows.size:
+            break
+        part = replace(restrict(problem, rows), pooled=False)
+        more = minimise(part.evaluate, part.admissible, solution.V[rows], options.iterations, options.least_gain)
+        solution = solution.updated(rows, more)
+    return solution
 
 
 def _too_uncertain(row: TradeOff, options: RefineOptions) -> bool:

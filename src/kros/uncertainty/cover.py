@@ -12,7 +12,7 @@ singular values is smoothed by a Schatten norm of order 2 q,
 
 whose gradient is the marginals of `Y * conj(M)`, `Y = (M M^H)^(q-1) M`; Newton's method runs over all frequencies at once with q rising to
 65, and s is then recomputed without smoothing. A weak pull towards equal entries keeps the optimum finite where residuals are triangular,
-and picks the smooth one where it is not unique.
+and picks the smooth one where it is not unique; a stronger pull gives covers that are easier to fit (`weights`).
 """
 
 from __future__ import annotations
@@ -88,13 +88,15 @@ def as_structure(structure: Structure | str) -> Structure:
         raise ConfigError(f"Weight structure {structure!r} is unknown; choose 'diagonal' or 'scalar'.") from error
 
 
-def optimal_cover(E: Array, structure: Structure | str = Structure.DIAGONAL) -> Cover:
+def optimal_cover(E: Array, structure: Structure | str = Structure.DIAGONAL, pull: float = _PULL) -> Cover:
     """Return the cover with the smallest mean log magnitudes.
 
     Parameters
     ----------
     E : ndarray, shape (unit, frequency, p', m'), complex
     structure : Structure or str
+    pull : float
+        Pull towards equal entries, relative to the cost: a larger one gives covers that cost more and vary less over frequency.
 
     Returns
     -------
@@ -106,16 +108,16 @@ def optimal_cover(E: Array, structure: Structure | str = Structure.DIAGONAL) -> 
     size = sigma_max_first(first).max(axis=0)
     if as_structure(structure) is Structure.SCALAR:
         return Cover(np.repeat(size[:, None], p, axis=1), np.ones((len(size), m)))
-    x = _descend(first, size, p, free_right=True)
+    x = _descend(first, size, p, pull, free_right=True)
     right = np.exp(x[p:] - x[p:].mean(axis=0)).T
     right = right / right[:, [int(np.argmax(np.median(right, axis=0)))]]
     return Cover(_scaled_left(first, np.exp(x[:p]).T, right), right)
 
 
-def optimal_left(E: Array, right: Array) -> Array:
+def optimal_left(E: Array, right: Array, pull: float = _PULL) -> Array:
     """Return the best left magnitudes, shape (frequency, p'), for given right ones, shape (frequency, m')."""
     first = entries_first(E) / right.T[None, :, None, :]
-    x = _descend(first, sigma_max_first(first).max(axis=0), first.shape[0], free_right=False)
+    x = _descend(first, sigma_max_first(first).max(axis=0), first.shape[0], pull, free_right=False)
     return _scaled_left(first, np.exp(x[: first.shape[0]]).T, np.ones_like(right))
 
 
@@ -134,7 +136,7 @@ def _scaled_left(first: Array, left: Array, right: Array) -> Array:
     return left * sigma_max_first(first / left.T[:, None, None, :] / right.T[None, :, None, :]).max(axis=0)[:, None]
 
 
-def _descend(first: Array, size: Array, p: int, *, free_right: bool) -> Array:
+def _descend(first: Array, size: Array, p: int, pull: float, *, free_right: bool) -> Array:
     """Minimise the smoothed cost over x of shape (p' + m', frequency); the right part only where it is free.
 
     Newton's method runs on part of the frequencies and of the units, and x is interpolated: the scale s, which is recomputed for all
@@ -150,7 +152,7 @@ def _descend(first: Array, size: Array, p: int, *, free_right: bool) -> Array:
     x = np.zeros((n, len(chosen)))
     for squarings in _SQUARINGS:
         for _ in range(_NEWTON):
-            x, moved = _newton(E, x, p, n if free_right else p, squarings)
+            x, moved = _newton(_Smooth(E, p, n if free_right else p, squarings, pull), x)
             if moved < 1e-3:
                 break
     return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
@@ -162,14 +164,47 @@ def _largest(sizes: Array) -> Array:
     return np.unique(order)
 
 
-def _newton(E: Array, x: Array, p: int, free: int, squarings: int) -> tuple[Array, float]:
+@dataclass(frozen=True, eq=False)
+class _Smooth:
+    """The smoothed cost of residuals (p', m', unit, frequency) in the first `free` of the x."""
+
+    E: Array
+    p: int
+    free: int
+    squarings: int
+    pull: float
+
+    def cost(self, x: Array) -> tuple[Array, Array]:
+        """Return the cost, shape (frequency,), and its gradient, shape (free, frequency)."""
+        p, m = self.p, len(x) - self.p
+        M = self.E * np.exp(-x[:p])[:, None, None, :] * np.exp(-x[p:])[None, :, None, :]
+        top = sigma_max_first(M).max(axis=0)
+        M = M / top
+        wide = p <= m
+        power = multiply(M, adjoint(M)) if wide else multiply(adjoint(M), M)
+        for _ in range(self.squarings):
+            power = multiply(power, power)
+        Y = multiply(power, M) if wide else multiply(M, power)
+        marginal = (Y * np.conj(M)).real.sum(axis=2)  # over units: (p', m', frequency)
+        total = marginal.sum(axis=(0, 1))
+        q = 2**self.squarings + 1
+        cost = x[:p].mean(axis=0) + np.log(top) + np.log(total) / (2 * q) + self.pull / 2 * (x**2).sum(axis=0)
+        gradient = 1 / p - marginal.sum(axis=1) / total
+        if self.free > p:
+            cost = cost + x[p:].mean(axis=0)
+            gradient = np.concatenate([gradient, 1 / m - marginal.sum(axis=0) / total])
+        return cost, gradient + self.pull * x[: self.free]
+
+
+def _newton(smooth: _Smooth, x: Array) -> tuple[Array, float]:
     """One damped Newton step; the Hessian from differences of the gradient."""
-    cost, gradient = _cost(E, x, p, free, squarings)
+    free = smooth.free
+    cost, gradient = smooth.cost(x)
     hessian = np.empty((x.shape[1], free, free))
     for i in range(free):
         ahead = x.copy()
         ahead[i] += _DIFFERENCE
-        hessian[:, :, i] = ((_cost(E, ahead, p, free, squarings)[1] - gradient) / _DIFFERENCE).T
+        hessian[:, :, i] = ((smooth.cost(ahead)[1] - gradient) / _DIFFERENCE).T
     hessian = (hessian + hessian.swapaxes(1, 2)) / 2 + 1e-6 * np.eye(free)
     step = -np.linalg.solve(hessian, gradient.T[..., None])[..., 0].T
     step *= np.minimum(1.0, _REACH / np.maximum(np.abs(step).max(axis=0), _TINY))
@@ -179,32 +214,10 @@ def _newton(E: Array, x: Array, p: int, free: int, squarings: int) -> tuple[Arra
     for _ in range(8):
         trial = x.copy()
         trial[:free] += length * step
-        better = pending & (_cost(E, trial, p, free, squarings)[0] <= cost + 0.1 * length * slope)
+        better = pending & (smooth.cost(trial)[0] <= cost + 0.1 * length * slope)
         best = np.where(better, trial, best)
         pending &= ~better
         if not pending.any():
             break
         length = np.where(pending, length / 3, length)
     return best, float(np.abs(best - x).max(initial=0.0))
-
-
-def _cost(E: Array, x: Array, p: int, free: int, squarings: int) -> tuple[Array, Array]:
-    """Smoothed cost, shape (frequency,), and its gradient, shape (free, frequency)."""
-    m = len(x) - p
-    M = E * np.exp(-x[:p])[:, None, None, :] * np.exp(-x[p:])[None, :, None, :]
-    top = sigma_max_first(M).max(axis=0)
-    M = M / top
-    wide = p <= m
-    power = multiply(M, adjoint(M)) if wide else multiply(adjoint(M), M)
-    for _ in range(squarings):
-        power = multiply(power, power)
-    Y = multiply(power, M) if wide else multiply(M, power)
-    marginal = (Y * np.conj(M)).real.sum(axis=2)  # over units: (p', m', frequency)
-    total = marginal.sum(axis=(0, 1))
-    q = 2**squarings + 1
-    cost = x[:p].mean(axis=0) + np.log(top) + np.log(total) / (2 * q) + _PULL / 2 * (x**2).sum(axis=0)
-    gradient = 1 / p - marginal.sum(axis=1) / total
-    if free > p:
-        cost = cost + x[p:].mean(axis=0)
-        gradient = np.concatenate([gradient, 1 / m - marginal.sum(axis=0) / total])
-    return cost, gradient + _PULL * x[:free]

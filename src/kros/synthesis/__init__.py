@@ -1,6 +1,6 @@
 """Synthesis: from an uncertain model to a verified correction filter.
 
-    UncertainModel --> ObserverProblem --> h2 | mixed | worst_case_h2 | kalman --> Synthesis
+    UncertainModel --> ObserverProblem --> h2 | hinf | mixed | worst_case_h2 | kalman --> Synthesis
 
 Nothing leaves this layer unverified: norms and stability are recomputed by `kros.core`, failure is a `SynthesisError` that says why.
 """
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .constant_gain import kalman, luenberger
     from .generalized_plant import GeneralizedPlant
     from .h2_optimal import h2
+    from .hinf_optimal import hinf
     from .mixed_optimal import mixed
     from .observer_problem import ObserverProblem
     from .result import Injection, Status, Synthesis
@@ -26,6 +27,7 @@ _HOME = {
     "Status": "result",
     "Synthesis": "result",
     "h2": "h2_optimal",
+    "hinf": "hinf_optimal",
     "kalman": "constant_gain",
     "luenberger": "constant_gain",
     "mixed": "mixed_optimal",
@@ -39,6 +41,7 @@ __all__ = [
     "Status",
     "Synthesis",
     "h2",
+    "hinf",
     "kalman",
     "luenberger",
     "mixed",

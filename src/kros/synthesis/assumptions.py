@@ -83,12 +83,14 @@ def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
     return found
 
 
-def h2_violations(plant: GeneralizedPlant) -> list[Violation]:
+def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> list[Violation]:
     """Check every assumption of H2 synthesis and return those that fail.
 
     Parameters
     ----------
     plant : GeneralizedPlant
+    proper : bool
+        Include ``D11 = 0`` in continuous time, which H-infinity synthesis does not need.
 
     Returns
     -------
@@ -102,7 +104,7 @@ def h2_violations(plant: GeneralizedPlant) -> list[Violation]:
         found.append(Violation(Assumption.CONTROL_PENALTY, f"rank {rank12}, {n_u} controls"))
     if rank21 < n_y:
         found.append(Violation(Assumption.MEASUREMENT_NOISE, f"rank {rank21}, {n_y} measurements"))
-    if plant.dt == 0 and np.any(plant.D11):
+    if proper and plant.dt == 0 and np.any(plant.D11):
         found.append(Violation(Assumption.PROPER, f"largest entry {np.abs(plant.D11).max():.3g}"))
     if not found and n:
         zeros = _boundary_zeros(plant.A, plant.B2, plant.C1, plant.D12, plant.dt)[:1]
@@ -112,9 +114,9 @@ def h2_violations(plant: GeneralizedPlant) -> list[Violation]:
     return found
 
 
-def require(plant: GeneralizedPlant, method: str) -> None:
+def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
     """Raise a `SynthesisError` that names every violated assumption."""
-    found = h2_violations(plant)
+    found = h2_violations(plant, proper)
     if found:
         raise SynthesisError(f"{method} needs a regular generalized plant; violated: " + "; ".join(map(str, found)) + ".")
 

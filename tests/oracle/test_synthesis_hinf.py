@@ -1,0 +1,280 @@
+"""H-infinity synthesis against published optima, closed forms, coprime-factor theory and a slow linear matrix inequality."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from scipy.linalg import null_space, solve_continuous_are, solve_discrete_are
+
+from kros.core import StateSpace, SynthesisError, hinf_norm
+from kros.synthesis import GeneralizedPlant, Status, h2, hinf
+
+
+def partition(A, B, C, D, n_y, n_u, dt):
+    A, B, C, D = (np.array(x, dtype=float) for x in (A, B, C, D))
+    return GeneralizedPlant(
+        A, B[:, :-n_u], B[:, -n_u:], C[:-n_y], C[-n_y:], D[:-n_y, :-n_u], D[:-n_y, -n_u:], D[-n_y:, :-n_u], D[-n_y:, -n_u:], dt
+    )
+
+
+def slicot_sb10dd():
+    """Example of the SLICOT routine SB10DD (discrete H-infinity): published level 111.294."""
+    A = [
+        [-0.7, 0.0, 0.3, 0.0, -0.5, -0.1],
+        [-0.6, 0.2, -0.4, -0.3, 0.0, 0.0],
+        [-0.5, 0.7, -0.1, 0.0, 0.0, -0.8],
+        [-0.7, 0.0, 0.0, -0.5, -1.0, 0.0],
+        [0.0, 0.3, 0.6, -0.9, 0.1, -0.4],
+        [0.5, -0.8, 0.0, 0.0, 0.2, -0.9],
+    ]
+    B = [[-1, -2, -2, 1, 0], [1, 0, 1, -2, 1], [-3, -4, 0, 2, -2], [1, -2, 1, 0, -1], [0, 1, -2, 0, 3], [1, 0, 3, -1, -2]]
+    C = [[1, -1, 2, -2, 0, -3], [-3, 0, 1, -1, 1, 0], [0, 2, 0, -4, 0, -2], [1, -3, 0, 0, 3, 1], [0, 1, -2, 1, 0, -2]]
+    D = [[1, -1, -2, 0, 0], [0, 1, 0, 1, 0], [2, -1, -3, 0, 1], [0, 1, 0, 1, -1], [0, 0, 1, 2, 1]]
+    return partition(A, B, C, D, 2, 2, 1.0)
+
+
+CONTINUOUS_A = [
+    [-1, 0, 4, 5, -3, -2],
+    [-2, 4, -7, -2, 0, 3],
+    [-6, 9, -5, 0, 2, -1],
+    [-8, 4, 7, -1, -3, 0],
+    [2, 5, 8, -9, 1, -4],
+    [3, -5, 8, 0, 2, -6],
+]
+CONTINUOUS_B = [[-3, -4, -2, 1, 0], [2, 0, 1, -5, 2], [-5, -7, 0, 7, -2], [4, -6, 1, 1, -2], [-3, 9, -8, 0, 5], [1, -2, 3, -6, -2]]
+CONTINUOUS_C = [[1, -1, 2, -4, 0, -3], [-3, 0, 5, -1, 1, 1], [-7, 5, 0, -8, 2, -2], [9, -3, 4, 0, 3, 7], [0, 1, -2, 1, -6, -2]]
+
+
+def slicot_sb10fd():
+    """Example of the SLICOT routine SB10FD (continuous H-infinity) at the level 15, with its controller."""
+    D = [[1, -2, -3, 0, 0], [0, 4, 0, 1, 0], [5, -3, -4, 0, 1], [0, 1, 0, 1, -3], [0, 0, 1, 7, 1]]
+    K = StateSpace(
+        [
+            [-2.8043, 14.7367, 4.6658, 8.1596, 0.0848, 2.5290],
+            [4.6609, 3.2756, -3.5754, -2.8941, 0.2393, 8.2920],
+            [-15.3127, 23.5592, -7.1229, 2.7599, 5.9775, -2.0285],
+            [-22.0691, 16.4758, 12.5523, -16.3602, 4.4300, -3.3168],
+            [30.6789, -3.9026, -1.3868, 26.2357, -8.8267, 10.4860],
+            [-5.7429, 0.0577, 10.8216, -11.2275, 1.5074, -10.7244],
+        ],
+        [[-0.1581, -0.0793], [-0.9237, -0.5718], [0.7984, 0.6627], [0.1145, 0.1496], [-0.6743, -0.2376], [0.0196, -0.7598]],
+        [[-0.2480, -0.1713, -0.0880, 0.1534, 0.5016, -0.0730], [2.8810, -0.3658, 1.3007, 0.3945, 1.2244, 2.5690]],
+        [[0.0554, 0.1334], [-0.3195, 0.0333]],
+        0.0,
+    )
+    return partition(CONTINUOUS_A, CONTINUOUS_B, CONTINUOUS_C, D, 2, 2, 0.0), K
+
+
+def slicot_sb10hd():
+    """Example of the SLICOT routine SB10HD (continuous H2), with its controller."""
+    D = [[0, 0, 0, -4, -1], [0, 0, 0, 1, 0], [0, 0, 0, 0, 1], [3, 1, 0, 1, -3], [-2, 0, 1, 7, 1]]
+    K = {
+        "A": [
+            [88.0015, -145.7298, -46.2424, 82.2168, -45.2996, -31.1407],
+            [25.7489, -31.4642, -12.4198, 9.4625, -3.5182, 2.7056],
+            [54.3008, -102.4013, -41.4968, 50.8412, -20.1286, -26.7191],
+            [108.1006, -198.0785, -45.4333, 70.3962, -25.8591, -37.2741],
+            [-115.8900, 226.1843, 47.2549, -47.8435, -12.5004, 34.7474],
+            [59.0362, -101.8471, -20.1052, 36.7834, -16.1063, -26.4309],
+        ],
+        "B": [[3.7345, 3.4758], [-0.3020, 0.6530], [3.4735, 4.0499], [4.3198, 7.2755], [-3.9424, -10.5942], [2.1784, 2.5048]],
+        "C": [[-2.3346, 3.2556, 0.7150, -0.9724, 0.6962, 0.4074], [7.6899, -8.4558, -2.9642, 7.0365, -4.2844, 0.1390]],
+        "D": np.zeros((2, 2)),
+    }
+    return partition(CONTINUOUS_A, CONTINUOUS_B, CONTINUOUS_C, D, 2, 2, 0.0), K
+
+
+def scherer(C1, D12):
+    """Example 7 of Scherer, Gahinet and Chilali, IEEE Trans. Automatic Control 42 (1997) 907."""
+    n_z = len(C1)
+    C = [*C1, [0, 1, 0]]
+    D = [*([0, d] for d in D12), [2, 0]]
+    assert len(D12) == n_z
+    return partition([[0, 10, 2], [-1, 1, 0], [0, 2, -5]], [[1, 0], [0, 1], [1, 0]], C, D, 1, 1, 0.0)
+
+
+def coprime(A, B, C, dt):
+    """Robust stabilisation of normalised coprime factors as a four-block problem: w1 at the input, w2 at the output, z = (y, u)."""
+    n, m, p = len(A), B.shape[1], C.shape[0]
+    return GeneralizedPlant(
+        A,
+        np.hstack([B, np.zeros((n, p))]),
+        B,
+        np.vstack([C, np.zeros((m, n))]),
+        C,
+        np.block([[np.zeros((p, m)), np.eye(p)], [np.zeros((m, m + p))]]),
+        np.vstack([np.zeros((p, m)), np.eye(m)]),
+        np.hstack([np.zeros((p, m)), np.eye(p)]),
+        np.zeros((p, m)),
+        dt,
+    )
+
+
+def random_plant(rng, n, dt):
+    A = rng.standard_normal((n, n))
+    n_w, n_u, n_z, n_y = 3, int(rng.integers(1, 3)), 3, int(rng.integers(1, 3))
+    return GeneralizedPlant(
+        A,
+        rng.standard_normal((n, n_w)),
+        rng.standard_normal((n, n_u)),
+        rng.standard_normal((n_z, n)),
+        rng.standard_normal((n_y, n)),
+        rng.standard_normal((n_z, n_w)),
+        rng.standard_normal((n_z, n_u)),
+        rng.standard_normal((n_y, n_w)),
+        0.1 * rng.standard_normal((n_y, n_u)),
+        dt,
+    )
+
+
+def slow_optimum(p):
+    """Optimum by the projected bounded-real inequalities (Gahinet and Apkarian, 1994), solved by an interior-point method."""
+    n, n_w, _, n_z, _ = p.sizes
+    R, S, gamma = cp.Variable((n, n), symmetric=True), cp.Variable((n, n), symmetric=True), cp.Variable()
+
+    def projected(A, B1, C1, D11, N, P, n_in):
+        if p.dt > 0:
+            head = cp.bmat([[A @ P @ A.T - P, A @ P @ C1.T], [C1 @ P @ A.T, C1 @ P @ C1.T]])
+        else:
+            head = cp.bmat([[A @ P + P @ A.T, P @ C1.T], [C1 @ P, np.zeros((len(C1), len(C1)))]])
+        E = np.diag(np.r_[np.zeros(n), np.ones(len(C1))])
+        G = np.vstack([B1, D11])
+        whole = cp.bmat([[N.T @ (head - gamma * E) @ N, N.T @ G], [G.T @ N, -gamma * np.eye(n_in)]])
+        return (whole + whole.T) / 2 << 0
+
+    constraints = [
+        projected(p.A, p.B1, p.C1, p.D11, null_space(np.hstack([p.B2.T, p.D12.T])), R, n_w),
+        projected(p.A.T, p.C1.T, p.B1.T, p.D11.T, null_space(np.hstack([p.C2, p.D21])), S, n_z),
+        cp.bmat([[R, np.eye(n)], [np.eye(n), S]]) >> 0,
+    ]
+    problem = cp.Problem(cp.Minimize(gamma), constraints)
+    problem.solve(solver="CLARABEL")
+    return float(problem.value), problem.status
+
+
+def test_slicot_discrete_level():
+    # The example asks for 111.294, which is its optimum to all six digits.
+    plant = slicot_sb10dd()
+    found = hinf(plant)
+    assert found.status is Status.OPTIMAL
+    assert found.hinf_norm == pytest.approx(111.294, abs=1e-3)
+    assert hinf(plant, gamma=111.294).hinf_norm <= 111.2945
+    with pytest.raises(SynthesisError, match=r"gamma = 111\.29 is out of reach"):
+        hinf(plant, gamma=111.29)
+
+
+def test_slicot_continuous_controller():
+    plant, published = slicot_sb10fd()
+    found = hinf(plant, gamma=15.0)
+    assert found.hinf_norm < 15
+    assert found.controller.D == pytest.approx(published.D, abs=5e-5)
+    # The states are other ones; transfer functions compare. Four printed decimals of A leave about 1e-4 of its size.
+    freqs = np.array([0.01, 0.1, 0.5, 1.0, 3.0, 10.0])
+    error = found.controller.frequency_response(freqs) - published.frequency_response(freqs)
+    size = np.linalg.norm(published.frequency_response(freqs), 2, axis=(-2, -1)).max()
+    assert np.linalg.norm(error, 2, axis=(-2, -1)).max() < 2e-3 * size
+    assert hinf_norm(plant.close(published)) == pytest.approx(found.hinf_norm, rel=2e-3)
+
+
+def test_slicot_continuous_h2_controller():
+    plant, expected = slicot_sb10hd()
+    found = h2(plant).controller
+    for name in "ABCD":
+        assert getattr(found, name) == pytest.approx(np.array(expected[name]), abs=6e-5)  # four decimals are printed
+
+
+def test_scherer_example():
+    found = hinf(scherer([[1, 0, 0], [0, 0, 0]], [0, 1]))
+    assert found.hinf_norm == pytest.approx(9.508, abs=5e-4)
+    assert h2(scherer([[0, 1, 0], [0, 0, 1], [0, 0, 0]], [0, 0, 1])).h2_norm == pytest.approx(7.748, abs=5e-4)
+
+
+def test_zhou_doyle_glover_h2_example():
+    # Robust and Optimal Control, example 19.1.
+    A, B2 = [[-1, 0, 4], [0, 2, 0], [0, 0, -3]], [1, 1, 1]
+    B = [[0, 0, B2[0]], [1, 0, B2[1]], [0, 0, B2[2]]]
+    plant = partition(A, B, np.array(B).T, [[0, 0, 0], [0, 0, 1], [0, 1, 0]], 1, 1, 0.0)
+    found = h2(plant)
+    assert found.h2_norm == pytest.approx(8.9582, abs=5e-5)
+    assert hinf(plant).hinf_norm < hinf_norm(plant.close(found.controller))
+
+
+def test_matlab_h2syn_example():
+    # Documentation of h2syn: closed-loop poles, four decimals; the observer Riccati equation alone gives half of them.
+    A = [[5, 6, -6], [6, 0, 5], [-6, 5, 4]]
+    B = [[0, 4, 0, 0], [1, 1, -2, -2], [4, 0, 0, -3]]
+    C = [[-6, 0, 8], [0, 5, 0], [-2, 1, -4], [4, -6, -5], [0, -15, 7]]
+    D = [[0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0], [0, 0, 3, 6], [8, 0, -7, 0]]
+    plant = partition(A, B, C, D, 2, 1, 0.0)
+    poles = np.sort_complex(plant.close(h2(plant).controller).poles())
+    expected = [-31.6236, -12.6460 - 3.8045j, -12.6460 + 3.8045j, -9.6073, -9.2393, -8.6939]
+    assert poles == pytest.approx(np.array(expected), abs=1e-4)
+
+
+def test_octave_example_whose_optimum_is_zero():
+    # One-block problem with a minimum-phase plant: T = 0 is reached, K = -1 / (s + 3) (Octave's hinfsyn).
+    found = hinf(partition([[-1]], [[1, 1]], [[1], [1]], [[0, 1], [1, 0]], 1, 1, 0.0))
+    assert found.hinf_norm == pytest.approx(0, abs=1e-8)
+    assert found.status is Status.OPTIMAL
+    K = found.controller.frequency_response([0.0, 1.0]).ravel()
+    assert pytest.approx(-1 / (2j * np.pi * np.array([0.0, 1.0]) + 3), abs=1e-6) == K
+
+
+@pytest.mark.parametrize(("pole", "zero"), [(1.0, 2.0), (3.0, 0.1), (0.5, 5.0)])
+def test_interpolation_with_one_point(pole, zero):
+    # T = W + (s - a)/(s + a) K with W = 1 / (s + pole): the optimum is |W(a)| (Nevanlinna-Pick with one point), discrete by z = e^s alike.
+    # Theta u has states of its own: (s - a)/(s + a) = 1 - 2a/(s + a).
+    A, B1, B2 = np.diag([-pole, -zero]), [[1.0], [0.0]], [[0.0], [1.0]]
+    plant = GeneralizedPlant(A, B1, B2, [[1.0, -2 * zero]], [[0.0, 0.0]], [[0.0]], [[1.0]], [[1.0]], [[0.0]], 0.0)
+    found = hinf(plant)
+    assert found.hinf_norm == pytest.approx(1 / (zero + pole), rel=2e-5)
+    assert found.lower_bound <= 1 / (zero + pole) * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(("pole", "zero"), [(0.5, 2.0), (-0.5, 1.25), (0.9, -3.0)])
+def test_interpolation_in_discrete_time(pole, zero):
+    # W = 1 / (z - pole), Theta = (z - zero) / (1 - zero z): the optimum is |W(zero)|.
+    b = 1 / zero
+    A, B1, B2 = np.diag([pole, b]), [[1.0], [0.0]], [[0.0], [1.0]]
+    # (z - zero)/(1 - zero z) = -b (z - zero)/(z - b) = -b - b (b - zero)/(z - b)
+    plant = GeneralizedPlant(A, B1, B2, [[1.0, -b * (b - zero)]], [[0.0, 0.0]], [[0.0]], [[-b]], [[1.0]], [[0.0]], 1.0)
+    found = hinf(plant)
+    assert found.hinf_norm == pytest.approx(abs(1 / (zero - pole)), rel=2e-5)
+    assert found.lower_bound <= abs(1 / (zero - pole)) * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("a", [-1.0, 0.0, 2.0])
+def test_scalar_output_feedback_closed_form(a):
+    # dx = a x + w1 + u, z = (x, u), y = x + w2: X = Y, and X = gamma in 2 a X + X^2 (1/gamma^2 - 1) + 1 = 0.
+    plant = GeneralizedPlant([[a]], [[1.0, 0]], [[1.0]], [[1.0], [0]], [[1.0]], np.zeros((2, 2)), [[0], [1.0]], [[0, 1.0]], [[0]], 0.0)
+    assert hinf(plant).hinf_norm == pytest.approx(a + np.sqrt(a**2 + 2), rel=2e-5)
+
+
+@pytest.mark.parametrize("dt", [0.0, 1e-3])
+def test_normalised_coprime_factors(dt):
+    # Glover and McFarlane (1989): the optimum is sqrt(1 + rho(X Z)) with the two LQG Riccati solutions, for any order and size.
+    rng = np.random.default_rng(7)
+    solve = solve_discrete_are if dt > 0 else solve_continuous_are
+    for _ in range(25):
+        n, m, p = int(rng.integers(1, 9)), int(rng.integers(1, 4)), int(rng.integers(1, 4))
+        A, B, C = rng.standard_normal((n, n)), rng.standard_normal((n, m)), rng.standard_normal((p, n))
+        X, Z = solve(A, B, C.T @ C, np.eye(m)), solve(A.T, C.T, B @ B.T, np.eye(p))
+        expected = np.sqrt(1 + np.abs(np.linalg.eigvals(X @ Z)).max())
+        found = hinf(coprime(A, B, C, dt))
+        assert found.status is Status.OPTIMAL
+        assert found.hinf_norm == pytest.approx(expected, rel=2e-5)
+        assert found.lower_bound <= expected * (1 + 1e-7)
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_slow_inequality_finds_the_same_optimum(dt):
+    rng = np.random.default_rng(11)
+    compared = 0
+    for _ in range(8):
+        plant = random_plant(rng, int(rng.integers(1, 4)), dt)
+        slow, status = slow_optimum(plant)
+        found = hinf(plant)
+        assert found.hinf_norm == pytest.approx(hinf_norm(plant.close(found.controller)), rel=1e-9)
+        if status == "optimal":
+            compared += 1
+            assert found.hinf_norm == pytest.approx(slow, rel=1e-3)
+    assert compared >= 6

@@ -1,27 +1,23 @@
 r"""Outliers (Appendix A): units whose residual exceeds the cover of the others.
 
-For every pair of units the residual of the form is taken with the one as nominal and the other as perturbed plant. Entries are scaled by
-their typical size over the population (Sinkhorn scaling of the median squared magnitudes), and a unit's distance at a frequency is the
-median over all nominals of the largest singular value, averaged (in dB) over a third of a decade:
+For every pair of units the residual of the form is taken with the one as nominal and the other as perturbed plant (`distances`). A unit's
+distance at a frequency is the median over all nominals of the largest singular value, averaged (in dB) over a third of a decade:
 
     distance_i(f) = smooth median_(k != i) sigma_max(D_l^-1 E(G_k, G_i) D_r^-1)
-    score_i       = max_f ( distance_i(f) - max_(k != i) distance_k(f) ),    dB
+    excess_i      = max_f ( distance_i(f) - max_(k != i) distance_k(f) ),    dB
 
-No single nominal decides, and the nominal of the study has a score like any other unit. Where the others' cover is more than 40 dB below its
-peak, the reference is held there: an excess over next to nothing is noise.
+No single nominal decides, and the nominal of the study has a score like any other unit. Beside it the excess is computed with every unit as
+the only nominal, as the paper states its criterion: the range over the nominals, and the share of them under which the unit is conspicuous.
 
-Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold is therefore the
-upper prediction bound of a normal model of the scores of the inliers, with Student's t for the small number of units, at the stated rate:
-an extrapolation, and labelled as such. The unit on top is compared with the bound of the units that stay, and taken out while it is beyond;
-two outliers that are alike can hide one another. With three units nothing can be flagged: two scores make no model.
-
-Measured at the default rate of 0.3 % on populations without outlier: 0.3 % of the units flagged with 6 units, 0.6 % with 12, 1.4 % with 38
-(the scores have a heavier tail than the normal one). On five simulated populations of 12 drives and one badly assembled one, loaded, additive
-form: the planted drive on top in all, flagged in 4 (linear) and 5 (Koopman), no false alarm. The additive form separates best.
+Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold is the bound of a
+Gumbel model of the others' scores at the stated rate (`tail`): an extrapolation, and labelled as such. Units are taken out one at a time
+while they are beyond; where none is, groups that hide one another are looked for (`groups`), up to a third of the units and eight at once.
+With three units nothing can be flagged: two scores make no model. Two units are refused.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,18 +27,16 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.errors import ConfigError, DataError, DimensionError
-from .forms import Form, as_form, residual
+from .distances import Distances, balance, distances, largest_entries
+from .forms import Form, as_form
+from .groups import excess, separate
 from .residuals import check_responses
-from .small import entries_first, sigma_max_first, squared
+from .tail import leave_one_out_bounds
 
 Array = npt.NDArray[Any]
 
 FALSE_ALARM_RATE = 3e-3
-_SMOOTHING_DECADES = 1.0 / 3.0
-_FLOOR_DB = 40.0
 _FREQUENCIES = 120
-_SINKHORN = 50
-_SMALLEST = 1e-12  # relative to the largest typical entry
 
 
 @dataclass(frozen=True)
@@ -53,13 +47,20 @@ class OutlierScore:
     ----------
     unit : str
     score_db : float, dB
-        Largest excess over frequency; negative for a unit that the others cover everywhere.
+        The excess, referred to the threshold: a unit that is out covers the others and lowers their scores, and with them its own
+        threshold; the difference is added to its excess, so that one threshold serves all units.
     threshold_db : float, dB
     outlier : bool
     freq_hz : float, Hz
         Where the excess is largest.
     entry : tuple of int
         Row and column of the residual's largest entry there, relative to its typical size.
+    excess_db : float, dB
+        Largest excess over frequency over the cover of the inliers; negative for a unit that the others cover everywhere.
+    lowest_db, highest_db : float, dB
+        Range of the excess over all choices of one nominal unit.
+    agreement : float
+        Share of those nominals under which the unit is beyond the threshold that the others' scores then make.
     """
 
     unit: str
@@ -68,6 +69,10 @@ class OutlierScore:
     outlier: bool
     freq_hz: float
     entry: tuple[int, int]
+    excess_db: float
+    lowest_db: float
+    highest_db: float
+    agreement: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +96,10 @@ class OutlierModel:
         Nominal rate per unit.
     extrapolated : bool
         Whether the rate is below 1 / (N + 1), so that it rests on the tail model alone.
+    nominal_ids : tuple of str
+        Units that were the nominal in turn: all, or 64 of them.
+    by_nominal_db : ndarray, shape (nominal, scored unit), dB
+        The excess with one unit as the only nominal, NaN of a unit against itself.
     """
 
     form: Form
@@ -103,6 +112,8 @@ class OutlierModel:
     threshold_db: float
     false_alarm_rate: float
     extrapolated: bool
+    nominal_ids: tuple[str, ...]
+    by_nominal_db: Array
 
     def score(self, unit: str, response: npt.ArrayLike) -> OutlierScore:
         """Score a new unit.
@@ -121,21 +132,21 @@ class OutlierModel:
         ------
         DimensionError
             When the response does not have the shape of the population's.
+        DataError
+            When the response is not finite.
         """
         G = np.asarray(response)
         if G.shape != self.responses.shape[1:]:
             raise DimensionError(
                 f"Scoring unit {unit}: needs a response of shape {self.responses.shape[1:]} at the stored frequencies, found {G.shape}."
             )
-        G = G / self.output_scale[:, None] * self.input_scale
-        everyone = np.concatenate([self.responses, G[None]])
-        distance, entries = _distances(self.form, everyone, self.freqs_hz)
-        value, where = _excess(distance)
-        k = len(everyone) - 1
-        row = int(where[k])
-        return OutlierScore(
-            unit, float(value[k]), self.threshold_db, bool(value[k] > self.threshold_db), float(self.freqs_hz[row]), _entry(entries, k, row)
-        )
+        _require_finite(G[None], (unit,), self.freqs_hz)
+        everyone = np.concatenate([self.responses, (G / self.output_scale[:, None] * self.input_scale)[None]])
+        found = distances(self.form, everyone, self.freqs_hz)
+        last = np.arange(len(everyone)) == len(everyone) - 1
+        margin = _margins(found.levels, self.false_alarm_rate)[1][-1]
+        summary = _Nominals.of(found, ~last, self.false_alarm_rate)
+        return _scores(self.form, everyone, self.freqs_hz, found, ~last, (margin,), (unit,), self.threshold_db, summary, [len(last) - 1])[0]
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``outlier_model.json``."""
@@ -145,10 +156,10 @@ class OutlierModel:
             "threshold_db": self.threshold_db,
             "false_alarm_rate": self.false_alarm_rate,
             "extrapolated": self.extrapolated,
+            "nominal_ids": self.nominal_ids,
             "scores": [{**vars(s), "threshold_db": None} for s in self.scores],
         }
-        arrays = {name: getattr(self, name) for name in ("freqs_hz", "responses", "output_scale", "input_scale")}
-        save_artifact(Path(folder), "outlier_model", content, arrays)
+        save_artifact(Path(folder), "outlier_model", content, {name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
     def load(cls, folder: Path) -> OutlierModel:
@@ -163,12 +174,16 @@ class OutlierModel:
             threshold_db=threshold,
             false_alarm_rate=content["false_alarm_rate"],
             extrapolated=content["extrapolated"],
-            **arrays,
+            nominal_ids=tuple(content["nominal_ids"]),
+            **{name: arrays[name] for name in _ARRAYS},
         )
 
 
+_ARRAYS = ("freqs_hz", "responses", "output_scale", "input_scale", "by_nominal_db")
+
+
 def score_outliers(
-    responses: npt.ArrayLike,
+    responses: npt.ArrayLike | Sequence[npt.ArrayLike],
     freqs_hz: npt.ArrayLike,
     form: Form | str = Form.ADDITIVE,
     *,
@@ -188,7 +203,7 @@ def score_outliers(
     form : Form or str
     unit_ids : tuple of str, optional
     output_scale, input_scale : array_like, optional
-        Ranges, ones by default.
+        Ranges; without both, those at which the responses' typical entries are equal, so that units of measure never matter.
     false_alarm_rate : float
         Nominal rate per unit of the tail model.
 
@@ -200,33 +215,33 @@ def score_outliers(
     Raises
     ------
     DataError
-        With fewer than three units there are no others to be covered.
+        With fewer than three units there are no others to be covered; when a response is not finite.
+    DimensionError
+        When units have responses of different shapes.
     ConfigError
         When the rate is not between 0 and 1.
     """
-    G = check_responses(responses)
-    form, freqs = as_form(form), np.asarray(freqs_hz, float)
-    ids = tuple(str(k) for k in range(len(G))) if unit_ids is None else tuple(unit_ids)
-    if len(G) < 3 or len(ids) != len(G) or freqs.shape != G.shape[1:2]:
-        raise DataError(
-            f"Outlier scores: need at least three units, one id each, and one frequency for each response; found {len(G)} units, {len(ids)} ids, "
-            f"{freqs.size} frequencies for {G.shape[1]}."
-        )
-    if not 0 < false_alarm_rate < 1 or np.any(np.diff(freqs) <= 0) or freqs[0] <= 0:
-        raise ConfigError(
-            f"Outlier scores: need a rate between 0 and 1 and increasing positive frequencies, found {false_alarm_rate}, {freqs[:3]}."
-        )
-    scales = tuple(np.ones(n) if s is None else np.asarray(s, float) for s, n in ((output_scale, G.shape[2]), (input_scale, G.shape[3])))
+    G, ids, freqs = _population(responses, unit_ids, freqs_hz)
+    form, rate = as_form(form), float(false_alarm_rate)
+    if not 0 < rate < 1:
+        raise ConfigError(f"Outlier scores: need a false alarm rate between 0 and 1, found {rate}; 0.003 is usual.")
     rows = np.unique(np.linspace(0, len(freqs) - 1, _FREQUENCIES).round().astype(int))
-    freqs, G = freqs[rows], G[:, rows] / scales[0][:, None] * scales[1]
-    distance, entries = _distances(form, G, freqs)
-    inliers, threshold = _separate(distance, false_alarm_rate)
-    scores = []
-    for k, unit in enumerate(ids):
-        others = np.append(inliers[inliers != k], k)
-        value, where = _excess(distance[others])
-        row = int(where[-1])
-        scores.append(OutlierScore(unit, float(value[-1]), threshold, k not in inliers, float(freqs[row]), _entry(entries, k, row)))
+    freqs, G = freqs[rows], G[:, rows]
+    given = output_scale is not None or input_scale is not None
+    scales = tuple(np.ones(n) if s is None else np.asarray(s, float) for s, n in ((output_scale, G.shape[2]), (input_scale, G.shape[3])))
+    scales = scales if given else balance(G)
+    if any(s.shape != (n,) or not (np.isfinite(s).all() and (s > 0).all()) for s, n in zip(scales, G.shape[2:], strict=True)):
+        raise DimensionError(
+            f"Outlier scores: ranges should be {G.shape[2]} positive numbers for the outputs and {G.shape[3]} for the inputs, "
+            f"found {scales[0].tolist()} and {scales[1].tolist()}."
+        )
+    G = G / scales[0][:, None] * scales[1]
+    found = distances(form, G, freqs)
+    parts = separate(found.levels, rate)
+    summary = _Nominals.of(found, parts.inliers, rate)
+    margins = tuple(float(m) for m in parts.margin_db)
+    scores = _scores(form, G, freqs, found, parts.inliers, margins, ids, parts.threshold_db, summary, range(len(G)))
+    inliers = np.flatnonzero(parts.inliers)
     return OutlierModel(
         form=form,
         unit_ids=tuple(ids[k] for k in inliers),
@@ -234,84 +249,114 @@ def score_outliers(
         responses=G[inliers],
         output_scale=scales[0],
         input_scale=scales[1],
-        scores=tuple(scores),
-        threshold_db=threshold,
-        false_alarm_rate=false_alarm_rate,
-        extrapolated=false_alarm_rate < 1 / (len(inliers) + 1),
+        scores=scores,
+        threshold_db=parts.threshold_db,
+        false_alarm_rate=rate,
+        extrapolated=rate < 1 / (len(inliers) + 1),
+        nominal_ids=tuple(ids[k] for k in found.nominals),
+        by_nominal_db=summary.excess_db,
     )
 
 
-def _distances(form: Form, G: Array, freqs: Array) -> tuple[Array, Array]:
-    """Distances in dB, shape (unit, frequency), and relative entries, shape (unit, frequency, p', m')."""
-    count = len(G)
-    E = np.stack([residual(form, G[k], G) for k in range(count)])  # (nominal, perturbed, frequency, p', m')
-    pairs = ~np.eye(count, dtype=bool)
-    left, right = _typical(np.median(squared(E[pairs]), axis=0))
-    scaled = E / left[:, :, None] / right[:, None, :]
-    sigma = sigma_max_first(entries_first(scaled))
-    sigma[~pairs] = np.nan
-    entries = np.abs(scaled)
-    entries[~pairs] = np.nan
-    floor = np.finfo(float).tiny
-    level = 20 * np.log10(np.maximum(np.nanmedian(sigma, axis=0), floor))
-    return _smooth(level, freqs), np.nanmedian(entries, axis=0)
+@dataclass(frozen=True, eq=False)
+class _Nominals:
+    """Excess of every unit with one nominal at a time, shape (nominal, unit), and whether it is beyond its threshold."""
+
+    excess_db: Array
+    beyond: Array
+
+    @classmethod
+    def of(cls, found: Distances, inliers: npt.NDArray[np.bool_], rate: float) -> _Nominals:
+        shape = found.by_nominal.shape[:2]
+        values, beyond = np.full(shape, np.nan), np.zeros(shape, bool)
+        for row, nominal in enumerate(found.nominals):
+            others = np.arange(shape[1]) != nominal
+            for units, members in _juries(inliers & others, others):
+                score, margin = _margins(found.by_nominal[row, members], rate)
+                place = np.searchsorted(members, units)
+                values[row, units], beyond[row, units] = score[place], margin[place] > 0
+        return cls(values, beyond)
+
+    def summary(self, unit: int) -> tuple[float, float, float]:
+        """Return lowest and highest excess and agreement."""
+        known = np.isfinite(self.excess_db[:, unit])
+        values = self.excess_db[known, unit]
+        return float(values.min()), float(values.max()), float(self.beyond[known, unit].mean())
 
 
-def _typical(squares: Array) -> tuple[Array, Array]:
-    """Left and right scales that bring squared entries to equal row and column sums, shape (frequency, p') and (frequency, m')."""
-    top = squares.max(axis=(1, 2), keepdims=True)
-    weights = np.maximum(squares / np.where(top > 0, top, 1.0), _SMALLEST)
-    left, right = np.ones(weights.shape[:2]), np.ones((weights.shape[0], weights.shape[2]))
-    for _ in range(_SINKHORN):
-        left = (weights / right[:, None, :]).sum(axis=2)
-        right = (weights / left[:, :, None]).sum(axis=1)
-    scale = np.sqrt(np.where(top > 0, top, 1.0))[:, 0]
-    return np.sqrt(left) * scale, np.sqrt(right)
+def _juries(inliers: npt.NDArray[np.bool_], wanted: npt.NDArray[np.bool_]) -> list[tuple[Array, Array]]:
+    """Units, and the units that they are scored among: inliers together, every other unit alone with them."""
+    together = np.flatnonzero(inliers)
+    alone = [(np.array([k]), np.sort(np.append(together, k))) for k in np.flatnonzero(wanted & ~inliers)]
+    return [(together, together), *alone] if len(together) > 1 else alone
 
 
-def _smooth(level: Array, freqs: Array) -> Array:
-    """Moving average over log frequency."""
-    x = np.log10(freqs)
-    near = (np.abs(x[:, None] - x) <= _SMOOTHING_DECADES / 2).astype(float)
-    return level @ (near / near.sum(axis=0))
+def _margins(levels: Array, rate: float) -> tuple[Array, Array]:
+    """Excess of all units, and what it has beyond the bound of the others' scores."""
+    if len(levels) < 2:
+        return np.zeros(len(levels)), np.full(len(levels), -np.inf)
+    scores = excess(levels)[0]
+    return scores, scores - leave_one_out_bounds(scores, rate)
 
 
-def _excess(distance: Array) -> tuple[Array, Array]:
-    """Largest excess of each unit over the others' cover, dB, and the index of its frequency."""
-    order = np.sort(distance, axis=0)
-    cover = np.where(distance == order[-1], order[-2], order[-1])  # largest of the others
-    cover = np.maximum(cover, cover.max(axis=1, keepdims=True) - _FLOOR_DB)
-    excess = distance - cover
-    where = excess.argmax(axis=1)
-    return excess[np.arange(len(excess)), where], where
+def _scores(
+    form: Form,
+    G: Array,
+    freqs: Array,
+    found: Distances,
+    inliers: npt.NDArray[np.bool_],
+    margins: tuple[float, ...],
+    ids: tuple[str, ...],
+    threshold: float,
+    summary: _Nominals,
+    units: Sequence[int],
+) -> tuple[OutlierScore, ...]:
+    """Scores of some units; `margins` and `ids` are theirs."""
+    wanted = np.isin(np.arange(len(G)), np.asarray(units))
+    value, where = np.zeros(len(G)), np.zeros(len(G), int)
+    for some, members in _juries(inliers, wanted | inliers):
+        score, place = excess(found.levels[members])
+        value[some], where[some] = score[np.searchsorted(members, some)], place[np.searchsorted(members, some)]
+    rows = where[list(units)]
+    entries = largest_entries(form, G, found, np.asarray(units), rows)
+    scores = []
+    for k, unit, margin, row, entry in zip(units, ids, margins, rows, entries, strict=True):
+        referred = float(value[k]) if not np.isfinite(margin) else threshold + margin
+        beyond = bool(np.isfinite(threshold) and margin > 0)
+        scores.append(OutlierScore(unit, referred, threshold, beyond, float(freqs[row]), entry, float(value[k]), *summary.summary(k)))
+    return tuple(scores)
 
 
-def _separate(distance: Array, rate: float) -> tuple[Array, float]:
-    """Rows of the inliers, and the prediction bound of their scores, dB.
+def _population(
+    responses: npt.ArrayLike | Sequence[npt.ArrayLike], unit_ids: tuple[str, ...] | None, freqs_hz: npt.ArrayLike
+) -> tuple[Array, tuple[str, ...], Array]:
+    """Checked responses, names and frequencies."""
+    listed = responses if isinstance(responses, np.ndarray) else [np.asarray(r) for r in responses]  # type: ignore[union-attr]
+    ids = tuple(str(k) for k in range(len(listed))) if unit_ids is None else tuple(unit_ids)
+    freqs = np.asarray(freqs_hz, float)
+    for name, one in zip(ids, listed, strict=False):
+        if one.shape != listed[0].shape:
+            raise DimensionError(
+                f"Outlier scores: unit {name} has a response of shape {one.shape}, unit {ids[0]} one of shape {listed[0].shape}; "
+                "bring all units to the same frequencies and channels."
+            )
+    G = check_responses(np.asarray(listed))
+    if len(G) < 3 or len(ids) != len(G) or freqs.shape != G.shape[1:2]:
+        raise DataError(
+            f"Outlier scores: need at least three units, one id each, and one frequency for each response; found {len(G)} units, {len(ids)} ids, "
+            f"{freqs.size} frequencies for {G.shape[1]}."
+        )
+    if not np.isfinite(freqs).all() or np.any(np.diff(freqs) <= 0) or freqs[0] <= 0:
+        raise ConfigError(f"Outlier scores: need increasing positive frequencies, found {freqs[:3]}.")
+    _require_finite(G, ids, freqs)
+    return G, ids, freqs
 
-    The unit with the highest score goes out while it is beyond the bound of those that stay; at most a third goes.
-    """
-    kept = list(range(len(distance)))
-    for _ in range(len(distance) // 3):
-        scores = _excess(distance[kept])[0]
-        top = int(np.argmax(scores))
-        rest = kept[:top] + kept[top + 1 :]
-        if scores[top] <= _bound(_excess(distance[rest])[0], rate):
-            break
-        kept = rest
-    return np.array(kept), _bound(_excess(distance[kept])[0], rate)
 
-
-def _bound(scores: Array, rate: float) -> float:
-    """Upper prediction bound for one further score under a normal model."""
-    from scipy.stats import t
-
-    count = len(scores)
-    if count < 3:
-        return float("inf")
-    return float(scores.mean() + t.isf(rate, count - 1) * scores.std(ddof=1) * np.sqrt(1 + 1 / count))
-
-
-def _entry(entries: Array, unit: int, row: int) -> tuple[int, int]:
-    i, j = np.unravel_index(int(np.argmax(entries[unit, row])), entries.shape[2:])
-    return int(i), int(j)
+def _require_finite(G: Array, ids: tuple[str, ...], freqs: Array) -> None:
+    bad = np.argwhere(~np.isfinite(G))
+    if len(bad):
+        unit, row, i, j = bad[0]
+        raise DataError(
+            f"Outlier scores: the response of unit {ids[unit]} is {G[unit, row, i, j]} at {freqs[row]:.4g} Hz, entry ({i}, {j}), and not finite at "
+            f"{len(bad)} places in all; leave the unit out, or look at its model."
+        )

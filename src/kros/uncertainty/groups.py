@@ -1,0 +1,93 @@
+"""Scores of units from their distances, and the search for outliers one at a time and in groups that hide one another.
+
+What goes in are levels in dB, shape (unit, frequency); each unit's excess over the g-th largest of the others makes its score, the tail model
+of the scores tells which are too large.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .tail import group_factors, group_statistics, gumbel
+
+Array = npt.NDArray[Any]
+
+_FLOOR_DB = 40.0
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """Inliers and outliers.
+
+    Parameters
+    ----------
+    inliers : ndarray of bool, shape (unit,)
+    margin_db : ndarray, shape (unit,), dB
+        Score minus the threshold of the step at which the unit went out, or of the last step; minus infinity where nothing can be told.
+    threshold_db : float, dB
+        What the largest score of the inliers would have to exceed.
+    """
+
+    inliers: npt.NDArray[np.bool_]
+    margin_db: Array
+    threshold_db: float
+
+
+def excess(levels: Array, size: int = 1) -> tuple[Array, Array]:
+    """Return how far every unit exceeds the `size`-th largest of the others, and where.
+
+    Parameters
+    ----------
+    levels : ndarray, shape (unit, frequency), dB
+        More than `size` units.
+    size : int
+        With 1 the others' cover; with g a group of g that are alike no longer covers its members.
+
+    Returns
+    -------
+    tuple of ndarray, shape (unit,)
+        The largest excess over frequency in dB, and the index of its frequency. Where the reference is more than 40 dB below its peak, it
+        is held there: an excess over next to nothing is noise.
+    """
+    n = len(levels)
+    ordered = np.partition(levels, (n - size - 1, n - size), axis=0)
+    reference = np.where(levels >= ordered[n - size], ordered[n - size - 1], ordered[n - size])
+    reference = np.maximum(reference, reference.max(axis=1, keepdims=True) - _FLOOR_DB)
+    over = levels - reference
+    where = over.argmax(axis=1)
+    return over[np.arange(n), where], where
+
+
+def separate(levels: Array, rate: float) -> Separation:
+    """Take outliers out, the smallest group that is beyond its bound first, until none is.
+
+    At most a third of the units goes. Of equal scores the first unit's counts as the larger one.
+    """
+    here = np.arange(len(levels))
+    inliers, margin = np.ones(len(levels), bool), np.full(len(levels), -np.inf)
+    while True:
+        group, margins, threshold = _smallest_group(levels[here], rate, len(here) - (len(levels) - len(levels) // 3))
+        margin[here] = margins
+        if group.size == 0:
+            return Separation(inliers, margin, threshold)
+        inliers[here[group]] = False
+        here = np.flatnonzero(inliers)
+
+
+def _smallest_group(levels: Array, rate: float, most: int) -> tuple[Array, Array, float]:
+    """Rows of a group of at most `most`, margins of all units and the threshold."""
+    none, threshold, margins = np.array([], int), np.inf, np.full(len(levels), -np.inf)
+    for size, factor in enumerate(group_factors(len(levels), rate), start=1):
+        scores = excess(levels, size)[0]
+        order = np.argsort(-scores, kind="stable")
+        location, scale = gumbel(scores[order[size:]])
+        bound = float(location + factor * scale)
+        if size == 1:
+            threshold, margins = bound, scores - bound
+        if size <= most and group_statistics(scores)[size - 1] > factor:
+            return order[:size], scores - bound, bound
+    return none, margins, threshold

@@ -1,0 +1,128 @@
+r"""Tail of outlier scores: which of the largest scores are too large for the others.
+
+A score is a maximum over frequency, so the scores of good units are modelled as independent draws of a Gumbel distribution,
+
+    F(s) = exp(-exp(-(s - mu) / beta)),        beta = l2 / ln 2,    mu = l1 - gamma beta
+
+with l1, l2 the first two sample L-moments (Hosking, *L-moments*, J. R. Stat. Soc. B 52, 1990). Both estimates move with location and scale,
+so what is measured in them has a distribution of its own that depends on the number of scores alone: small samples get wider bounds, not
+wrong ones. Those distributions are drawn once, with a fixed seed:
+
+    T_g = (s_(n-g+1) - mu_g) / beta_g        the least of the g largest scores, mu_g and beta_g estimated from the n - g others
+    P(a score > mu + q_1 beta) = 3/4 rate    one unit at a time, location and scale of the n - 1 others
+    E[g; T_g > q_g, g > 1] = n rate / 4      groups of two and more, shared out equally
+
+so under the model a good unit is flagged with a probability of at most `rate`.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+
+LEAST_SCORES = 3  # a location, a scale, and one that tests them
+LARGEST_GROUP = 8
+_DRAWS = 400_000
+_NUMBERS = 4_000_000
+_SHARE_OF_GROUPS = 0.25
+_ASYMPTOTIC = 60  # from here on the correction of the factor is proportional to 1 / n
+
+
+def largest_group(count: int) -> int:
+    """Return how many of `count` units may be outliers: a third, at most eight, and three others have to stay."""
+    return max(0, min(count // 3, count - LEAST_SCORES, LARGEST_GROUP))
+
+
+def prediction_bound(scores: Array, rate: float) -> Array:
+    """Return what one further score exceeds with probability `rate`.
+
+    Parameters
+    ----------
+    scores : ndarray, shape (..., score), dB
+    rate : float
+
+    Returns
+    -------
+    ndarray, shape (...), dB
+        Infinity with fewer than three scores.
+    """
+    scores = np.asarray(scores, float)
+    if scores.shape[-1] < LEAST_SCORES:
+        return np.full(scores.shape[:-1], np.inf)
+    location, scale = gumbel(scores)
+    return np.asarray(location + prediction_factor(scores.shape[-1], rate) * scale)
+
+
+@lru_cache(maxsize=256)
+def prediction_factor(count: int, rate: float) -> float:
+    """Return c of the bound ``mu + c beta``: the mean of ``1 - F_0(mu_0 + c beta_0)`` over estimates from standard draws is `rate`."""
+    limit = -float(np.log(-np.log1p(-rate)))
+    if count > _ASYMPTOTIC:
+        return limit + (prediction_factor(_ASYMPTOTIC, rate) - limit) * _ASYMPTOTIC / count
+    from scipy.optimize import brentq
+
+    location, scale = gumbel(np.random.default_rng(0).gumbel(size=(_NUMBERS // 40 // count, count)))
+
+    def too_many(c: float) -> float:
+        return float(np.log(-np.expm1(-np.exp(-(location + c * scale))).mean() / rate))
+
+    top = 2 * max(abs(limit), 1.0)
+    while too_many(top) > 0:
+        top *= 2
+    return float(brentq(too_many, -top, top))
+
+
+@lru_cache(maxsize=64)
+def group_factors(count: int, rate: float) -> tuple[float, ...]:
+    """Return q_1, q_2, ... for a number of scores; empty where nothing can be told."""
+    sizes = largest_group(count)
+    if sizes == 0:
+        return ()
+    single = prediction_factor(count - 1, (1 - _SHARE_OF_GROUPS) * rate)
+    if sizes == 1:
+        return (single,)
+    T = group_statistics(np.random.default_rng(1).gumbel(size=(min(_DRAWS, _NUMBERS // count), count)))
+    levels = [_SHARE_OF_GROUPS * min(count * rate, 1.0) / (sizes - 1) / g for g in range(2, sizes + 1)]
+    return (single, *(float(np.quantile(T[:, g - 1], 1 - level)) for g, level in enumerate(levels, start=2)))
+
+
+def group_statistics(scores: Array) -> Array:
+    """Return T_1, T_2, ... of scores of shape (..., n): shape (..., group)."""
+    x = np.sort(scores, axis=-1)
+    n = x.shape[-1]
+    g = np.arange(1, largest_group(n) + 1)
+    m = n - g
+    first, second = x.cumsum(axis=-1)[..., m - 1], (x * np.arange(n)).cumsum(axis=-1)[..., m - 1]
+    scale = (2 * second - (m - 1) * first) / (m * (m - 1)) / np.log(2)
+    over = x[..., m] - (first / m - np.euler_gamma * scale)
+    tiny = np.finfo(float).eps * np.abs(x).max(axis=-1, keepdims=True)
+    return np.asarray(np.divide(over, scale, out=np.where(over > tiny, np.inf, 0.0), where=scale > tiny))
+
+
+def gumbel(scores: Array) -> tuple[Array, Array]:
+    """Return location and scale from L-moments over the last axis."""
+    ordered = np.sort(scores, axis=-1)
+    n = ordered.shape[-1]
+    scale = ordered @ ((2 * np.arange(n) - n + 1) / (n * (n - 1))) / np.log(2)
+    return ordered.mean(axis=-1) - np.euler_gamma * scale, scale
+
+
+def leave_one_out_bounds(scores: Array, rate: float) -> Array:
+    """Return for every score what it exceeds with probability `rate`, given the others; shape (score,), infinity with fewer than four."""
+    n = len(scores)
+    if n <= LEAST_SCORES:
+        return np.full(n, np.inf)
+    order = np.argsort(scores, kind="stable")
+    x, rank, m = scores[order], np.arange(n), n - 1
+    first = x.sum() - x
+    above = x[::-1].cumsum()[::-1] - x
+    second = (rank * x).sum() - rank * x - above
+    scale = np.maximum((2 * second - (m - 1) * first) / (m * (m - 1)) / np.log(2), 0.0)
+    bounds = np.empty(n)
+    bounds[order] = first / m + (prediction_factor(m, rate) - np.euler_gamma) * scale
+    return bounds

@@ -1,0 +1,122 @@
+"""Variation against noise: static systems whose shares are known, and recordings of identical and of different systems."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError, DataError, DimensionError
+from kros.core.linalg import qr_triangle
+from kros.identify import KoopmanMatrices, ModelSamples, bootstrap_edmd, episode_weights
+from kros.uncertainty import Form
+from kros.uncertainty.noise import VariationAndNoise, variation_and_noise
+
+DT = 1e-2
+FREQS = np.geomspace(0.1, 40.0, 12)
+
+
+def static(variation: float, noise: float, units: int = 200, draws: int = 50, seed: int = 0) -> ModelSamples:
+    """``G = B / z``: the squared residual is that of B at every frequency, so the share of noise is its share of the variance."""
+    rng = np.random.default_rng(seed)
+    truth = np.array([[5.0, 1.0], [1.0, 4.0]]) + variation * rng.normal(size=(units, 2, 2))
+    B = truth + noise * rng.normal(size=truth.shape)
+    samples = B[:, None] + noise * rng.normal(size=(units, draws, 2, 2))
+    A = np.zeros((units, 2, 2))
+    return ModelSamples(tuple(str(k) for k in range(units)), KoopmanMatrices(A, B), KoopmanMatrices(np.zeros_like(samples), samples))
+
+
+@pytest.mark.parametrize("form", list(Form))
+@pytest.mark.parametrize(("variation", "noise"), [(0.0, 0.02), (0.02, 0.02), (0.04, 0.02), (0.05, 0.0)])
+def test_static_shares(form: Form, variation: float, noise: float) -> None:
+    """The mean square of 200 units has 4 x 199 degrees of freedom: 5 percent standard deviation of the ratio, less for both together."""
+    found = variation_and_noise(static(variation, noise), FREQS, DT, form)
+    expected = noise**2 / (noise**2 + variation**2)
+    assert found.ratio == pytest.approx(np.full(len(FREQS), expected), rel=0.15, abs=1e-12)
+    assert np.all((found.noise_share >= 0) & (found.noise_share <= 1))
+    np.testing.assert_allclose(found.noise_share + found.variation_share, 1.0)
+
+
+def test_band_is_the_quantile_of_the_draws() -> None:
+    """A scalar B with Gaussian noise: 95 percent of the draws are within 1.96 standard deviations."""
+    rng = np.random.default_rng(1)
+    B = np.array([[[2.0]], [[3.0]]])
+    samples = B[:, None] + 0.1 * rng.normal(size=(2, 20000, 1, 1))
+    models = ModelSamples(("a", "b"), KoopmanMatrices(np.zeros_like(B), B), KoopmanMatrices(np.zeros_like(samples), samples))
+    found = variation_and_noise(models, FREQS, DT, nominal=1)
+    np.testing.assert_allclose(found.band, 0.196, rtol=0.03)
+    np.testing.assert_allclose(found.residual, np.array([[1.0], [0.0]]) * np.ones(len(FREQS)), atol=1e-12)
+
+
+def recordings(spread: float, units: int = 10, episodes: int = 12, seed: int = 2) -> ModelSamples:
+    """Resampled models of noisy first-order systems, of the same one where `spread` is zero."""
+    rng = np.random.default_rng(seed)
+    R = np.empty((units, episodes, 3, 3))
+    for i in range(units):
+        a, b = 0.9 + spread * 0.05 * rng.uniform(-1, 1), 1.0 + spread * rng.normal()
+        for e in range(episodes):
+            u, w = rng.normal(size=301), 0.3 * rng.normal(size=301)
+            x = np.zeros(301)
+            for t in range(300):
+                x[t + 1] = a * x[t] + b * u[t] + w[t]
+            R[i, e] = qr_triangle(np.column_stack([x[:-1], u[:-1], x[1:]]))
+    return bootstrap_edmd(R, 1, 0.0, episode_weights([episodes] * units, 100, seed))
+
+
+def test_identical_systems_are_all_noise_and_different_ones_hardly() -> None:
+    """Ten units leave the ratio of a scalar response scattered by up to sqrt(2 / 9) = 47 percent, 2 degrees of freedom where it is complex."""
+    same = variation_and_noise(recordings(0.0), FREQS, DT)
+    assert np.all((same.ratio > 0.4) & (same.ratio < 2.5))
+    assert 0.6 < np.exp(np.log(same.ratio).mean()) < 1.7
+    different = variation_and_noise(recordings(0.3), FREQS, DT)
+    assert np.all(different.noise_share < 0.05)
+    assert np.all(different.band.max(axis=0) < different.residual.max(axis=0))
+
+
+def test_first_order_samples_agree_with_full_ones_for_small_noise() -> None:
+    models = recordings(0.1, units=3)
+    small = KoopmanMatrices(
+        models.estimate.A[:, None] + 1e-3 * (models.samples.A - models.estimate.A[:, None]),
+        models.estimate.B[:, None] + 1e-3 * (models.samples.B - models.estimate.B[:, None]),
+    )
+    full, first = (
+        variation_and_noise(ModelSamples(models.unit_ids, models.estimate, small, linear), FREQS, DT) for linear in (False, True)
+    )
+    np.testing.assert_allclose(first.noise, full.noise, rtol=1e-2)
+    np.testing.assert_allclose(first.band, full.band, rtol=1e-2)
+
+
+def test_shares_do_not_depend_on_units_of_measure_or_the_nominal(tmp_path: Path) -> None:
+    models = static(0.02, 0.02, units=20)
+    out, into = np.array([10.0, 0.1]), np.array([3.0, 0.5])
+    plain = variation_and_noise(models, FREQS, DT, output_scale=[1.0, 2.0], input_scale=[1.0, 4.0])
+
+    def changed(m: KoopmanMatrices) -> KoopmanMatrices:
+        return KoopmanMatrices(m.A, m.B * out[:, None] / into)
+
+    scaled = ModelSamples(models.unit_ids, changed(models.estimate), changed(models.samples))
+    other = variation_and_noise(scaled, FREQS, DT, nominal=7, output_scale=out * [1.0, 2.0], input_scale=into * [1.0, 4.0])
+    np.testing.assert_allclose(other.ratio, plain.ratio, rtol=1e-10)
+    np.testing.assert_allclose(other.band, plain.band, rtol=1e-10)
+    other.save(tmp_path)
+    again = VariationAndNoise.load(tmp_path)
+    np.testing.assert_array_equal(again.noise_share, other.noise_share)
+    assert (again.form, again.unit_ids, again.nominal, again.level) == (other.form, other.unit_ids, 7, 0.95)
+
+
+def test_bad_input_is_refused() -> None:
+    models = static(0.02, 0.02, units=3, draws=4)
+    one = ModelSamples(("a",), *(KoopmanMatrices(m.A[:1], m.B[:1]) for m in (models.estimate, models.samples)))
+    with pytest.raises(DataError, match="at least two units"):
+        variation_and_noise(one, FREQS, DT)
+    broken = models.samples.B.copy()
+    broken[1, 2] = np.nan
+    with pytest.raises(DataError, match=r"unit 1 .* not finite"):
+        variation_and_noise(ModelSamples(models.unit_ids, models.estimate, KoopmanMatrices(models.samples.A, broken)), FREQS, DT)
+    with pytest.raises(ConfigError, match="nominal"):
+        variation_and_noise(models, FREQS, DT, nominal=3)
+    with pytest.raises(DimensionError, match="positive"):
+        variation_and_noise(models, FREQS, DT, output_scale=[1.0, 0.0])
+    with pytest.raises(ConfigError):
+        variation_and_noise(models, [60.0], DT)

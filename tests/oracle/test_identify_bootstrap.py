@@ -101,7 +101,7 @@ def test_one_gauss_newton_step_is_exact_where_the_cost_is_quadratic() -> None:
 
 STATES = ("position", "velocity", "current")
 KOOPMAN = Lifting(STATES, ("sin(100*position + phase)",), ("phase",))
-OPTIONS = RefineOptions(horizons=(5, 20), segments=20, strengths=(10.0,), iterations=10)
+OPTIONS = RefineOptions(horizons=(5, 20, 80), segments=20, strengths=(10.0,), iterations=10)
 EPISODES = 5
 
 
@@ -184,7 +184,7 @@ def test_one_step_spreads_as_full_refits_on_resampled_episodes_do(drives: tuple)
     ratio = np.divide(*(response_bands(each, grid, 1e-3, *scales, level=0.7).spectral for each in (step, full)))
     assert 1 / 1.6 < ratio.min() < ratio.max() < 1.6
     straight = response_bands(replace(step, linear=False), grid, 1e-3, *scales, level=0.7).spectral
-    assert straight.max() > 3 * response_bands(full, grid, 1e-3, *scales, level=0.7).spectral.max()
+    assert straight.max() > 2 * response_bands(full, grid, 1e-3, *scales, level=0.7).spectral.max()
 
 
 def test_one_step_is_the_derivative_of_the_refit(drives: tuple) -> None:

@@ -118,6 +118,7 @@ def refined(found: ModelSet) -> RefinedModels:
         units=KoopmanMatrices(found.A, found.B),
         pooled=KoopmanMatrices(found.A[0], found.B[0]),
         strength=10.0,
+        strengths=np.full(5, 10.0),
         trade_off=(pooled, *rows[::-1]),
         sigma=np.ones(3),
         converged=np.ones(5, dtype=bool),

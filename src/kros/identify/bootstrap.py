@@ -219,7 +219,7 @@ def bootstrap_refined(
     -------
     ModelSamples
         Marked `linear`: the prior keeps responses together along a curved set of (A, B), which a straight step leaves. Against full refits
-        of three simulated drives, first-order bands were right to about 20 percent, bands of the steps' own responses up to 12 times too wide.
+        of three simulated drives, first-order bands were right to about 20 percent, bands of the steps' own responses 2.6 to 12 times too wide.
         The steps lead from a minimum: a search that ran out of iterations far from one makes them unreliable.
     """
     n, p = units.A.shape[-1], len(whitening)

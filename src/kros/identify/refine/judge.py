@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import IdentificationError
 from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
 from ..free_run import free_run
@@ -80,7 +79,7 @@ def free_run_errors(
     return rms, top, reached
 
 
-def require_bounded(
+def find_unbounded(
     A: Array,
     B: Array,
     lifting: Lifting,
@@ -89,8 +88,8 @@ def require_bounded(
     keys: Mapping[str, Sequence[EpisodeKey]],
     limit: Array,
     judged: int | None = None,
-) -> None:
-    """Run every unit's model over all of its training episodes, or their first `judged` samples, and refuse one that leaves the limit.
+) -> dict[int, str]:
+    """Run every unit's model over all of its training episodes, and find those that leave the limit.
 
     Parameters
     ----------
@@ -105,24 +104,25 @@ def require_bounded(
     judged : int, optional
         As in `free_run_errors`.
 
-    Raises
-    ------
-    IdentificationError
-        Names the unit, the episode and the state.
+    Returns
+    -------
+    dict of int to str
+        For the rows of units that leave it: the episode, the state and how far it goes.
     """
+    found: dict[int, str] = {}
     flat = [(row, key) for row, episodes in enumerate(keys.values()) for key in episodes]
     width = max(1, _AT_ONCE // (len(population.channels) * 20_000))
     for part in (flat[i : i + width] for i in range(0, len(flat), width)):
         rows = [row for row, _ in part]
         own = {name: values[rows] for name, values in parameters.items()}
         _, _, reached = free_run_errors(A[None, rows], B[None, rows], lifting, own, population, [key for _, key in part], judged)
-        over = np.argwhere(~(reached[0] <= limit))
-        if len(over):
-            which, state = over[0]
-            raise IdentificationError(
-                f"Refinement: the free run over {part[which][1]} reaches {reached[0, which, state]:.3g} in {lifting.states[state]!r}, "
-                f"beyond {limit[state]:.3g}; use a stronger prior, longer horizons, or functions that stay bounded."
+        for which, state in np.argwhere(~(reached[0] <= limit)):
+            row, key = part[which]
+            found.setdefault(
+                row,
+                f"the free run over {key} reaches {reached[0, which, state]:.3g} in {lifting.states[state]!r}, beyond {limit[state]:.3g}",
             )
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,6 +50,8 @@ class RefinedModels:
         A (n, n) and B (n, m) of the model fitted to all pooled units at once.
     strength : float
         Of the prior, as chosen on held-out training episodes.
+    strengths : ndarray, shape (unit,)
+        The same for every unit, but stronger where a unit's free runs would have left their bound.
     trade_off : tuple of TradeOff
         One row for every strength that was tried, strongest first, and a first one for the pooled model alone (strength infinite).
     sigma : ndarray, shape (n_states,)
@@ -67,6 +69,7 @@ class RefinedModels:
     units: KoopmanMatrices
     pooled: KoopmanMatrices
     strength: float
+    strengths: Array
     trade_off: tuple[TradeOff, ...]
     sigma: Array
     converged: npt.NDArray[np.bool_]
@@ -102,7 +105,7 @@ class RefinedModels:
         )
 
 
-_ARRAYS = ("sigma", "information", "whitening", "spectral_radius")
+_ARRAYS = ("strengths", "sigma", "information", "whitening", "spectral_radius")
 
 
 def _row(row: dict[str, Any]) -> TradeOff:

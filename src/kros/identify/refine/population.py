@@ -10,7 +10,7 @@ strongest one whose error is as good as the best.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from ...core.errors import DimensionError, IdentificationError
 from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
 from ..factors import Factor
-from .judge import Judge, require_bounded
+from .judge import Judge, find_unbounded
 from .marquardt import Solution, minimise
 from .metric import ResponsePrior
 from .model import RefinedModels, TradeOff
@@ -87,18 +87,26 @@ def refine_population(
     path, trade_off = _path(prepared, common, judge, options)
     choice = _choose(trade_off, options)
     log.info("prior of strength %g chosen, held-out score %.4g", trade_off[choice].strength, trade_off[choice].score)
-    final = _strengthen(replace(prepared, segments=segments), trade_off[choice].strength)
-    solution = _settle(final, path[choice], options)
+    final = replace(prepared, segments=segments)
+    solution = _settle(_strengthen(final, trade_off[choice].strength), path[choice], options)
+    limit = options.bound * factor.peak[rows, : lifting.n_states].max(axis=0)
+
+    def unbounded(V: Array, some: npt.NDArray[np.int64]) -> dict[int, str]:
+        models = matrices_of(V, problem.T, lifting.n_lifted)
+        own = {name: values[some] for name, values in parameters.items()}
+        ids = tuple(keys)
+        return find_unbounded(models.A, models.B, lifting, own, population, {ids[i]: keys[ids[i]] for i in some}, limit, options.judged)
+
+    solution, strengths = _keep_bounded(final, solution, common, trade_off[choice].strength, unbounded, options)
     units = matrices_of(solution.V, problem.T, lifting.n_lifted)
     radius = units.spectral_radius()
     _require_stable(tuple(keys), radius, options.margin)
-    limit = options.bound * factor.peak[rows, : lifting.n_states].max(axis=0)
-    require_bounded(units.A, units.B, lifting, parameters, population, keys, limit, options.judged)
     return RefinedModels(
         unit_ids=tuple(keys),
         units=units,
         pooled=matrices_of(common, problem.T, lifting.n_lifted),
         strength=trade_off[choice].strength,
+        strengths=strengths,
         trade_off=(*judge.trade_off([common], (np.inf,)), *trade_off),
         sigma=prepared.sigma,
         converged=solution.converged,
@@ -171,6 +179,35 @@ def _settle(problem: Problem, V: Array, options: RefineOptions) -> Solution:
         more = minimise(part.evaluate, part.admissible, solution.V[rows], options.iterations, options.least_gain)
         solution = solution.updated(rows, more)
     return solution
+
+
+def _keep_bounded(
+    problem: Problem,
+    solution: Solution,
+    common: Array,
+    strength: float,
+    unbounded: Callable[[Array, npt.NDArray[np.int64]], dict[int, str]],
+    options: RefineOptions,
+) -> tuple[Solution, Array]:
+    """Fit units whose free runs leave their bound again, from the pooled model and with a prior ten times as strong, until none does.
+
+    Returns the strength for every unit beside the solution.
+    """
+    rows = np.arange(len(solution.V))
+    strengths = np.full(len(rows), strength)
+    for _ in range(_ROUNDS):
+        found = unbounded(solution.V[rows], rows)
+        if not found:
+            return solution, strengths
+        rows, strength = rows[sorted(found)], 10 * strength
+        strengths[rows] = strength
+        log.warning("%s; fitted again with a prior of strength %g", "; ".join(found[i] for i in sorted(found)), strength)
+        part = replace(restrict(_strengthen(problem, strength), rows), pooled=False)
+        V = np.repeat(common[None], len(rows), axis=0)
+        solution = solution.updated(rows, minimise(part.evaluate, part.admissible, V, options.iterations, options.least_gain))
+    raise IdentificationError(
+        f"Refinement: {next(iter(found.values()))}, even with a prior of strength {strength:g}; use longer horizons, or functions that stay bounded."
+    )
 
 
 def _too_uncertain(row: TradeOff, options: RefineOptions) -> bool:

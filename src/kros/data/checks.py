@@ -55,7 +55,7 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
     NonFiniteError
         NaN or infinity.
     DataError
-        Wrong number of columns, or too short. (A state or an input may rest in one episode, not in all of them; see `InputWatch`.)
+        Wrong number of columns, or too short. (A state or an input may rest in one episode, not in all of them; see `RestWatch`.)
     """
     if values.ndim != 2 or values.shape[1] != len(channels):
         raise DataError(
@@ -105,7 +105,7 @@ def check_finite(
             )
 
 
-class InputWatch:
+class RestWatch:
     """Notice inputs and states that never change over all episodes of one unit and condition.
 
     An input may be held at another level in every episode. A state may not: what moves it would be seen in no episode.
@@ -213,7 +213,7 @@ def scan_population(population: Population, min_samples: int = MIN_SAMPLES, on_n
     policy = parse_on_nan(on_nan)
     kept: list[EpisodeKey] = []
     for unit, condition, keys in population.groups():
-        watch = InputWatch(population.channels)
+        watch = RestWatch(population.channels)
         for key in keys:
             values = read_or_drop(population, key, policy)
             if values is not None:

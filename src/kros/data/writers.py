@@ -24,7 +24,7 @@ import numpy.typing as npt
 from ..core.artifacts import save_artifact
 from ..core.errors import DataError
 from .arrow import from_numpy, repeated
-from .checks import InputWatch, OnNan, check_structure, parse_on_nan, read_or_drop
+from .checks import RestWatch, OnNan, check_structure, parse_on_nan, read_or_drop
 from .folders import whole_folder
 from .population import EpisodeKey, Population
 from .readers.parquet import INDEX
@@ -92,7 +92,7 @@ def write_group(population: Population, unit: str, condition: str, folder: Path 
         raise DataError(f"Asked to write unit {unit} ({condition}); the population has no episode of it.")
     path = Path(folder) / group_file(unit, condition)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    watch = InputWatch(population.channels)
+    watch = RestWatch(population.channels)
     try:
         written = list(_write_episodes(population, keys, temporary, parse_on_nan(on_nan), watch))
         if not written:
@@ -172,7 +172,7 @@ def write_parquet(
 
 
 def _write_episodes(
-    population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: OnNan, watch: InputWatch
+    population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: OnNan, watch: RestWatch
 ) -> Iterable[tuple[str, int]]:
     from pyarrow import parquet
 

@@ -68,13 +68,14 @@ def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> 
 
 
 def error_percent(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
-    """Return ``100 rms(x_hat - x) / max|x|`` of every episode, shape (batch, n); arguments as in `summarise`."""
+    """Return ``100 rms(x_hat - x) / max|x|`` of every episode, shape (batch, n), NaN for a state at zero; arguments as in `summarise`."""
     return _of_range(error_rms(estimate, truth, lengths), truth, lengths)
 
 
 def _of_range(rms: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
     inside = np.arange(len(truth))[:, None, None] < lengths[:, None]
-    return 100 * rms / np.max(np.abs(truth), axis=0, where=inside, initial=np.finfo(float).tiny)
+    size = np.max(np.abs(truth), axis=0, where=inside, initial=0.0)
+    return np.divide(100 * rms, size, out=np.full_like(rms, np.nan), where=size > 0)
 
 
 def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT) -> tuple[Array, Array]:

@@ -188,12 +188,12 @@ def _arrays(
     arrays: dict[str, npt.NDArray[Any]] = {"freqs_hz": outcomes[0].summary.freqs_hz}
     for number, i in enumerate(shown):
         states, inputs = population.read_parts(keys[i])
-        arrays[f"shown{number}/states"], arrays[f"shown{number}/inputs"] = states.astype(np.float32), inputs.astype(np.float32)
+        arrays[f"shown{number}/states"], arrays[f"shown{number}/inputs"] = _single(states), _single(inputs)
         for name, outcome in zip(observers, outcomes, strict=False):
-            arrays[f"shown{number}/observer/{name}"] = outcome.shown[number].astype(np.float32)
+            arrays[f"shown{number}/observer/{name}"] = _single(outcome.shown[number])
     for name, outcome in zip(models, outcomes[len(observers) :], strict=True):
         for number, _ in enumerate(shown_on):
-            arrays[f"shown{number}/model/{name}"] = outcome.shown[number].astype(np.float32)
+            arrays[f"shown{number}/model/{name}"] = _single(outcome.shown[number])
         arrays[f"spectrum/model/{name}"] = outcome.summary.spectra.mean(axis=0)
     conditions = sorted({k.condition for k in keys})
     for name, outcome in zip(observers, outcomes, strict=False):
@@ -203,3 +203,9 @@ def _arrays(
                 if chosen:
                     arrays[f"spectrum/{role}/{condition}/{name}"] = outcome.summary.spectra[chosen].mean(axis=0)
     return arrays
+
+
+def _single(values: Array) -> npt.NDArray[np.float32]:
+    """Halve what is stored; an estimate that diverged becomes infinite."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from ..core.artifacts import save_artifact
 from ..core.errors import DataError
 from .arrow import from_numpy, repeated
-from .checks import RestWatch, OnNan, check_structure, parse_on_nan, read_or_drop
+from .checks import OnNan, RestWatch, check_structure, parse_on_nan, read_or_drop
 from .folders import whole_folder
 from .population import EpisodeKey, Population
 from .readers.parquet import INDEX

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import matrix_balance
 
 from ..core.errors import SynthesisError
 from .generalized_plant import GeneralizedPlant
@@ -71,7 +72,8 @@ class Violation:
 
 
 def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
-    """Return the eigenvalues of A on or beyond the stability boundary that B does not reach (Hautus test)."""
+    """Return the eigenvalues of A on or beyond the stability boundary that B does not reach (Hautus test, in balanced units of the states)."""
+    A, B = _balanced(A, B)
     modes = np.linalg.eigvals(A) if A.size else np.zeros(0)
     outside = modes[np.abs(modes) >= 1 - 1e-12] if dt > 0 else modes[modes.real >= -1e-12 * (1 + np.abs(modes))]
     found = []
@@ -121,6 +123,16 @@ def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
         raise SynthesisError(f"{method} needs a regular generalized plant; violated: " + "; ".join(map(str, found)) + ".")
 
 
+def _balanced(A: Array, B: Array) -> tuple[Array, Array]:
+    """States in units that balance A, and inputs in units that make B as large as A: the test must not depend on anyone's units."""
+    if not A.size:
+        return A, B
+    A, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    B = B / scale[:, None]
+    sizes = np.linalg.norm(B, axis=0)
+    return A, B / np.where(sizes > 0, sizes, 1.0) * max(float(np.linalg.norm(A, 2)), 1e-300)
+
+
 def _rank(matrix: Array) -> int:
     values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.zeros(0)
     return int(np.sum(values > _RANK * max(values.max(initial=0.0), 1e-300)))
@@ -131,6 +143,8 @@ def _boundary_zeros(A: Array, B: Array, C: Array, D: Array, dt: float) -> list[c
     pinv = np.linalg.pinv(D)
     inner = A - B @ pinv @ C
     rest = C - D @ (pinv @ C)
+    inner, seen = _balanced(inner.T, rest.T)
+    inner, rest = inner.T, seen.T
     zeros = []
     for mode in np.linalg.eigvals(inner):
         distance = abs(abs(mode) - 1) if dt > 0 else abs(mode.real) / (1 + abs(mode))

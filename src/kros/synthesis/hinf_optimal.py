@@ -13,6 +13,7 @@ gamma : level;  K : controller;  P11, P12, P21 : frequency responses of the plan
 from __future__ import annotations
 
 import time
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -106,17 +107,18 @@ class _Search:
         search = cls(plant, frame, None, float("inf"), bound, 0.0)
         _, _, n_u, _, n_y = plant.sizes
         search = search.consider(gain(np.zeros((n_u, n_y)), plant.dt))
+        no_direct_gain = replace(plant, D11=np.zeros_like(plant.D11)) if plant.dt == 0 else plant
         try:
-            no_direct_gain = replace(plant, D11=np.zeros_like(plant.D11)) if plant.dt == 0 else plant
-            search = search.consider(h2(no_direct_gain).controller)
-        except SynthesisError:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", RuntimeWarning)
+                search = search.consider(h2(no_direct_gain).controller)
+        except (SynthesisError, RuntimeWarning):
             pass
-        return replace(search, scale=search.uncancelled())
+        return search._open()
 
     def uncancelled(self) -> float:
         """Size that the closed loop would have if nothing in it cancelled: a norm far below it is rounding."""
-        if self.K is None:
-            return 0.0
+        assert self.K is not None
         closed = self.plant.close(self.K)
         states = replace(closed, C=np.eye(closed.n_states), D=np.zeros((closed.n_states, closed.n_inputs)))
         size = float(np.linalg.norm(closed.C)) * hinf_norm(states, tol=0.1) if closed.n_states else 0.0
@@ -155,8 +157,7 @@ class _Search:
 
     def bisect(self, tolerance: float) -> _Search:
         """Narrow the bracket to the tolerance."""
-        search = self._open()
-        low, high = search.lower, search.norm
+        search, low, high = self, self.lower, self.norm
         floor = _NEGLIGIBLE * search.scale
         for _ in range(_MAX_STEPS):
             if high <= max(low * (1 + tolerance / 4), floor):
@@ -172,7 +173,7 @@ class _Search:
         search, gamma = self, 2 * max(self.lower, float(np.linalg.norm(self.plant.D11)), 1e-3)
         for _ in range(_MAX_STEPS):
             if np.isfinite(search.norm):
-                return search
+                return replace(search, scale=search.uncancelled())
             search, obstacle = search.level(gamma)
             gamma *= 4
         reason = obstacle.value if obstacle is not None else "no closed loop was stable"
@@ -213,7 +214,7 @@ def _result(search: _Search, injection: Injection, elapsed: float, tolerance: fl
         controller=K,
         status=Status.OPTIMAL if optimal else Status.CERTIFIED,
         injection=injection,
-        h2_norm=h2_norm(closed),
+        h2_norm=_h2_norm(closed),
         hinf_norm=norm,
         lower_bound=0.0 if vanishes else min(lower, norm),
         gap_percent=0.0 if vanishes else (100 * (norm / min(lower, norm) - 1) if lower > 0 else None),
@@ -221,6 +222,16 @@ def _result(search: _Search, injection: Injection, elapsed: float, tolerance: fl
         solve_s=elapsed,
         solver="riccati",
     )
+
+
+def _h2_norm(closed: StateSpace) -> float | None:
+    """H2 norm; None where poles are so close to the stability boundary that it has no digits."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        try:
+            return h2_norm(closed)
+        except RuntimeWarning:
+            return None
 
 
 def _frequency_bound(p: GeneralizedPlant) -> float:

@@ -69,7 +69,9 @@ def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> flo
     if np.abs(np.linalg.eigvals(closed)).max() >= 1:
         return float("inf")
     cost = Q + S @ F + F.T @ S.T + F.T @ R @ F
-    return float(np.linalg.norm(closed.T @ X @ closed + cost - X)) / max(float(np.linalg.norm(X)), 1e-300)
+    # A plant that can be inverted costs nothing, X = 0: what is left is measured against the terms that cancel.
+    size = max(float(np.linalg.norm(X)), float(np.linalg.norm(Q)), 1e-300)
+    return float(np.linalg.norm(closed.T @ X @ closed + cost - X)) / size
 
 
 def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, block_diagonal, gain
 from ..identify import ModelSet
-from ..observer import Observer, kalman_candidates, noise_covariances
-from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, worst_case_h2
+from ..observer import Observer, kalman_candidates, mean_error_dynamics, noise_covariances, one_step_residual, residual_spectra
+from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, residual_h2, worst_case_h2
 from ..uncertainty import fit_magnitude
 from .tuning import TuningSet, rank
 
@@ -160,6 +160,31 @@ def make_worst_case_h2(task: Task) -> Made:
     return replace(synthesis, lower_bound=lower, gap_percent=gap), surroundings.facts(), assumed
 
 
+def make_residual_h2(task: Task) -> Made:
+    """Kalman gains for the one-step residuals that the nominal's model leaves on the training episodes of all units."""
+    models, row = task.models, task.models.index(task.unit)
+    judge, lifting, n = task.tuning.read(), models.lifting, models.lifting.n_states
+    batch, values = judge.batch, judge.parameters if lifting.parameters else None
+    residual = one_step_residual(lifting, models.A[row], models.B[row], batch.states, batch.inputs, values)
+    spectra = residual_spectra(residual, batch.lengths - 1 - lifting.history, [key.unit for key in batch.keys])
+    synthesis = residual_h2(
+        mean_error_dynamics(lifting, models.A[row], batch.states, batch.inputs, values),
+        task.selector[:, :n],
+        spectra,
+        task.noise,
+        models.output_scale[:n],
+        models.sample_period_s,
+        n_lifted=lifting.n_lifted,
+    )
+    limit = judge.percent(task.observer(open_loop(task)[0]))
+    _, share = rank(judge.percent(task.observer(synthesis)), limit, models.measured)
+    if not np.isfinite(share):
+        raise SynthesisError(
+            "Residual-shaped observer: it diverges on the training episodes, where it is retracted and lifted at every step."
+        )
+    return synthesis, {"training_error_to_open_loop": share, "order_reduction_percent": synthesis.gap_percent}, task.problem
+
+
 def remembering(fit: Callable[..., Any]) -> Callable[..., Any]:
     """Return a fit that remembers: candidates that differ in noise alone share their shaping filters."""
     known: dict[Any, Any] = {}
@@ -217,6 +242,7 @@ def candidates(sample_period_s: float) -> list[Surroundings]:
 MAKERS: dict[str, Callable[[Task], Made]] = {
     "worst_case_h2": make_worst_case_h2,
     "mixed": make_mixed,
+    "residual_h2": make_residual_h2,
     "open_loop": open_loop,
     "kalman_white": kalman_white,
     "kalman_tuned": kalman_tuned,

@@ -18,9 +18,12 @@ if TYPE_CHECKING:
     from .mixed_optimal import mixed
     from .observer_problem import ObserverProblem
     from .result import Injection, Status, Synthesis
+    from .shaped import residual_h2
+    from .shaping import Bank, shaping_filter
     from .worst_case import worst_case_h2
 
 _HOME = {
+    "Bank": "shaping",
     "GeneralizedPlant": "generalized_plant",
     "Injection": "result",
     "ObserverProblem": "observer_problem",
@@ -31,10 +34,13 @@ _HOME = {
     "kalman": "constant_gain",
     "luenberger": "constant_gain",
     "mixed": "mixed_optimal",
+    "residual_h2": "shaped",
+    "shaping_filter": "shaping",
     "worst_case_h2": "worst_case",
 }
 
 __all__ = [
+    "Bank",
     "GeneralizedPlant",
     "Injection",
     "ObserverProblem",
@@ -45,6 +51,8 @@ __all__ = [
     "kalman",
     "luenberger",
     "mixed",
+    "residual_h2",
+    "shaping_filter",
     "worst_case_h2",
 ]
 

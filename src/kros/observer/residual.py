@@ -1,0 +1,125 @@
+r"""One-step residuals: what drives the error of an observer that retracts and lifts its state at every step.
+
+Let the nominal's one-step model be :math:`x^+ = f(x, u) = A_s x + a\,\sigma(x) + B_s u`, the first n rows of the lifted model. Along any recording
+
+.. math:: \omega_k = x_{k+1} - f(x_k, u_k)
+
+does not depend on the observer, and holds everything that the model does not know: the unit's own parameters, loads, the lifting's error.
+The deployed error obeys, exactly, ``e+ = (A_s + a delta_k) e - y^c + omega_k`` with ``delta_k`` between the slopes of the lifted functions.
+**Only the rows of the original states drive it**: the lifted functions are computed anew from the states at every step, so their rows of
+the model, and what these rows miss, never enter. The linear time-invariant stand-in for the error dynamics takes the mean of ``delta_k`` over
+the recordings. Where functions oscillate as the machine moves, as ``sin(100 position + phase)`` does, that mean is nearly zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError, DimensionError
+from ..lifting import Lifting
+
+Array = npt.NDArray[np.float64]
+SEGMENT = 4096
+_FEWEST = 64  # samples of a segment
+
+
+def one_step_residual(
+    lifting: Lifting, A: Array, B: Array, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
+) -> Array:
+    """Run the one-step model along recordings and return what it misses.
+
+    Parameters
+    ----------
+    lifting : Lifting
+    A : ndarray, shape (n_lifted, n_lifted)
+    B : ndarray, shape (n_lifted, m)
+    states : ndarray, shape (n_samples, batch, n)
+    inputs : ndarray, shape (n_samples, batch, m)
+        Recorded inputs.
+    parameters : mapping of str to array_like, shape (batch,)
+        Lifting parameters of the machine behind each episode.
+
+    Returns
+    -------
+    ndarray, shape (n_samples - 1 - history, batch, n)
+        Rows of the original states.
+    """
+    if states.ndim != 3 or inputs.ndim != 3 or states.shape[:2] != inputs.shape[:2]:
+        raise DimensionError(f"One-step residual: states {states.shape} and inputs {inputs.shape} should agree in (n_samples, batch).")
+    n, h = lifting.n_states, lifting.history
+    lifting.window.require(len(states), beyond=1)
+    x, u = np.swapaxes(states, 0, 1), np.swapaxes(inputs, 0, 1)
+    values = {name: np.asarray(value, dtype=float)[..., None] for name, value in (parameters or {}).items()}
+    window, u = lifting.windows(x, u)[:, :-1], u[:, h:-1]
+    predicted = lifting.lift(window, values) @ A[:n].T + lifting.lift_inputs(u, window, values) @ B[:n].T
+    return np.swapaxes(x[:, h + 1 :] - predicted, 0, 1)
+
+
+def mean_error_dynamics(
+    lifting: Lifting, A: Array, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
+) -> Array:
+    """Return the dynamics of the deployed error with the lifted functions' slopes at their mean over recordings, shape (n, n).
+
+    Parameters as in `one_step_residual`; slopes by earlier values, and of input functions, count as residual.
+    """
+    n = lifting.n_states
+    if not lifting.functions:
+        return A[:n, :n].copy()
+    values = {name: np.asarray(value, dtype=float)[..., None] for name, value in (parameters or {}).items()}
+    slopes = lifting.slopes(lifting.windows(np.swapaxes(states, 0, 1), np.swapaxes(inputs, 0, 1)), values)[..., :n]
+    return A[:n, :n] + A[:n, n:] @ slopes.mean(axis=(0, 1))
+
+
+def residual_spectra(residual: Array, lengths: npt.ArrayLike, units: Sequence[str], segment: int = SEGMENT) -> Array:
+    """Return every unit's cross spectral density of the residual by Welch's method; means are kept, since a bias is an error too.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n_samples, batch, n)
+    lengths : array_like of int, shape (batch,)
+        Samples of every episode that count.
+    units : sequence of str, length batch
+        The unit of every episode.
+    segment : int
+        Samples of a segment, Hann window, half overlapping; the shortest episode where it is shorter.
+
+    Returns
+    -------
+    ndarray, shape (unit, segment // 2 + 1, n, n), complex
+        From zero to Nyquist, units in order of appearance. The mean over the unit circle is the covariance.
+
+    Raises
+    ------
+    DataError
+        When an episode is shorter than 64 samples, or the residual is not finite.
+    """
+    lengths = np.asarray(lengths, dtype=int)
+    if residual.ndim != 3 or lengths.shape != (residual.shape[1],) or len(units) != residual.shape[1]:
+        raise DimensionError(
+            f"Residual spectra: {residual.shape} should be (n_samples, batch, n) with as many lengths ({lengths.shape}) and units ({len(units)})."
+        )
+    size = int(min(segment, lengths.min(), len(residual)))
+    if size < _FEWEST:
+        raise DataError(
+            f"Residual spectra: an episode of unit {units[int(lengths.argmin())]} has {size} samples, at least {_FEWEST} are needed; "
+            "leave short episodes out."
+        )
+    size -= size % 2
+    hann = np.sin(np.pi * np.arange(size) / size) ** 2
+    hann /= np.sqrt(size * np.mean(hann**2))
+    n = residual.shape[2]
+    total = np.zeros((residual.shape[1], size // 2 + 1, n, n), complex)
+    counts = np.zeros(residual.shape[1])
+    for start in range(0, len(residual) - size + 1, size // 2):
+        inside = np.flatnonzero(start + size <= lengths)
+        response = np.moveaxis(np.fft.rfft(residual[start : start + size, inside] * hann[:, None, None], axis=0), 0, 1)
+        total[inside] += response[..., :, None] * response[..., None, :].conj()
+        counts[inside] += 1
+    if not np.isfinite(total).all():
+        raise DataError("Residual spectra: the residual contains NaN or infinity; look at the recordings and the nominal model.")
+    names = list(dict.fromkeys(units))
+    member = np.array([[u == name for u in units] for name in names], dtype=float)
+    return np.asarray(np.einsum("ub,bfij->ufij", member / (member @ counts)[:, None], total))

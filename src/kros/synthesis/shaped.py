@@ -1,0 +1,244 @@
+r"""The residual-shaped observer: the Kalman predictor for disturbances with the spectrum that was measured.
+
+The error of an observer on any unit is driven by the one-step residual omega of the nominal model, which does not depend on the observer and
+can be measured on every unit. With a shaping filter ``omega = C_f zeta + D_f w``, ``zeta+ = A_f zeta + B_f w`` of the population's mean spectrum,
+
+    [ e    ]+   [ A   C_f ] [ e    ]   [ D_f ]       [ I ]
+    [ zeta ]  = [ 0   A_f ] [ zeta ] + [ B_f ] w  -  [ 0 ] y^c,      nu = C e + v,
+
+the error of least variance is left by the Kalman predictor's gains ``L = [L_e; L_zeta]``, which is a correction through the state of the
+order of the filter: ``zeta_hat+ = A_f zeta_hat + L_zeta nu``, ``y^c = C_f zeta_hat + L_e nu``. For the mean spectrum it minimises the mean square error over
+the units. The worst unit's error is minimised by a mixture of the units' spectra: for fixed weights the best observer minimises the weighted mean, which is
+concave in the weights, and its gradient is the units' errors.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DimensionError, SynthesisError
+from ..core.lti import StateSpace
+from ..core.norms import gramian, h2_norm
+from .constant_gain import kalman
+from .result import Injection, Status, Synthesis
+from .shaping import Bank, shaping_filter
+
+Array = npt.NDArray[np.float64]
+Spectra = npt.NDArray[Any]
+_ROUNDS = 30
+_STEP = 1.0
+_CLOSE = 1.02
+_NEGLIGIBLE = 1e-12
+
+
+def residual_h2(
+    A: npt.ArrayLike,
+    C: npt.ArrayLike,
+    spectra: Spectra,
+    noise: npt.ArrayLike,
+    scale: npt.ArrayLike,
+    dt: float,
+    bank: Bank | None = None,
+    tolerance_percent: float = 1.0,
+    worst_unit: bool = False,
+    n_lifted: int | None = None,
+) -> Synthesis:
+    """Return the correction filter that is optimal for the residuals of a population.
+
+    Parameters
+    ----------
+    A : array_like, shape (n, n)
+        Error dynamics of the original states (`kros.observer.mean_error_dynamics`).
+    C : array_like, shape (q, n)
+        Selects the measured states.
+    spectra : ndarray, shape (unit, f, n, n), complex
+        Cross spectral density of every unit's one-step residual (`kros.observer.residual_spectra`), physical units.
+    noise : array_like, shape (q,)
+        Standard deviation of the measurement noise.
+    scale : array_like, shape (n,)
+        Range of every state; norms are of errors in these units.
+    dt : float, s
+    bank : Bank, optional
+        Memory of the shaping filter; by default eight delays. A lag with a pole near one is a disturbance state, for loads.
+    tolerance_percent : float
+        What the reduction of the order from ``n * bank.size`` may cost in the norm; 0 keeps every state.
+    worst_unit : bool
+        Minimise the largest error of a unit in place of the mean.
+    n_lifted : int, optional
+        Rows of the correction; those of lifted functions are zero, since the functions are computed anew from the states.
+
+    Returns
+    -------
+    Synthesis
+        ``h2_norm`` is the root mean square of the scaled error under the full shaping filter and the noise, recomputed; ``lower_bound`` that of
+        the unreduced optimum, so that `gap_percent` is what the reduction of the order costs.
+
+    Raises
+    ------
+    SynthesisError
+        When the residual has no spectrum to shape, or the Riccati equation no solution.
+    """
+    A, C, noise, scale = (np.asarray(x, dtype=float) for x in (A, C, noise, scale))
+    n, q = len(A), len(C)
+    if (
+        A.shape != (n, n)
+        or C.shape != (q, n)
+        or noise.shape != (q,)
+        or scale.shape != (n,)
+        or spectra.ndim != 4
+        or spectra.shape[2:] != (n, n)
+    ):
+        raise DimensionError(
+            "Residual-shaped observer: needs A (n, n), C (q, n), spectra (unit, f, n, n), noise (q,), scale (n,), "
+            f"found {A.shape}, {C.shape}, {spectra.shape}, {noise.shape}, {scale.shape}."
+        )
+    start = time.perf_counter()
+    problem = _Problem(A / scale[:, None] * scale, C * scale, noise, spectra / np.outer(scale, scale), Bank() if bank is None else bank, dt)
+    weights, note = problem.worst_unit() if worst_unit else (np.full(len(spectra), 1 / len(spectra)), f"mean of {len(spectra)} units")
+    full = problem.filter(weights)
+    K = problem.correction(full)
+    best = problem.norm(full, K)
+    if not np.isfinite(best):
+        raise SynthesisError(
+            "Residual-shaped observer: the error of the optimal observer is not bounded; check the nominal model and what is measured."
+        )
+    K = problem.reduced(full, K, best * (1 + tolerance_percent / 100))
+    norm, radius = problem.norm(full, K), float(problem.error_system(K).spectral_radius())
+    note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
+    rows = np.zeros(((n_lifted or n) - n, q))
+    controller = StateSpace(
+        K.A,
+        K.B,
+        np.vstack([scale[:, None] * K.C, np.zeros((len(rows), K.n_states))]),
+        np.vstack([scale[:, None] * K.D, rows]),
+        dt,
+    )
+    return Synthesis(
+        method="residual_h2",
+        controller=controller,
+        status=Status.OPTIMAL if K.n_states == full.n_states else Status.CERTIFIED,
+        injection=Injection.STATE,
+        h2_norm=norm,
+        lower_bound=best,
+        gap_percent=100 * (norm / best - 1),
+        spectral_radius=radius,
+        solve_s=time.perf_counter() - start,
+        solver="riccati",
+        notes=(note,),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The problem in scaled coordinates."""
+
+    A: Array
+    C: Array
+    noise: Array
+    spectra: Spectra
+    bank: Bank
+    dt: float
+
+    def filter(self, weights: Array) -> StateSpace:
+        """Shaping filter of a mixture of the units' spectra."""
+        return shaping_filter(np.tensordot(weights, self.spectra, 1), self.bank, self.dt)
+
+    def correction(self, shaping: StateSpace) -> StateSpace:
+        """Kalman gains of plant and shaping filter as a correction filter."""
+        n = len(self.A)
+        A = np.block([[self.A, shaping.C], [np.zeros((shaping.n_states, n)), shaping.A]])
+        G = np.vstack([shaping.D, shaping.B])
+        C = np.hstack([self.C, np.zeros((len(self.C), shaping.n_states))])
+        L = kalman(A, C, G @ G.T, np.diag(self.noise**2), self.dt).controller.D
+        return StateSpace(shaping.A, L[n:], shaping.C, L[:n], self.dt)
+
+    def error_system(self, K: StateSpace) -> StateSpace:
+        """From (omega, white noise of unit variance) to the error e."""
+        n, root = len(self.A), np.diag(self.noise)
+        A = np.block([[self.A - K.D @ self.C, -K.C], [K.B @ self.C, K.A]])
+        B = np.block([[np.eye(n), -K.D @ root], [np.zeros((K.n_states, n)), K.B @ root]])
+        return StateSpace(A, B, np.eye(n, len(A)), np.zeros((n, B.shape[1])), self.dt)
+
+    def loop(self, shaping: StateSpace, K: StateSpace) -> StateSpace:
+        """From white noise of unit variance to the error, omega made by a shaping filter."""
+        error, n = self.error_system(K), len(self.A)
+        drive, rest = error.B[:, :n], error.B[:, n:]
+        A = np.block([[error.A, drive @ shaping.C], [np.zeros((shaping.n_states, error.n_states)), shaping.A]])
+        B = np.block([[drive @ shaping.D, rest], [shaping.B, np.zeros((shaping.n_states, rest.shape[1]))]])
+        return StateSpace(A, B, np.hstack([error.C, np.zeros((n, shaping.n_states))]), np.zeros((n, B.shape[1])), self.dt)
+
+    def norm(self, shaping: StateSpace, K: StateSpace) -> float:
+        """Root mean square of the scaled error."""
+        return h2_norm(self.loop(shaping, K))
+
+    def unit_errors(self, K: StateSpace) -> Array:
+        """Variance of every state's error on every unit, from the units' own spectra; shape (unit, n)."""
+        f, n = self.spectra.shape[1], len(self.A)
+        response = self.error_system(K).frequency_response(np.linspace(0, 0.5 / self.dt, f))
+        weight = np.full(f, 1.0 / (f - 1))
+        weight[[0, -1]] /= 2
+        drive, rest = response[..., :n], response[..., n:]
+        driven = np.einsum("f,fia,ufab,fib->ui", weight, drive, self.spectra, drive.conj(), optimize=True).real
+        return np.asarray(driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2))
+
+    def worst_unit(self) -> tuple[Array, str]:
+        """Weights of the units for which the largest error of a unit is smallest.
+
+        An error is the mean over the states that are not measured, each relative to its mean over the units under equal weights. The weights
+        grow by multiplication with the unit's error over the weighted mean, which is ascent on a concave function.
+        """
+        weights = np.full(len(self.spectra), 1 / len(self.spectra))
+        hidden = np.flatnonzero(~np.any(self.C, axis=0)) if not np.all(np.any(self.C, axis=0)) else np.arange(len(self.A))
+        reference, best, first = None, (np.inf, weights), np.inf
+        for _ in range(_ROUNDS):
+            errors = self.unit_errors(self.correction(self.filter(weights)))[:, hidden]
+            reference = errors.mean(axis=0) if reference is None else reference
+            cost = np.mean(errors / reference, axis=1)
+            first = min(first, cost.max()) if not np.isfinite(first) else first
+            best = min(best, (float(cost.max()), weights), key=lambda item: item[0])
+            mean = float(weights @ cost)
+            if cost.max() <= _CLOSE * mean:
+                break
+            weights = weights * (cost / mean) ** _STEP
+            weights = weights / weights.sum()
+        gain = 100 * (1 - np.sqrt(best[0] / first))
+        return best[1], f"worst of {len(self.spectra)} units, whose predicted error is {gain:.1f} % below that under equal weights"
+
+    def reduced(self, shaping: StateSpace, K: StateSpace, allowed: float) -> StateSpace:
+        """The correction filter of lowest order whose error under the full shaping filter is allowed.
+
+        Balanced truncation of the shaping filter, its output weighted by the error dynamics of the full observer (weighting one side alone
+        keeps it stable), and new gains at every order that bisection tries.
+        """
+        if not shaping.n_states or allowed <= self.norm(shaping, K):
+            return K
+        loop = self.loop(shaping, K)
+        variance = np.diag(loop.C @ gramian(loop.A, loop.B, self.dt) @ loop.C.T)
+        weighted = loop.C / np.sqrt(np.maximum(variance, np.finfo(float).tiny))[:, None]
+        P = gramian(shaping.A, shaping.B, self.dt)
+        Q = gramian(loop.A.T, weighted.T, self.dt)[-shaping.n_states :, -shaping.n_states :]
+        R, S = _root(P), _root(Q).T
+        U, h, Vh = np.linalg.svd(S @ R)
+        usable = int(np.sum(h > _NEGLIGIBLE * h[0]))
+        left, right = (U[:, :usable] / np.sqrt(h[:usable])).T @ S, R @ Vh[:usable].T / np.sqrt(h[:usable])
+        low, high = -1, usable + 1
+        while high - low > 1:
+            k = (low + high) // 2
+            trial = self.correction(
+                replace(shaping, A=left[:k] @ shaping.A @ right[:, :k], B=left[:k] @ shaping.B, C=shaping.C @ right[:, :k])
+            )
+            if self.norm(shaping, trial) <= allowed:
+                K, high = trial, k
+            else:
+                low = k
+        return K
+
+
+def _root(matrix: Array) -> Array:
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -190,5 +190,29 @@ def test_bad_input_is_refused() -> None:
     broken = StateSpace(units.A * np.array([1, np.nan, 1])[:, None, None], units.B, units.C, units.D, DT)
     with pytest.raises(DataError, match="unit 1 has NaN"):
         quantify(broken)
-    with pytest.raises(DataError, match="continuous"):
-        quantify(StateSpace(-np.abs(units.A), units.B, units.C, units.D, 0.0))
+    with pytest.raises(DataError, match="largest real part of a pole"):
+        quantify(StateSpace(np.abs(units.A), units.B, units.C, units.D, 0.0))
+
+
+def test_the_nominal_may_be_sought_by_other_criteria_and_among_models_that_are_no_units() -> None:
+    units, freqs = drives(5, 7), np.geomspace(1.0, 500.0, 30)
+    mean = StateSpace(units.A.mean(axis=0), units.B.mean(axis=0), np.eye(3), np.zeros((3, 2)), DT)
+    options = {"tolerance_db": 20.0, "density": 1, "max_order": 1}
+    peak = quantify(units, "additive", freqs, extra={"mean": mean}, **options)
+    alone = quantify(units, "additive", freqs, **options)
+    assert (peak.nominal, peak.nominal_id) == (-1, "mean")
+    assert peak.peak_db[Form.ADDITIVE] < alone.peak_db[Form.ADDITIVE]
+    assert peak.cover.left.shape == alone.cover.left.shape
+    for criterion in ("area", "cost"):
+        found = quantify(units, "additive", freqs, criterion=criterion, **options)
+        scores = []
+        for k in range(5):
+            model = quantify(units, "additive", freqs, nominal=k, **options)
+            log_bound = np.log(model.bounds[Form.ADDITIVE]) if criterion == "area" else model.cover.cost_db()
+            scores.append(np.average(log_bound, weights=np.gradient(np.log(freqs))))
+        assert found.nominal == np.argmin(scores)
+    assert quantify(units, "additive", freqs, extra={"mean": mean}, nominal="mean", **options).nominal_id == "mean"
+    with pytest.raises(ConfigError, match="name of a unit"):
+        quantify(units, "additive", freqs, extra={"0": mean}, **options)
+    with pytest.raises(DataError, match="candidate 'bad' is unstable"):
+        quantify(units, "additive", freqs, extra={"bad": StateSpace(2 * np.eye(3), mean.B, mean.C, mean.D, DT)}, **options)

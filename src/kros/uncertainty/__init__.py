@@ -7,7 +7,8 @@ from .model import UncertainModel, scale_system
 from .nominal import Criterion, NominalChoice, choose_nominal, choose_nominals
 from .outliers import OutlierModel, OutlierScore, score_outliers
 from .quantify import quantify
-from .residuals import all_bounds, bounds, misfit, sigma_max
+from .residuals import all_bounds, bounds, completion, misfit, sigma_max
+from .responses import ResponseUncertainty, quantify_responses
 from .weights import Weight, fit_weight
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "NominalChoice",
     "OutlierModel",
     "OutlierScore",
+    "ResponseUncertainty",
     "Side",
     "Structure",
     "UncertainModel",
@@ -26,6 +28,7 @@ __all__ = [
     "bounds",
     "choose_nominal",
     "choose_nominals",
+    "completion",
     "cover_ratio",
     "existence",
     "fit_magnitude",
@@ -35,6 +38,7 @@ __all__ = [
     "optimal_cover",
     "optimal_left",
     "quantify",
+    "quantify_responses",
     "rebuild",
     "residual",
     "residual_shape",

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,19 +12,16 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.frequency import check_grid, log_grid
 from ..core.lti import StateSpace
+from .bilinear import BilinearAxis, beyond, check_continuous_grid, continuous_grid
+from .bounded import Bounded, Responder, bound_residuals
 from .cover import Cover, Structure
-from .forms import Form, as_form, rebuild, residual
+from .forms import Form, as_form
 from .model import UncertainModel, scale_system
-from .nominal import choose_nominals
-from .residuals import misfit, sigma_max
-from .weights import Weight, fit_weight
+from .nominal import Criterion, NominalChoice, as_criterion, choose_nominal, choose_nominals
 
 Array = npt.NDArray[Any]
 
-_LOG = logging.getLogger(__name__)
-MISFIT = 0.01  # relative misfit beyond which an additive remainder joins the set
 POOLED = "pooled"
-_REMAINDER_TOLERANCE = 1.5  # the remainder is small: its weight may be looser by this factor
 
 
 def quantify(
@@ -38,6 +33,8 @@ def quantify(
     output_scale: npt.ArrayLike | None = None,
     input_scale: npt.ArrayLike | None = None,
     nominal: int | str | StateSpace | None = None,
+    criterion: Criterion | str = Criterion.PEAK,
+    extra: Mapping[str, StateSpace] | None = None,
     candidates: npt.ArrayLike | None = None,
     structure: Structure | str = Structure.DIAGONAL,
     max_order: int = 4,
@@ -49,17 +46,24 @@ def quantify(
     Parameters
     ----------
     models : StateSpace, sequence of StateSpace, or ModelSet
-        Stable discrete models, the unit axis first; at least two units. A model set brings its unit ids and scales.
+        Stable models, the unit axis first; at least two units. Models of fewer states than others get states that do nothing. A model set
+        brings its unit ids and scales. Continuous models (``dt = 0``) are quantified on the unit circle that the bilinear map makes of the
+        imaginary axis, and the weights mapped back to continuous time: what bounds there bounds here, exactly.
     form : Form or str
         Uncertainty form of the weights; the bounds of all six are reported.
     freqs_hz : array_like, shape (frequency,), Hz, optional
-        1000 logarithmic points over the six decades below Nyquist by default.
+        1000 logarithmic points over the six decades below Nyquist by default; of continuous models from a hundredth of the slowest to ten
+        times the fastest pole. To the grid of continuous models points up to ten times its end are added; beyond these, residuals count as constant.
     unit_ids : sequence of str, optional
         Names; ``0, 1, ...`` by default. Of a model set: the units to use.
     output_scale, input_scale : array_like, shape (p,) and (m,), optional
         Ranges of outputs and inputs over the population; residuals and weights are in these units. Ones by default.
     nominal : int, str or StateSpace, optional
-        Unit to use as nominal, or a model of its own; by default the unit with the lowest peak residual of this form.
+        Unit (or name in `extra`) to use as nominal, or a model of its own; by default the best by `criterion`.
+    criterion : {"peak", "area", "cost"}
+        What the nominal of this form makes small, see `choose_nominal`; those of the other forms have the lowest peaks.
+    extra : mapping of str to StateSpace, optional
+        Further candidates for the nominal by name, for example a pooled model; they are no units, and need not be covered.
     candidates : array_like of bool, shape (unit,), optional
         Units that may be nominal.
     structure : {"diagonal", "scalar"}
@@ -80,9 +84,9 @@ def quantify(
     DimensionError
         Sizes or sampling periods differ, or scales do not fit.
     DataError
-        Fewer than two units, unstable or continuous models, NaN.
+        Fewer than two units, unstable models, NaN.
     ConfigError
-        Unknown form or nominal, frequencies above Nyquist.
+        Unknown form, criterion or nominal, frequencies above Nyquist.
 
     Examples
     --------
@@ -95,89 +99,126 @@ def quantify(
     >>> model.nominal, model.cover_max <= 1
     (1, True)
     """
-    form = as_form(form)
+    form, criterion = as_form(form), as_criterion(criterion)
     system, ids, scales = _read_models(models, unit_ids, output_scale, input_scale)
-    freqs = log_grid(system.dt) if freqs_hz is None else check_grid(freqs_hz, system.dt)
+    others = _read_extra(extra, system, ids)
+    axis, freqs = _axis(system, freqs_hz)
     responses = scale_system(system, *scales).frequency_response(freqs)
-    choices = choose_nominals(responses, candidates=candidates)
-    index, nominal_system = _find_nominal(nominal, system, ids, choices[form].index)
-    population = _Residuals(form, scale_system(system, *scales), scale_system(nominal_system, *scales))
-    options: dict[str, Any] = {"structure": structure, "max_order": max_order, "tolerance_db": tolerance_db, "density": density}
-    weight, cover = fit_weight(population.of_form, freqs, system.dt, **options)
-    G = population.nominal.frequency_response(freqs)
-    E = residual(form, G, responses)
-    ratio = misfit(form, G, responses, E)
-    remainder, remainder_cover = _remainder(population, freqs, ratio, options)
-    bounds = {f: choice.bound for f, choice in choices.items()} | {form: sigma_max(E).max(axis=0)}
-    name = ids[index] if index >= 0 else POOLED
+    of_others = np.array([scale_system(s, *scales).frequency_response(freqs) for s in others.values()]).reshape(-1, *responses.shape[1:])
+    choices = choose_by(responses, form, criterion, of_others, candidates, freqs, structure)
+    names = (*ids, *others)
+    index, nominal_system = _find_nominal(nominal, system, ids, others, choices[form].index)
+    found = axis.bound(
+        form, scale_system(nominal_system, *scales), scale_system(system, *scales), structure, max_order, tolerance_db, density
+    )
+    name = names[index] if index >= 0 else POOLED
     return UncertainModel(
         form=form,
         unit_ids=ids,
-        nominal=index,
+        nominal=index if index < len(ids) else -1,
         nominal_id=name,
         nominal_system=nominal_system,
         freqs_hz=freqs,
         output_scale=scales[0],
         input_scale=scales[1],
-        bounds=bounds,
-        nominals={f: ids[choice.index] for f, choice in choices.items()} | {form: name},
-        cover=cover,
-        weight=weight,
-        misfit=ratio,
-        remainder=remainder,
-        remainder_cover=remainder_cover,
+        bounds={f: choice.bound for f, choice in choices.items()} | {form: found.bound},
+        nominals={f: names[choice.index] for f, choice in choices.items()} | {form: name},
+        cover=found.cover,
+        weight=found.weight,
+        misfit=found.misfit,
+        remainder=found.remainder,
+        remainder_cover=found.remainder_cover,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Residuals:
-    """Residuals of the scaled units at any frequency."""
-
-    form: Form
-    units: StateSpace
-    nominal: StateSpace
-
-    @cached_property
-    def _memory(self) -> dict[bytes, tuple[Array, Array]]:
-        return {}
-
-    def _responses(self, freqs_hz: Array) -> tuple[Array, Array]:
-        key = freqs_hz.tobytes()
-        if key not in self._memory:
-            self._memory[key] = self.nominal.frequency_response(freqs_hz), self.units.frequency_response(freqs_hz)
-        return self._memory[key]
-
-    def of_form(self, freqs_hz: Array) -> Array:
-        """Residuals of the form."""
-        return residual(self.form, *self._responses(freqs_hz))
-
-    def left_over(self, freqs_hz: Array) -> Array:
-        """What the form does not rebuild; NaN (a singular inverse) counts as the whole difference from the nominal."""
-        G, Gp = self._responses(freqs_hz)
-        rest = Gp - rebuild(self.form, G, residual(self.form, G, Gp))
-        return np.where(np.isfinite(rest).all(axis=(-2, -1), keepdims=True), rest, Gp - G)
+def choose_by(
+    responses: Array,
+    form: Form,
+    criterion: Criterion,
+    extra: Array,
+    candidates: npt.ArrayLike | None,
+    freqs_hz: Array,
+    structure: Structure | str,
+) -> dict[Form, NominalChoice]:
+    """Return the nominal of every form with the lowest peak, and of one form by a criterion."""
+    choices = choose_nominals(responses, extra=extra, candidates=candidates)
+    if criterion is not Criterion.PEAK:
+        options: dict[str, Any] = {"extra": extra, "candidates": candidates, "freqs_hz": freqs_hz, "structure": structure}
+        choices[form] = choose_nominal(responses, form, criterion, **options)
+    return choices
 
 
-def _remainder(population: _Residuals, freqs: Array, ratio: Array, options: dict[str, Any]) -> tuple[Weight | None, Cover | None]:
-    """Additive weight for the misfit, where it exceeds one percent."""
-    unknown = int(np.isnan(ratio).sum())
-    if unknown:
-        _LOG.warning(
-            "Uncertainty form %s: near singular (condition above 1e12) for %d of %d units and frequencies; the misfit is unknown there.",
-            population.form.value,
-            unknown,
-            ratio.size,
+@dataclass(frozen=True)
+class _Axis:
+    """Where weights are fitted: the unit circle of discrete models, or the one that a bilinear map makes of the imaginary axis."""
+
+    freqs_hz: Array
+    sample_period_s: float
+    map: BilinearAxis | None
+
+    def bound(
+        self,
+        form: Form,
+        nominal: StateSpace,
+        units: StateSpace,
+        structure: Structure | str,
+        max_order: int,
+        tolerance_db: float,
+        density: int,
+    ) -> Bounded:
+        """Return weights in the time of the models."""
+        options: dict[str, Any] = {"structure": structure, "max_order": max_order, "tolerance_db": tolerance_db, "density": density}
+        if self.map is None:
+            return bound_residuals(
+                form, nominal.frequency_response, units.frequency_response, self.freqs_hz, self.sample_period_s, **options
+            )
+        return bound_continuous(form, nominal.frequency_response, units.frequency_response, self.freqs_hz, self.map, **options)
+
+
+def bound_continuous(form: Form, nominal: Responder, units: Responder, freqs_hz: Array, axis: BilinearAxis, **options: Any) -> Bounded:
+    """Return continuous weights for responses at continuous frequencies, as `bound_residuals`."""
+    back, count = axis.continuous_hz, len(freqs_hz)
+    grid = np.concatenate([axis.discrete_hz(freqs_hz), axis.held()])
+    found = bound_residuals(form, lambda f: nominal(back(f)), lambda f: units(back(f)), grid, axis.period_s, **options)
+    return Bounded(
+        bound=found.bound[:count],
+        cover=Cover(found.cover.left[:count], found.cover.right[:count]),
+        weight=axis.continuous_weight(found.weight),
+        misfit=found.misfit[:, :count],
+        remainder=None if found.remainder is None else axis.continuous_weight(found.remainder),
+        remainder_cover=found.remainder_cover and Cover(found.remainder_cover.left[:count], found.remainder_cover.right[:count]),
+    )
+
+
+def _axis(system: StateSpace, freqs_hz: npt.ArrayLike | None) -> tuple[_Axis, Array]:
+    if system.dt > 0:
+        freqs = log_grid(system.dt) if freqs_hz is None else check_grid(freqs_hz, system.dt)
+        return _Axis(freqs, system.dt, None), freqs
+    freqs = continuous_grid(system) if freqs_hz is None else check_continuous_grid(freqs_hz)
+    wide = beyond(freqs)
+    return _Axis(wide, 0.0, BilinearAxis.over(wide)), wide
+
+
+def _read_extra(extra: Mapping[str, StateSpace] | None, system: StateSpace, ids: tuple[str, ...]) -> dict[str, StateSpace]:
+    """Further candidates, checked like units."""
+    others = dict(extra or {})
+    for name, candidate in others.items():
+        if name in ids:
+            raise ConfigError(f"Quantify: candidate {name!r} has the name of a unit; give it another.")
+        _check_candidate(candidate, system)
+        if not bool(np.all(candidate.is_stable())):
+            raise DataError(
+                f"Quantify: candidate {name!r} is unstable (spectral radius {float(candidate.spectral_radius()):.6f}); leave it out."
+            )
+    return others
+
+
+def _check_candidate(nominal: StateSpace, system: StateSpace) -> None:
+    if nominal.batch_shape or (nominal.n_outputs, nominal.n_inputs, nominal.dt) != (system.n_outputs, system.n_inputs, system.dt):
+        raise DimensionError(
+            f"Quantify: the nominal should be one system with {system.n_outputs} outputs, {system.n_inputs} inputs at {system.dt} s, found "
+            f"{nominal.n_outputs}, {nominal.n_inputs} at {nominal.dt} s in a batch of {nominal.batch_shape}."
         )
-    largest = np.nanmax(ratio) if unknown < ratio.size else np.inf
-    if largest <= MISFIT:
-        return None, None
-    _LOG.warning(
-        "Uncertainty form %s leaves out up to %.3g of a unit's response; an additive remainder joins the set. The additive form leaves nothing.",
-        population.form.value,
-        largest,
-    )
-    looser = options | {"tolerance_db": _REMAINDER_TOLERANCE * options["tolerance_db"]}
-    return fit_weight(population.left_over, freqs, population.nominal.dt, **looser)
 
 
 def _read_models(
@@ -197,11 +238,13 @@ def _read_models(
             f"Quantify: needs one id for each of {count} units, all different, found {len(ids)} ({', '.join(ids[:5])} ...)."
         )
     _check(system, ids)
-    return system, ids, (_scale("output", output_scale, system.n_outputs), _scale("input", input_scale, system.n_inputs))
+    return system, ids, (check_scale("output", output_scale, system.n_outputs), check_scale("input", input_scale, system.n_inputs))
 
 
 def stack_systems(models: Any) -> StateSpace:
-    """Return a batch from a batch, or from a sequence of systems with the same sizes and sampling period.
+    """Return a batch from a batch, or from a sequence of systems with the same outputs, inputs and sampling period.
+
+    Systems with fewer states than others get further ones that are stable and do nothing.
 
     Raises
     ------
@@ -210,11 +253,15 @@ def stack_systems(models: Any) -> StateSpace:
     """
     if not isinstance(models, StateSpace):
         systems = list(models)
-        found = {(s.n_states, s.n_outputs, s.n_inputs, s.dt) for s in systems}
+        found = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
         if len(found) != 1:
             raise DimensionError(
-                f"Quantify: units differ in (states, outputs, inputs, sampling period): {sorted(found)}; identify them alike."
+                f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(found)}; identify them alike."
+                if systems
+                else "Quantify: found no models; give at least two."
             )
+        n_states = max(s.n_states for s in systems)
+        systems = [_padded(s, n_states) for s in systems]
         A, B, C, D = (np.stack([getattr(s, x) for s in systems]) for x in "ABCD")
         models = StateSpace(A, B, C, D, systems[0].dt)
     if len(models.batch_shape) != 1:
@@ -224,13 +271,25 @@ def stack_systems(models: Any) -> StateSpace:
     return models
 
 
+def _padded(system: StateSpace, n_states: int) -> StateSpace:
+    """Add states without input and output: at rest after one sample, or decaying as fast as the system's slowest mode."""
+    more = n_states - system.n_states
+    if not more:
+        return system
+    slowest = np.abs(system.poles().real).min() if system.n_states else 1.0
+    A = np.zeros((n_states, n_states))
+    A[: system.n_states, : system.n_states] = system.A
+    if system.dt == 0:
+        A[system.n_states :, system.n_states :] = -max(slowest, 1e-300) * np.eye(more)
+    B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
+    return StateSpace(A, B, C, system.D, system.dt)
+
+
 def _check(system: StateSpace, ids: tuple[str, ...]) -> None:
     if len(ids) < 2:
         raise DataError(
             f"Quantify: uncertainty of a population needs at least two units, found {len(ids)} ({', '.join(ids)}); record more units."
         )
-    if system.dt <= 0:
-        raise DataError("Quantify: found continuous-time models; weights are fitted in discrete time, so sample the models first.")
     finite = np.ones(len(ids), bool)
     for name in "ABCD":
         finite &= np.broadcast_to(np.isfinite(getattr(system, name)).all(axis=(-2, -1)), (len(ids),))
@@ -241,34 +300,35 @@ def _check(system: StateSpace, ids: tuple[str, ...]) -> None:
     stable = np.broadcast_to(system.is_stable(), (len(ids),))
     if not stable.all():
         unit = int(np.argmin(stable))
-        radius = np.broadcast_to(system.spectral_radius(), (len(ids),))[unit]
+        poles = np.broadcast_to(system.poles(), (len(ids), system.n_states))[unit]
+        worst = f"spectral radius {np.abs(poles).max():.6f}" if system.dt > 0 else f"largest real part of a pole {poles.real.max():.6g}"
         raise DataError(
-            f"Quantify: the model of unit {ids[unit]} is unstable (spectral radius {radius:.6f}, {int((~stable).sum())} units in all); "
+            f"Quantify: the model of unit {ids[unit]} is unstable ({worst}, {int((~stable).sum())} units in all); "
             "identify with more regularisation or leave it out."
         )
 
 
-def _scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
+def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
+    """Return ranges as an array, ones by default, or say what is wrong with them."""
     scale = np.ones(size) if values is None else np.asarray(values, float)
     if scale.shape != (size,) or not (np.isfinite(scale) & (scale > 0)).all():
         raise DimensionError(f"Quantify: {side}_scale needs {size} positive ranges, found {np.array2string(scale, threshold=10)}.")
     return scale
 
 
-def _find_nominal(nominal: int | str | StateSpace | None, system: StateSpace, ids: tuple[str, ...], best: int) -> tuple[int, StateSpace]:
-    """Row of the nominal (-1 for a model of its own) and its system."""
+def _find_nominal(
+    nominal: int | str | StateSpace | None, system: StateSpace, ids: tuple[str, ...], others: Mapping[str, StateSpace], best: int
+) -> tuple[int, StateSpace]:
+    """Row of the nominal among units and candidates (-1 for a model of its own) and its system."""
     if isinstance(nominal, StateSpace):
-        if nominal.batch_shape or (nominal.n_outputs, nominal.n_inputs, nominal.dt) != (system.n_outputs, system.n_inputs, system.dt):
-            raise DimensionError(
-                f"Quantify: the nominal should be one system with {system.n_outputs} outputs, {system.n_inputs} inputs at {system.dt} s, found "
-                f"{nominal.n_outputs}, {nominal.n_inputs} at {nominal.dt} s in a batch of {nominal.batch_shape}."
-            )
+        _check_candidate(nominal, system)
         return -1, nominal
+    names = (*ids, *others)
     if isinstance(nominal, str):
-        if nominal not in ids:
-            raise ConfigError(f"Quantify: nominal {nominal!r} is not among the units {', '.join(ids[:10])}.")
-        nominal = ids.index(nominal)
+        if nominal not in names:
+            raise ConfigError(f"Quantify: nominal {nominal!r} is not among the units {', '.join(names[:10])}.")
+        nominal = names.index(nominal)
     index = best if nominal is None else int(nominal)
-    if not 0 <= index < len(ids):
-        raise ConfigError(f"Quantify: nominal {index} is out of range for {len(ids)} units.")
-    return index, system[index]
+    if not 0 <= index < len(names):
+        raise ConfigError(f"Quantify: nominal {index} is out of range for {len(names)} units.")
+    return index, system[index] if index < len(ids) else others[names[index]]

@@ -175,6 +175,30 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
     return ratio
 
 
+def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike) -> tuple[Array, Array]:
+    """Return residuals and the additive remainder that completes them: `Gp = rebuild(form, G, E) + R` for every unit and frequency.
+
+    Parameters
+    ----------
+    form : Form or str
+    nominal, responses : array_like, shape (..., p, m), complex
+        Leading axes broadcast.
+
+    Returns
+    -------
+    E : ndarray, shape (..., p', m')
+        As `residual`, but zero where the matrix that the form inverts has a condition number above 1e12.
+    R : ndarray, shape (..., p, m)
+        Zero but for rounding where the form is exact, and `Gp - G` where E was set to zero.
+    """
+    form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
+    E = residual(form, G, Gp)
+    if form.value.startswith("inverse"):
+        regular = np.linalg.cond(inverted_matrix(form, G, E)) <= MAX_CONDITION
+        E = np.where(regular[..., None, None], E, 0.0)
+    return E, Gp - rebuild(form, G, E)
+
+
 def check_responses(responses: npt.ArrayLike) -> Array:
     """Return responses as an array, or say which axes are missing."""
     G = np.asarray(responses)

@@ -1,0 +1,117 @@
+r"""The imaginary axis as a unit circle: continuous weights by a discrete fit, without approximation.
+
+    s = (2 / T) (z - 1) / (z + 1)        j 2 pi f = j (2 / T) tan(theta / 2),   theta = 2 pi f_d T
+
+maps the unit circle onto the imaginary axis one to one, Nyquist to infinity, and stable minimum-phase systems to stable minimum-phase systems of the
+same order. A magnitude that bounds residuals at the mapped frequencies f_d bounds them at f: nothing is sampled. The period T is that of the map and
+of nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError
+from ..core.lti import StateSpace
+from .weights import Weight
+
+Array = npt.NDArray[Any]
+
+_BEYOND = 10.0  # how far above the last frequency the grid goes on, for systems
+_HELD = 30.0  # how far above the last frequency the weight is held above the residuals at the end of the grid
+_POINTS_BEYOND = 16
+_DEFAULT_POINTS = 1000
+
+
+@dataclass(frozen=True)
+class BilinearAxis:
+    """Map between a continuous and a discrete frequency axis.
+
+    Parameters
+    ----------
+    period_s : float, s
+        Period T of the map.
+    last_hz : float, Hz
+        End of the grid, from which on residuals count as constant, infinity included: numerically a strictly proper plant has no
+        pseudo-inverse there, and an additive residual vanishes faster than a weight with a stable inverse may.
+    """
+
+    period_s: float
+    last_hz: float
+
+    @classmethod
+    def over(cls, freqs_hz: Array) -> BilinearAxis:
+        """Return the map for a grid, to whose end it gives tau = 10, the highest knot of the fit."""
+        top = float(freqs_hz[-1])
+        return cls(float(np.sqrt(10.0)) / (np.pi * top), top)
+
+    def discrete_hz(self, freqs_hz: npt.ArrayLike) -> Array:
+        """Return the frequencies on the discrete axis."""
+        return np.asarray(np.arctan(np.pi * self.period_s * np.asarray(freqs_hz, float)) / (np.pi * self.period_s))
+
+    def continuous_hz(self, freqs_hz: npt.ArrayLike) -> Array:
+        """Return the frequencies on the continuous axis, at most `last_hz`."""
+        angle = np.pi * self.period_s * np.asarray(freqs_hz, float)
+        return np.asarray(np.minimum(np.tan(np.minimum(angle, np.pi / 2)) / (np.pi * self.period_s), self.last_hz))
+
+    def held(self) -> Array:
+        """Return discrete frequencies beyond the end of the grid."""
+        return self.discrete_hz(np.geomspace(self.last_hz, _HELD * self.last_hz, _POINTS_BEYOND)[1:])
+
+    def continuous(self, system: StateSpace) -> StateSpace:
+        """Return the continuous system with the same response at mapped frequencies."""
+        n = system.n_states
+        inverse = np.linalg.inv(system.A + np.eye(n))
+        scale = 2 / np.sqrt(self.period_s)
+        return StateSpace(
+            2 / self.period_s * (inverse @ (system.A - np.eye(n))),
+            scale * (inverse @ system.B),
+            scale * (system.C @ inverse),
+            system.D - system.C @ inverse @ system.B,
+            0.0,
+        )
+
+    def continuous_weight(self, weight: Weight) -> Weight:
+        """Return a weight with both sides continuous."""
+        return replace(weight, left=self.continuous(weight.left), right=self.continuous(weight.right))
+
+
+def beyond(freqs_hz: Array) -> Array:
+    """Return the frequencies, and more of them up to ten times the last."""
+    top = freqs_hz[-1]
+    return np.concatenate([freqs_hz, np.geomspace(top, _BEYOND * top, _POINTS_BEYOND)[1:]])
+
+
+def check_continuous_grid(freqs_hz: npt.ArrayLike) -> Array:
+    """Return the frequencies as an array, or say why they are no grid.
+
+    Raises
+    ------
+    ConfigError
+        When they are not finite, not increasing or negative.
+    """
+    freqs = np.atleast_1d(np.asarray(freqs_hz, float))
+    if freqs.ndim != 1 or not freqs.size or not np.isfinite(freqs).all() or freqs[0] < 0 or np.any(np.diff(freqs) <= 0) or freqs[-1] == 0:
+        raise ConfigError(
+            f"Frequency grid: needs finite frequencies in Hz that increase from zero or above, found {freqs.ravel()[:5]} ...; sort them and drop doubles."
+        )
+    return freqs
+
+
+def continuous_grid(system: StateSpace) -> Array:
+    """Return 1000 logarithmic points from a hundredth of the slowest to ten times the fastest pole, Hz.
+
+    Raises
+    ------
+    ConfigError
+        When there are no poles.
+    """
+    sizes = np.abs(system.poles()) / (2 * np.pi)
+    sizes = sizes[sizes > 0]
+    if not sizes.size:
+        raise ConfigError("Frequency grid: static continuous models have no band of their own; give freqs_hz.")
+    return np.geomspace(sizes.min() / 100, sizes.max() * 10, _DEFAULT_POINTS)

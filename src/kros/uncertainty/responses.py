@@ -1,0 +1,233 @@
+"""Uncertainty from frequency responses alone: no state space is needed, and nothing is claimed between or beyond the frequencies given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError, DataError, DimensionError
+from ..core.frequency import check_grid
+from .bilinear import BilinearAxis, check_continuous_grid
+from .bounded import bound_residuals
+from .cover import Cover, Structure
+from .forms import Form, as_form
+from .nominal import Criterion, as_criterion
+from .quantify import POOLED, bound_continuous, check_scale, choose_by
+from .residuals import check_responses
+from .weights import Weight
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseUncertainty:
+    """Weights that bound how measured frequency responses differ from a nominal one, at the frequencies given and nowhere else.
+
+    Parameters
+    ----------
+    form : Form
+    unit_ids : tuple of str
+    nominal : int
+        Row of the nominal unit; -1 when the nominal is none of the units.
+    nominal_id : str
+    nominal_response : ndarray, shape (frequency, p, m), complex
+        In physical units.
+    freqs_hz : ndarray, shape (frequency,), Hz
+    sample_period_s : float, s
+        Zero for continuous time.
+    output_scale : ndarray, shape (p,)
+    input_scale : ndarray, shape (m,)
+    bounds : dict of Form to ndarray, shape (frequency,)
+    nominals : dict of Form to str
+    cover : Cover
+    weight : Weight
+        Its `cover_max` is over `freqs_hz`.
+    misfit : ndarray, shape (unit, frequency)
+    remainder : Weight or None
+    remainder_cover : Cover or None
+    certificate : str
+        Where the bound holds.
+    """
+
+    form: Form
+    unit_ids: tuple[str, ...]
+    nominal: int
+    nominal_id: str
+    nominal_response: Array
+    freqs_hz: Array
+    sample_period_s: float
+    output_scale: Array
+    input_scale: Array
+    bounds: dict[Form, Array]
+    nominals: dict[Form, str]
+    cover: Cover
+    weight: Weight
+    misfit: Array
+    remainder: Weight | None
+    remainder_cover: Cover | None
+    certificate: str
+
+
+def quantify_responses(
+    responses: npt.ArrayLike,
+    freqs_hz: npt.ArrayLike,
+    form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE,
+    *,
+    sample_period_s: float = 0.0,
+    unit_ids: Sequence[str] | None = None,
+    output_scale: npt.ArrayLike | None = None,
+    input_scale: npt.ArrayLike | None = None,
+    nominal: int | str | npt.ArrayLike | None = None,
+    criterion: Criterion | str = Criterion.PEAK,
+    extra: Mapping[str, npt.ArrayLike] | None = None,
+    candidates: npt.ArrayLike | None = None,
+    structure: Structure | str = Structure.DIAGONAL,
+    max_order: int = 4,
+    tolerance_db: float = 1.0,
+) -> ResponseUncertainty:
+    """Quantify how frequency responses of units differ from a nominal one.
+
+    The weights are stable systems and bound the residuals at every frequency given, which is checked for the weights as returned. Between and beyond
+    these frequencies the responses are not known, and nothing is claimed: take a grid that resolves every resonance.
+
+    Parameters
+    ----------
+    responses : array_like, shape (unit, frequency, p, m), complex
+    freqs_hz : array_like, shape (frequency,), Hz
+    form : Form or str
+    sample_period_s : float, s
+        Of the systems behind the responses, and of the weights; zero for continuous time, in which weights are fitted through the bilinear map of the axis.
+    unit_ids : sequence of str, optional
+    output_scale, input_scale : array_like, shape (p,) and (m,), optional
+        Ranges; residuals and weights are in these units.
+    nominal : int, str or array_like of shape (frequency, p, m), optional
+        A unit, the name of a candidate, or a response of its own; by default the best by `criterion`.
+    criterion : {"peak", "area", "cost"}
+        See `choose_nominal`.
+    extra : mapping of str to array_like, shape (frequency, p, m), optional
+        Further candidates for the nominal by name.
+    candidates : array_like of bool, shape (unit,), optional
+        Units that may be nominal.
+    structure : {"diagonal", "scalar"}
+    max_order : int
+    tolerance_db : float, dB
+
+    Returns
+    -------
+    ResponseUncertainty
+
+    Raises
+    ------
+    DimensionError
+        Shapes that do not fit together.
+    DataError
+        Fewer than two units, NaN.
+    ConfigError
+        Frequencies that do not increase or are above Nyquist; unknown form, criterion or nominal.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import quantify_responses
+    >>> freqs = np.geomspace(0.01, 100.0, 50)
+    >>> gains = np.array([0.9, 1.0, 1.2])
+    >>> lags = gains[:, None] / (1 + 2j * np.pi * freqs)
+    >>> found = quantify_responses(lags[:, :, None, None], freqs, "output_multiplicative")
+    >>> found.nominal, found.weight.cover_max <= 1
+    (1, True)
+    >>> round(float(abs(found.weight.left.frequency_response([1.0])[0, 0, 0])), 6)
+    0.2
+    """
+    form, criterion = as_form(form), as_criterion(criterion)
+    G = check_responses(responses)
+    freqs = check_grid(freqs_hz, sample_period_s) if sample_period_s > 0 else check_continuous_grid(freqs_hz)
+    ids = tuple(str(k) for k in range(len(G))) if unit_ids is None else tuple(unit_ids)
+    others = {name: np.asarray(value) for name, value in (extra or {}).items()}
+    _check(G, freqs, ids, others)
+    scales = check_scale("output", output_scale, G.shape[2]), check_scale("input", input_scale, G.shape[3])
+    scaled = G / scales[0][:, None] * scales[1]
+    extras = np.array([value / scales[0][:, None] * scales[1] for value in others.values()]).reshape(-1, *G.shape[1:])
+    choices = choose_by(scaled, form, criterion, extras, candidates, freqs, structure)
+    names = (*ids, *others)
+    index, chosen = _nominal(nominal, G, others, names, choices[form].index)
+    base = chosen / scales[0][:, None] * scales[1]
+    options: dict[str, Any] = {"structure": structure, "max_order": max_order, "tolerance_db": tolerance_db, "density": 1}
+
+    def of_nominal(at_hz: Array) -> Array:
+        return base[nearest(freqs, at_hz)]
+
+    def of_units(at_hz: Array) -> Array:
+        return scaled[:, nearest(freqs, at_hz)]
+
+    if sample_period_s > 0:
+        found = bound_residuals(form, of_nominal, of_units, freqs, sample_period_s, **options)
+    else:
+        found = bound_continuous(form, of_nominal, of_units, freqs, BilinearAxis.over(freqs), **options)
+    name = names[index] if index >= 0 else POOLED
+    return ResponseUncertainty(
+        form=form,
+        unit_ids=ids,
+        nominal=index if index < len(ids) else -1,
+        nominal_id=name,
+        nominal_response=chosen,
+        freqs_hz=freqs,
+        sample_period_s=float(sample_period_s),
+        output_scale=scales[0],
+        input_scale=scales[1],
+        bounds={f: choice.bound for f, choice in choices.items()} | {form: found.bound},
+        nominals={f: names[choice.index] for f, choice in choices.items()} | {form: name},
+        cover=found.cover,
+        weight=found.weight,
+        misfit=found.misfit,
+        remainder=found.remainder,
+        remainder_cover=found.remainder_cover,
+        certificate=f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them",
+    )
+
+
+def nearest(grid: Array, freqs_hz: Array) -> npt.NDArray[np.intp]:
+    """Return the index of the nearest grid point: the responses elsewhere are not known, and the ends stand for what is beyond them."""
+    if len(grid) == 1:
+        return np.zeros(len(freqs_hz), np.intp)
+    return np.asarray(np.searchsorted((grid[1:] + grid[:-1]) / 2, freqs_hz))
+
+
+def _check(G: Array, freqs: Array, ids: tuple[str, ...], others: Mapping[str, Array]) -> None:
+    if G.shape[1] != len(freqs):
+        raise DimensionError(f"Quantify: responses at {G.shape[1]} frequencies need as many in freqs_hz, found {len(freqs)}.")
+    if len(ids) != len(G) or len(set(ids)) != len(G):
+        raise DimensionError(
+            f"Quantify: needs one id for each of {len(G)} units, all different, found {len(ids)} ({', '.join(ids[:5])} ...)."
+        )
+    if len(G) < 2:
+        raise DataError(f"Quantify: uncertainty of a population needs at least two units, found {len(G)}; record more units.")
+    for name, value in [*zip(ids, G, strict=True), *others.items()]:
+        if value.shape != G.shape[1:]:
+            raise DimensionError(f"Quantify: candidate {name!r} should have the shape {G.shape[1:]}, found {value.shape}.")
+        if not np.isfinite(value).all():
+            at = freqs[int(np.argmin(np.isfinite(value).all(axis=(1, 2))))]
+            raise DataError(f"Quantify: the response of {name!r} has NaN or infinity at {at:.6g} Hz; leave it or the frequency out.")
+    double = set(ids) & set(others)
+    if double:
+        raise ConfigError(f"Quantify: candidates {sorted(double)} have names of units; give them others.")
+
+
+def _nominal(nominal: Any, G: Array, others: Mapping[str, Array], names: tuple[str, ...], best: int) -> tuple[int, Array]:
+    """Row of the nominal among units and candidates, -1 for a response of its own, and its response."""
+    if nominal is not None and not isinstance(nominal, str) and np.ndim(nominal) > 0:
+        response = np.asarray(nominal)
+        if response.shape != G.shape[1:]:
+            raise DimensionError(f"Quantify: the nominal's response should have the shape {G.shape[1:]}, found {response.shape}.")
+        return -1, response
+    if isinstance(nominal, str):
+        if nominal not in names:
+            raise ConfigError(f"Quantify: nominal {nominal!r} is not among {', '.join(names[:10])}.")
+        nominal = names.index(nominal)
+    index = best if nominal is None else int(nominal)
+    if not 0 <= index < len(names):
+        raise ConfigError(f"Quantify: nominal {index} is out of range for {len(names)} candidates.")
+    return index, G[index] if index < len(G) else others[names[index]]

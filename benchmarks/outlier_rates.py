@@ -49,8 +49,12 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=["koopman"], choices=["koopman", "linear"])
     parser.add_argument("--cache", type=Path, default=Path("outlier_rates"))
     options = parser.parse_args()
-    print("| models | form | condition | nominal rate | false alarms, 12 good | false alarms, 12 good + 1 bad | " + header() + " |")
-    print("|---|---|---|---|---|---|" + "---|" * len(SEVERITIES))
+    print(
+        "| models | form | condition | nominal rate | false alarms, 12 good | populations with one | false alarms beside a planted drive | "
+        + header()
+        + " |"
+    )
+    print("|---|---|---|---|---|---|---|---|" + "---|" * len(SEVERITIES))
     factors = [factors_of(seed, options) for seed in range(*options.seeds)]
     for kind in options.kinds:
         for condition in CONDITIONS:
@@ -65,21 +69,21 @@ def main() -> None:
 
 def header() -> str:
     """Return the columns of the severities."""
-    return " | ".join(f"detected, severity {s:g}" for s in SEVERITIES)
+    return (
+        " | ".join(f"detected, severity {s:g}" for s in SEVERITIES)
+        + " | nominals that agree, severity "
+        + ", ".join(f"{s:g}" for s in SEVERITIES)
+    )
 
 
 def count(populations: list[dict[float, tuple[Array, Array, Array]]], form: str, rate: float) -> list[str]:
-    """Return false alarms without and with a planted drive, then detections at every severity."""
-    good = [flags(p[0.0], form, rate) for p in populations]
-    bad = {s: [flags(p[s], form, rate) for p in populations] for s in SEVERITIES}
-    alarms = np.array(good)
-    beside = np.array([f[:-1] for s in SEVERITIES for f in bad[s]])
-    return [share(alarms), share(beside)] + [share(np.array([f[-1] for f in bad[s]])) for s in SEVERITIES]
-
-
-def flags(population: tuple[Array, Array, Array], form: str, rate: float) -> list[bool]:
-    """Return which units are flagged."""
-    return [s.outlier for s in scored(population, form, rate).scores]
+    """Return false alarms without and with a planted drive, detections at every severity, and the median share of agreeing nominals."""
+    good = np.array([[s.outlier for s in scored(p[0.0], form, rate).scores] for p in populations])
+    bad = {s: [scored(p[s], form, rate).scores for p in populations] for s in SEVERITIES}
+    beside = np.array([[s.outlier for s in scores[:-1]] for s in SEVERITIES for scores in bad[s]])
+    detected = [share(np.array([scores[-1].outlier for scores in bad[s]])) for s in SEVERITIES]
+    agreement = [f"{100 * np.median([scores[-1].agreement for scores in bad[s]]):.0f} %" for s in SEVERITIES]
+    return [share(good), share(good.any(axis=1)), share(beside), *detected, ", ".join(agreement)]
 
 
 def scored(population: tuple[Array, Array, Array], form: str, rate: float) -> OutlierModel:

@@ -65,6 +65,32 @@ def test_order_of_units_and_units_of_measure_do_not_matter() -> None:
     np.testing.assert_allclose([s.score_db for s in scaled.scores], reference, atol=1e-6)
 
 
+@pytest.mark.parametrize("form", list(Form))
+def test_without_ranges_units_of_measure_do_not_matter_either(form: Form) -> None:
+    G = responses(6, 8)
+    plain = score_outliers(G, FREQS, form)
+    changed = score_outliers(G * np.array([1e3, 1e-2, 5.0])[:, None] / np.array([30.0, 0.1]), FREQS, form)
+    np.testing.assert_allclose([s.score_db for s in changed.scores], [s.score_db for s in plain.scores], atol=1e-6)
+    assert [s.entry for s in changed.scores] == [s.entry for s in plain.scores]
+
+
+def test_one_threshold_serves_all_units() -> None:
+    model = score_outliers(responses(13, 1, outlier=True), FREQS)
+    assert {s.threshold_db for s in model.scores} == {model.threshold_db}
+    assert all(s.outlier == (s.score_db > s.threshold_db) for s in model.scores)
+    assert all(s.lowest_db <= s.highest_db and 0 <= s.agreement <= 1 for s in model.scores)
+    assert model.by_nominal_db.shape == (13, 13)
+    assert model.nominal_ids == tuple(str(k) for k in range(13))
+    assert all(s.score_db == pytest.approx(s.excess_db) for s in model.scores if not s.outlier)
+
+
+def test_many_units_are_scored_against_some_nominals() -> None:
+    model = score_outliers(responses(90, 2)[:, ::5], FREQS[::5])
+    assert len(model.nominal_ids) == 64
+    assert len(model.scores) == 90
+    assert sum(s.outlier for s in model.scores) <= 3
+
+
 def test_new_units_are_scored_against_a_stored_population(tmp_path: Path) -> None:
     G = responses(13, 4, outlier=True)
     out = np.array([1.0, 5.0, 2.0])
@@ -93,6 +119,22 @@ def test_identical_units_score_zero() -> None:
     model = score_outliers(G, FREQS)
     assert [s.score_db for s in model.scores] == [0.0] * 5
     assert not any(s.outlier for s in model.scores)
+    rounded = score_outliers(G * (1 + 1e-14 * np.arange(5.0)[:, None, None, None]), FREQS)
+    assert [s.score_db for s in rounded.scores] == [0.0] * 5
+
+
+def test_one_unit_beside_identical_ones_is_flagged() -> None:
+    G = np.repeat(responses(1, 6), 6, axis=0)
+    G[4] *= 1.01
+    model = score_outliers(G, FREQS)
+    assert [s.outlier for s in model.scores] == [False] * 4 + [True, False]
+    assert np.isfinite(model.scores[4].score_db)
+
+
+def test_equal_scores_are_no_outliers() -> None:
+    """Pairs of equal units: the scores tie, nothing fails and nothing is flagged."""
+    model = score_outliers(np.repeat(responses(4, 9), 2, axis=0), FREQS)
+    assert not any(s.outlier for s in model.scores)
 
 
 def test_bad_input_is_refused() -> None:
@@ -105,3 +147,16 @@ def test_bad_input_is_refused() -> None:
         score_outliers(G, FREQS, false_alarm_rate=2.0)
     with pytest.raises(DimensionError, match="unit, frequency"):
         score_outliers(G[0], FREQS)
+    with pytest.raises(DimensionError, match="unit c has a response of shape"):
+        score_outliers([G[0], G[1], G[2, :, :2]], FREQS, unit_ids=("a", "b", "c"))
+    with pytest.raises(DimensionError, match="positive numbers"):
+        score_outliers(G, FREQS, output_scale=[1.0, 0.0, 1.0])
+    with pytest.raises(ConfigError, match="form"):
+        score_outliers(G, FREQS, "sideways")
+    broken = G.copy()
+    broken[2, 10, 1, 0] = np.nan
+    with pytest.raises(DataError, match=r"unit 2 is .*nan.* entry \(1, 0\)"):
+        score_outliers(broken, FREQS)
+    model = score_outliers(G, FREQS)
+    with pytest.raises(DataError, match="unit new"):
+        model.score("new", np.full_like(model.responses[0], np.nan))

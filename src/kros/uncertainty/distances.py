@@ -22,7 +22,7 @@ Array = npt.NDArray[Any]
 MOST_NOMINALS = 64
 _SMOOTHING_DECADES = 1.0 / 3.0
 _SINKHORN = 50
-_SMALLEST = 1e-12  # relative to the largest typical entry
+_SMALLEST = 1e-12  # relative to the largest typical entry of row and column
 _EQUAL = 1e-12  # responses that differ by less, relative to the larger, are the same
 _LEAST = 1e-10  # distance of responses that are the same, relative to the typical one
 _AT_ONCE = 4_000_000  # complex numbers of residuals in memory
@@ -92,14 +92,14 @@ def typical(squares: Array) -> tuple[Array, Array]:
     -------
     tuple of ndarray, shape (frequency, p') and (frequency, m')
     """
-    top = squares.max(axis=(1, 2), keepdims=True)
-    top = np.where(top > 0, top, 1.0)
-    weights = np.maximum(squares / top, _SMALLEST)
+    row = _positive(squares.max(axis=2, keepdims=True))
+    column = _positive((squares / row).max(axis=1, keepdims=True))
+    weights = np.maximum(squares / row / column, _SMALLEST)
     left, right = np.ones(weights.shape[:2]), np.ones((weights.shape[0], weights.shape[2]))
     for _ in range(_SINKHORN):
         left = (weights / right[:, None, :]).sum(axis=2)
         right = (weights / left[:, :, None]).sum(axis=1)
-    return np.sqrt(left) * np.sqrt(top)[:, 0], np.sqrt(right)
+    return np.sqrt(left * row[:, :, 0]), np.sqrt(right * column[:, 0])
 
 
 def balance(responses: Array) -> tuple[Array, Array]:
@@ -122,6 +122,10 @@ def _same(G: Array, nominals: Array) -> npt.NDArray[np.bool_]:
     """Tell where nominal and unit are equal but for rounding, shape (nominal, unit, frequency)."""
     size = np.abs(G).max(axis=(2, 3))
     return np.stack([np.abs(G - G[k]).max(axis=(2, 3)) <= _EQUAL * np.maximum(size, size[k]) for k in nominals])
+
+
+def _positive(values: Array) -> Array:
+    return np.where(values > 0, values, 1.0)
 
 
 def _middle(squares: Array) -> Array:

@@ -26,12 +26,11 @@ from ..core.lti import StateSpace
 from ..core.norms import gramian, h2_norm
 from .constant_gain import kalman
 from .result import Injection, Status, Synthesis
-from .shaping import Bank, shaping_filter
+from .shaping import Bank, circle_weights, shaping_filter
 
 Array = npt.NDArray[np.float64]
 Spectra = npt.NDArray[Any]
 _ROUNDS = 30
-_STEP = 1.0
 _CLOSE = 1.02
 _NEGLIGIBLE = 1e-12
 
@@ -66,7 +65,8 @@ def residual_h2(
     bank : Bank, optional
         Memory of the shaping filter; by default eight delays. A lag with a pole near one is a disturbance state, for loads.
     tolerance_percent : float
-        What the reduction of the order from ``n * bank.size`` may cost in the norm; 0 keeps every state.
+        What the reduction of the order from ``n * bank.size`` may cost in the RMS error of any state that is not measured; 0 keeps every
+        state of the filter.
     worst_unit : bool
         Minimise the largest error of a unit in place of the mean.
     n_lifted : int, optional
@@ -107,7 +107,7 @@ def residual_h2(
         raise SynthesisError(
             "Residual-shaped observer: the error of the optimal observer is not bounded; check the nominal model and what is measured."
         )
-    K = problem.reduced(full, K, best * (1 + tolerance_percent / 100))
+    K = problem.reduced(full, K, tolerance_percent)
     norm, radius = problem.norm(full, K), float(problem.error_system(K).spectral_radius())
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
     rows = np.zeros(((n_lifted or n) - n, q))
@@ -172,6 +172,19 @@ class _Problem:
         B = np.block([[drive @ shaping.D, rest], [shaping.B, np.zeros((shaping.n_states, rest.shape[1]))]])
         return StateSpace(A, B, np.hstack([error.C, np.zeros((n, shaping.n_states))]), np.zeros((n, B.shape[1])), self.dt)
 
+    @property
+    def hidden(self) -> npt.NDArray[np.intp]:
+        """States that are not measured; all where none is hidden."""
+        measured = np.any(self.C, axis=0)
+        return np.flatnonzero(~measured) if not measured.all() else np.arange(len(self.A))
+
+    def deviations(self, shaping: StateSpace, K: StateSpace) -> Array:
+        """Root mean square of every state's scaled error, shape (n,); infinite where the error dynamics are unstable."""
+        loop = self.loop(shaping, K)
+        if not loop.is_stable():
+            return np.full(len(self.A), np.inf)
+        return np.asarray(np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, self.dt) @ loop.C.T), np.finfo(float).tiny)))
+
     def norm(self, shaping: StateSpace, K: StateSpace) -> float:
         """Root mean square of the scaled error."""
         return h2_norm(self.loop(shaping, K))
@@ -180,8 +193,7 @@ class _Problem:
         """Variance of every state's error on every unit, from the units' own spectra; shape (unit, n)."""
         f, n = self.spectra.shape[1], len(self.A)
         response = self.error_system(K).frequency_response(np.linspace(0, 0.5 / self.dt, f))
-        weight = np.full(f, 1.0 / (f - 1))
-        weight[[0, -1]] /= 2
+        weight = circle_weights(f)
         drive, rest = response[..., :n], response[..., n:]
         driven = np.einsum("f,fia,ufab,fib->ui", weight, drive, self.spectra, drive.conj(), optimize=True).real
         return np.asarray(driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2))
@@ -192,47 +204,52 @@ class _Problem:
         An error is the mean over the states that are not measured, each relative to its mean over the units under equal weights. The weights
         grow by multiplication with the unit's error over the weighted mean, which is ascent on a concave function.
         """
-        weights = np.full(len(self.spectra), 1 / len(self.spectra))
-        hidden = np.flatnonzero(~np.any(self.C, axis=0)) if not np.all(np.any(self.C, axis=0)) else np.arange(len(self.A))
-        reference, best, first = None, (np.inf, weights), np.inf
+
+        def errors(weights: Array) -> Array:
+            return self.unit_errors(self.correction(self.filter(weights)))[:, self.hidden]
+
+        equal = np.full(len(self.spectra), 1 / len(self.spectra))
+        start = errors(equal)
+        reference = start.mean(axis=0)
+        weights, cost = equal, np.mean(start / reference, axis=1)
+        first = best = float(cost.max())
+        chosen = weights
         for _ in range(_ROUNDS):
-            errors = self.unit_errors(self.correction(self.filter(weights)))[:, hidden]
-            reference = errors.mean(axis=0) if reference is None else reference
-            cost = np.mean(errors / reference, axis=1)
-            first = min(first, cost.max()) if not np.isfinite(first) else first
-            best = min(best, (float(cost.max()), weights), key=lambda item: item[0])
             mean = float(weights @ cost)
             if cost.max() <= _CLOSE * mean:
                 break
-            weights = weights * (cost / mean) ** _STEP
+            weights = weights * (cost / mean)
             weights = weights / weights.sum()
-        gain = 100 * (1 - np.sqrt(best[0] / first))
-        return best[1], f"worst of {len(self.spectra)} units, whose predicted error is {gain:.1f} % below that under equal weights"
+            cost = np.mean(errors(weights) / reference, axis=1)
+            if cost.max() < best:
+                best, chosen = float(cost.max()), weights
+        gain = 100 * (1 - np.sqrt(best / first))
+        return chosen, f"worst of {len(self.spectra)} units, whose predicted error is {gain:.1f} % below that under equal weights"
 
-    def reduced(self, shaping: StateSpace, K: StateSpace, allowed: float) -> StateSpace:
-        """The correction filter of lowest order whose error under the full shaping filter is allowed.
+    def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float) -> StateSpace:
+        """The correction filter of lowest order whose errors under the full shaping filter are within the tolerance.
 
         Balanced truncation of the shaping filter, its output weighted by the error dynamics of the full observer (weighting one side alone
         keeps it stable), and new gains at every order that bisection tries.
         """
-        if not shaping.n_states or allowed <= self.norm(shaping, K):
+        if not shaping.n_states or tolerance_percent <= 0:
             return K
-        loop = self.loop(shaping, K)
-        variance = np.diag(loop.C @ gramian(loop.A, loop.B, self.dt) @ loop.C.T)
-        weighted = loop.C / np.sqrt(np.maximum(variance, np.finfo(float).tiny))[:, None]
+        best, loop = self.deviations(shaping, K), self.loop(shaping, K)
+        weighted = loop.C / best[:, None]
         P = gramian(shaping.A, shaping.B, self.dt)
         Q = gramian(loop.A.T, weighted.T, self.dt)[-shaping.n_states :, -shaping.n_states :]
         R, S = _root(P), _root(Q).T
         U, h, Vh = np.linalg.svd(S @ R)
         usable = int(np.sum(h > _NEGLIGIBLE * h[0]))
         left, right = (U[:, :usable] / np.sqrt(h[:usable])).T @ S, R @ Vh[:usable].T / np.sqrt(h[:usable])
+        allowed = (1 + tolerance_percent / 100) * best[self.hidden]
         low, high = -1, usable + 1
         while high - low > 1:
             k = (low + high) // 2
             trial = self.correction(
                 replace(shaping, A=left[:k] @ shaping.A @ right[:, :k], B=left[:k] @ shaping.B, C=shaping.C @ right[:, :k])
             )
-            if self.norm(shaping, trial) <= allowed:
+            if np.all(self.deviations(shaping, trial)[self.hidden] <= allowed):
                 K, high = trial, k
             else:
                 low = k

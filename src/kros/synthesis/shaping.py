@@ -77,6 +77,13 @@ class Bank:
         return np.kron(A, np.eye(n)).reshape(n * self.size, n * self.size), np.kron(b[:, None], np.eye(n)).reshape(n * self.size, n)
 
 
+def circle_weights(f: int) -> Array:
+    """Return weights of the mean over the unit circle, for f equal steps from zero to Nyquist; they sum to one."""
+    weight = np.full(f, 1.0 / (f - 1))
+    weight[[0, -1]] /= 2
+    return weight
+
+
 def shaping_filter(spectrum: Array, bank: Bank, dt: float) -> StateSpace:
     """Fit a shaping filter to a spectrum.
 
@@ -103,8 +110,7 @@ def shaping_filter(spectrum: Array, bank: Bank, dt: float) -> StateSpace:
         raise DimensionError(
             f"Shaping filter: the spectrum should have shape (f, n, n) with at least two frequencies, found {spectrum.shape}."
         )
-    weight = np.full(f, 1.0 / (f - 1))
-    weight[[0, -1]] /= 2
+    weight = circle_weights(f)
     R = np.tensordot(weight, spectrum, 1).real
     largest = float(np.max(np.diag(R), initial=0.0))
     if not (np.isfinite(R).all() and largest > 0):

@@ -10,7 +10,7 @@ Basis and spectral factor: see `spectral`. In `tau = tan^2(theta / 2)` the fit h
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise
 from typing import Any
@@ -21,6 +21,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DataError, DimensionError, KrosError
 from ..core.frequency import bilinear_squared, check_grid
 from ..core.lti import StateSpace, gain
+from .given import best_numerator, pole_roots
 from .minimax import Grid
 from .spectral import RationalMagnitude, basis, on_half_line, roots, spectral_factor
 
@@ -33,6 +34,8 @@ _ROUNDS = 6
 _TOP = 10.0  # tau beyond which (80 % of Nyquist) no knots are placed
 _EXCHANGE = 10**0.002 - 1  # 0.02 dB of squared magnitude
 _HOPELESS = 2.0  # an order whose overbound is beyond this many tolerances is not polished while a higher one is allowed
+_UNPROVEN_DB = 0.5  # a fit farther than this from what is proven to be the best is compared with those that start from lower orders
+_HALVINGS, _BOTTOMS = 30, 25  # of the search for an alternation
 _GAIN = 0.9  # a further order that brings the overbound in dB to this share needs no other start
 
 
@@ -57,6 +60,9 @@ class FittedMagnitude:
     side : Side
     within_tolerance : bool
         Whether `overbound_db` is within the tolerance asked for.
+    proven_db : float, dB
+        No system of this order stays closer to the data on the same grid than this: proven by the alternation of the fit around them,
+        whatever the programs did. With given poles, NaN.
     """
 
     system: StateSpace
@@ -64,6 +70,7 @@ class FittedMagnitude:
     overbound_db: float
     side: Side
     within_tolerance: bool
+    proven_db: float = float("nan")
 
     def inverse(self) -> StateSpace:
         """Return the inverse system, stable because the system is minimum phase."""
@@ -81,6 +88,7 @@ def fit_magnitude(
     side: Side | str = Side.ABOVE,
     nyquist_zeros: int = 0,
     dc_zeros: int = 0,
+    poles: npt.ArrayLike | None = None,
 ) -> FittedMagnitude:
     r"""Return a discrete system whose magnitude is the tightest uniform bound of the data.
 
@@ -101,6 +109,9 @@ def fit_magnitude(
     nyquist_zeros, dc_zeros : int
         Zeros at z = -1 and z = 1 that the system must have beyond `order` (roll-off); it then has no stable inverse, and grid points where
         it vanishes do not count.
+    poles : array_like of complex, optional
+        Poles in z that the system must have, complex ones in pairs; only its zeros are fitted then, and the order is their number. From below
+        the zeros are given in the same way.
 
     Returns
     -------
@@ -136,19 +147,67 @@ def fit_magnitude(
     if not values.any():
         return FittedMagnitude(gain([[0.0]], sample_period_s), 0, 0.0, side, True)
     problem = _Problem(freqs, values, sample_period_s, side, nyquist_zeros, dc_zeros)
+    if poles is not None:
+        return problem.with_poles(pole_roots(poles), tolerance_db)
     best: FittedMagnitude | None = None
     lower: _Bound | None = None
-    for candidate in range(highest + 1) if order is None else (order, *range(order + 1)):
+    if order is not None:
+        best, _ = problem.fit(order, tolerance_db, None, last=True)
+        if best is not None and best.overbound_db < best.proven_db + _UNPROVEN_DB:
+            return best
+    for candidate in range((order or 0) // 2, highest + 1):
         found, lower = problem.fit(candidate, tolerance_db, lower, last=candidate == highest)
         if found is not None and (best is None or found.overbound_db < best.overbound_db):
             best = found
-        if best is not None and (best.within_tolerance or best.order == order):
-            return best
+        if best is not None and best.within_tolerance:
+            break
     if best is None:
         raise KrosError(
             f"Magnitude fit: no system of order up to {highest} found for {len(freqs)} points; raise max_order or smooth the data."
         )
     return best
+
+
+def alternation_db(ratio: npt.ArrayLike, count: int) -> float:
+    r"""Return a lower bound on the overbound of any magnitude of one order, from the ratio of one such fit to the data.
+
+    Let the squared fit `n / d` have degree N in tau, and its ratio to the data swing `count = 2 N + 2` times in turn above H and below L.
+    Another `n' / d'` whose ratio stays within less than H / L would, scaled, be below the fit at every high and above it at every low point:
+    `n' d - n d'` of degree 2 N would change sign 2 N + 1 times. This is de la Vallee Poussin's bound for a ratio instead of a difference.
+
+    Parameters
+    ----------
+    ratio : array_like, shape (n_points,)
+        Fit over data, in the order of the frequencies.
+    count : int
+        Alternations needed, at least two.
+
+    Returns
+    -------
+    float, dB
+        Of magnitudes, when the ratio is one; the largest H / L for which the alternation exists, between zero and `max / min`.
+    """
+    level = 20 * np.log10(np.asarray(ratio, float))
+    low, high = 0.0, float(np.ptp(level))
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        if any(_swings(level, bottom, bottom + middle) >= count for bottom in _bottoms(level, middle)):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _bottoms(level: Array, width: float) -> Array:
+    """Lower levels that are tried for an alternation of some width."""
+    return np.linspace(level.min(), level.max() - width, _BOTTOMS)
+
+
+def _swings(level: Array, bottom: float, top: float) -> int:
+    """How often the level reaches below the bottom and above the top in turn."""
+    side = np.where(level >= top, 1, np.where(level <= bottom, -1, 0))
+    side = side[side != 0]
+    return int((side[1:] != side[:-1]).sum()) + 1 if side.size else 0
 
 
 def invert(system: StateSpace) -> StateSpace:
@@ -193,21 +252,24 @@ class _Problem:
 
     def fit(self, order: int, tolerance_db: float, lower: _Bound | None, *, last: bool) -> tuple[FittedMagnitude | None, _Bound | None]:
         """Fit one order, starting from the bound of a lower order; None where the programs fail."""
+        tau, targets, unit, keep = self._targets()
+        hopeless = np.inf if last else 10 ** (_HOPELESS * tolerance_db / 10)
+        found = _minimax(tau, targets, order, lower, hopeless)
+        return (None, lower) if found is None else (self._finish(found.rational, unit, keep, tolerance_db), found)
+
+    def with_poles(self, found: Array, tolerance_db: float) -> FittedMagnitude:
+        """Fit the numerator for given roots of the denominator in tau: one linear program, and further points where it is not positive."""
+        tau, targets, unit, keep = self._targets()
+        return replace(self._finish(best_numerator(tau, targets, found), unit, keep, tolerance_db), proven_db=float("nan"))
+
+    def _targets(self) -> tuple[Array, Array, float, Array]:
+        """Points in tau, squared magnitudes to stay above there, their unit, and which points of the grid these are."""
         tau = bilinear_squared(self.freqs, self.dt)
         shape = self._zero_factor(tau)
         keep = shape > 1e-30
         targets = self.values[keep] ** (2 if self.side is Side.ABOVE else -2) / shape[keep]
-        unit = np.exp(np.mean(np.log(targets)))
-        hopeless = np.inf if last else 10 ** (_HOPELESS * tolerance_db / 10)
-        found = _minimax(tau[keep], targets / unit, order, lower, hopeless)
-        if found is None:
-            return None, lower
-        rational = found.rational
-        bound = RationalMagnitude(rational.numerator * unit, rational.denominator, rational.knots)
-        if self.side is Side.BELOW:
-            bound = RationalMagnitude(bound.denominator, bound.numerator, bound.knots)
-        system = spectral_factor(bound, self.dt, nyquist_zeros=self.nyquist_zeros, dc_zeros=self.dc_zeros)
-        return self._finish(system, keep, tolerance_db), found
+        unit = float(np.exp(np.mean(np.log(targets))))
+        return tau[keep], targets / unit, unit, keep
 
     def _zero_factor(self, tau: Array) -> Array:
         """Squared magnitude of the prescribed zeros; from below they would be poles of the inverse fit."""
@@ -215,14 +277,20 @@ class _Problem:
         power = down**self.nyquist_zeros * (1.0 - down) ** self.dc_zeros if self.dc_zeros else down**self.nyquist_zeros
         return power if self.side is Side.ABOVE else 1.0 / np.maximum(power, 1e-300)
 
-    def _finish(self, system: StateSpace, keep: Array, tolerance_db: float) -> FittedMagnitude:
-        """Lift (or lower) by the deficit of the system as evaluated."""
+    def _finish(self, rational: RationalMagnitude, unit: float, keep: Array, tolerance_db: float) -> FittedMagnitude:
+        """Factorise, and lift (or lower) by the deficit of the system as evaluated."""
+        bound = RationalMagnitude(rational.numerator * unit, rational.denominator, rational.knots)
+        if self.side is Side.BELOW:
+            bound = RationalMagnitude(bound.denominator, bound.numerator, bound.knots)
+        system = spectral_factor(bound, self.dt, nyquist_zeros=self.nyquist_zeros, dc_zeros=self.dc_zeros)
         ratio = np.abs(system.frequency_response(self.freqs[keep])[:, 0, 0]) / self.values[keep]
         margin = 1 + 1e-12
         touch = margin / ratio.min() if self.side is Side.ABOVE else 1 / (margin * ratio.max())
         system = StateSpace(system.A, system.B, system.C * touch, system.D * touch, system.dt)
         overbound = float(20 * np.log10(ratio.max() / ratio.min()))
-        return FittedMagnitude(system, system.n_states, overbound, self.side, overbound <= tolerance_db)
+        degree = system.n_states - self.nyquist_zeros - self.dc_zeros
+        proven = alternation_db(ratio, 2 * degree + 2)
+        return FittedMagnitude(system, system.n_states, overbound, self.side, overbound <= tolerance_db, proven)
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,12 +49,15 @@ class JointFit:
         Cost of the optimal cover: mean log left plus mean log right.
     guard : ndarray, shape (n,)
         Further tau at which numerators and denominators are kept positive.
+    price : float
+        Of the peak of square weights.
     """
 
     residuals: Array
     tau: Array
     optimal: Array
     guard: Array
+    price: float = _PEAK
 
     def fit(self, start: Sequence[RationalMagnitude]) -> tuple[list[RationalMagnitude], float]:
         """Return squared magnitudes that are positive at all frequencies, and their excess cost in dB.
@@ -144,7 +147,7 @@ class _State:
     def value(self) -> float:
         """What is minimised, nepers."""
         scale = self.sigma.max()
-        return float(self.excess.max() + scale + (_PEAK * (self.product.max() + scale) if self.product.size else 0.0))
+        return float(self.excess.max() + scale + (self.data.price * (self.product.max() + scale) if self.product.size else 0.0))
 
     def program(self, trust: float) -> _Step | None:
         """Solve the linear program around this point."""
@@ -158,7 +161,7 @@ class _State:
         sound -= np.einsum("kj,jkx->kx", self.right[unit, freq, rank], slopes[n_left:, freq])
         entry, high = np.nonzero(self.product > self.product.max(initial=-np.inf) - reach)
         peak = slopes[entry, high] + slopes[n_left + entry, high]
-        count, price = slopes.shape[-1], _PEAK if self.product.size else 0.0
+        count, price = slopes.shape[-1], self.data.price if self.product.size else 0.0
         blocks = [np.hstack([rows, np.tile(-np.eye(3)[i], (len(rows), 1))]) for i, rows in enumerate((cost, sound, peak))]
         result = linprog(
             np.append(np.zeros(count), [1.0, 1.0 + price, price]),

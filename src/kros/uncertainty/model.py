@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.lti import StateSpace
+from .certificate import Method
 from .cover import Cover, Structure
 from .forms import Form
 from .weights import Weight
@@ -170,8 +171,15 @@ def _facts(weight: Weight) -> dict[str, Any]:
         "orders": [weight.left_orders, weight.right_orders],
         "cover_max": weight.cover_max,
         "overbound_db_max": weight.overbound_db_max,
+        "overbound_entry_db": weight.overbound_entry_db,
         "within_tolerance": weight.within_tolerance,
+        "method": weight.method,
+        "remaining_margin": weight.remaining_margin,
     }
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
 
 
 def _pack_system(name: str, system: StateSpace) -> dict[str, Array]:
@@ -198,5 +206,8 @@ def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], d
         cover_max=facts["cover_max"],
         overbound_db_max=facts["overbound_db_max"],
         within_tolerance=facts["within_tolerance"],
+        overbound_entry_db=_number(facts.get("overbound_entry_db")),
+        method=Method(facts.get("method", Method.GRID)),
+        remaining_margin=_number(facts.get("remaining_margin")),
     )
     return weight, Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])

@@ -23,10 +23,11 @@ import numpy.typing as npt
 from ..core.errors import KrosError
 from ..core.frequency import bilinear_squared, dense_grid
 from ..core.lti import StateSpace, block_diagonal, gain
+from .certificate import Method, ResidualSystems, certify
 from .cover import Cover, Structure, as_structure, cover_ratio, optimal_cover, optimal_left
 from .fit import fit_magnitude, rough
 from .joint import JointFit
-from .spectral import RationalMagnitude, spectral_factor
+from .spectral import RationalMagnitude, roots, spectral_factor
 
 Array = npt.NDArray[Any]
 Residuals = Callable[[Array], Array]
@@ -68,6 +69,10 @@ class Weight:
     overbound_entry_db : float, dB
         Largest fitted over optimal `left_i right_j` over the grid and all (i, j). The optimal cover is rarely unique: a large value beside a
         small `overbound_db_max` says that another cover of nearly the same cost was taken.
+    method : Method
+        How the bound between grid points is known, see `certificate`.
+    remaining_margin : float
+        One minus the largest ratio over all frequencies: by level sets a bound on it, on a grid what was found.
     """
 
     left: StateSpace
@@ -79,6 +84,8 @@ class Weight:
     overbound_db_max: float
     within_tolerance: bool = True
     overbound_entry_db: float = float("nan")
+    method: Method = Method.GRID
+    remaining_margin: float = float("nan")
 
     def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""
@@ -94,6 +101,7 @@ def fit_weight(
     max_order: int = 4,
     tolerance_db: float = 1.0,
     density: int = 10,
+    systems: ResidualSystems | None = None,
 ) -> tuple[Weight, Cover]:
     """Fit weights to residuals that can be evaluated at any frequency.
 
@@ -110,6 +118,8 @@ def fit_weight(
         Overbound at which a lower order is good enough.
     density : int
         How much denser the grid of the final check is.
+    systems : ResidualSystems, optional
+        The systems behind the residuals: the bound is then tested at all frequencies, by level sets, and not on a grid alone.
 
     Returns
     -------
@@ -124,8 +134,8 @@ def fit_weight(
     checked = _Checked(dense, residuals(dense))
     fitter = _Fitter(sample_period_s, max_order, tolerance_db, (freqs_hz[0], freqs_hz[-1]))
     together = structure is Structure.DIAGONAL and best.left.any()
-    weight = _fit_diagonal(fitter, checked) if together else _fit_scalar(fitter, freqs_hz, E, checked, structure)
-    weight = _finish(weight, checked)
+    weight = _fit_diagonal(fitter, residuals, checked) if together else _fit_scalar(fitter, freqs_hz, E, checked, structure)
+    weight = _finish(weight, residuals, checked, systems)
     excess = overbound_db(weight, freqs_hz, best)
     kept = weight.within_tolerance if structure is Structure.SCALAR else excess <= tolerance_db
     return replace(
@@ -153,6 +163,11 @@ class _Checked:
         """Largest ratio for every unit and frequency."""
         used = weight.magnitudes(self.freqs_hz)
         return cover_ratio(self.E, used.left, used.right)
+
+    def with_points(self, freqs_hz: Array, E: Array) -> _Checked:
+        """Return the same with further frequencies."""
+        freqs, index = np.unique(np.concatenate([self.freqs_hz, freqs_hz]), return_index=True)
+        return _Checked(freqs, np.concatenate([self.E, E], axis=1)[:, index]) if len(freqs_hz) else self
 
     def added(self, worst: Array, freqs_hz: Array, E: Array) -> tuple[Array, Array]:
         """Grid and residuals with the worst frequencies in them."""
@@ -190,7 +205,7 @@ def _fit_scalar(fitter: _Fitter, freqs_hz: Array, E: Array, checked: _Checked, s
     return weight
 
 
-def _fit_diagonal(fitter: _Fitter, checked: _Checked) -> Weight:
+def _fit_diagonal(fitter: _Fitter, residuals: Residuals, checked: _Checked) -> Weight:
     """Joint fit from several starts, and again with the frequencies and units at which it is exceeded."""
     size = optimal_cover(checked.E, Structure.SCALAR).left[:, 0]
     chosen = np.concatenate([np.flatnonzero(~fitter.inside(checked.freqs_hz)), _telling(checked.freqs_hz, size)])
@@ -209,13 +224,15 @@ def _fit_diagonal(fitter: _Fitter, checked: _Checked) -> Weight:
         raise KrosError("Weights: no fit of the diagonal cover is positive at all frequencies; ask for scalar weights or another order.")
     weight = found.weight(fitter, some.shape[2])
     for _ in range(_ROUNDS):
-        ratio = checked.ratio(weight)
+        bends = found.bends_hz(fitter.sample_period_s)
+        seen = checked.with_points(bends, residuals(bends))
+        ratio = seen.ratio(weight)
         if ratio.max() <= _LIFT:
             break
         _LOG.debug("Weight: exceeded %.3f times between grid points, refining the grid", ratio.max())
-        freqs, some = checked.added(_peaks(ratio.max(axis=0)), freqs, some)
+        freqs, some = seen.added(_peaks(ratio.max(axis=0)), freqs, some)
         units = np.union1d(units, _leading(ratio))
-        again = _Candidate.of(found.rationals, _joint(freqs, some[units], fitter, checked.freqs_hz))
+        again = _Candidate.of(found.rationals, _joint(freqs, some[units], fitter, seen.freqs_hz))
         if again is None:
             break
         found, weight = again, again.weight(fitter, some.shape[2])
@@ -279,6 +296,12 @@ class _Candidate:
         rationals, excess = joint.fit(start)
         return cls(rationals, excess, joint) if np.isfinite(excess) else None
 
+    def bends_hz(self, sample_period_s: float) -> Array:
+        """Frequencies nearest to the poles and zeros: a peak or a notch between grid points is there."""
+        found = np.array([t for r in self.rationals for c in (r.numerator, r.denominator) for t in roots(c, r.knots)[0]], complex)
+        tau = found[found.real > 0].real
+        return np.unique(np.arctan(np.sqrt(tau)) / (np.pi * sample_period_s))
+
     def weight(self, fitter: _Fitter, n_left: int) -> Weight:
         """Return the systems, not yet checked."""
         dt = fitter.sample_period_s
@@ -321,13 +344,21 @@ def overbound_entry_db(weight: Weight, freqs_hz: Array, cover: Cover) -> float:
     return float(20 * np.log10(np.max(fitted[some] / optimal[some]))) if some.any() else 0.0
 
 
-def _finish(weight: Weight, checked: _Checked) -> Weight:
-    """Scale the left weight until it touches the residuals from above, and measure what is returned."""
-    ratio = checked.ratio(weight).max(initial=0.0)
-    if ratio > 0:
-        weight = scaled(weight, ratio * (1 + _MARGIN))
-        ratio = checked.ratio(weight).max(initial=0.0)
-    return replace(weight, cover_max=float(ratio))
+def _finish(weight: Weight, residuals: Residuals, checked: _Checked, systems: ResidualSystems | None) -> Weight:
+    """Scale the left weight until it touches the residuals from above, between grid points too, and measure what is returned."""
+    if not checked.ratio(weight).max(initial=0.0) > 0:
+        return replace(weight, cover_max=0.0, remaining_margin=1.0)
+
+    def ratio(freqs_hz: Array) -> Array:
+        used = weight.magnitudes(freqs_hz)
+        return cover_ratio(residuals(freqs_hz), used.left, used.right)
+
+    proof = certify(ratio, checked.freqs_hz, weight.left, weight.right, systems)
+    bound = proof.peak * (1 + proof.margin) if proof.method is Method.LEVEL_SETS else proof.peak
+    lift = bound * (1 + _MARGIN)
+    weight = scaled(weight, lift)
+    on_grid = float(checked.ratio(weight).max())
+    return replace(weight, cover_max=on_grid, method=proof.method, remaining_margin=1 - max(bound / lift, on_grid))
 
 
 def scaled(weight: Weight, factor: float) -> Weight:

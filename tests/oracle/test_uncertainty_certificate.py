@@ -1,0 +1,120 @@
+"""Bounds between grid points and bounds on what a fit can reach, against cases whose answer is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError
+from kros.core.lti import StateSpace, gain
+from kros.core.norms import hinf_norm
+from kros.uncertainty import cover_ratio, fit_magnitude, residual
+from kros.uncertainty.certificate import Method, ResidualSystems, _pencils, certify
+from kros.uncertainty.fit import alternation_db
+from kros.uncertainty.weights import fit_weight
+
+DT = 1e-3
+GRID = np.geomspace(0.1, 500.0, 60)
+
+
+def population(seed: int, units: int, p: int, m: int, n: int = 3) -> tuple[StateSpace, StateSpace]:
+    rng = np.random.default_rng(seed)
+    A = 0.7 * np.linalg.qr(rng.normal(size=(n, n)))[0] * (1 + 0.05 * rng.normal(size=(units + 1, n, n)))
+    B, C = rng.normal(size=(n, m)), rng.normal(size=(p, n))
+    D = rng.normal(size=(p, m)) * (1 + 0.1 * rng.normal(size=(units + 1, p, m)))
+    every = StateSpace(A, np.broadcast_to(B, (units + 1, n, m)), np.broadcast_to(C, (units + 1, p, n)), D, DT)
+    return every[0], every[1:]
+
+
+def lag(pole: float, zero: float) -> StateSpace:
+    return StateSpace([[pole]], [[1.0]], [[pole - zero]], [[1.0]], DT)
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (3, 2), (2, 3)])
+@pytest.mark.parametrize(
+    "form",
+    ["additive", "input_multiplicative", "output_multiplicative", "inverse_input_multiplicative", "inverse_output_multiplicative"],
+)
+def test_realisations_have_the_responses_of_the_residuals(form: str, shape: tuple[int, int]) -> None:
+    nominal, units = population(3, 2, *shape)
+    E = residual(form, nominal.frequency_response(GRID), units.frequency_response(GRID))
+    left, right = (gain(np.diag(np.arange(1.0, n + 1)), DT) for n in E.shape[2:])
+    expected = cover_ratio(E, np.tile(np.diag(left.D), (60, 1)), np.tile(np.diag(right.D), (60, 1)))
+    for unit, pencil in enumerate(_pencils(ResidualSystems(form, nominal, units), left, right)):
+        s = 1j * np.tan(np.pi * GRID[:-1] * DT)
+        found = [np.linalg.norm(pencil.C @ np.linalg.solve(x * pencil.F - pencil.A, pencil.B) + pencil.D, 2) for x in s]
+        np.testing.assert_allclose(found, expected[unit, :-1], rtol=1e-7)
+
+
+def test_a_peak_between_grid_points_is_found_and_is_the_norm() -> None:
+    """A resonance a millionth wide on a grid of 60 points: the additive peak is the H-infinity norm of the difference."""
+    radius, angle = 1 - 1e-6, 2 * np.pi * 37.77 * DT
+    A = radius * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    unit = StateSpace(A[None], np.array([[[1e-5], [0.0]]]), np.array([[[1.0, 0.0]]]), np.array([[[0.1]]]), DT)
+    nominal = gain([[0.0]], DT)
+    one = gain([[1.0]], DT)
+
+    def ratio(freqs: np.ndarray) -> np.ndarray:
+        return np.abs(unit.frequency_response(freqs)[:, :, 0, 0])
+
+    proof = certify(ratio, GRID, one, one, ResidualSystems("additive", nominal, unit))
+    assert proof.method is Method.LEVEL_SETS
+    assert proof.peak == pytest.approx(hinf_norm(unit[0]), rel=2e-5)
+    assert proof.freq_hz == pytest.approx(37.77, rel=1e-4)
+    assert ratio(GRID).max() < proof.peak / 2
+    assert certify(ratio, GRID, one, one).method is Method.GRID
+
+
+@pytest.mark.parametrize("form", ["additive", "inverse_input_multiplicative", "inverse_additive"])
+@pytest.mark.parametrize("structure", ["diagonal", "scalar"])
+def test_weights_hold_between_grid_points(form: str, structure: str) -> None:
+    nominal, units = population(5, 3, 2, 2)
+    systems = ResidualSystems(form, nominal, units)
+
+    def residuals(freqs: np.ndarray) -> np.ndarray:
+        return residual(form, nominal.frequency_response(freqs), units.frequency_response(freqs))
+
+    weight, _ = fit_weight(residuals, GRID, DT, structure=structure, max_order=3, tolerance_db=3.0, systems=systems)
+    assert weight.method is (Method.GRID if form == "inverse_additive" else Method.LEVEL_SETS)
+    assert 0 <= weight.remaining_margin < 1e-3
+    freqs = np.linspace(0.0, 500.0, 20001)
+    used = weight.magnitudes(freqs)
+    assert cover_ratio(residuals(freqs), used.left, used.right).max() <= 1 + (1e-6 if form == "inverse_additive" else 0.0)
+
+
+def test_what_no_fit_goes_below_is_below_every_fit_and_met_by_good_ones() -> None:
+    """A step of two levels: a first order cannot do better than the bound, found here by an exhaustive search over pole and zero."""
+    freqs = np.geomspace(0.05, 499.0, 80)
+    data = np.where(freqs < 5.0, 3.0, 1.0)
+    fit = fit_magnitude(freqs, data, DT, order=1)
+    best = np.inf
+    for pole in 1 - np.geomspace(1e-5, 1.0, 120):
+        z = np.exp(2j * np.pi * freqs * DT)
+        for zero in 1 - np.geomspace(1e-5, 1.0, 120):
+            level = 20 * np.log10(np.abs((z - zero) / (z - pole)) / data)
+            best = min(best, float(np.ptp(level)))
+    assert fit.proven_db <= best + 1e-9
+    assert fit.proven_db <= fit.overbound_db + 1e-9
+    assert fit.overbound_db <= best + 1e-6
+    assert fit.overbound_db - fit.proven_db < 0.1
+
+
+def test_alternations_are_counted() -> None:
+    assert alternation_db(10 ** (np.array([0.0, 1.0, 0.0, 1.0]) / 20), 4) == pytest.approx(1.0, abs=1e-6)
+    assert alternation_db(10 ** (np.array([0.0, 1.0, 0.0, 1.0]) / 20), 5) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_given_poles_are_kept_and_only_zeros_fitted() -> None:
+    freqs = np.geomspace(0.01, 500.0, 300)
+    truth = lag(0.999, 0.9) @ lag(0.7, 0.2)
+    data = np.abs(truth.frequency_response(freqs)[:, 0, 0])
+    fit = fit_magnitude(freqs, data, DT, poles=[0.999, 0.7])
+    assert fit.overbound_db < 1e-3
+    np.testing.assert_allclose(np.sort(fit.system.poles().real), [0.7, 0.999], rtol=1e-9)
+    loose = fit_magnitude(freqs, data, DT, poles=[0.99, 0.7])
+    assert (np.abs(loose.system.frequency_response(freqs)[:, 0, 0]) >= data * (1 - 1e-9)).all()
+    assert loose.overbound_db > 1
+    with pytest.raises(ConfigError, match="unit circle"):
+        fit_magnitude(freqs, data, DT, poles=[1.1])
+    with pytest.raises(ConfigError, match="pairs"):
+        fit_magnitude(freqs, data, DT, poles=[0.5 + 0.1j])

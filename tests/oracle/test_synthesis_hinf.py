@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import null_space, solve_continuous_are, solve_discrete_are
 
-from kros.core import StateSpace, SynthesisError, hinf_norm
+from kros.core import StateSpace, SynthesisError, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Status, h2, hinf
 
 
@@ -278,3 +278,136 @@ def test_slow_inequality_finds_the_same_optimum(dt):
             compared += 1
             assert found.hinf_norm == pytest.approx(slow, rel=1e-3)
     assert compared >= 6
+
+
+def test_static_optimum_is_parrotts():
+    empty = np.zeros
+    plant = GeneralizedPlant(
+        empty((0, 0)), empty((0, 2)), empty((0, 1)), empty((2, 0)), empty((1, 0)), [[1, 2], [3, 4]], [[0], [1]], [[0, 1]], [[0.5]], 1.0
+    )
+    found = hinf(plant)
+    assert found.hinf_norm == pytest.approx(np.sqrt(10), rel=2e-5)  # the larger of the first row and the first column
+    assert found.controller.n_states == 0
+    assert found.status is Status.OPTIMAL
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_nothing_to_measure_gives_the_zero_gain(dt):
+    pole = 0.5 if dt > 0 else -0.5
+    plant = GeneralizedPlant([[pole]], [[1.0, 0]], [[1.0]], [[1.0], [0]], [[0.0]], np.zeros((2, 2)), [[0], [1.0]], [[0, 1.0]], [[0]], dt)
+    found = hinf(plant)
+    assert found.hinf_norm == pytest.approx(2.0, rel=1e-6)
+    assert found.lower_bound == pytest.approx(2.0, rel=2e-5)
+    assert found.controller.n_states == 0
+    assert not found.controller.D.any()
+
+
+def test_plants_without_controls_or_measurements():
+    a, one, none = [[0.5]], [[1.0]], np.zeros
+    assert hinf(GeneralizedPlant(a, one, none((1, 0)), one, one, [[0.0]], none((1, 0)), one, none((1, 0)), 1.0)).hinf_norm == pytest.approx(
+        2.0
+    )
+    deaf = GeneralizedPlant(a, one, one, one, none((0, 1)), [[0.0]], one, none((0, 1)), none((0, 1)), 1.0)
+    assert hinf(deaf, gamma=2.1).hinf_norm == pytest.approx(2.0)
+    with pytest.raises(SynthesisError, match="without controls or measurements"):
+        hinf(deaf, gamma=1.9)
+
+
+def test_poles_at_both_ends_of_the_map():
+    # Poles at z = 1 and z = -1: no bilinear map takes both, a constant feedback moves them first. The coprime optimum is known.
+    A, B, C = np.diag([1.0, -1.0, 0.5]), np.array([[1.0], [0.7], [0.2]]), np.array([[0.5, 1.0, -0.3]])
+    X, Z = solve_discrete_are(A, B, C.T @ C, np.eye(1)), solve_discrete_are(A.T, C.T, B @ B.T, np.eye(1))
+    found = hinf(coprime(A, B, C, 1.0))
+    assert found.hinf_norm == pytest.approx(np.sqrt(1 + np.abs(np.linalg.eigvals(X @ Z)).max()), rel=2e-5)
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_units_do_not_matter(dt):
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        p = random_plant(rng, 5, dt)
+        t, c, m = 10 ** rng.uniform(-5, 5, 5), 10 ** rng.uniform(-4, 4, p.sizes[2]), 10 ** rng.uniform(-4, 4, p.sizes[4])
+        other = GeneralizedPlant(
+            p.A * t[:, None] / t,
+            p.B1 * t[:, None],
+            p.B2 * t[:, None] * c,
+            p.C1 / t,
+            p.C2 / t * m[:, None],
+            p.D11,
+            p.D12 * c,
+            p.D21 * m[:, None],
+            p.D22 * c * m[:, None],
+            dt,
+        )
+        assert hinf(other).hinf_norm == pytest.approx(hinf(p).hinf_norm, rel=2e-5)
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_the_feedthrough_of_the_control_is_absorbed(dt):
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        p = random_plant(rng, 4, dt)
+        without = GeneralizedPlant(p.A, p.B1, p.B2, p.C1, p.C2, p.D11, p.D12, p.D21, 0 * p.D22, dt)
+        assert hinf(p).hinf_norm == pytest.approx(hinf(without).hinf_norm, rel=2e-5)
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_levels_between_optimum_and_h2(dt):
+    rng = np.random.default_rng(4)
+    plant = random_plant(rng, 4, dt)
+    best = hinf(plant)
+    for factor in (1.01, 1.3, 3.0):
+        found = hinf(plant, gamma=factor * best.hinf_norm)
+        assert best.lower_bound <= found.hinf_norm <= factor * best.hinf_norm
+        assert found.status is Status.CERTIFIED
+        assert found.lower_bound <= best.hinf_norm
+    with pytest.raises(SynthesisError, match="out of reach"):
+        hinf(plant, gamma=0.99 * best.lower_bound)
+    assert np.isfinite(best.spectral_radius)
+    assert best.spectral_radius < (1 if dt > 0 else 0)
+
+
+@pytest.mark.parametrize(("gap", "angle"), [(1e-6, 0.3), (1e-7, np.pi - 1e-3), (1e-6, np.pi / 2)])
+def test_lightly_damped_open_loop_where_a_grid_fails(gap, angle):
+    # The resonance is not measured, so the optimum is its peak, 1e6 and more, in a band of 1e-6 rad.
+    A = (1 - gap) * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    B1, zero = np.array([[1.0, 0], [0, 0]]), np.zeros((2, 2))
+    plant = GeneralizedPlant(A, B1, [[1.0], [0]], [[1.0, 0], [0, 0]], [[0.0, 0]], zero, [[0], [1.0]], [[0, 1.0]], [[0]], 1.0)
+    local = (angle + gap * np.linspace(-5, 5, 20001)) / (2 * np.pi)
+    open_loop = StateSpace(A, B1[:, :1], [[1.0, 0]], [[0.0]], 1.0)
+    truth = np.abs(open_loop.frequency_response(local)).max()
+    assert hinf(plant).hinf_norm == pytest.approx(truth, rel=1e-5)
+    assert np.abs(open_loop.frequency_response(np.linspace(0, 0.5, 4001) + 0.0000625)).max() < 0.5 * truth, "a grid should fail"
+
+
+def test_slycot_agrees_on_random_plants():
+    slycot = pytest.importorskip("slycot")
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        for dt, routine in ((0.0, slycot.sb10fd), (1.0, slycot.sb10dd)):
+            plant = random_plant(rng, int(rng.integers(1, 7)), dt)
+            found, (n, n_w, n_u, n_z, n_y) = hinf(plant), plant.sizes
+            s = plant.open_loop()
+
+            def reached(level, routine=routine, plant=plant, s=s, sizes=(n, n_w + n_u, n_z + n_y, n_u, n_y)):
+                try:
+                    out = routine(*sizes, level, s.A, s.B, s.C, s.D, 1e-12)
+                except ArithmeticError:
+                    return False
+                K = StateSpace(*[x for x in out if np.ndim(x) == 2][:4], plant.dt)
+                return hinf_norm(plant.close(K)) <= level * (1 + 1e-6)
+
+            assert reached(found.hinf_norm * 1.001)
+            assert not reached(found.lower_bound * 0.999)
+
+
+def test_slycot_h2_agrees_on_random_plants():
+    slycot = pytest.importorskip("slycot")
+    rng = np.random.default_rng(6)
+    for _ in range(50):
+        p = random_plant(rng, int(rng.integers(1, 7)), 0.0)
+        plant = GeneralizedPlant(p.A, p.B1, p.B2, p.C1, p.C2, 0 * p.D11, p.D12, p.D21, p.D22, 0.0)
+        n, n_w, n_u, n_z, n_y = plant.sizes
+        s = plant.open_loop()
+        A, B, C, *_ = slycot.sb10hd(n, n_w + n_u, n_z + n_y, n_u, n_y, s.A, s.B, s.C, s.D)
+        assert h2(plant).h2_norm == pytest.approx(h2_norm(plant.close(StateSpace(A, B, C, np.zeros((n_u, n_y)), 0.0))), rel=1e-6)

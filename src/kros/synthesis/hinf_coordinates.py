@@ -50,21 +50,25 @@ class Coordinates:
             When the algebraic loop has no solution.
         """
         K = StateSpace(K.A, K.B @ self.right, self.left @ K.C, self.left @ K.D @ self.right, 0.0)
-        K = absorb_feedthrough(K, self.D22_mapped)
         if self.original.dt > 0:
             K = to_discrete(K, self.original.dt)
             if self.mirrored:
                 K = StateSpace(-K.A, -K.B, K.C, K.D, K.dt)
+        # In discrete time, because a controller may well have a pole at z = -1, where the continuous loop would not be solvable.
+        K = absorb_feedthrough(K, self.D22_mapped)
         K = StateSpace(K.A, K.B, K.C, K.D + self.constant, K.dt)
         return absorb_feedthrough(K, self.original.D22)
 
 
-def coordinates(plant: GeneralizedPlant) -> Coordinates:
-    """Map, balance and normalise a regular plant."""
-    balanced = _balance(replace(plant, D22=np.zeros_like(plant.D22)))
-    constant, mirrored, mapped = np.zeros(plant.D22.T.shape), False, balanced
+def coordinates(plant: GeneralizedPlant, balanced: bool = True) -> Coordinates:
+    """Map, balance and normalise a regular plant; without `balanced` the states are only scaled."""
+    strict = replace(plant, D22=np.zeros_like(plant.D22))
+    scaled = _scale(strict)
+    if balanced:
+        scaled = _balance(scaled)
+    constant, mirrored, mapped = np.zeros(plant.D22.T.shape), False, scaled
     if plant.dt > 0:
-        constant, mirrored, mapped = _best_map(balanced)
+        constant, mirrored, mapped = _best_map(scaled)
     normal = normalise(mapped)
     return Coordinates(normal.plant, normal.left, normal.right, mapped.D22, constant, mirrored, plant)
 
@@ -98,10 +102,11 @@ def _best_map(plant: GeneralizedPlant) -> tuple[Array, bool, GeneralizedPlant]:
             shifted = _feed_back(plant, constant)
             if mirrored:
                 shifted = replace(shifted, A=-shifted.A, B1=-shifted.B1, B2=-shifted.B2)
-            if shifted.sizes[0] and np.linalg.cond(shifted.A + np.eye(shifted.sizes[0])) > 1e14:
+            distance = _distance(shifted.A)
+            if distance > 1e14:
                 continue
             mapped = _continuous(shifted)
-            quality = max(_condition(shifted.A + np.eye(shifted.sizes[0])), _condition(mapped.D12), _condition(mapped.D21))
+            quality = max(distance, _condition(mapped.D12), _condition(mapped.D21))
             # A feedback or a mirror must earn its place: by a factor of 100.
             if best is None or quality < best[0] / 100:
                 best = quality, constant, mirrored, mapped
@@ -132,35 +137,59 @@ def _continuous(p: GeneralizedPlant) -> GeneralizedPlant:
     return GeneralizedPlant(s.A, B[:, :n_w], B[:, n_w:], C[:n_z], C[n_z:], D[:n_z, :n_w], D[:n_z, n_w:], D[n_z:, :n_w], D[n_z:, n_w:], 0.0)
 
 
-def _balance(p: GeneralizedPlant) -> GeneralizedPlant:
-    """Scale the states, then balance the H2 Riccati solutions where these can be computed."""
+def _scale(p: GeneralizedPlant) -> GeneralizedPlant:
+    """Scale the states by powers of two, so that A is balanced and B as large as C."""
     if not p.sizes[0]:
         return p
     _, (scale, _) = matrix_balance(p.A, permute=False, separate=True)
     p = _transform(p, np.diag(1 / scale), np.diag(scale))
+    return _level_out(p)
+
+
+def _balance(p: GeneralizedPlant) -> GeneralizedPlant:
+    """Balance the H2 Riccati solutions, where these can be computed and do not vanish."""
+    if not p.sizes[0]:
+        return p
     purpose = "H-infinity synthesis, balancing"
     try:
         X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, p.D12.T @ p.D12, p.C1.T @ p.D12, p.dt, purpose)
         Y = solve_riccati(p.A.T, p.C2.T, p.B1 @ p.B1.T, p.D21 @ p.D21.T, p.B1 @ p.D21.T, p.dt, purpose)
-        square = [_root(M) for M in (X, Y)]
+        square = [_root(X, p.A, p.C1), _root(Y, p.A, p.B1)]
     except (SynthesisError, LinAlgError):
         return p
     U, s, Vh = np.linalg.svd(square[0].T @ square[1])
     T, back = (U / np.sqrt(s)).T @ square[0].T, square[1] @ Vh.T / np.sqrt(s)
-    return _transform(p, T, back)
+    return _level_out(_transform(p, T, back))
 
 
-def _root(M: Array) -> Array:
-    """Square root factor ``M = L L'`` with directions of no weight raised to a small one, so that it can be inverted."""
+def _level_out(p: GeneralizedPlant) -> GeneralizedPlant:
+    """Scale all states alike, so that B is as large as C."""
+    inputs, outputs = np.linalg.norm(np.hstack([p.B1, p.B2])), np.linalg.norm(np.vstack([p.C1, p.C2]))
+    if not (inputs > 0 and outputs > 0):
+        return p
+    eye, size = np.eye(p.sizes[0]), float(np.sqrt(outputs / inputs))
+    return _transform(p, eye * size, eye / size)
+
+
+def _root(M: Array, A: Array, source: Array) -> Array:
+    """Square root factor ``M = L L'`` with directions of no weight raised to a small one; the identity where M is only rounding."""
     values, vectors = np.linalg.eigh(M)
     floor = 1e-8 * max(float(values[-1]), 0.0)
-    if floor == 0.0:
+    if values[-1] * max(float(np.linalg.norm(A, 2)), 1.0) <= 1e-9 * float(np.linalg.norm(source)) ** 2:
         return np.eye(len(M))
     return vectors * np.sqrt(np.maximum(values, floor))
 
 
 def _transform(p: GeneralizedPlant, T: Array, back: Array) -> GeneralizedPlant:
     return replace(p, A=T @ p.A @ back, B1=T @ p.B1, B2=T @ p.B2, C1=p.C1 @ back, C2=p.C2 @ back)
+
+
+def _distance(A: Array) -> float:
+    """Size of A over its distance from a pole at -1, which the map sends to infinity."""
+    if not A.size:
+        return 1.0
+    smallest = float(np.linalg.svd(A + np.eye(len(A)), compute_uv=False)[-1])
+    return (1 + float(np.linalg.norm(A, 2))) / max(smallest, 1e-300)
 
 
 def _condition(matrix: Array) -> float:

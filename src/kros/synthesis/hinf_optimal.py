@@ -33,8 +33,9 @@ from .result import Injection, Status, Synthesis
 Array = npt.NDArray[Any]
 
 _MAX_STEPS = 100
+_MAX_RAISES = 40
 _NEGLIGIBLE = 1e-9
-_RELAXATIONS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+_RELAXATIONS = (0.0, *np.geomspace(1e-6, 0.1, 16))
 
 
 def hinf(
@@ -82,6 +83,8 @@ def hinf(
         raise ConfigError(f"H-infinity synthesis: tolerance should lie in [1e-8, 1), found {tolerance}; 1e-5 is the default.")
     require(plant, "H-infinity synthesis", proper=False)
     start = time.perf_counter()
+    if 0 in plant.sizes[2::2]:
+        return _without_control(plant, injection, gamma)
     search = _Search.begin(plant)
     search = search.at(gamma) if gamma is not None else search.bisect(tolerance)
     elapsed = time.perf_counter() - start
@@ -90,10 +93,10 @@ def hinf(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The best controller so far with its recomputed norm, and the bracket."""
+    """The best controller so far with its recomputed norm, and the bracket; the second frame is for levels where the first fails."""
 
     plant: GeneralizedPlant
-    frame: Coordinates
+    frames: tuple[Coordinates, ...]
     K: StateSpace | None
     norm: float
     lower: float
@@ -102,30 +105,35 @@ class _Search:
     @classmethod
     def begin(cls, plant: GeneralizedPlant) -> _Search:
         """Bracket the optimum: Parrott's bound from below, controllers that are at hand from above."""
-        frame = coordinates(plant)
-        bound = max(_frequency_bound(frame.plant), direct_bound(frame.plant)) * (1 - 1e-9)
-        search = cls(plant, frame, None, float("inf"), bound, 0.0)
+        frames = coordinates(plant), coordinates(plant, balanced=False)
+        mapped = frames[1].plant
+        bound = max(_frequency_bound(mapped), direct_bound(mapped)) * (1 - 1e-9)
+        search = cls(plant, frames, None, float("inf"), bound, 0.0)
         _, _, n_u, _, n_y = plant.sizes
         search = search.consider(gain(np.zeros((n_u, n_y)), plant.dt))
-        no_direct_gain = replace(plant, D11=np.zeros_like(plant.D11)) if plant.dt == 0 else plant
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", RuntimeWarning)
-                search = search.consider(h2(no_direct_gain).controller)
-        except (SynthesisError, RuntimeWarning):
-            pass
+        search = search.consider(_h2_controller(plant))
+        for frame in frames:
+            if search.K is None and (K := _h2_controller(frame.plant)) is not None:
+                search = search.consider(frame.controller(K))
         return search._open()
 
     def uncancelled(self) -> float:
         """Size that the closed loop would have if nothing in it cancelled: a norm far below it is rounding."""
         assert self.K is not None
         closed = self.plant.close(self.K)
-        states = replace(closed, C=np.eye(closed.n_states), D=np.zeros((closed.n_states, closed.n_inputs)))
-        size = float(np.linalg.norm(closed.C)) * hinf_norm(states, tol=0.1) if closed.n_states else 0.0
-        return size + float(np.linalg.norm(self.plant.D11))
+        direct = float(np.linalg.norm(self.plant.D11))
+        if not closed.n_states:
+            return direct
+        n = closed.n_states
+        states = StateSpace(closed.A, closed.B, np.eye(n), np.zeros((n, closed.n_inputs)), closed.dt)
+        top = 0.5 / closed.dt if closed.dt > 0 else 10 * max(float(closed.spectral_radius()), 1e-300)
+        gains = np.linalg.norm(states.frequency_response(top * np.geomspace(1e-6, 1, 50)), axis=-1)
+        return direct + float((gains @ np.linalg.norm(closed.C, axis=0)).max())
 
-    def consider(self, K: StateSpace) -> _Search:
+    def consider(self, K: StateSpace | None) -> _Search:
         """Keep the controller if its closed loop is stable and better than the best so far."""
+        if K is None:
+            return self
         try:
             norm = hinf_norm(self.plant.close(K))
         except (KrosError, np.linalg.LinAlgError):
@@ -133,15 +141,22 @@ class _Search:
         return replace(self, K=K, norm=norm) if norm < self.norm else self
 
     def level(self, gamma: float) -> tuple[_Search, Obstacle | None]:
-        """Decide one level; the controller counts only with the norm of its closed loop."""
-        found = central(self.frame.plant, gamma)
-        if isinstance(found, Obstacle):
-            shown = found is not Obstacle.NUMERICAL and gamma < self.norm
-            return (replace(self, lower=max(self.lower, gamma)) if shown else self), found
-        try:
-            return self.consider(self.frame.controller(found)), None
-        except SynthesisError:
-            return self, None
+        """Decide one level; what the controller is worth is the norm of its closed loop, whatever the equations promise."""
+        search, verdict = self, [Obstacle.NUMERICAL]
+        for frame in self.frames:
+            found = central(frame.plant, gamma)
+            if isinstance(found, Obstacle):
+                if found is not Obstacle.NUMERICAL and gamma < self.norm:
+                    return replace(search, lower=max(search.lower, gamma)), found
+                continue
+            verdict = []
+            try:
+                search = search.consider(frame.controller(found))
+            except SynthesisError:
+                continue
+            if search.norm <= gamma * (1 + 1e-6):
+                break
+        return search, verdict[0] if verdict else None
 
     def at(self, gamma: float) -> _Search:
         """Controller for a level that was asked for."""
@@ -171,7 +186,7 @@ class _Search:
     def _open(self) -> _Search:
         """Find any controller when none is at hand, by raising the level."""
         search, gamma = self, 2 * max(self.lower, float(np.linalg.norm(self.plant.D11)), 1e-3)
-        for _ in range(_MAX_STEPS):
+        for _ in range(_MAX_RAISES):
             if np.isfinite(search.norm):
                 return replace(search, scale=search.uncancelled())
             search, obstacle = search.level(gamma)
@@ -222,6 +237,38 @@ def _result(search: _Search, injection: Injection, elapsed: float, tolerance: fl
         solve_s=elapsed,
         solver="riccati",
     )
+
+
+def _without_control(plant: GeneralizedPlant, injection: Injection, gamma: float | None) -> Synthesis:
+    """Nothing to choose: no control, or no measurement; by then the plant is known to be stable."""
+    open_loop = StateSpace(plant.A, plant.B1, plant.C1, plant.D11, plant.dt)
+    norm = hinf_norm(open_loop)
+    if gamma is not None and norm > gamma:
+        raise SynthesisError(f"H-infinity synthesis: without controls or measurements the norm is {norm:.6g}, above gamma = {gamma:.6g}.")
+    return Synthesis(
+        method="hinf",
+        controller=gain(np.zeros((plant.sizes[2], plant.sizes[4])), plant.dt),
+        status=Status.OPTIMAL,
+        injection=injection,
+        h2_norm=_h2_norm(open_loop),
+        hinf_norm=norm,
+        lower_bound=norm,
+        gap_percent=0.0,
+        spectral_radius=stability_margin(open_loop),
+        solver="riccati",
+    )
+
+
+def _h2_controller(plant: GeneralizedPlant) -> StateSpace | None:
+    """H2-optimal controller, for the first upper bound; in continuous time as if D11 were zero."""
+    if plant.dt == 0:
+        plant = replace(plant, D11=np.zeros_like(plant.D11))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        try:
+            return h2(plant).controller
+        except (SynthesisError, RuntimeWarning):
+            return None
 
 
 def _h2_norm(closed: StateSpace) -> float | None:

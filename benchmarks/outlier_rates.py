@@ -49,12 +49,8 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=["koopman"], choices=["koopman", "linear"])
     parser.add_argument("--cache", type=Path, default=Path("outlier_rates"))
     options = parser.parse_args()
-    print(
-        "| models | form | condition | nominal rate | false alarms, 12 good | populations with one | false alarms beside a planted drive | "
-        + header()
-        + " |"
-    )
-    print("|---|---|---|---|---|---|---|---|" + "---|" * len(SEVERITIES))
+    print("| models | form | condition | nominal rate | " + header() + " |")
+    print("|---" * (8 + len(SEVERITIES)) + "|")
     factors = [factors_of(seed, options) for seed in range(*options.seeds)]
     for kind in options.kinds:
         for condition in CONDITIONS:
@@ -68,12 +64,10 @@ def main() -> None:
 
 
 def header() -> str:
-    """Return the columns of the severities."""
-    return (
-        " | ".join(f"detected, severity {s:g}" for s in SEVERITIES)
-        + " | nominals that agree, severity "
-        + ", ".join(f"{s:g}" for s in SEVERITIES)
-    )
+    """Return the columns that `count` fills."""
+    alarms = "false alarms, 12 good | populations with one | false alarms beside a planted drive"
+    detected = " | ".join(f"detected, severity {s:g}" for s in SEVERITIES)
+    return f"{alarms} | {detected} | nominals that agree, severity {', '.join(f'{s:g}' for s in SEVERITIES)}"
 
 
 def count(populations: list[dict[float, tuple[Array, Array, Array]]], form: str, rate: float) -> list[str]:

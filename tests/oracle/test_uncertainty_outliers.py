@@ -9,6 +9,8 @@ from scipy import stats
 from kros.uncertainty import Form, score_outliers
 from kros.uncertainty.groups import excess, separate
 from kros.uncertainty.tail import (
+    SHAPE,
+    exceedance,
     group_factors,
     group_statistics,
     gumbel,
@@ -29,15 +31,19 @@ def test_l_moments_find_location_and_scale() -> None:
 
 @pytest.mark.parametrize(("count", "rate"), [(5, 0.05), (11, 0.01), (38, 0.003), (150, 0.003)])
 def test_prediction_bound_is_exceeded_at_its_rate(count: int, rate: float) -> None:
-    """Draws of another seed, other location and scale; four binomial standard deviations of 400,000 trials and 3 percent for the factor's own."""
-    trials = 400_000 if count < 100 else 40_000
-    draws = stats.gumbel_r.rvs(-7.0, 3.0, size=(trials, count + 1), random_state=np.random.default_rng(77))
+    """Draws of another seed, other location and scale; four binomial standard deviations of the trials and 3 percent for the factor's own."""
+    trials = 100_000 if count < 100 else 20_000
+    draws = stats.genextreme.rvs(-SHAPE, -7.0, 3.0, size=(trials, count + 1), random_state=np.random.default_rng(77))
     share = (draws[:, -1] > prediction_bound(draws[:, :-1], rate)).mean()
     assert share == pytest.approx(rate, abs=4 * np.sqrt(rate / trials) + 0.03 * rate)
 
 
 def test_factors_tend_to_the_quantile_of_the_distribution() -> None:
-    assert prediction_factor(10**7, 0.003) == pytest.approx(stats.gumbel_r.isf(0.003), abs=1e-4)
+    many = stats.genextreme.rvs(-SHAPE, size=2_000_000, random_state=3)
+    location, scale = gumbel(many)
+    limit = (stats.genextreme.isf(0.003, -SHAPE) - location) / scale
+    assert prediction_factor(10**7, 0.003) == pytest.approx(limit, rel=5e-3)
+    np.testing.assert_allclose(exceedance(np.array([-20.0, -1.0, 0.0, 3.0])), stats.genextreme.sf([-20.0, -1.0, 0.0, 3.0], -SHAPE))
     assert prediction_factor(61, 0.003) == pytest.approx(prediction_factor(60, 0.003), rel=3e-3)
 
 
@@ -60,17 +66,17 @@ def test_group_statistics_equal_their_definition() -> None:
 def test_share_of_scores_in_groups_beyond_their_factors_is_the_rate(count: int) -> None:
     """The smallest group of independent scores, as one step of the search takes it, on draws of another seed."""
     rate = 0.01
-    T = group_statistics(np.random.default_rng(88).gumbel(size=(100_000, count)))
+    T = group_statistics(stats.genextreme.rvs(-SHAPE, size=(100_000, count), random_state=88))
     beyond = np.array(group_factors(count, rate)) < T
     size = np.where(beyond.any(axis=1), beyond.argmax(axis=1) + 1, 0)
     assert 0.75 * rate <= size.mean() / count <= 1.05 * rate
 
 
 def test_whole_search_flags_the_nominal_share_of_independent_scores() -> None:
-    """Twelve units that each exceed at a frequency of their own, so that nobody's score depends on the others. Measured over 48,000 units: 1.01 %."""
+    """Twelve units that each exceed at a frequency of their own, so that nobody's score depends on the others."""
     rng, flagged, trials = np.random.default_rng(5), 0, 1500
     for _ in range(trials):
-        flagged += int((~separate(np.diag(rng.gumbel(size=12) + 30.0), 0.01).inliers).sum())
+        flagged += int((~separate(np.diag(stats.genextreme.rvs(-SHAPE, size=12, random_state=rng) + 30.0), 0.01).inliers).sum())
     share = flagged / (12 * trials)
     assert share == pytest.approx(0.01, abs=4 * np.sqrt(0.01 / (12 * trials)))
 
@@ -110,8 +116,8 @@ def test_a_gross_outlier_is_found_in_every_form_and_with_every_nominal(form: For
     model = score_outliers(population([*GOOD, 25.0]), FREQS, form)
     assert model.scores[-1].outlier
     assert int(np.argmax([s.score_db for s in model.scores])) == 11
-    assert model.scores[-1].agreement == 1.0
-    assert model.scores[-1].lowest_db > 0
+    assert model.scores[-1].agreement > 0.5
+    assert model.scores[-1].lowest_db > 10  # beyond the cover of the others whatever the nominal, as the paper has it
     assert all(s.agreement <= 0.5 for s in model.scores[:-1])
 
 

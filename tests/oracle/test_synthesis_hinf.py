@@ -157,7 +157,7 @@ def test_slicot_discrete_level():
     found = hinf(plant)
     assert found.status is Status.OPTIMAL
     assert found.hinf_norm == pytest.approx(111.294, abs=1e-3)
-    assert hinf(plant, gamma=111.294).hinf_norm <= 111.2945
+    assert hinf(plant, gamma=111.294).hinf_norm <= 111.294
     with pytest.raises(SynthesisError, match=r"gamma = 111\.29 is out of reach"):
         hinf(plant, gamma=111.29)
 
@@ -254,7 +254,7 @@ def test_normalised_coprime_factors(dt):
     # Glover and McFarlane (1989): the optimum is sqrt(1 + rho(X Z)) with the two LQG Riccati solutions, for any order and size.
     rng = np.random.default_rng(7)
     solve = solve_discrete_are if dt > 0 else solve_continuous_are
-    for _ in range(25):
+    for _ in range(15):
         n, m, p = int(rng.integers(1, 9)), int(rng.integers(1, 4)), int(rng.integers(1, 4))
         A, B, C = rng.standard_normal((n, n)), rng.standard_normal((n, m)), rng.standard_normal((p, n))
         X, Z = solve(A, B, C.T @ C, np.eye(m)), solve(A.T, C.T, B @ B.T, np.eye(p))

@@ -160,9 +160,15 @@ class _Search:
 
     def at(self, gamma: float) -> _Search:
         """Controller for a level that was asked for."""
-        search, obstacle = replace(self, K=None, norm=float("inf")).level(gamma)
-        if obstacle is None and search.norm <= gamma * (1 + 1e-6):
-            return search
+        blank = replace(self, K=None, norm=float("inf"))
+        search, obstacle = blank.level(gamma)
+        for margin in (1e-7, 1e-6, 1e-5):
+            if obstacle is not None or search.norm <= gamma:
+                break
+            closer, _ = search.level(gamma * (1 - margin))
+            search = closer if closer.norm < search.norm else search
+        if search.norm <= gamma * (1 + 1e-6):
+            return replace(search, lower=self.lower)
         best = self.bisect(1e-3)
         reached = f"the best that was reached is {best.norm:.6g}, and no controller is below {best.lower:.6g}"
         why = obstacle.value if obstacle is not None else f"the closed loop has norm {search.norm:.6g}"

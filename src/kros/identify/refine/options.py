@@ -31,7 +31,7 @@ class RefineOptions:
         A state's error counts in units of ``start**balance * range**(1 - balance)``, with `start` the free-run error of the EDMD
         model and `range` that of the state: 0 weighs states by their range, 1 asks every state for the same improvement.
     starts : tuple of (int, float)
-        First horizons and weighings from which the pooled model is sought; the best end, in the weighing `balance`, is taken.
+        First horizons and weighings from which the pooled model is sought; the end whose whole free runs are best is taken.
     level : float
         Residual of the inverse input multiplicative form beyond which the prior bites.
     power : int
@@ -71,7 +71,7 @@ class RefineOptions:
     negligible_residual: float = 0.1
     tolerance: float = 0.1
     balance: float = 0.65
-    starts: tuple[tuple[int, float], ...] = ((5, 0.8), (80, 0.8))
+    starts: tuple[tuple[int, float], ...] = ((5, 0.8), (320, 0.8))
     level: float = 0.3
     power: int = 2
     pooled_segments: int = 120

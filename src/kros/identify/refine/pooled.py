@@ -53,16 +53,17 @@ def start_pooled(
     return V, replace(problem, sigma=_sigma(error, span, options.balance)), error, span
 
 
-def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, options: RefineOptions) -> Array:
+def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, score: Callable[[Array], float], options: RefineOptions) -> Array:
     """Fit one model to all units, horizons growing; shape (n_lifted, p).
 
     The free-run error has several minima, so the search is made once for every first horizon and way of weighing the states in
-    `options.starts`, and the ends are finished and compared in the weighing asked for. Growing the horizon from a few samples finds
-    the models of stiff velocity loops best, starting at a long one those of soft loops. On the way a model may be unstable: kept stable from the start, the
-    search runs into the edge of stability and stops there, far from the optimum.
+    `options.starts`, and the end with the best `score` over whole episodes is finished: what is best over a second need not be best over
+    twenty. Growing the horizon from a few samples finds the models of stiff velocity loops best, starting at a long one those of soft
+    loops. On the way a model may be unstable: kept stable from the start, the search runs into the edge of stability and stops there, far
+    from the optimum.
     """
     few = replace(problem, segments=problem.segments.first(max(2, -(-options.pooled_segments // problem.segments.n_units))))
-    found: list[tuple[float, Array]] = []
+    found: list[tuple[float, float, Array]] = []
     sigma = problem.sigma
     for first, balance in options.starts:
         grown = _grow(V, replace(few, sigma=_sigma(error, span, balance)), options, few.finite, first)
@@ -74,8 +75,8 @@ def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, options
             sigma = sigma if found else normalised(few, stable, options).sigma
             edged = replace(few, sigma=sigma, guard=options.guard)
             kept = minimise(edged.evaluate, edged.admissible, stable, _COMPARED, options.least_gain)
-            found.append((float(kept.cost[0]), kept.V))
-            log.debug("pooled model from horizon %d and balance %g: cost %.6g", first, balance, found[-1][0])
+            found.append((score(kept.V[0]), float(kept.cost[0]), kept.V))
+            log.debug("pooled model from horizon %d and balance %g: score %.6g, cost %.6g", first, balance, *found[-1][:2])
     if not found:
         log.warning("refinement of the pooled model: the best models are unstable, so it is sought among the stable ones")
         grown = _grow(V, problem, options, problem.admissible, 1)
@@ -86,7 +87,7 @@ def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, options
             )
         return np.asarray(grown[0])
     edged = replace(problem, sigma=sigma, guard=options.guard)
-    best = min(found, key=lambda pair: pair[0])[1]
+    best = min(found, key=lambda row: row[:2])[2]
     return np.asarray(minimise(edged.evaluate, edged.admissible, best, options.iterations, options.least_gain).V[0])
 
 

@@ -142,8 +142,8 @@ def _stabilising(A: Array, B: Array, C: Array, D: Array, R: Array) -> Array | st
     quadratic, cost = B @ gain[:, n:], C.T @ C - C.T @ D @ gain[:, :n]
     H = np.block([[closed, -(quadratic + quadratic.T) / 2], [-(cost + cost.T) / 2, -closed.T]])
     T, Z, stable = schur(H, output="real", sort="lhp")
-    nearest = np.abs(np.linalg.eigvals(T).real).min()
-    if stable != n or nearest <= _AXIS * np.linalg.norm(H, 2):
+    # LAPACK's real Schur form has the real parts of all eigenvalues on its diagonal.
+    if stable != n or np.abs(np.diag(T)).min() <= _AXIS * np.linalg.norm(H):
         return "axis"
     X1, X2 = Z[:n, :n], Z[n:, :n]
     product = X1.T @ X2

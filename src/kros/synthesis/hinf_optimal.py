@@ -140,7 +140,7 @@ class _Search:
             return self
         return replace(self, K=K, norm=norm) if norm < self.norm else self
 
-    def level(self, gamma: float) -> tuple[_Search, Obstacle | None]:
+    def level(self, gamma: float, verify: bool = True) -> tuple[_Search, Obstacle | None]:
         """Decide one level; what the controller is worth is the norm of its closed loop, whatever the equations promise."""
         search, verdict = self, [Obstacle.NUMERICAL]
         for frame in self.frames:
@@ -150,6 +150,8 @@ class _Search:
                     return replace(search, lower=max(search.lower, gamma)), found
                 continue
             verdict = []
+            if not verify:
+                break
             try:
                 search = search.consider(frame.controller(found))
             except SynthesisError:
@@ -185,7 +187,7 @@ class _Search:
                 break
             bottom = max(low, floor)
             middle = float(np.sqrt(bottom * high)) if high > 2 * bottom else (bottom + high) / 2
-            search, obstacle = search.level(middle)
+            search, obstacle = search.level(middle, verify=False)
             low, high = (low, middle) if obstacle is None else (middle, high)
         return search._settle(high, tolerance)
 

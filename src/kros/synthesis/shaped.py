@@ -15,6 +15,7 @@ concave in the weights, and its gradient is the units' errors.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,6 +31,7 @@ from .shaping import Bank, circle_weights, shaping_filter
 
 Array = npt.NDArray[np.float64]
 Spectra = npt.NDArray[Any]
+BANKS = (Bank(8), Bank(4, (0.8, 0.95, 0.98)), Bank(8, (0.95, 0.98)), Bank(8, (0.9, 0.97, 0.99, 0.997)))
 _ROUNDS = 30
 _CLOSE = 1.02
 _NEGLIGIBLE = 1e-12
@@ -42,7 +44,7 @@ def residual_h2(
     noise: npt.ArrayLike,
     scale: npt.ArrayLike,
     dt: float,
-    bank: Bank | None = None,
+    banks: Sequence[Bank] = BANKS,
     tolerance_percent: float = 1.0,
     worst_unit: bool = False,
     n_lifted: int | None = None,
@@ -62,8 +64,9 @@ def residual_h2(
     scale : array_like, shape (n,)
         Range of every state; norms are of errors in these units.
     dt : float, s
-    bank : Bank, optional
-        Memory of the shaping filter; by default eight delays. A lag with a pole near one is a disturbance state, for loads.
+    banks : sequence of Bank
+        Memories of the shaping filter that are tried: the one with the least error under the spectra as they were measured is kept. A lag
+        with a pole near one is a disturbance state, for loads.
     tolerance_percent : float
         What the reduction of the order from ``n * bank.size`` may cost in the RMS error of any state that is not measured; 0 keeps every
         state of the filter.
@@ -98,7 +101,10 @@ def residual_h2(
             f"found {A.shape}, {C.shape}, {spectra.shape}, {noise.shape}, {scale.shape}."
         )
     start = time.perf_counter()
-    problem = _Problem(A / scale[:, None] * scale, C * scale, noise, spectra / np.outer(scale, scale), Bank() if bank is None else bank, dt)
+    scaled = A / scale[:, None] * scale, C * scale, noise, spectra / np.outer(scale, scale)
+    problem = (
+        min((_Problem(*scaled, bank, dt) for bank in banks), key=_Problem.promise) if len(banks) > 1 else _Problem(*scaled, banks[0], dt)
+    )
     weights, note = problem.worst_unit() if worst_unit else (np.full(len(spectra), 1 / len(spectra)), f"mean of {len(spectra)} units")
     full = problem.filter(weights)
     K = problem.correction(full)
@@ -109,6 +115,7 @@ def residual_h2(
         )
     K = problem.reduced(full, K, tolerance_percent)
     norm, radius = problem.norm(full, K), float(problem.error_system(K).spectral_radius())
+    note += f", {problem.bank.delays} delays, lags {problem.bank.poles}"
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
     rows = np.zeros(((n_lifted or n) - n, q))
     controller = StateSpace(
@@ -197,6 +204,11 @@ class _Problem:
         drive, rest = response[..., :n], response[..., n:]
         driven = np.einsum("f,fia,ufab,fib->ui", weight, drive, self.spectra, drive.conj(), optimize=True).real
         return np.asarray(driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2))
+
+    def promise(self) -> float:
+        """Sum of logarithms of the hidden states' mean square errors under equal weights."""
+        equal = np.full(len(self.spectra), 1 / len(self.spectra))
+        return float(np.log(self.unit_errors(self.correction(self.filter(equal))).mean(axis=0)[self.hidden]).sum())
 
     def worst_unit(self) -> tuple[Array, str]:
         """Weights of the units for which the largest error of a unit is smallest.

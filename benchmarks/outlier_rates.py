@@ -1,6 +1,6 @@
 """How often the outlier scores flag a badly assembled drive, and how often a good one.
 
-    python benchmarks/outlier_rates.py --seeds 0 24
+    python benchmarks/outlier_rates.py --seeds 200 260
 
 Every population is 12 simulated drives and one with loose fasteners, at three severities (the same 12 drives each time), filed under the
 same group, in both conditions. The drives are calibrated and identified as a study does it by default (Koopman models by extended dynamic
@@ -41,10 +41,10 @@ N_UNITS = 12
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs=2, default=[0, 24], metavar=("FIRST", "END"))
+    parser.add_argument("--seeds", type=int, nargs=2, default=[200, 260], metavar=("FIRST", "END"))
     parser.add_argument("--episodes", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--rate", type=float, nargs="+", default=[3e-3, 1e-2, 5e-2])
+    parser.add_argument("--rate", type=float, nargs="+", default=[3e-3, 1e-2])
     parser.add_argument("--forms", nargs="+", default=["additive"], choices=[f.value for f in Form])
     parser.add_argument("--kinds", nargs="+", default=["koopman"], choices=["koopman", "linear"])
     parser.add_argument("--cache", type=Path, default=Path("outlier_rates"))

@@ -10,9 +10,9 @@ No single nominal decides, and the nominal of the study has a score like any oth
 the only nominal, as the paper states its criterion: the range over the nominals, and the share of them under which the unit is conspicuous.
 
 Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold is the bound of a
-generalised extreme value model of the others' scores at the stated rate (`tail`): an extrapolation, and labelled as such. Units are taken out one at a time
-while they are beyond; where none is, groups that hide one another are looked for (`groups`), up to a third of the units and eight at once.
-With three units nothing can be flagged: two scores make no model. Two units are refused.
+generalised extreme value model of the others' scores at the stated rate (`tail`): an extrapolation, and labelled as such. Units are taken
+out one at a time while they are beyond; where none is, groups that hide one another are looked for (`groups`), up to a third of the units
+and eight at once. With three units nothing can be flagged: two scores make no model. Two units are refused.
 """
 
 from __future__ import annotations

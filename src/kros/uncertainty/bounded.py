@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from .certificate import ResidualSystems
 from .cover import Cover, Structure
 from .forms import Form, residual
 from .residuals import completion, misfit, sigma_max
@@ -47,7 +48,15 @@ class Bounded:
     remainder_cover: Cover | None
 
 
-def bound_residuals(form: Form, nominal: Responder, units: Responder, freqs_hz: Array, sample_period_s: float, **options: Any) -> Bounded:
+def bound_residuals(
+    form: Form,
+    nominal: Responder,
+    units: Responder,
+    freqs_hz: Array,
+    sample_period_s: float,
+    systems: ResidualSystems | None = None,
+    **options: Any,
+) -> Bounded:
     """Return weights for the residuals and for the remainder.
 
     Parameters
@@ -57,6 +66,8 @@ def bound_residuals(form: Form, nominal: Responder, units: Responder, freqs_hz: 
         From frequencies (n,), Hz, to responses of shape (n, p, m) and (unit, n, p, m) in scaled coordinates.
     freqs_hz : ndarray, shape (frequency,), Hz
     sample_period_s : float, s
+    systems : ResidualSystems, optional
+        The systems behind the responses, for a proof between grid points; the remainder's weight is checked on a grid.
     **options
         Of `fit_weight`.
 
@@ -68,7 +79,7 @@ def bound_residuals(form: Form, nominal: Responder, units: Responder, freqs_hz: 
     G, Gp = residuals.responses(freqs_hz)
     E = residual(form, G, Gp)
     of_form = options | ({"structure": Structure.SCALAR} if E.shape[-2:] == (1, 1) else {})  # of one entry the same, and one fit less
-    weight, cover = fit_weight(residuals.of_form, freqs_hz, sample_period_s, **of_form)
+    weight, cover = fit_weight(residuals.of_form, freqs_hz, sample_period_s, systems=systems, **of_form)
     ratio = misfit(form, G, Gp, E)
     bound = sigma_max(E).max(axis=0)
     if not _leaves_out(form, ratio):

@@ -14,6 +14,7 @@ from ..core.frequency import check_grid, log_grid
 from ..core.lti import StateSpace
 from .bilinear import BilinearAxis, beyond, check_continuous_grid, continuous_grid
 from .bounded import Bounded, Responder, bound_residuals
+from .certificate import ResidualSystems
 from .cover import Cover, Structure
 from .forms import Form, as_form
 from .model import UncertainModel, scale_system
@@ -169,8 +170,9 @@ class _Axis:
         """Return weights in the time of the models."""
         options: dict[str, Any] = {"structure": structure, "max_order": max_order, "tolerance_db": tolerance_db, "density": density}
         if self.map is None:
+            systems = ResidualSystems(form, nominal, units)
             return bound_residuals(
-                form, nominal.frequency_response, units.frequency_response, self.freqs_hz, self.sample_period_s, **options
+                form, nominal.frequency_response, units.frequency_response, self.freqs_hz, self.sample_period_s, systems, **options
             )
         return bound_continuous(form, nominal.frequency_response, units.frequency_response, self.freqs_hz, self.map, **options)
 

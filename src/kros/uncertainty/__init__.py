@@ -1,5 +1,6 @@
 """Uncertainty of a population: six forms, residuals, nominal, cover and weights, outliers. The stage's result is an `UncertainModel`."""
 
+from .certificate import Method, ResidualSystems, certify
 from .cover import Cover, Structure, cover_ratio, optimal_cover, optimal_left
 from .fit import FittedMagnitude, Side, fit_magnitude, invert
 from .forms import Form, existence, rebuild, residual, residual_shape
@@ -9,6 +10,7 @@ from .outliers import OutlierModel, OutlierScore, score_outliers
 from .quantify import quantify
 from .residuals import all_bounds, bounds, completion, misfit, sigma_max
 from .responses import ResponseUncertainty, quantify_responses
+from .tightness import Tightness, magnitude_tightness, weight_tightness
 from .weights import Weight, fit_weight
 
 __all__ = [
@@ -16,16 +18,20 @@ __all__ = [
     "Criterion",
     "FittedMagnitude",
     "Form",
+    "Method",
     "NominalChoice",
     "OutlierModel",
     "OutlierScore",
+    "ResidualSystems",
     "ResponseUncertainty",
     "Side",
     "Structure",
+    "Tightness",
     "UncertainModel",
     "Weight",
     "all_bounds",
     "bounds",
+    "certify",
     "choose_nominal",
     "choose_nominals",
     "completion",
@@ -34,6 +40,7 @@ __all__ = [
     "fit_magnitude",
     "fit_weight",
     "invert",
+    "magnitude_tightness",
     "misfit",
     "optimal_cover",
     "optimal_left",
@@ -45,4 +52,5 @@ __all__ = [
     "scale_system",
     "score_outliers",
     "sigma_max",
+    "weight_tightness",
 ]

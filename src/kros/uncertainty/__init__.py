@@ -5,6 +5,7 @@ from .cover import Cover, Structure, cover_ratio, optimal_cover, optimal_left
 from .fit import FittedMagnitude, Side, fit_magnitude, invert
 from .forms import Form, existence, rebuild, residual, residual_shape
 from .model import UncertainModel, scale_system
+from .noise import VariationAndNoise, variation_and_noise
 from .nominal import Criterion, NominalChoice, choose_nominal, choose_nominals
 from .outliers import OutlierModel, OutlierScore, score_outliers
 from .quantify import quantify
@@ -28,6 +29,7 @@ __all__ = [
     "Structure",
     "Tightness",
     "UncertainModel",
+    "VariationAndNoise",
     "Weight",
     "all_bounds",
     "bounds",
@@ -52,5 +54,6 @@ __all__ = [
     "scale_system",
     "score_outliers",
     "sigma_max",
+    "variation_and_noise",
     "weight_tightness",
 ]

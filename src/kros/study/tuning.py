@@ -16,7 +16,6 @@ Array = npt.NDArray[np.float64]
 TUNING_UNITS = 12
 TUNING_EPISODES = 3
 TUNING_S = 10.0
-_ALLOWED = 1.02  # error of a state over that of the open loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +49,7 @@ class Judge:
 
 
 def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, float]:
-    """Order candidates: first those that are in no state (noticeably) worse than the open loop, by the error of the hidden states relative to it.
+    """Order candidates: first those that are in no state worse than the open loop, by the error of the hidden states relative to it.
 
     Parameters
     ----------
@@ -67,7 +66,7 @@ def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, f
     """
     ratio = percent / np.maximum(limit, np.finfo(float).tiny)
     worst = float(ratio.max())
-    if not worst <= _ALLOWED:
+    if not worst <= 1:
         return True, worst
     hidden = [i for i in range(len(ratio)) if i not in measured] or list(measured)
     return False, float(np.exp(np.mean(np.log(np.maximum(ratio[hidden], np.finfo(float).tiny)))))

@@ -68,7 +68,9 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     folder = context.store.path("uncertainty", name)
     noise = measurement_noise(context, models)
     problem, refusal = usable_problem(models, unit, UncertainModel.load(folder), noise, context)
-    methods = config.observer.baselines + config.synthesis.methods
+    methods = set(config.observer.baselines + config.synthesis.methods)
+    if name not in context.edmd_names:
+        methods.discard("mixed")  # the paper's synthesis is made for the paper's models: see the page on limits
     ordered = [m for m in ("open_loop", "kalman_white", "kalman_tuned", "mixed", "worst_case_h2", "residual_h2") if m in methods]
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings["max_order"] = config.uncertainty.max_order

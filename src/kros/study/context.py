@@ -63,6 +63,10 @@ class Context:
             self.progress.advance()
             yield result
 
+    def run(self, title: str, work: Iterable[Callable[[], T]]) -> list[T]:
+        """Run independent pieces of work, in order, telling the progress listener."""
+        return list(self.map(title, _call, work))
+
     @cached_property
     def facts(self) -> Facts:
         """What the read stage found."""
@@ -111,6 +115,10 @@ class Context:
         from urllib.parse import quote
 
         return self.store.path("models", f"{name}@{quote(str(condition), safe='')}")
+
+
+def _call(work: Callable[[], T]) -> T:
+    return work()
 
 
 @dataclass(frozen=True)

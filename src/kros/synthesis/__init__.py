@@ -7,8 +7,9 @@ Nothing leaves this layer unverified: norms and stability are recomputed by `kro
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ..core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .constant_gain import kalman, luenberger
@@ -56,16 +57,4 @@ __all__ = [
     "worst_case_h2",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """Import the module behind a public name when it is first asked for."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f".{_HOME[name]}", __name__), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    """List the public names."""
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)

@@ -59,10 +59,6 @@ def _outcome(estimate: Array, batch: EpisodeBatch, dt: float, shown: tuple[int, 
     return Outcome(summarise(estimate, batch.states, batch.lengths, dt), [estimate[: batch.lengths[i], i] for i in shown])
 
 
-def _call(task: Any) -> Outcome:
-    return task()
-
-
 def run(context: Context) -> list[Path]:
     """Evaluate and save errors, spectra and the trajectories that are shown."""
     facts, population = context.facts, context.population
@@ -80,7 +76,7 @@ def run(context: Context) -> list[Path]:
     tasks = [partial(evaluate_observer, observer, population, keys, units, shown) for observer in observers.values()]
     models = {name: context.models(name) for name in context.model_names}
     tasks += [partial(evaluate_model, m, population, on, units, shown_on) for m in models.values()]
-    outcomes = list(context.map("evaluate", _call, tasks))
+    outcomes = context.run("evaluate", tasks)
 
     top_speed = _top_speed(context, models)
     band = gearbox_band_hz(context.config, population, top_speed)

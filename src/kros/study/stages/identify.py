@@ -6,7 +6,6 @@ import logging
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -121,14 +120,10 @@ def refine_models(
         )
         for start in starts
     ]
-    refined = list(context.map("identify (refine)", _call, work))
+    refined = context.run("identify (refine)", work)
     models = [with_matrices(start, found.units, factor, context, parameters) for start, found in zip(starts, refined, strict=True)]
     files = [file for m, found in zip(models, refined, strict=True) for file in found.save(context.store.path("refinement", m.name))]
     return models, files
-
-
-def _call(task: Any) -> Any:
-    return task()
 
 
 def with_matrices(start: ModelSet, matrices: KoopmanMatrices, factor: Factor, context: Context, parameters: dict[str, Array]) -> ModelSet:

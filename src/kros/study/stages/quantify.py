@@ -39,17 +39,13 @@ def run(context: Context) -> list[Path]:
     first = next(iter(sets.values()))
     nominal = choose_nominal(first, units, context.config.uncertainty)
     tasks = [partial(quantify_models, models, units, context.config.uncertainty, nominal) for models in sets.values()]
-    found = list(context.map("quantify", _call, tasks))
+    found = context.run("quantify", tasks)
     for name, uncertain in zip(sets, found, strict=True):
         uncertain.save(folder / name)
         files += sorted((folder / name).iterdir())
     choice = {"nominal": nominal, "worst_off_nominal": worst_off_nominal(first, found[0]), "dropped": sorted(dropped)}
     save_artifact(folder, "choice", choice)
     return [*files, folder / "choice.json"]
-
-
-def _call(task: Any) -> Any:
-    return task()
 
 
 def choose_nominal(models: ModelSet, units: list[str], config: UncertaintyConfig) -> str:

@@ -16,18 +16,22 @@ inequality ``||P Theta Q||_F^2 = tr(P^H P  Theta Q Q^H Theta^H) <= sum_i s_i(P)^
 
 The smaller of this and the dual bound of `dual_bound` is used.
 
-*Lower bound.* The worst case is at least any average over the set. Theta uniform on the unitary matrices has mean zero and
-``E[Theta Q Q^H Theta^H] = I ||Q||_F^2 / m``, so for every T
+Without a loop (``N = 0``) the set is the unit ball itself and the bound is attained; the same formulas hold whatever N is made of, for
+example ``W_R G W_L``.
 
-    max_X ||T X M||_F^2 >= tr T (X_c M M^H X_c^H + R_l R_l^H ||R_r M||_F^2 / m) T^H.
+*Lower bound.* The worst case is at least any average over the set. Theta uniform on the matrices (b, a) with orthonormal columns or rows has
+mean zero and ``E[Theta Q Q^H Theta^H] = I ||Q||_F^2 / max(a, b)``, so for every T
 
-If N and M are diagonal the set does not change under ``X -> V X V^H`` with V a diagonal matrix of signs, and averaging over V removes the
-off-diagonal entries of ``X M M^H X^H``. So *the diagonal of the spectrum of any element* gives a lower bound as well, and because the
-observer's error is linear in the spectrum, so does every convex combination of such spectra.
+    max_X ||T X M||_F^2 >= tr T (X_c M M^H X_c^H + R_l R_l^H ||R_r M||_F^2 / max(a, b)) T^H.
+
+If N and M are diagonal the set of ``X M`` does not change under ``X -> V X V^H`` with V a diagonal matrix of signs, and without a loop not
+under ``X -> V X``; averaging over V removes the off-diagonal entries of ``X M M^H X^H``. So in both cases *the diagonal of the spectrum of any
+element* gives a lower bound as well, and because the observer's error is linear in the spectrum, so does every convex combination of such
+spectra. Elsewhere the largest diagonal spectrum below the average's is used.
 
 Symbols
 -------
-N, M, X_c, R_l, R_r : as above, shape (f, m, m) over f frequencies;  T : error per unit disturbance, shape (f, p, m)
+N : (f, a, b) over f frequencies, with Delta and X (f, b, a);  M : (f, a, m);  T : error per unit of w2, shape (f, p, b)
 """
 
 from __future__ import annotations
@@ -49,11 +53,11 @@ class Ball:
 
     Parameters
     ----------
-    center : ndarray, shape (f, m, m)
+    center : ndarray, shape (f, b, m)
         ``X_c M``.
-    left : ndarray, shape (f, m, m)
+    left : ndarray, shape (f, b, b)
         ``R_l``.
-    right : ndarray, shape (f, m, m)
+    right : ndarray, shape (f, a, m)
         ``R_r M``.
     """
 
@@ -63,12 +67,18 @@ class Ball:
 
     @classmethod
     def of(cls, N: Array, M: Array) -> Ball:
-        """Build the ball of ``Delta (I - N Delta)^-1 M`` from the loop N and the right factor M, both (f, m, m)."""
+        """Build the ball of ``Delta (I - N Delta)^-1 M`` from the loop N, shape (f, a, b), and the right factor M, shape (f, a, m)."""
         U, s, Vh = np.linalg.svd(N)
+        k = s.shape[-1]
         radius = 1 / np.sqrt(1 - s**2)
-        V, Uh = _hermitian(Vh), _hermitian(U)
-        X_c = (V * (s * radius**2)[..., None, :]) @ Uh
-        return cls(X_c @ M, (V * radius[..., None, :]) @ Vh, (U * radius[..., None, :]) @ Uh @ M)
+        X_c = (_hermitian(Vh)[..., :k] * (s * radius**2)[..., None, :]) @ _hermitian(U)[..., :k, :]
+        return cls(X_c @ M, _with_gains(_hermitian(Vh), radius), _with_gains(U, radius) @ M)
+
+    @classmethod
+    def without_loop(cls, M: Array, b: int) -> Ball:
+        """Build the ball of ``Delta M`` for Delta with b rows."""
+        f, _, m = M.shape
+        return cls(np.zeros((f, b, m), complex), np.broadcast_to(np.eye(b, dtype=complex), (f, b, b)), M)
 
     def bound(self, T: Array) -> Array:
         """Upper bound of ``||T X M||_F`` over the set, shape (f,)."""
@@ -77,13 +87,12 @@ class Ball:
         return np.minimum(simple, dual_bound(inner, outer, self.right))
 
     def average(self) -> Array:
-        """Diagonal of the average spectrum, shape (f, m)."""
-        m = self.right.shape[-2]
-        energy = np.sum(np.abs(self.right) ** 2, axis=(-2, -1)) / m
-        return np.sum(np.abs(self.center) ** 2, axis=-1) + energy[..., None] * np.sum(np.abs(self.left) ** 2, axis=-1)
+        """Average spectrum, shape (f, b, b)."""
+        energy = np.sum(np.abs(self.right) ** 2, axis=(-2, -1)) / max(self.right.shape[-2], self.left.shape[-1])
+        return self.center @ _hermitian(self.center) + energy[..., None, None] * (self.left @ _hermitian(self.left))
 
     def worst_spectrum(self, T: Array, iterations: int = 15) -> Array:
-        """Diagonal of the spectrum of an element that is (locally) worst for T, shape (f, m).
+        """Diagonal of the spectrum of an element that is (locally) worst for T, shape (f, b).
 
         The squared error is convex in Theta, so its linearisation is a minorant, and moving to the maximiser of the linearisation, the
         polar factor of the gradient, never decreases it. Where T hardly tells elements apart the first start wins, which fits smoothly.
@@ -91,10 +100,11 @@ class Ball:
         P = T @ self.left
         _, _, Vh_p = np.linalg.svd(P)
         U_q, _, _ = np.linalg.svd(self.right)
+        k = min(P.shape[-1], self.right.shape[-2])
         starts = (
             _polar(_hermitian(self.left) @ self.center @ _hermitian(self.right)),  # aligned with the centre
             _polar(_hermitian(P) @ (T @ self.center) @ _hermitian(self.right)),  # aligned with the centre, as T sees it
-            _hermitian(Vh_p) @ _hermitian(U_q),  # worst without the centre
+            _hermitian(Vh_p)[..., :k] @ _hermitian(U_q)[..., :k, :],  # worst without the centre
         )
         best, best_value = np.zeros_like(self.center), np.full(T.shape[:-2], -1.0)
         for theta in starts:
@@ -118,6 +128,20 @@ def spread(P: Array, Q: Array) -> Array:
 
 def _hermitian(matrix: Array) -> Array:
     return np.conj(np.swapaxes(matrix, -1, -2))
+
+
+def _with_gains(U: Array, gains: Array) -> Array:
+    """Return ``U diag(gains, 1, ...) U^H``."""
+    gains = np.concatenate([gains, np.ones((*gains.shape[:-1], U.shape[-1] - gains.shape[-1]))], axis=-1)
+    return (U * gains[..., None, :]) @ _hermitian(U)
+
+
+def below(spectrum: Array) -> Array:
+    """Return a diagonal spectrum below a full one, proportional to its diagonal: shape (f, b) for (f, b, b)."""
+    power = np.real(np.einsum("fii->fi", spectrum))
+    root = np.sqrt(np.maximum(power, 1e-300))
+    least = np.linalg.eigvalsh(spectrum / (root[:, :, None] * root[:, None, :]))[:, 0]
+    return power * np.clip(least, 0.0, 1.0)[:, None]
 
 
 def _polar(matrix: Array) -> Array:

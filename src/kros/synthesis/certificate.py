@@ -18,29 +18,23 @@ import numpy.typing as npt
 
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace
-from .ball import Ball, spread
+from .ball import spread
+from .disturbance import uncertain_ball
 from .observer_problem import ObserverProblem
 from .quadrature import circle_mean
 
 Array = npt.NDArray[Any]
 
 
-def uncertain_ball(problem: ObserverProblem, freqs_hz: Array) -> Ball:
-    """Return the ball of ``Delta (I - N Delta)^-1 M`` with ``N = W_R W_L`` and ``M = W_R W_u``."""
-    right = problem.W_R.frequency_response(freqs_hz)
-    return Ball.of(right @ problem.W_L.frequency_response(freqs_hz), right @ problem.input_weight.frequency_response(freqs_hz))
-
-
 def density(problem: ObserverProblem, loop: StateSpace, freqs_hz: Array) -> Array:
     """Certified worst-case power density of ``W_p e``, shape (f,), for the closed error system `loop`."""
     m, n = problem.nominal.n_inputs, problem.nominal.n_states
     response = loop.frequency_response(freqs_hz)
-    T = response[..., :m] @ problem.W_L.frequency_response(freqs_hz)
+    T = response[..., problem.port] @ problem.W_L.frequency_response(freqs_hz)
     uncertain = uncertain_ball(problem, freqs_hz).bound(T)
     if problem.remainder_left is not None and problem.remainder_right is not None:
         left = response[..., m : m + n] @ problem.remainder_left.frequency_response(freqs_hz)
-        right = problem.remainder_right.frequency_response(freqs_hz) @ problem.input_weight.frequency_response(freqs_hz)
-        uncertain = uncertain + spread(left, right)
+        uncertain = uncertain + spread(left, (problem.remainder_right @ problem.input_weight).frequency_response(freqs_hz))
     return uncertain**2 + np.sum(np.abs(response[..., m + n :]) ** 2, axis=(-2, -1))
 
 
@@ -74,7 +68,7 @@ def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5
 
 def _log_poles(problem: ObserverProblem, loop: StateSpace) -> Array:
     """Logarithms of all poles, in the upper half plane."""
-    systems = [loop, problem.W_L, problem.W_R, problem.W_u, problem.remainder_left, problem.remainder_right]
+    systems = [loop, problem.W_L, problem.chain, problem.loop, problem.remainder_left, problem.remainder_right]
     poles = np.concatenate([s.poles() for s in systems if s is not None]).astype(complex)
     poles = poles[(poles.imag >= 0) & (np.abs(poles) > 1e-3)]
     return np.log(poles)

@@ -14,7 +14,7 @@ the square, every element of the ball obeys
 
 Symbols
 -------
-a : (f, p, m);  P : (f, p, m);  Q : (f, m, m), over f frequencies;  d_ij = s_i^2 q_j^2
+a : (f, p, m);  P : (f, p, b);  Q : (f, a, m), over f frequencies, Theta (f, b, a);  d_ij = s_i^2 q_j^2
 """
 
 from __future__ import annotations
@@ -36,18 +36,16 @@ def dual_bound(a: Array, P: Array, Q: Array) -> Array:
     Parameters
     ----------
     a : ndarray, shape (f, p, m)
-    P : ndarray, shape (f, p, m)
-    Q : ndarray, shape (f, m, m)
+    P : ndarray, shape (f, p, b)
+    Q : ndarray, shape (f, a, m)
     """
     U, s, _ = np.linalg.svd(P, full_matrices=False)
-    _, q, Hh = np.linalg.svd(Q)
-    k = s.shape[-1]
+    _, q, Hh = np.linalg.svd(Q, full_matrices=False)
     d = (s[..., :, None] * q[..., None, :]) ** 2
     rotated = np.conj(np.swapaxes(U, -1, -2)) @ a @ np.conj(np.swapaxes(Hh, -1, -2))
     c = d * np.abs(rotated) ** 2
-    g, columns = _without_centre(s, q[..., :k])
-    multipliers = np.concatenate([columns, np.zeros((*q.shape[:-1], q.shape[-1] - k))], axis=-1)
-    g = g + np.sqrt(c.sum(axis=(-2, -1)) / max(k, 1))[..., None]
+    g, multipliers = _without_centre(s, q)
+    g = g + np.sqrt(c.sum(axis=(-2, -1)) / max(s.shape[-1], 1))[..., None]
     for _ in range(_SWEEPS):
         g = _best_rows(c, multipliers[..., None, :] - d)
         multipliers = _best_rows(np.swapaxes(c, -1, -2), np.swapaxes(g[..., :, None] - d, -1, -2))
@@ -59,10 +57,13 @@ def dual_bound(a: Array, P: Array, Q: Array) -> Array:
 
 def _without_centre(s: Array, q: Array) -> tuple[Array, Array]:
     """Optimal multipliers for ``a = 0``: the dual of the sorted assignment (s and q descend)."""
+    rows, columns = s.shape[-1], q.shape[-1]
+    size = max(rows, columns)
+    s, q = (np.concatenate([x, np.zeros((*x.shape[:-1], size - x.shape[-1]))], axis=-1) for x in (s, q))
     following = np.concatenate([s[..., 1:] ** 2, np.zeros((*s.shape[:-1], 1))], axis=-1)
     steps = (s**2 - following) * q**2
     g = np.cumsum(steps[..., ::-1], axis=-1)[..., ::-1]
-    return g, np.maximum(s**2 * q**2 - g, 0.0)
+    return g[..., :rows], np.maximum(s**2 * q**2 - g, 0.0)[..., :columns]
 
 
 def _best_rows(c: Array, shift: Array) -> Array:

@@ -8,7 +8,7 @@ K : controller with matrices A^c, B^c, C^c, D^c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,8 @@ class GeneralizedPlant:
         For `mixed`: the first `n_w1` disturbances are ``w1`` (performance), the others ``w2`` (uncertainty). Default all.
     n_z1 : int, optional
         For `mixed`: the first `n_z1` outputs are ``z1``, the others ``z2``. Default all.
+    w_parts, z_parts : dict of str to int
+        Names and sizes of the parts of w and of z, in order, where they have names.
 
     Raises
     ------
@@ -73,6 +75,8 @@ class GeneralizedPlant:
     dt: float
     n_w1: int | None = None
     n_z1: int | None = None
+    w_parts: dict[str, int] = field(default_factory=dict)
+    z_parts: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in _MATRICES:
@@ -93,6 +97,9 @@ class GeneralizedPlant:
         for name, part, whole in (("n_w1", self.n_w1, n_w), ("n_z1", self.n_z1, n_z)):
             if part is not None and not 0 <= part <= whole:
                 raise DimensionError(f"Generalized plant: {name} = {part} should lie between 0 and {whole}.")
+        for name, parts, whole in (("w", self.w_parts, n_w), ("z", self.z_parts, n_z)):
+            if parts and sum(parts.values()) != whole:
+                raise DimensionError(f"Generalized plant: the parts of {name} should have {whole} signals together, found {parts}.")
 
     @property
     def sizes(self) -> tuple[int, int, int, int, int]:
@@ -108,6 +115,23 @@ class GeneralizedPlant:
         """Columns of w that belong to channel 1 (performance) or 2 (uncertainty)."""
         split = self.sizes[1] if self.n_w1 is None else self.n_w1
         return slice(0, split) if channel == 1 else slice(split, None)
+
+    def part(self, signal: str, name: str) -> Array:
+        """Return the indices of a named part of ``w`` or ``z``.
+
+        Raises
+        ------
+        DimensionError
+            When the signal has no part of that name.
+        """
+        parts = {"w": self.w_parts, "z": self.z_parts}.get(signal, {})
+        if name not in parts:
+            raise DimensionError(
+                f"Generalized plant: {signal!r} has no part {name!r}, only {', '.join(parts) or 'none'}; name one of them."
+            )
+        names = list(parts)
+        first = sum(parts[other] for other in names[: names.index(name)])
+        return np.arange(first, first + parts[name])
 
     def channel(self, rows: slice, columns: slice) -> GeneralizedPlant:
         """Return the plant restricted to some performance outputs and disturbances."""

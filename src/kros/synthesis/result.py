@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.lti import StateSpace
@@ -62,6 +63,10 @@ class Synthesis:
         H-infinity norm of the closed loop from w (or w2) to z (or z2), recomputed.
     worst_case_h2 : float or None
         Certified H2 norm for every member of the uncertain set.
+    causal_h2 : float or None
+        Largest H2 norm that was found for a causal perturbation: a lower estimate beside `worst_case_h2`, which allows any.
+    worst_case_hinf : float or None
+        Certified H-infinity norm for every member of the uncertain set.
     lower_bound : float or None
         No controller of this kind does better.
     gap_percent : float or None
@@ -83,6 +88,8 @@ class Synthesis:
     h2_norm: float | None = None
     hinf_norm: float | None = None
     worst_case_h2: float | None = None
+    causal_h2: float | None = None
+    worst_case_hinf: float | None = None
     lower_bound: float | None = None
     gap_percent: float | None = None
     quadrature_error: float | None = None
@@ -101,7 +108,7 @@ class Synthesis:
     def load(cls, folder: Path) -> Synthesis:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "synthesis")
-        values = {name: content[name] for name in _PLAIN}
+        values: dict[str, Any] = {name: content.get(name) for name in _PLAIN}
         values |= {"status": Status(content["status"]), "injection": Injection(content["injection"]), "notes": tuple(content["notes"])}
         return cls(controller=StateSpace(arrays["A"], arrays["B"], arrays["C"], arrays["D"], content["dt"]), **values)
 

@@ -27,6 +27,7 @@ from ...identify import (
 from ...identify.excitation import require_excitation, require_independent
 from ...identify.refine import RefineOptions, refine_population
 from ...lifting import Lifting
+from ..config import IdentifyConfig
 from ..context import Context
 from . import calibrate
 
@@ -105,8 +106,7 @@ def refine_models(
     facts = context.facts
     keys = {u: facts.keys("train", u, facts.identify_on) for u in units}
     pooled = np.array([u in facts.pooled for u in units])
-    config = context.config.identify
-    options = RefineOptions(margin=max(config.margin, RefineOptions().margin), largest_residual=config.largest_residual)
+    options = refine_options(context.config.identify)
     work = [
         partial(
             refine_population,
@@ -124,6 +124,11 @@ def refine_models(
     models = [with_matrices(start, found.units, factor, context, parameters) for start, found in zip(starts, refined, strict=True)]
     files = [file for m, found in zip(models, refined, strict=True) for file in found.save(context.store.path("refinement", m.name))]
     return models, files
+
+
+def refine_options(config: IdentifyConfig) -> RefineOptions:
+    """Return the options of the refinement that a study asks for."""
+    return RefineOptions(margin=max(config.margin, RefineOptions().margin), largest_residual=config.largest_residual)
 
 
 def with_matrices(start: ModelSet, matrices: KoopmanMatrices, factor: Factor, context: Context, parameters: dict[str, Array]) -> ModelSet:

@@ -1,16 +1,29 @@
 """The observer as it runs: one-step predictor with retraction and re-lifting, and the baselines it is compared with."""
 
-from .baselines import kalman_candidates, noise_covariances
+from .baselines import kalman_candidates, luenberger_candidates, noise_covariances
+from .difference import FilteredDifference, cutoffs_hz, rates
+from .extended_kalman import ExtendedKalman, start_covariance
+from .learned import Features, Learned, Moments
 from .observer import Observer
 from .residual import mean_error_dynamics, one_step_residual, residual_spectra
-from .simulate import run_observer
+from .simulate import run_observer, run_observers
 
 __all__ = [
+    "ExtendedKalman",
+    "Features",
+    "FilteredDifference",
+    "Learned",
+    "Moments",
     "Observer",
+    "cutoffs_hz",
     "kalman_candidates",
+    "luenberger_candidates",
     "mean_error_dynamics",
     "noise_covariances",
     "one_step_residual",
+    "rates",
     "residual_spectra",
     "run_observer",
+    "run_observers",
+    "start_covariance",
 ]

@@ -1,4 +1,4 @@
-"""What people would use instead: steady-state Kalman gains with guessed or tuned white noise."""
+"""What people would use instead: steady-state Kalman gains with guessed or tuned white noise, and placed poles."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from ..synthesis import kalman
+from ..core.errors import SynthesisError
+from ..synthesis import kalman, luenberger
 from ..synthesis.result import Synthesis
 
 Array = npt.NDArray[np.float64]
 _SWEEP_DECADES = (-6, 10)
 _PER_DECADE = 1
+_FASTER = (1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.3, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0, 32.0)
 
 
 def noise_covariances(residual_covariance: Array, resolution: Array) -> tuple[Array, Array]:
@@ -32,25 +34,53 @@ def noise_covariances(residual_covariance: Array, resolution: Array) -> tuple[Ar
     return residual_covariance.mean(axis=0), np.diag(resolution**2 / 12)
 
 
-def kalman_candidates(A: Array, C: Array, scale: Array, R: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:
-    """Sweep white process noise of equal relative size in every state over sixteen decades.
+def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:
+    """Sweep the size of white process noise over sixteen decades.
 
     Parameters
     ----------
     A : ndarray, shape (n, n)
     C : ndarray, shape (q, n)
-    scale : ndarray, shape (n,)
-        Range of every state.
+    shape : ndarray, shape (n, n) or (n,)
+        Covariance of the process noise up to its size; or the range of every state, for noise of equal relative size.
     R : ndarray, shape (q, q)
     dt : float, s
 
     Yields
     ------
     float
-        Process noise variance relative to the squared ranges and to the relative measurement noise.
+        Process noise, as variance of the measured combinations relative to the measurement noise.
     Synthesis
     """
-    base = np.trace(R) / max(np.sum((C @ scale) ** 2), np.finfo(float).tiny)
+    shape = np.diag(shape**2) if shape.ndim == 1 else shape
+    base = np.trace(R) / max(float(np.trace(C @ shape @ C.T)), np.finfo(float).tiny)
     start, stop = _SWEEP_DECADES
     for level in np.logspace(start, stop, _PER_DECADE * (stop - start) + 1):
-        yield float(level), kalman(A, C, level * base * np.diag(scale**2), R, dt)
+        yield float(level), kalman(A, C, level * base * shape, R, dt)
+
+
+def luenberger_candidates(A: Array, C: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:
+    """Place the poles of the error dynamics at those of the model, made faster by growing factors.
+
+    A pole ``z`` becomes ``z**factor``: the decay rate and the frequency of its continuous counterpart grow alike. Factors whose poles cannot be
+    placed are left out.
+
+    Parameters
+    ----------
+    A : ndarray, shape (n, n)
+        Stable.
+    C : ndarray, shape (q, n)
+    dt : float, s
+
+    Yields
+    ------
+    float
+        The factor.
+    Synthesis
+    """
+    poles = np.linalg.eigvals(A)
+    for factor in _FASTER:
+        try:
+            yield factor, luenberger(A, C, poles**factor, dt)
+        except SynthesisError:
+            continue

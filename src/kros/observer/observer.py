@@ -26,6 +26,7 @@ from ..core.errors import DataError, DimensionError
 from ..core.lti import StateSpace, gain
 from ..lifting import Lifting
 from ..synthesis.result import Injection
+from .simulate import run_observer
 
 Array = npt.NDArray[np.float64]
 
@@ -106,6 +107,10 @@ class Observer:
     def start(self, y: npt.ArrayLike, parameters: Mapping[str, float] | None = None) -> RunningObserver:
         """Return a running observer that starts at a first measurement, shape (q,)."""
         return RunningObserver(self, np.atleast_1d(np.asarray(y, dtype=float)), {**self.parameters, **(parameters or {})})
+
+    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+        """Estimate a batch of episodes; see `run_observer`."""
+        return run_observer(self, y, u, parameters)
 
     def save(self, path: Path) -> None:
         """Write the observer as one JSON file that a person can read."""

@@ -1,14 +1,17 @@
-"""Batched simulation of an observer over many episodes at once."""
+"""Batched simulation of observers over many episodes at once."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DimensionError
-from .observer import Observer
+
+if TYPE_CHECKING:
+    from .observer import Observer
 
 Array = npt.NDArray[np.float64]
 
@@ -29,37 +32,75 @@ def run_observer(observer: Observer, y: Array, u: Array, parameters: Mapping[str
     ndarray, shape (n_samples, batch, n)
         Row k is the estimate of the state at k from data up to k - 1; row 0 is the start.
     """
-    if y.ndim != 3 or u.ndim != 3 or y.shape[:2] != u.shape[:2]:
-        raise DimensionError(
-            f"Running observer {observer.name}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch)."
-        )
+    return run_observers([observer], y, u, parameters)[0]
+
+
+def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    """Run observers of one and the same model, which differ in their corrections, side by side.
+
+    Parameters
+    ----------
+    observers : sequence of Observer
+        Of the same lifting, measured states and inputs; corrections may have different orders.
+    y, u, parameters
+        As in `run_observer`.
+
+    Returns
+    -------
+    ndarray, shape (observer, n_samples, batch, n)
+        A view with the samples outermost in memory.
+    """
+    observer = observers[0]
+    require_recordings(f"observer {observer.name}", observer.inputs, y, u)
     lifting, n_samples, batch = observer.lifting, *y.shape[:2]
-    n, n_lifted, order, m = lifting.n_states, lifting.n_lifted, observer.controller.n_states, observer.B.shape[1]
-    if u.shape[2] != len(observer.inputs):
-        raise DimensionError(f"Running observer {observer.name}: expected inputs {observer.inputs}, found shape {u.shape}.")
+    if any((o.lifting, o.measured, o.inputs) != (lifting, observer.measured, observer.inputs) for o in observers[1:]):
+        raise DimensionError(
+            f"Running {len(observers)} observers side by side: they differ in lifting, measured states or inputs; run them one by one."
+        )
+    n, n_lifted, m, k = lifting.n_states, lifting.n_lifted, observer.B.shape[1], len(observers)
+    order = max(o.controller.n_states for o in observers)
     values = {**observer.parameters, **(parameters or {})}
-    step = np.ascontiguousarray(observer.one_step.T)
+    step = np.stack([_padded(o, order) for o in observers])
     # One row a machine: [theta, x^c, u, y]. The product gives [x_hat+, x^c+].
-    row = np.zeros((batch, step.shape[0]))
-    lifted = row[:, :n_lifted]
-    row[:, :n] = observer.initial(y[0])
-    estimates = np.empty((n_samples, batch, n))
-    following = np.empty((batch, n + order))
+    row = np.zeros((k, batch, step.shape[1]))
+    lifted, inflow, measurement = row[..., :n_lifted], row[..., n_lifted + order : n_lifted + order + m], row[..., n_lifted + order + m :]
+    row[..., :n] = observer.initial(y[0])
+    estimates = np.empty((n_samples, k, batch, n))
+    following = np.empty((k, batch, n + order))
     plain = not (lifting.history or lifting.input_functions)
-    earlier = lifting.window.hold(row[:, :n], u[0])
+    held = np.broadcast_to(u[0], (k, *u[0].shape))
+    earlier = lifting.window.hold(row[..., :n], held)
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(n_samples):
-            estimates[k] = row[:, :n]
+        for sample in range(n_samples):
+            estimates[sample] = row[..., :n]
             if plain:
                 lifting.lift_into(lifted, values)
-                row[:, n_lifted + order : n_lifted + order + m] = u[k]
+                inflow[...] = u[sample]
             else:
-                window = np.concatenate([row[:, :n], earlier], axis=-1)
+                held = np.broadcast_to(u[sample], held.shape)
+                window = np.concatenate([row[..., :n], earlier], axis=-1)
                 lifting.lift_into(lifted, values, earlier)
-                row[:, n_lifted + order : n_lifted + order + m] = lifting.lift_inputs(u[k], window, values)
-                earlier = lifting.window.advance(window, u[k])
-            row[:, n_lifted + order + m :] = y[k]
+                inflow[...] = lifting.lift_inputs(held, window, values)
+                earlier = lifting.window.advance(window, held)
+            measurement[...] = y[sample]
             np.matmul(row, step, out=following)
-            row[:, :n] = following[:, :n]
-            row[:, n_lifted : n_lifted + order] = following[:, n:]
-    return estimates
+            row[..., :n] = following[..., :n]
+            row[..., n_lifted : n_lifted + order] = following[..., n:]
+    return np.moveaxis(estimates, 0, 1)
+
+
+def require_recordings(who: str, inputs: Sequence[str], y: Array, u: Array) -> None:
+    """Refuse measurements and inputs that do not fit together, or to the inputs of an observer."""
+    if y.ndim != 3 or u.ndim != 3 or y.shape[:2] != u.shape[:2]:
+        raise DimensionError(f"Running {who}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch).")
+    if u.shape[2] != len(inputs):
+        raise DimensionError(f"Running {who}: expected inputs {tuple(inputs)}, found shape {u.shape}.")
+
+
+def _padded(observer: Observer, order: int) -> Array:
+    """The one-step map, transposed, with silent controller states up to an order."""
+    n, nl, own = observer.lifting.n_states, observer.lifting.n_lifted, observer.controller.n_states
+    step = observer.one_step.T
+    missing = order - own
+    step = np.insert(step, [nl + own] * missing, 0.0, axis=0)
+    return np.ascontiguousarray(np.insert(step, [n + own] * missing, 0.0, axis=1))

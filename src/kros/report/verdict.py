@@ -58,7 +58,7 @@ def _better(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
     for channel in channels:
         own, best = table.cells[name][channel].mean, table.best(channel, "mean")
         if own is not None and best is not None and best < 0.95 * own:
-            other = next(o for o in table.observers if table.cells[o][channel].mean == best)
+            other = next(o for o in table.observers if channel in table.cells[o] and table.cells[o][channel].mean == best)
             parts.append(f"“{observer_label(other)}” in {channel.replace('_', ' ')} ({number(best)} %)")
     return [f"Better in the mean: {_join(parts)}."] if parts else []
 

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
@@ -21,6 +21,7 @@ FORMS = Literal[
     "inverse_input_multiplicative",
     "inverse_output_multiplicative",
 ]
+BASELINES = Literal["open_loop", "kalman_white", "kalman_tuned", "luenberger", "ekf", "filtered_difference", "learned"]
 
 
 class Stage(str, Enum):
@@ -133,9 +134,13 @@ class SynthesisConfig(_Section):
 
 
 class ObserverConfig(_Section):
-    """Which observers are compared, and which one is handed over."""
+    """Which observers are compared, and which one is handed over.
 
-    baselines: tuple[Literal["open_loop", "kalman_white", "kalman_tuned"], ...] = ("open_loop", "kalman_white", "kalman_tuned")
+    The extended Kalman filter runs on lifted models, where alone it differs from the tuned Kalman filter; ``filtered_difference`` and
+    ``learned`` need no model.
+    """
+
+    baselines: tuple[BASELINES, ...] = get_args(BASELINES)
     deployed: str | None = None
 
 

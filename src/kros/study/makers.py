@@ -12,9 +12,10 @@ import numpy.typing as npt
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, block_diagonal, gain
 from ..identify import ModelSet
-from ..observer import Observer, kalman_candidates, mean_error_dynamics, noise_covariances, one_step_residual, residual_spectra
+from ..observer import Observer, mean_error_dynamics, noise_covariances, one_step_residual, residual_spectra
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, residual_h2, worst_case_h2
 from ..uncertainty import fit_magnitude
+from .baselines import kalman_tuned, make_luenberger
 from .tuning import TuningSet, rank
 
 Array = npt.NDArray[np.float64]
@@ -108,22 +109,6 @@ def kalman_white(task: Task) -> Made:
     """Kalman gains for noise guessed as anybody would: one-step residuals and quantisation."""
     Q, R = noise_covariances(task.models.residual_covariance, task.noise * np.sqrt(12))
     return kalman(task.dynamics, task.selector, Q, R, task.models.sample_period_s), {}, task.problem
-
-
-def kalman_tuned(task: Task) -> Made:
-    """Kalman gains for the white process noise that does best on training episodes."""
-    judge = task.tuning.read()
-    limit = judge.percent(task.observer(open_loop(task)[0]))
-    candidates = kalman_candidates(
-        task.dynamics, task.selector, task.models.output_scale, np.diag(task.noise**2), task.models.sample_period_s
-    )
-    scored = [
-        (rank(judge.percent(task.observer(synthesis)), limit, task.models.measured), level, synthesis) for level, synthesis in candidates
-    ]
-    (_, share), level, best = min(scored, key=lambda row: row[0])
-    if not np.isfinite(share):
-        raise SynthesisError("Tuned Kalman filter: every candidate diverges on the training episodes.")
-    return best, {"process_noise_level": level, "training_error_to_open_loop": share}, task.problem
 
 
 def make_mixed(task: Task) -> Made:
@@ -246,4 +231,5 @@ MAKERS: dict[str, Callable[[Task], Made]] = {
     "open_loop": open_loop,
     "kalman_white": kalman_white,
     "kalman_tuned": kalman_tuned,
+    "luenberger": make_luenberger,
 }

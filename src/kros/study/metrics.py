@@ -122,6 +122,10 @@ def _observers(context: Context) -> dict[str, Any]:
     return entries
 
 
+def _observers_and_baselines(context: Context) -> dict[str, Any]:
+    return {**_observers(context), **_evaluation_record(context)["baselines"]}
+
+
 def _evaluation(context: Context) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = _evaluation_record(context)["rows"]
     return rows
@@ -148,5 +152,6 @@ _SECTIONS = (
     (Stage.QUANTIFY, "outliers", _outliers),
     (Stage.SYNTHESIZE, "observers", _observers),
     (Stage.EVALUATE, "models", _free_run),
+    (Stage.EVALUATE, "observers", _observers_and_baselines),
     (Stage.EVALUATE, "evaluation", _evaluation),
 )

@@ -10,12 +10,13 @@ import numpy.typing as npt
 
 from ..data.population import EpisodeKey, Population
 from ..evaluate import EpisodeBatch, error_percent
-from ..observer import Observer, run_observer
+from ..observer import Observer, run_observer, run_observers
 
 Array = npt.NDArray[np.float64]
 TUNING_UNITS = 12
 TUNING_EPISODES = 3
 TUNING_S = 10.0
+SIDE_BY_SIDE = 20  # keeps a study of twelve units below 200 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +41,32 @@ class Judge:
     batch: EpisodeBatch
     parameters: dict[str, Array]
 
+    def first(self, n_samples: float) -> Judge:
+        """Return the same episodes, cut to so many samples."""
+        cut, b = round(n_samples), self.batch
+        short = EpisodeBatch(b.keys, np.minimum(b.lengths, cut), b.states[:cut], np.ascontiguousarray(b.inputs[:cut]))
+        return Judge(short, self.parameters)
+
+    def measurements(self, measured: Sequence[int]) -> Array:
+        """Return the measured states, shape (n_samples, batch, q)."""
+        return np.ascontiguousarray(self.batch.states[..., list(measured)])
+
     def percent(self, observer: Observer) -> Array:
         """Return the mean error of every state in percent of its range, shape (n,); infinite where the observer diverges."""
         values = self.parameters if observer.lifting.parameters else None
         estimate = run_observer(observer, self.batch.states[..., list(observer.measured)], self.batch.inputs, values)
         percent = error_percent(estimate, self.batch.states, self.batch.lengths).mean(axis=0)
         return np.where(np.isfinite(percent), percent, np.inf)
+
+    def percent_of_all(self, observers: Sequence[Observer]) -> Array:
+        """Return the same for observers of one model that differ in their corrections, shape (observer, n): several at a time run side by side."""
+        values = self.parameters if observers[0].lifting.parameters else None
+        y = self.batch.states[..., list(observers[0].measured)]
+        found = []
+        for start in range(0, len(observers), SIDE_BY_SIDE):
+            estimates = run_observers(observers[start : start + SIDE_BY_SIDE], y, self.batch.inputs, values)
+            found += [error_percent(estimate, self.batch.states, self.batch.lengths).mean(axis=0) for estimate in estimates]
+        return np.where(np.isfinite(found), found, np.inf)
 
 
 def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, float]:

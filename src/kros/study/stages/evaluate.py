@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,24 +13,33 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
+from ...core.errors import KrosError
 from ...data.population import EpisodeKey, Population
 from ...evaluate import EpisodeBatch, ErrorSummary, summarise
 from ...identify import ModelSet, free_run
 from ...observer import Observer, run_observer
 from ..context import Context
+from ..estimators import Baseline, make_difference, make_extended, make_learned
 from ..presets import gearbox_band_hz
 from . import calibrate
+from .synthesize import measurement_noise, tuning_set
 
+log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 UnitParameters = dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one model or observer did on the test episodes: errors, and trajectories of the episodes that are shown."""
+    """What one model or observer did on the test episodes: errors, and trajectories of the episodes that are shown.
+
+    A baseline that is made here leaves its `facts`; `estimated` are the states that it estimates, all where it is None.
+    """
 
     summary: ErrorSummary
     shown: list[Array]
+    facts: dict[str, Any] | None = None
+    estimated: tuple[int, ...] | None = None
 
 
 def evaluate_observer(
@@ -40,6 +51,19 @@ def evaluate_observer(
         observer, batch.states[..., list(observer.measured)], batch.inputs, batch.parameters(units) if observer.lifting.parameters else None
     )
     return _outcome(estimate, batch, population.sample_period_s, shown)
+
+
+def evaluate_baseline(
+    make: Callable[[], Baseline], population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
+) -> Outcome | str:
+    """Make a baseline and run it on test episodes; the reason where it cannot be made."""
+    try:
+        baseline = make()
+    except KrosError as error:
+        return str(error)
+    batch = EpisodeBatch.read(population, keys)
+    outcome = _outcome(baseline.run(batch, batch.parameters(units)), batch, population.sample_period_s, shown)
+    return replace(outcome, facts=baseline.facts, estimated=baseline.estimated)
 
 
 def evaluate_model(
@@ -72,21 +96,20 @@ def run(context: Context) -> list[Path]:
     shown = showcase(context, keys, roles)
     shown_on = tuple(on.index(keys[i]) for i in shown if keys[i] in on)
 
-    observers = load_observers(context)
-    tasks = [partial(evaluate_observer, observer, population, keys, units, shown) for observer in observers.values()]
-    models = {name: context.models(name) for name in context.model_names}
-    tasks += [partial(evaluate_model, m, population, on, units, shown_on) for m in models.values()]
-    outcomes = context.run("evaluate", tasks)
+    observers, models = load_observers(context), {name: context.models(name) for name in context.model_names}
+    makers = baseline_makers(context, models)
+    work: list[Callable[[], Outcome | str]] = [partial(evaluate_observer, o, population, keys, units, shown) for o in observers.values()]
+    work += [partial(evaluate_baseline, make, population, keys, units, shown) for make in makers.values()]
+    work += [partial(evaluate_model, m, population, on, units, shown_on) for m in models.values()]
+    results = dict(zip([*observers, *makers, *(f"free run/{m}" for m in models)], context.run("evaluate", work), strict=True))
+    free_runs = {m: outcome for m in models if isinstance(outcome := results[f"free run/{m}"], Outcome)}
+    estimates = {name: outcome for name in (*observers, *makers) if isinstance(outcome := results[name], Outcome)}
 
-    top_speed = _top_speed(context, models)
-    band = gearbox_band_hz(context.config, population, top_speed)
+    band = gearbox_band_hz(context.config, population, _top_speed(context, models))
     rows = []
-    for name, outcome in zip(observers, outcomes, strict=False):
-        rows += error_rows(name, outcome.summary, keys, roles, population.states, band)
-    free = {
-        name: free_run_percent(o.summary, on, facts.pooled, population.states)
-        for name, o in zip(models, outcomes[len(observers) :], strict=True)
-    }
+    for name, outcome in estimates.items():
+        rows += error_rows(name, outcome.summary, keys, roles, population.states, band, outcome.estimated)
+    free = {name: free_run_percent(o.summary, on, facts.pooled, population.states) for name, o in free_runs.items()}
     folder = context.store.path("evaluation")
     content: dict[str, Any] = {
         "rows": rows,
@@ -94,12 +117,36 @@ def run(context: Context) -> list[Path]:
         "band_hz": band,
         "roles": roles,
         "shown": [[k.unit, k.condition, k.episode] for k in (keys[i] for i in shown)],
+        "baselines": {name: facts_of(name, results[name]) for name in makers},
     }
-    content |= {"observers": list(observers), "models": list(models), "states": population.states}
-    save_artifact(
-        folder, "evaluation", content, _arrays(population, keys, on, shown, shown_on, roles, list(observers), list(models), outcomes)
-    )
+    content |= {"observers": list(estimates), "models": list(models), "states": population.states}
+    save_artifact(folder, "evaluation", content, _arrays(population, keys, on, shown, shown_on, roles, estimates, free_runs))
     return [folder / "evaluation.json", folder / "arrays.npz"]
+
+
+def baseline_makers(context: Context, models: dict[str, ModelSet]) -> dict[str, Callable[[], Baseline]]:
+    """Return what makes every baseline that is no correction of a model: extended filters of lifted models, and those without a model."""
+    asked, first = context.config.observer.baselines, next(iter(models.values()))
+    nominal = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
+    tuning = tuning_set(context, first)
+    makers: dict[str, Callable[[], Baseline]] = {}
+    if "ekf" in asked:
+        for name, found in models.items():
+            if found.lifting.functions or found.lifting.input_functions:
+                makers[f"{name}/ekf"] = partial(make_extended, tuning, found, nominal, measurement_noise(context, found))
+    if "filtered_difference" in asked:
+        makers["filtered_difference"] = partial(make_difference, tuning, first.measured)
+    if "learned" in asked:
+        makers["learned"] = partial(make_learned, tuning, context.lifting, first.measured)
+    return makers
+
+
+def facts_of(name: str, result: Outcome | str) -> dict[str, Any]:
+    """Return what the records say about a baseline that was made here."""
+    if isinstance(result, Outcome):
+        return result.facts or {}
+    log.info("%s could not be made: %s", name, result)
+    return {"status": "failed", "reason": result}
 
 
 def _usable(context: Context) -> list[str]:
@@ -140,13 +187,16 @@ def error_rows(
     roles: dict[str, str],
     channels: tuple[str, ...],
     band: tuple[float, float] | None,
+    estimated: tuple[int, ...] | None = None,
 ) -> list[dict[str, Any]]:
-    """Return a row for every unit, condition and channel: the mean over the unit's test episodes."""
+    """Return a row for every unit, condition and channel that is estimated: the mean over the unit's test episodes."""
     power = None if band is None else summary.band_power(band)
     rows = []
     for unit, condition in dict.fromkeys((k.unit, k.condition) for k in keys):
         chosen = [i for i, k in enumerate(keys) if (k.unit, k.condition) == (unit, condition)]
         for j, channel in enumerate(channels):
+            if estimated is not None and j not in estimated:
+                continue
             row = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition, "channel": channel}
             row |= {"rms": summary.rms[chosen, j].mean(), "error_percent": summary.percent[chosen, j].mean()}
             rows.append(row | ({} if power is None else {"gearbox_band_power": power[chosen, j].mean()}))
@@ -176,23 +226,22 @@ def _arrays(
     shown: tuple[int, ...],
     shown_on: tuple[int, ...],
     roles: dict[str, str],
-    observers: list[str],
-    models: list[str],
-    outcomes: list[Outcome],
+    estimates: dict[str, Outcome],
+    free_runs: dict[str, Outcome],
 ) -> dict[str, npt.NDArray[Any]]:
     """Collect what the figures need: shown trajectories (float32) and mean error spectra by role and condition."""
-    arrays: dict[str, npt.NDArray[Any]] = {"freqs_hz": outcomes[0].summary.freqs_hz}
+    arrays: dict[str, npt.NDArray[Any]] = {"freqs_hz": next(iter(free_runs.values())).summary.freqs_hz}
     for number, i in enumerate(shown):
         states, inputs = population.read_parts(keys[i])
         arrays[f"shown{number}/states"], arrays[f"shown{number}/inputs"] = _single(states), _single(inputs)
-        for name, outcome in zip(observers, outcomes, strict=False):
+        for name, outcome in estimates.items():
             arrays[f"shown{number}/observer/{name}"] = _single(outcome.shown[number])
-    for name, outcome in zip(models, outcomes[len(observers) :], strict=True):
+    for name, outcome in free_runs.items():
         for number, _ in enumerate(shown_on):
             arrays[f"shown{number}/model/{name}"] = _single(outcome.shown[number])
         arrays[f"spectrum/model/{name}"] = outcome.summary.spectra.mean(axis=0)
     conditions = sorted({k.condition for k in keys})
-    for name, outcome in zip(observers, outcomes, strict=False):
+    for name, outcome in estimates.items():
         for role in ("nominal", "off_nominal"):
             for condition in conditions:
                 chosen = [i for i, k in enumerate(keys) if roles[k.unit] == role and k.condition == condition]

@@ -24,7 +24,7 @@ from . import calibrate
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-PREFERRED = ("worst_case_h2", "mixed", "residual_h2", "kalman_tuned", "kalman_white", "open_loop")
+PREFERRED = ("worst_case_h2", "mixed", "residual_h2", "kalman_tuned", "luenberger", "kalman_white", "open_loop")
 
 
 def run(context: Context) -> list[Path]:
@@ -71,7 +71,7 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     methods = set(config.observer.baselines + config.synthesis.methods)
     if name not in context.edmd_names:
         methods.discard("mixed")  # the paper's synthesis is made for the paper's models: see the page on limits
-    ordered = [m for m in ("open_loop", "kalman_white", "kalman_tuned", "mixed", "worst_case_h2", "residual_h2") if m in methods]
+    ordered = [m for m in ("open_loop", "kalman_white", "kalman_tuned", "luenberger", "mixed", "worst_case_h2", "residual_h2") if m in methods]
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings["max_order"] = config.uncertainty.max_order
     return [

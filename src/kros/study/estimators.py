@@ -1,0 +1,147 @@
+"""Baselines that are no constant correction of a model, and so have no certificate: made and run where observers are evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError, SynthesisError
+from ..evaluate import EpisodeBatch, error_percent
+from ..identify import ModelSet
+from ..lifting import Lifting
+from ..observer import ExtendedKalman, Features, FilteredDifference, Learned, Moments, cutoffs_hz, rates, start_covariance
+from .baselines import EQUAL, RESIDUAL
+from .tuning import TuningSet, rank
+
+Array = npt.NDArray[np.float64]
+Parameters = Mapping[str, Array]
+_LEVELS = (-4.0, -2.0, 0.0, 2.0, 4.0)  # decades of process noise that the extended filter tries, for either shape
+_EXTENDED_S = 2.0
+
+
+class Estimator(Protocol):
+    """What can be run over a batch of episodes."""
+
+    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+        """Return estimates, shape (n_samples, batch, n)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Baseline:
+    """A baseline that was tuned or trained.
+
+    Parameters
+    ----------
+    by_unit : mapping of str to Estimator
+        The estimator for a unit; the empty name for all others.
+    measured : tuple of int
+    estimated : tuple of int
+        States that it estimates.
+    facts : dict
+        For the records.
+    """
+
+    by_unit: Mapping[str, Estimator]
+    measured: tuple[int, ...]
+    estimated: tuple[int, ...]
+    facts: dict[str, Any]
+
+    def run(self, batch: EpisodeBatch, parameters: Parameters) -> Array:
+        """Estimate all episodes, each with the estimator of its unit; NaN for states that are not estimated."""
+        estimate = np.empty_like(batch.states)
+        groups: dict[str, list[int]] = {}
+        for i, key in enumerate(batch.keys):
+            groups.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
+        for name, rows in groups.items():
+            y = batch.states[:, rows][..., list(self.measured)]
+            estimate[:, rows] = self.by_unit[name].run(y, batch.inputs[:, rows], {k: v[rows] for k, v in parameters.items()})
+        return estimate
+
+
+def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) -> Baseline:
+    """Tune the extended Kalman filter of a nominal model: process noise over eight decades, of two shapes, all run side by side.
+
+    Raises
+    ------
+    SynthesisError
+        When every candidate diverges on the training episodes.
+    """
+    judge, lifting, n = tuning.read(), models.lifting, models.lifting.n_states
+    row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
+    shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2), RESIDUAL: models.residual_covariance.mean(axis=0)[:n, :n]}
+    tried = [(name, level, 10**level * _relative(shape, R, C)) for name, shape in shapes.items() for level in _LEVELS]
+    start = start_covariance(models.output_scale[:n], R, models.measured)
+    values = {name: float(v[row]) for name, v in models.parameters.items()}
+    filters = ExtendedKalman(
+        lifting, models.A[row], models.B[row], models.measured, models.recorded_inputs, np.stack([Q for *_, Q in tried]), R, start, values
+    )
+    short = judge.first(_EXTENDED_S / models.sample_period_s)
+    percents = [
+        error_percent(estimate, short.batch.states, short.batch.lengths).mean(axis=0)
+        for estimate in filters.run_all(short.measurements(models.measured), short.batch.inputs, short.parameters)
+    ]
+    bounded = [np.where(np.isfinite(p), p, np.inf) for p in percents]
+    limit = np.full(n, 100.0)
+    ranks = [rank(p, limit, models.measured) for p in bounded]
+    first = min(range(len(tried)), key=lambda i: ranks[i])
+    if not np.isfinite(bounded[first]).all():
+        raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
+    shape_name, level, Q = tried[first]
+    facts = {"status": "tuned", "process_noise_level": 10**level, "process_noise_shape": shape_name}
+    return Baseline({"": replace(filters, Q=Q)}, models.measured, tuple(range(n)), facts)
+
+
+def make_difference(tuning: TuningSet, measured: tuple[int, ...]) -> Baseline:
+    """Choose the cut-off of the filtered difference.
+
+    Raises
+    ------
+    ConfigError
+        When the units of measure name no state as the rate of a measured one.
+    """
+    population = tuning.population
+    states = [c for c in population.channels if c.name in population.states]
+    pairs = rates(states, [population.states[i] for i in measured])
+    if not pairs:
+        units = ", ".join(f"{c.name} ({c.unit or 'no unit'})" for c in states)
+        raise ConfigError(
+            f"Filtered difference: no state is the rate of a measured one by its unit of measure, found {units}; declare units such as rad and rad/s."
+        )
+    judge, estimated = tuning.read(), [state for _, state in pairs]
+    y, truth, lengths = judge.measurements(measured), judge.batch.states[..., estimated], judge.batch.lengths
+    best: tuple[float, FilteredDifference] | None = None
+    for cutoff in cutoffs_hz(population.sample_period_s):
+        trial = FilteredDifference(len(states), pairs, float(cutoff), population.sample_period_s)
+        error = float(error_percent(trial.run(y, judge.batch.inputs)[..., estimated], truth, lengths).mean())
+        if best is None or error < best[0]:
+            best = (error, trial)
+    assert best is not None
+    return Baseline({"": best[1]}, measured, tuple(estimated), {"status": "tuned", "cutoff_hz": best[1].cutoff_hz})
+
+
+def make_learned(tuning: TuningSet, lifting: Lifting, measured: tuple[int, ...]) -> Baseline:
+    """Train the learned estimator on the training episodes of all units, once for every unit without it.
+
+    Raises
+    ------
+    DataError
+        When every state is measured, there is one unit only, or episodes are too short.
+    """
+    judge = tuning.read()
+    batch, y = judge.batch, judge.measurements(measured)
+    features = Features.of(lifting, measured, y, batch.inputs)
+    units = [key.unit for key in batch.keys]
+    moments = Moments.of(features, batch.states, batch.inputs, batch.lengths, units, judge.parameters)
+    estimators: dict[str, Learned] = {unit: moments.estimator([unit]) for unit in moments.units}
+    facts = {"status": "trained", "taps": features.taps, "left_out": "the unit under test"}
+    return Baseline(estimators | {"": moments.estimator()}, measured, moments.estimated, facts)
+
+
+def _relative(shape: Array, R: Array, measured: list[int]) -> Array:
+    """Process noise whose measured combinations have the variance of the measurement noise."""
+    size = float(np.trace(shape[np.ix_(measured, measured)]))
+    return np.asarray(shape * np.trace(R) / max(size, np.finfo(float).tiny))

@@ -1,0 +1,179 @@
+"""Baselines against what is known without them: textbook recursions, analytic filters, an estimator that is linear in the past."""
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError, DataError, DimensionError
+from kros.core.lti import StateSpace, gain
+from kros.data import Channel, Role
+from kros.lifting import Lifting
+from kros.observer import (
+    ExtendedKalman,
+    Features,
+    FilteredDifference,
+    Moments,
+    Observer,
+    cutoffs_hz,
+    luenberger_candidates,
+    rates,
+    run_observer,
+    run_observers,
+    start_covariance,
+)
+from kros.synthesis import Injection, kalman
+
+DT = 0.001
+KOOPMAN = Lifting(("position", "velocity", "current"), ("sin(10*position + phase)",), ("phase",))
+
+
+def stable(rng, n):
+    A = rng.normal(size=(n, n))
+    return 0.9 * A / np.abs(np.linalg.eigvals(A)).max()
+
+
+def test_extended_filter_is_the_textbook_recursion_with_numerical_slopes():
+    rng = np.random.default_rng(0)
+    A, B = 0.2 * rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
+    Q, R, P0 = np.diag([1e-3, 1e-2, 1e-1]), np.array([[0.02]]), np.diag([0.02, 1.0, 2.0])
+    y, u, phases = rng.normal(size=(40, 2, 1)), rng.normal(size=(40, 2, 2)), np.array([0.4, -1.0])
+    found = ExtendedKalman(KOOPMAN, A, B, (0,), ("a", "b"), Q, R, P0).run(y, u, {"phase": phases})
+    for i, phase in enumerate(phases):
+
+        def model(x, v, phase=phase):
+            return A[:3] @ [*x, np.sin(10 * x[0] + phase)] + B[:3] @ v
+
+        x, P, C = np.array([y[0, i, 0], 0, 0]), P0, np.eye(1, 3)
+        for k in range(40):
+            np.testing.assert_allclose(found[k, i], x, rtol=1e-6, atol=1e-8)
+            L = P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
+            x, P = x + L @ (y[k, i] - C @ x), (np.eye(3) - L @ C) @ P
+            F = np.array([(model(x + d, u[k, i]) - model(x - d, u[k, i])) / 2e-6 for d in 1e-6 * np.eye(3)]).T
+            x, P = model(x, u[k, i]), F @ P @ F.T + Q
+
+
+def test_extended_filter_of_a_linear_model_settles_at_the_riccati_gain():
+    rng = np.random.default_rng(1)
+    A, B = stable(rng, 2), rng.normal(size=(2, 1))
+    plain, Q, R = Lifting(("a", "b")), np.diag([0.3, 0.1]), np.array([[0.5]])
+    y, u = rng.normal(size=(600, 1, 1)), rng.normal(size=(600, 1, 1))
+    steady = Observer("k", plain, A, B, (0,), ("u",), kalman(A, np.eye(1, 2), Q, R, DT).controller, Injection.STATE, DT)
+    extended = ExtendedKalman(plain, A, B, (0,), ("u",), Q, R, start_covariance(np.array([1.0, 5.0]), R, (0,)))
+    np.testing.assert_allclose(extended.run(y, u)[500:], run_observer(steady, y, u)[500:], atol=1e-9)
+
+
+def test_extended_filter_with_two_measurements_and_delays_runs_as_a_stack():
+    rng = np.random.default_rng(2)
+    lifting = Lifting(("a", "b", "c"), ("sin(a[-1])",), (), ("u",))
+    A, B = 0.3 * rng.normal(size=(4, 4)), rng.normal(size=(4, 1))
+    Qs, R = np.stack([0.1 * np.eye(3), 2.0 * np.eye(3)]), np.diag([0.1, 0.2])
+    y, u = rng.normal(size=(20, 2, 2)), rng.normal(size=(20, 2, 1))
+    together = ExtendedKalman(lifting, A, B, (0, 2), ("u",), Qs, R, np.eye(3)).run_all(y, u)
+    for Q, found in zip(Qs, together, strict=True):
+        np.testing.assert_allclose(ExtendedKalman(lifting, A, B, (0, 2), ("u",), Q, R, np.eye(3)).run(y, u), found, rtol=1e-12)
+    with pytest.raises(DimensionError, match="3 states and 2 measurements"):
+        ExtendedKalman(lifting, A, B, (0, 2), ("u",), Qs, np.eye(1), np.eye(3))
+
+
+def test_filtered_difference_of_a_ramp_and_a_sine():
+    t = np.arange(4000) * DT
+    y = np.stack([2.0 * t, np.sin(2 * np.pi * 40 * t)], axis=1)[..., None]
+    found = FilteredDifference(3, ((0, 1),), 40.0, DT).run(y, np.zeros((4000, 2, 0)))
+    assert np.isnan(found[..., [0, 2]]).all()
+    assert found[-1, 0, 1] == pytest.approx(2.0)
+    # At its cut-off a Butterworth filter passes 1/sqrt(2); the difference of a sine has amplitude 2 sin(w dt / 2) / dt.
+    expected = 2 * np.sin(np.pi * 40 * DT) / DT / np.sqrt(2)
+    assert np.sqrt(2 * np.mean(found[2000:, 1, 1] ** 2)) == pytest.approx(expected, rel=1e-6)  # over eighty periods
+    later = y.copy()
+    later[2000:] += 1.0
+    changed = FilteredDifference(3, ((0, 1),), 40.0, DT).run(later, np.zeros((4000, 2, 0)))
+    np.testing.assert_array_equal(changed[:2001, :, 1], found[:2001, :, 1])  # row k reads measurements up to k - 1
+    assert changed[2001, 0, 1] != found[2001, 0, 1]
+
+
+def test_rates_follow_from_units_of_measure():
+    states = [Channel(n, Role.STATE, u) for n, u in (("angle", "rad"), ("speed", "rad/s"), ("current", "A"), ("flow", "m/s"))]
+    assert rates(states, ["angle"]) == ((0, 1),)
+    assert rates(states, ["current", "angle"]) == ((1, 1),)
+    assert rates(states, ["current"]) == ()
+    assert rates([*states, Channel("other", Role.STATE, "rad/s")], ["angle"]) == ()
+    with pytest.raises(ConfigError, match="half the sampling"):
+        FilteredDifference(2, ((0, 1),), 600.0, DT)
+    assert 1.0 <= cutoffs_hz(DT).min() < cutoffs_hz(DT).max() < 500
+
+
+def linear_in_the_past(seed=3, units=3, n_samples=900):
+    """Recordings in which the hidden states are linear in the last samples, and differ from unit to unit."""
+    rng = np.random.default_rng(seed)
+    lifting = Lifting(("x", "v"), ("sin(3*x + phase)", "x*v"), ("phase",))
+    phases = rng.normal(size=units)
+    u = rng.normal(size=(n_samples, units, 1))
+    y = 2 * u + 0.3 + 0.5 * rng.normal(size=u.shape)
+    v = np.zeros(u.shape)
+    size = 1 + np.arange(units)[:, None]
+    v[4:] = (
+        size * (0.7 + y[3:-1] - 2 * y[1:-3] + 0.4 * u[2:-2])
+        + (0.5 * np.sin(3 * y[3:-1, :, 0] + phases) + np.cos(3 * y[2:-2, :, 0] + phases))[..., None]
+    )
+    return lifting, np.concatenate([y, v], axis=-1), u, {"phase": phases}
+
+
+def test_learned_estimator_finds_what_is_linear_in_the_past():
+    lifting, states, u, phases = linear_in_the_past(units=1)
+    y = states[..., :1]
+    features = Features.of(lifting, (0,), y, u, taps=6)
+    assert features.visible == (0,)
+    np.testing.assert_allclose(features.static, [[0.3, 2.0]], atol=0.05)
+    learned = Moments.of(features, states, u, [900], ["a"], phases, thin=1).estimator(ridge=1e-12)
+    found = learned.run(y, u, phases)
+    assert np.isnan(found[..., 0]).all()
+    np.testing.assert_allclose(found[10:, :, 1], states[10:, :, 1], atol=1e-6)
+
+
+def test_a_unit_that_is_left_out_leaves_no_trace():
+    lifting, states, u, phases = linear_in_the_past()
+    features = Features.of(lifting, (0,), states[..., :1], u, taps=6)
+    moments = Moments.of(features, states, u, [900, 900, 700], ["a", "b", "c"], phases)
+    changed = states.copy()
+    changed[:, 1] *= -3
+    others = Moments.of(features, changed, u, [900, 900, 700], ["a", "b", "c"], phases)
+    y = states[..., :1]
+    kept, again = (m.estimator(["b"]).run(y, u, phases)[..., 1] for m in (moments, others))
+    np.testing.assert_array_equal(kept, again)
+    assert np.abs(moments.estimator().run(y, u, phases) - others.estimator().run(y, u, phases))[..., 1].max() > 0.1
+    with pytest.raises(DataError, match="no unit is left"):
+        moments.estimator(["a", "b", "c"])
+
+
+def test_learned_estimator_refuses_what_it_cannot_use():
+    lifting, states, u, phases = linear_in_the_past()
+    both = Features.of(lifting, (0, 1), states, u)
+    with pytest.raises(DataError, match="every state is measured"):
+        Moments.of(both, states, u, [900] * 3, list("abc"), phases)
+    one = Features.of(lifting, (0,), states[..., :1], u)
+    with pytest.raises(DataError, match="unit c has 40 samples"):
+        Moments.of(one, states, u, [900, 900, 40], list("abc"), phases)
+    with pytest.raises(DimensionError, match="expected 1 measurements"):
+        one.channels(states, u, phases)
+
+
+def test_placed_poles_are_the_models_made_faster():
+    A, C = np.array([[0.9, 0.1], [-0.1, 0.8]]), np.eye(1, 2)
+    for factor, synthesis in luenberger_candidates(A, C, DT):
+        reached = np.linalg.eigvals(A - synthesis.controller.D @ C)
+        np.testing.assert_allclose(np.sort_complex(reached), np.sort_complex(np.linalg.eigvals(A) ** factor), atol=1e-6)
+    assert list(luenberger_candidates(A, np.zeros((1, 2)), DT)) == []
+
+
+def test_observers_side_by_side_are_the_same_observers():
+    rng = np.random.default_rng(5)
+    A, B = 0.3 * rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
+    corrections = [
+        gain(0.1 * rng.normal(size=(4, 1)), DT),
+        StateSpace(0.3 * rng.normal(size=(2, 2)), rng.normal(size=(2, 1)), rng.normal(size=(4, 2)), 0.1 * rng.normal(size=(4, 1)), DT),
+    ]
+    observers = [Observer("o", KOOPMAN, A, B, (0,), ("a", "b"), K, Injection.STATE, DT, {"phase": 0.2}) for K in corrections]
+    y, u = rng.normal(size=(50, 3, 1)), rng.normal(size=(50, 3, 2))
+    for observer, found in zip(observers, run_observers(observers, y, u), strict=True):
+        np.testing.assert_allclose(found, run_observer(observer, y, u), rtol=1e-12, atol=1e-12)
+    with pytest.raises(DimensionError, match="side by side"):
+        run_observers([observers[0], Observer("o", KOOPMAN, A, B, (1,), ("a", "b"), corrections[0], Injection.STATE, DT)], y, u)

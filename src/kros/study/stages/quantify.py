@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...core.artifacts import save_artifact, write_json
 from ...core.errors import IdentificationError
@@ -18,17 +17,18 @@ from ...identify import ModelSet
 from ...uncertainty import Form, OutlierScore, UncertainModel, choose_nominals, quantify, residual, score_outliers, sigma_max
 from ..config import UncertaintyConfig
 from ..context import Context
+from ..diagnostics import diagnose
+from ..responses import scaled_responses
 
 log = logging.getLogger(__name__)
 _LARGEST_PRODUCT = 0.7  # of |W_R W_L|: an amplification by 3.3
 _LOOSEST = 3.0  # overbound in tolerances at which a diagonal weight is loose
-Array = npt.NDArray[Any]
 
 
 def run(context: Context) -> list[Path]:
     """Score outliers first, so that flagged units can be dropped where the study asks for it; then quantify."""
-    files, flagged = score_units(context)
-    dropped = flagged if context.config.uncertainty.drop_outliers else set()
+    files, scores = score_units(context)
+    dropped = {row["unit"] for row in scores if row["outlier"]} if context.config.uncertainty.drop_outliers else set()
     units = [u for u in context.facts.pooled if u in context.models(context.model_names[0]).unit_ids and u not in dropped]
     if len(units) < 2:
         raise IdentificationError(
@@ -45,6 +45,7 @@ def run(context: Context) -> list[Path]:
         files += sorted((folder / name).iterdir())
     choice = {"nominal": nominal, "worst_off_nominal": worst_off_nominal(first, found[0]), "dropped": sorted(dropped)}
     save_artifact(folder, "choice", choice)
+    files += diagnose(context, units, dict(zip(sets, found, strict=True)), scores)
     return [*files, folder / "choice.json"]
 
 
@@ -102,14 +103,8 @@ def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:
     return uncertain.unit_ids[int(np.argmax(peaks))]
 
 
-def scaled_responses(models: ModelSet, units: list[str], freqs_hz: Array) -> Array:
-    """Return frequency responses in units of the population's ranges, shape (unit, frequency, n, m)."""
-    response = models.systems(units).frequency_response(freqs_hz)
-    return response / models.output_scale[:, None] * models.input_scale
-
-
-def score_units(context: Context) -> tuple[list[Path], set[str]]:
-    """Score every unit against the others in every condition, whatever group it is filed under."""
+def score_units(context: Context) -> tuple[list[Path], list[dict[str, Any]]]:
+    """Score every unit against the others in every condition, whatever group it is filed under; return files and rows."""
     name = context.edmd_names[0]
     folder = context.store.path("outliers")
     rows: list[dict[str, Any]] = []
@@ -136,10 +131,10 @@ def score_units(context: Context) -> tuple[list[Path], set[str]]:
         files += sorted((folder / place).iterdir())
         rows += [score_row(score, condition) for score in outliers.scores]
     write_json(folder / "scores.json", {"schema": 1, "rows": rows})
-    return [*files, folder / "scores.json"], {row["unit"] for row in rows if row["outlier"]}
+    return [*files, folder / "scores.json"], rows
 
 
 def score_row(score: OutlierScore, condition: str) -> dict[str, Any]:
     """Return a score as a row of metrics, with where it comes from."""
     row = {"unit": score.unit, "condition": condition, "score": score.score_db, "threshold": score.threshold_db, "outlier": score.outlier}
-    return row | {"freq_hz": score.freq_hz, "entry": score.entry}
+    return row | {key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db", "agreement")}

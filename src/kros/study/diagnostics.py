@@ -1,0 +1,191 @@
+"""What the report tells about the uncertainty beside its weights; nothing that later stages use.
+
+models of resampled episodes    --> how much of the residuals finite recordings make    uncertainty/<model>/noise
+largest residual over frequency --> overbound over order, with what is proven           uncertainty/<model>/order
+residuals of all units          --> beside the weights                                  uncertainty/<model>/units
+the most conspicuous unit       --> against the cover of all the others                 outliers/<models>/others
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..core.errors import KrosError
+from ..core.frequency import log_grid
+from ..identify import ModelSet
+from ..uncertainty import (
+    Form,
+    Tightness,
+    UncertainModel,
+    choose_nominals,
+    magnitude_tightness,
+    optimal_cover,
+    residual,
+    variation_and_noise,
+)
+from ..uncertainty.unit_residuals import UnitResiduals, unit_residuals
+from .config import UncertaintyConfig
+from .context import Context
+from .resampling import resampled_models
+from .responses import scaled_responses
+
+log = logging.getLogger(__name__)
+
+_NOISE_POINTS, _ORDER_POINTS, _POINTS = 80, 120, 240  # frequencies
+_MOST_UNITS = 60  # whose models are resampled
+_FURTHER_ORDERS = 1  # beyond those that a weight may have
+
+
+class _Result(Protocol):
+    def save(self, folder: Path) -> None:
+        """Write into a folder."""
+
+
+Work = tuple[Path, Callable[[], _Result]]
+
+
+def diagnose(context: Context, units: list[str], found: Mapping[str, UncertainModel], rows: Sequence[Mapping[str, Any]]) -> list[Path]:
+    """Compute and save what there is to tell; what cannot be told is logged, with its reason, and left out.
+
+    Parameters
+    ----------
+    context : Context
+    units : list of str
+        Units that the weights cover.
+    found : mapping of str to UncertainModel
+    rows : sequence of mapping
+        Outlier scores of all conditions.
+
+    Returns
+    -------
+    list of Path
+        Files that were written.
+    """
+    folder, config = context.store.path("uncertainty"), context.config.uncertainty
+    work: list[Work] = []
+    for name, uncertain in found.items():
+        work += [(folder / name / "noise", task) for task in _noise(context, name, units, uncertain)]
+        work.append((folder / name / "order", partial(order_curve, uncertain, config.max_order + _FURTHER_ORDERS)))
+    for name in context.model_names[: len(context.edmd_names)]:  # the pair that figures compare
+        work.append((folder / name / "units", partial(beside_weights, context.models(name), found[name], config)))
+    work += _others(context, rows)
+    results = context.run("quantify (diagnose)", [partial(_attempt, place.parent.name, task) for place, task in work])
+    files: list[Path] = []
+    for (place, _), result in zip(work, results, strict=True):
+        if result is not None:
+            result.save(place)
+            files += sorted(place.iterdir())
+    return files
+
+
+def _attempt(name: str, task: Callable[[], _Result]) -> _Result | None:
+    try:
+        return task()
+    except KrosError as error:
+        log.warning("%s: left out of the report: %s", name, error)
+        return None
+
+
+def _noise(context: Context, name: str, units: list[str], uncertain: UncertainModel) -> list[Callable[[], _Result]]:
+    """Compare variation and noise over at most 60 units, the nominal one among them."""
+    if uncertain.nominal < 0:
+        return []
+    some = np.linspace(0, len(units) - 1, min(_MOST_UNITS, len(units))).round().astype(int)
+    chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
+    models = context.models(name)
+    try:
+        samples = resampled_models(context, name, chosen)
+    except KrosError as error:
+        log.info("%s: variation and noise are not told apart: %s", name, error)
+        return []
+    compare = partial(
+        variation_and_noise,
+        samples,
+        log_grid(models.sample_period_s, _NOISE_POINTS),
+        models.sample_period_s,
+        uncertain.form,
+        nominal=chosen.index(uncertain.nominal_id),
+        output_scale=models.output_scale,
+        input_scale=models.input_scale,
+    )
+    return [compare]
+
+
+def order_curve(uncertain: UncertainModel, highest: int) -> Tightness:
+    """Return the overbound of a scalar magnitude over its order, on part of the grid; what is proven there holds on all of it."""
+    every = max(1, len(uncertain.freqs_hz) // _ORDER_POINTS)
+    bound = uncertain.bounds[uncertain.form][::every]
+    return magnitude_tightness(uncertain.freqs_hz[::every], bound, uncertain.sample_period_s, range(1, highest + 1))
+
+
+def beside_weights(models: ModelSet, uncertain: UncertainModel, config: UncertaintyConfig) -> UnitResiduals:
+    """Return the residuals of all covered units beside the weights of a study."""
+    every = max(1, len(uncertain.freqs_hz) // _POINTS)
+    freqs = uncertain.freqs_hz[::every]
+    return unit_residuals(
+        uncertain.form,
+        uncertain.scaled_nominal().frequency_response(freqs),
+        scaled_responses(models, list(uncertain.unit_ids), freqs),
+        uncertain.weight,
+        freqs,
+        models.sample_period_s,
+        unit_ids=uncertain.unit_ids,
+        nominal_id=uncertain.nominal_id,
+        max_order=config.max_order,
+        tolerance_db=config.tolerance_db,
+    )
+
+
+def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Work]:
+    """The most conspicuous unit against the others, in the condition where it scores highest; both kinds of models as in the paper."""
+    top = most_conspicuous(rows)
+    if top is None:
+        return []
+    condition = top["condition"]
+    outside = [top["unit"], *(r["unit"] for r in rows if r["outlier"] and r["condition"] == condition and r["unit"] != top["unit"])]
+    sets = [context.models(name, condition) for name in context.edmd_names]
+    others = [u for u, state in zip(sets[0].unit_ids, sets[0].status, strict=True) if state == "ok" and u not in outside]
+    if len(others) < 2:
+        return []
+    responses = scaled_responses(sets[0], others, log_grid(sets[0].sample_period_s, _POINTS))
+    nominal = others[choose_nominals(responses)[Form(context.config.uncertainty.form)].index]
+    return [
+        (
+            context.store.path("outliers", context.model_folder(models.name, condition).name, "others"),
+            partial(against_others, models, others, outside, nominal, context.config.uncertainty),
+        )
+        for models in sets
+    ]
+
+
+def most_conspicuous(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """Return the row of the highest score, flagged ones first; None where nothing was scored."""
+    scored = [r for r in rows if r["score"] is not None]
+    return max(scored, key=lambda r: (bool(r["outlier"]), float(r["score"])), default=None)
+
+
+def against_others(models: ModelSet, others: list[str], outside: list[str], nominal: str, config: UncertaintyConfig) -> UnitResiduals:
+    """Return the residuals of all units beside the smallest diagonal cover of `others`, frequency by frequency, and beside fits to their entries."""
+    freqs, form, row = log_grid(models.sample_period_s, _POINTS), Form(config.form), others.index(nominal)
+    everyone = [*others, *outside]
+    responses = scaled_responses(models, everyone, freqs)
+    cover = optimal_cover(residual(form, responses[row], responses[: len(others)]))
+    return unit_residuals(
+        form,
+        responses[row],
+        responses,
+        cover,
+        freqs,
+        models.sample_period_s,
+        unit_ids=everyone,
+        nominal_id=nominal,
+        outside=outside,
+        max_order=config.max_order,
+        tolerance_db=config.tolerance_db,
+    )

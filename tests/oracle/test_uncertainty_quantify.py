@@ -179,7 +179,7 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(ConfigError, match="unknown"):
         quantify(units, "nonsense")
     with pytest.raises(ConfigError, match="diagonal"):
-        quantify(units, freqs_hz=[1.0, 2.0], structure="full")
+        quantify(units, freqs_hz=[1.0, 2.0], structure="block")
     with pytest.raises(DimensionError, match="output_scale"):
         quantify(units, output_scale=[1, 2])
     with pytest.raises(DimensionError, match="differ"):

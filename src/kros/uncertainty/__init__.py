@@ -1,9 +1,11 @@
 """Uncertainty of a population: six forms, residuals, nominal, cover and weights, outliers. The stage's result is an `UncertainModel`."""
 
 from .certificate import Method, ResidualSystems, certify
-from .cover import Cover, Structure, cover_ratio, optimal_cover, optimal_left
+from .cover import Cover, Perturbation, Structure, cover_ratio, optimal_cover, optimal_left
+from .entrywise import EntrywiseWeight
 from .fit import FittedMagnitude, Side, fit_magnitude, invert
 from .forms import Form, existence, rebuild, residual, residual_shape
+from .full import FullWeight
 from .model import UncertainModel, scale_system
 from .noise import VariationAndNoise, variation_and_noise
 from .nominal import Criterion, NominalChoice, choose_nominal, choose_nominals
@@ -17,12 +19,15 @@ from .weights import Weight, fit_weight
 __all__ = [
     "Cover",
     "Criterion",
+    "EntrywiseWeight",
     "FittedMagnitude",
     "Form",
+    "FullWeight",
     "Method",
     "NominalChoice",
     "OutlierModel",
     "OutlierScore",
+    "Perturbation",
     "ResidualSystems",
     "ResponseUncertainty",
     "Side",

@@ -9,7 +9,7 @@ of nothing else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -77,7 +77,7 @@ class BilinearAxis:
 
     def continuous_weight(self, weight: Weight) -> Weight:
         """Return a weight with both sides continuous."""
-        return replace(weight, left=self.continuous(weight.left), right=self.continuous(weight.right))
+        return weight.mapped(self.continuous)
 
 
 def beyond(freqs_hz: Array) -> Array:

@@ -85,6 +85,8 @@ def bound_residuals(
     if not _leaves_out(form, ratio):
         return Bounded(bound, cover, weight, ratio, None, None)
     looser = options | {"tolerance_db": _REMAINDER_TOLERANCE * options["tolerance_db"]}
+    if weight.structure not in (Structure.SCALAR, Structure.DIAGONAL):  # the remainder is small, and its block apart from the form's
+        looser["structure"] = Structure.DIAGONAL
     remainder, remainder_cover = fit_weight(residuals.left_over, freqs_hz, sample_period_s, **looser)
     return Bounded(bound, cover, weight, ratio, remainder, remainder_cover)
 

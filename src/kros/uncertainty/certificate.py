@@ -33,10 +33,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.frequency import nyquist_hz
-from ..core.lti import StateSpace
+from ..core.lti import StateSpace, gain
 from ..core.norms import to_continuous
 from .fit import invert
-from .forms import Form, as_form
+from .forms import Form, as_form, residual_shape
 
 Array = npt.NDArray[Any]
 Ratio = Callable[[Array], Array]
@@ -68,11 +68,14 @@ class ResidualSystems:
         Discrete, one system.
     units : StateSpace
         Discrete, the unit axis first.
+    entry : tuple of int, optional
+        Row and column of the residual where that entry alone is bounded.
     """
 
     form: Form | str
     nominal: StateSpace
     units: StateSpace
+    entry: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -200,10 +203,14 @@ def _pencils(systems: ResidualSystems, left: StateSpace, right: StateSpace) -> l
     form, nominal, units = as_form(systems.form), systems.nominal, systems.units
     if form is Form.INVERSE_ADDITIVE:
         return []
+    first, last = invert(right), invert(left)
+    if systems.entry is not None:
+        rows, columns = (np.eye(size) for size in residual_shape(form, nominal.n_outputs, nominal.n_inputs))
+        first, last = gain(columns[:, [systems.entry[1]]], right.dt) @ first, last @ gain(rows[[systems.entry[0]]], left.dt)
     if form in (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE):
-        form, nominal, units, left, right = form.dual, _transposed(nominal), _transposed(units), right, left
+        form, nominal, units, first, last = form.dual, _transposed(nominal), _transposed(units), _transposed(last), _transposed(first)
     G = to_continuous(nominal)
-    before, after = (_Descriptor.of(to_continuous(invert(w))) for w in (right, left))
+    before, after = (_Descriptor.of(to_continuous(w)) for w in (first, last))
     found = [after @ _residual(form, G, to_continuous(units[k])) @ before for k in range(units.batch_shape[0])]
     return found if 2 * len(found[0].A) + found[0].B.shape[1] <= _LARGEST else []
 

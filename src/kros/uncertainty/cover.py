@@ -39,11 +39,25 @@ _DIFFERENCE = 1e-5
 _TINY = 1e-300
 
 
+class Perturbation(str, Enum):
+    """Which perturbations Delta a weight is sound for."""
+
+    FULL = "full"
+    DIAGONAL = "diagonal"
+
+
 class Structure(str, Enum):
     """Which entries of the weights are free."""
 
     SCALAR = "scalar"
     DIAGONAL = "diagonal"
+    ENTRYWISE = "entrywise"
+    FULL = "full"
+
+    @property
+    def perturbation(self) -> Perturbation:
+        """Perturbations with which weights of this structure reach every residual they were made for."""
+        return Perturbation.DIAGONAL if self is Structure.ENTRYWISE else Perturbation.FULL
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +99,7 @@ def as_structure(structure: Structure | str) -> Structure:
     try:
         return Structure(structure)
     except ValueError as error:
-        raise ConfigError(f"Weight structure {structure!r} is unknown; choose 'diagonal' or 'scalar'.") from error
+        raise ConfigError(f"Weight structure {structure!r} is unknown; choose {', '.join(repr(s.value) for s in Structure)}.") from error
 
 
 def optimal_cover(E: Array, structure: Structure | str = Structure.DIAGONAL, pull: float = _PULL) -> Cover:
@@ -95,6 +109,7 @@ def optimal_cover(E: Array, structure: Structure | str = Structure.DIAGONAL, pul
     ----------
     E : ndarray, shape (unit, frequency, p', m'), complex
     structure : Structure or str
+        Scalar; every other one has the diagonal cover.
     pull : float
         Pull towards equal entries, relative to the cost: a larger one gives covers that cost more and vary less over frequency.
 

@@ -18,10 +18,16 @@ from ..core.artifacts import load_artifact, save_artifact
 from ..core.lti import StateSpace
 from .certificate import Method
 from .cover import Cover, Structure
+from .entrywise import EntrywiseWeight
 from .forms import Form
+from .full import FullWeight
 from .weights import Weight
 
 Array = npt.NDArray[Any]
+
+_KINDS: dict[Structure, type[Weight]] = {Structure.ENTRYWISE: EntrywiseWeight, Structure.FULL: FullWeight}
+_OWN_FACTS = {Structure.ENTRYWISE: ("unstructured_excess",), Structure.FULL: ("saved_db",)}
+_FRAMES = ("left_frame", "right_frame")
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +172,10 @@ def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) ->
 
 
 def _facts(weight: Weight) -> dict[str, Any]:
-    return {
+    own = {name: getattr(weight, name) for name in _OWN_FACTS.get(weight.structure, ())}
+    return own | {
         "structure": weight.structure,
+        "perturbation": weight.perturbation,
         "orders": [weight.left_orders, weight.right_orders],
         "cover_max": weight.cover_max,
         "overbound_db_max": weight.overbound_db_max,
@@ -192,17 +200,25 @@ def _unpack_system(name: str, arrays: dict[str, Array], dt: float) -> StateSpace
 
 
 def _pack_weight(name: str, weight: Weight, cover: Cover) -> dict[str, Array]:
-    left, right = _pack_system(f"{name}_left", weight.left), _pack_system(f"{name}_right", weight.right)
-    return {**left, **right, f"{name}_cover_left": cover.left, f"{name}_cover_right": cover.right}
+    systems = {"left": weight.left, "right": weight.right}
+    if isinstance(weight, FullWeight):
+        systems |= dict(zip(_FRAMES, weight.frames, strict=True))
+    packed = {key: array for part, system in systems.items() for key, array in _pack_system(f"{name}_{part}", system).items()}
+    return packed | {f"{name}_cover_left": cover.left, f"{name}_cover_right": cover.right}
 
 
 def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> tuple[Weight, Cover]:
-    weight = Weight(
+    structure = Structure(facts["structure"])
+    own: dict[str, Any] = {field: _number(facts[field]) for field in _OWN_FACTS.get(structure, ())}
+    if structure is Structure.FULL:
+        own |= {part: _unpack_system(f"{name}_{part}", arrays, dt) for part in _FRAMES}
+    weight = _KINDS.get(structure, Weight)(
+        **own,
         left=_unpack_system(f"{name}_left", arrays, dt),
         right=_unpack_system(f"{name}_right", arrays, dt),
         left_orders=tuple(facts["orders"][0]),
         right_orders=tuple(facts["orders"][1]),
-        structure=Structure(facts["structure"]),
+        structure=structure,
         cover_max=facts["cover_max"],
         overbound_db_max=facts["overbound_db_max"],
         within_tolerance=facts["within_tolerance"],

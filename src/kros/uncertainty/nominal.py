@@ -99,8 +99,8 @@ def choose_nominal(
         Which units may be nominal; none is allowed if there are further candidates.
     freqs_hz : array_like, shape (frequency,), Hz, optional
         For means over log-frequency; without it all frequencies count alike.
-    structure : {"diagonal", "scalar"}
-        Of the cover whose cost counts.
+    structure : {"diagonal", "scalar", "full", "entrywise"}
+        Of the cover whose cost counts; with full and entrywise weights that of the diagonal one.
 
     Returns
     -------

@@ -67,7 +67,8 @@ def quantify(
         Further candidates for the nominal by name, for example a pooled model; they are no units, and need not be covered.
     candidates : array_like of bool, shape (unit,), optional
         Units that may be nominal.
-    structure : {"diagonal", "scalar"}
+    structure : {"diagonal", "scalar", "full", "entrywise"}
+        Of the weights; entrywise ones bound the entries and are sound for a diagonal perturbation only.
     max_order : int
         Largest order of one entry of a weight.
     tolerance_db : float, dB

@@ -112,7 +112,8 @@ def quantify_responses(
         Further candidates for the nominal by name.
     candidates : array_like of bool, shape (unit,), optional
         Units that may be nominal.
-    structure : {"diagonal", "scalar"}
+    structure : {"diagonal", "scalar", "full", "entrywise"}
+        Of the weights; entrywise ones bound the entries and are sound for a diagonal perturbation only.
     max_order : int
     tolerance_db : float, dB
 

@@ -24,7 +24,7 @@ from ..core.errors import KrosError
 from ..core.frequency import bilinear_squared, dense_grid
 from ..core.lti import StateSpace, block_diagonal, gain
 from .certificate import Method, ResidualSystems, certify
-from .cover import Cover, Structure, as_structure, cover_ratio, optimal_cover, optimal_left
+from .cover import Cover, Perturbation, Structure, as_structure, cover_ratio, optimal_cover, optimal_left
 from .fit import fit_magnitude, rough
 from .joint import JointFit
 from .spectral import RationalMagnitude, roots, spectral_factor
@@ -87,9 +87,18 @@ class Weight:
     method: Method = Method.GRID
     remaining_margin: float = float("nan")
 
+    @property
+    def perturbation(self) -> Perturbation:
+        """Perturbations Delta for which the weight is sound: ``full``, or ``diagonal`` alone for entrywise weights."""
+        return self.structure.perturbation
+
     def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""
         return Cover(_diagonal(self.left, freqs_hz), _diagonal(self.right, freqs_hz))
+
+    def mapped(self, change: Callable[[StateSpace], StateSpace]) -> Weight:
+        """Return the weight with its systems changed, for example to another time."""
+        return replace(self, left=change(self.left), right=change(self.right))
 
 
 def fit_weight(
@@ -128,9 +137,16 @@ def fit_weight(
         The optimal cover at `freqs_hz`, against which the overbound is measured.
     """
     structure = as_structure(structure)
+    if structure in (Structure.ENTRYWISE, Structure.FULL):
+        from .entrywise import fit_entrywise  # both are made of scalar and diagonal weights
+        from .full import fit_full
+
+        fit = fit_entrywise if structure is Structure.ENTRYWISE else fit_full
+        options: dict[str, Any] = {"max_order": max_order, "tolerance_db": tolerance_db, "density": density}
+        return fit(residuals, freqs_hz, sample_period_s, systems=systems, **options)
     E = residuals(freqs_hz)
     best = optimal_cover(E, structure)
-    dense = _checking_grid(freqs_hz, sample_period_s, density)
+    dense = checking_grid(freqs_hz, sample_period_s, density)
     checked = _Checked(dense, residuals(dense))
     fitter = _Fitter(sample_period_s, max_order, tolerance_db, (freqs_hz[0], freqs_hz[-1]))
     together = structure is Structure.DIAGONAL and best.left.any()
@@ -143,8 +159,8 @@ def fit_weight(
     ), best
 
 
-def _checking_grid(freqs_hz: Array, sample_period_s: float, density: int) -> Array:
-    """Dense grid that goes on from its ends to DC and Nyquist, in decades of tau: a fit is free to bend wherever nobody looks."""
+def checking_grid(freqs_hz: Array, sample_period_s: float, density: int) -> Array:
+    """Return a dense grid that goes on from its ends to DC and Nyquist, in decades of tau: a fit is free to bend wherever nobody looks."""
     dense = dense_grid(freqs_hz, sample_period_s, density)
     inner = dense[(dense > 0) & (bilinear_squared(dense, sample_period_s) < np.inf)]
     tails = 10.0 ** (np.arange(1, _TAIL + 1) / 4)

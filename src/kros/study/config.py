@@ -113,7 +113,7 @@ class UncertaintyConfig(_Section):
 
     form: FORMS = "inverse_input_multiplicative"
     nominal: str | None = None
-    structure: Literal["auto", "diagonal", "scalar"] = "auto"
+    structure: Literal["auto", "diagonal", "scalar", "full", "entrywise"] = "auto"
     n_freqs: int = Field(1000, ge=50)
     max_order: int = Field(4, ge=1, le=8)
     tolerance_db: float = Field(1.0, gt=0)

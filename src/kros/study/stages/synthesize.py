@@ -16,7 +16,7 @@ from ...identify import ModelSet
 from ...observer import Observer
 from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...synthesis.certificate import certify
-from ...uncertainty import Form, UncertainModel
+from ...uncertainty import Form, Structure, UncertainModel
 from ..context import Context
 from ..makers import Product, Task, produce
 from ..tuning import TUNING_EPISODES, TUNING_UNITS, TuningSet
@@ -86,6 +86,11 @@ def usable_problem(
     """Return the synthesis problem of one kind of model, or None and why there is none."""
     if uncertain.form is not Form.INVERSE_INPUT_MULTIPLICATIVE:
         refusal = f"synthesis knows the inverse input multiplicative form only, and the study uses {uncertain.form.value}"
+    elif uncertain.weight.structure in (Structure.FULL, Structure.ENTRYWISE):
+        refusal = (
+            f"synthesis knows weights with one filter per channel only, and those of the study are {uncertain.weight.structure.value} "
+            f"(for a {uncertain.weight.perturbation.value} perturbation); set uncertainty.structure to 'auto', 'diagonal' or 'scalar'"
+        )
     else:
         problem = observer_problem(models, unit, uncertain, noise, context)
         try:

@@ -5,11 +5,14 @@ What was not run is absent, what is unknown is null, nothing is invented.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ..core.artifacts import load_artifact, plain, read_json
 from ..synthesis.result import Synthesis
-from ..uncertainty import UncertainModel
+from ..uncertainty import Tightness, UncertainModel, VariationAndNoise
 from .config import Stage
 from .context import Context
 from .stages import calibrate
@@ -81,7 +84,8 @@ def _pooled_radius(context: Context, name: str) -> float:
 
 def _uncertainty(context: Context) -> dict[str, Any]:
     folder = context.store.path("uncertainty")
-    return {name: uncertainty_entry(UncertainModel.load(folder / name)) for name in context.model_names if (folder / name).exists()}
+    found = {name: folder / name for name in context.model_names if (folder / name).exists()}
+    return {name: uncertainty_entry(UncertainModel.load(place)) | diagnostic_entry(place) for name, place in found.items()}
 
 
 def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
@@ -99,6 +103,20 @@ def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
             "overbound_db_max": model.overbound_db_max,
         },
     }
+    return entry
+
+
+def diagnostic_entry(folder: Path) -> dict[str, Any]:
+    """Return what was told about one uncertain model beside its weights: share of noise, and overbounds of a scalar magnitude over order."""
+    entry: dict[str, Any] = {}
+    if (folder / "noise").exists():
+        noise = VariationAndNoise.load(folder / "noise")
+        place = int(noise.residual.max(axis=0).argmax())
+        shares = {"median": np.median(noise.noise_share), "at_peak": noise.noise_share[place], "peak_hz": noise.freqs_hz[place]}
+        entry["noise_share"] = shares
+    if (folder / "order").exists():
+        order = Tightness.load(folder / "order")
+        entry["order_db"] = {"orders": order.orders, "overbound": order.overbound_db, "proven": order.proven_db}
     return entry
 
 
@@ -137,7 +155,8 @@ def _evaluation_record(context: Context) -> dict[str, Any]:
 
 def _outliers(context: Context) -> list[dict[str, Any]]:
     path = context.store.path("outliers", "scores.json")
-    return [{k: row[k] for k in ("unit", "condition", "score", "outlier")} for row in read_json(path)["rows"]] if path.exists() else []
+    rows: list[dict[str, Any]] = read_json(path)["rows"] if path.exists() else []
+    return rows
 
 
 def _free_run(context: Context) -> dict[str, Any]:

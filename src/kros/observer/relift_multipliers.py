@@ -1,0 +1,123 @@
+r"""Best multipliers over a grid of frequencies: a convex problem in as many numbers as there are slopes, solved by a barrier.
+
+    minimise g   subject to   F_f(t, g) = diag(t, g I) - sum_j t_j h_fj h_fj' - H_z' H_z > 0   at every frequency f,
+
+with ``h_fj`` the row of H that leads to the slope's input q_j. The set of multipliers that prove stability at all is found first, as the
+one for which ``lambda diag(t) > sum_j t_j h_fj h_fj'`` with a lambda below one. Newton's method on batches of small Hermitian matrices.
+
+References
+----------
+S. Boyd and L. El Ghaoui, "Method of centers for minimizing generalized eigenvalues", Linear Algebra and its Applications 188 (1993) 63-111.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+_NEWTON = 40
+_CENTRES = 40
+_ACCURACY = 2e-4
+_MOST_FREQUENCIES = 80
+_WELL_INSIDE = 0.25
+
+
+def best_multipliers(H: Array, width: int) -> Array | None:
+    """Return multipliers for which the gain is close to least, shape (n_p,); None where no multipliers prove stability.
+
+    Parameters
+    ----------
+    H : ndarray, shape (f, n_p + n_z, n_p + n_w)
+        Frequency responses from [p, w] to [q, z].
+    width : int
+        n_p.
+    """
+    largest = np.argsort(-np.linalg.norm(H, axis=(1, 2)))[: _MOST_FREQUENCIES // 2]
+    H = H[np.union1d(largest, np.linspace(0, len(H) - 1, _MOST_FREQUENCIES // 2).astype(int))]
+    size = np.linalg.norm(H[:, width:, width:], 2, axis=(1, 2)).max() or 1.0
+    through = np.maximum(np.sqrt(np.max(np.sum(np.abs(H[:, width:, :width]) ** 2, axis=1), axis=0)), 1e-12 * size)
+    H = H / np.concatenate([through, np.full(H.shape[2] - width, size)])
+    H[:, :width] *= through[:, None]  # now t is measured in units of through^2
+    start = _stabilising(H[:, :width, :width])
+    if start is None:
+        return None
+    rows = np.einsum("fja,fjb->fjab", H[:, :width].conj(), H[:, :width])
+    fixed = np.conj(np.swapaxes(H[:, width:], 1, 2)) @ H[:, width:]
+    n = H.shape[2]
+    units = np.zeros((width + 1, n, n))
+    units[range(width), range(width), range(width)] = 1.0
+    units[width, range(width, n), range(width, n)] = 1.0
+    slopes = np.concatenate([units[:width] - rows, np.broadcast_to(units[width:], (len(H), 1, n, n))], axis=1)
+    x = np.append(start, 1.0)
+    while not _inside(-fixed[:, :width, :width], slopes[:, :width, :width, :width], x[:width]):
+        x[:width] *= 2.0
+    while not _inside(-fixed, slopes, x):
+        x[width] *= 2.0
+    weight = len(H) * n / x[width]
+    while weight * x[width] * _ACCURACY < len(H) * n:
+        x = _newton(-fixed, slopes, np.append(np.zeros(width), weight), x)
+        weight *= 8.0
+    return np.asarray(x[:width] * through**2)
+
+
+def _stabilising(G: Array) -> Array | None:
+    """Return multipliers with ``diag(t) > G_f' diag(t) G_f`` at every frequency, well inside; None where there are none."""
+    width = G.shape[1]
+    rows = np.einsum("fja,fjb->fjab", G.conj(), G)
+    units = np.zeros((width, width, width))
+    units[range(width), range(width), range(width)] = 1.0
+    t = np.ones(width)
+    level = _needed(G, t)
+    for _ in range(_CENTRES):
+        if level < _WELL_INSIDE:
+            break
+        looser = level * 1.05 + 1e-12
+        # One number of the t is free: their sum stays below the number of slopes.
+        rest = np.zeros((len(G) + 1, width, width), complex)
+        slopes = np.concatenate([looser * units - rows, -np.broadcast_to(np.eye(width), (1, width, width, width))], axis=0)
+        rest[-1] = 2 * width * np.eye(width)
+        t = _newton(rest, slopes, np.zeros(width), t * width / t.sum())
+        before, level = level, _needed(G, t)
+        if level > 0.999 * before:
+            break
+    return t if level < 1 else None
+
+
+def _needed(G: Array, t: Array) -> float:
+    """Return the least lambda for given multipliers."""
+    root = np.sqrt(t)
+    return float(np.linalg.norm(root[:, None] * G / root, 2, axis=(1, 2)).max() ** 2)
+
+
+def _inside(fixed: Array, slopes: Array, x: Array) -> bool:
+    return bool(np.linalg.eigvalsh(fixed + np.tensordot(x, slopes, (0, 1)))[:, 0].min() > 0)
+
+
+def _newton(fixed: Array, slopes: Array, cost: Array, x: Array) -> Array:
+    """Minimise ``cost x - sum_f log det (fixed_f + sum_i x_i slopes_fi)`` from a point inside."""
+
+    def value(x: Array) -> float:
+        sign, log = np.linalg.slogdet(F := fixed + np.tensordot(x, slopes, (0, 1)))
+        inside = bool(np.all(sign.real > 0)) and np.linalg.eigvalsh(F)[:, 0].min() > 0
+        return float(cost @ x - log.sum()) if inside else np.inf
+
+    current = value(x)
+    for _ in range(_NEWTON):
+        F = fixed + np.tensordot(x, slopes, (0, 1))
+        parts = np.linalg.solve(F[:, None], slopes + 0j)
+        gradient = cost - np.trace(parts, axis1=2, axis2=3).real.sum(axis=0)
+        hessian = np.einsum("fiab,fjba->ij", parts, parts, optimize=True).real
+        step = -np.linalg.lstsq(hessian, gradient, rcond=None)[0]
+        decrease = -float(gradient @ step)
+        if decrease < 1e-4:
+            break
+        length = 1.0
+        while (trial := value(x + length * step)) > current - 0.1 * length * decrease and length > 1e-8:
+            length /= 2
+        if length <= 1e-8:
+            break
+        x, current = x + length * step, trial
+    return x

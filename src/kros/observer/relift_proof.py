@@ -1,0 +1,143 @@
+r"""Proof of a gain, independent of whatever solver proposed it.
+
+With Lyapunov matrices ``P_v = R_v' R_v``, one for every word v of the last corners (one in all without memory), the gain gamma is proven when
+
+    F = [[P_v, 0], [0, gamma^2 I]] - [A_c, B_c]' P_v' [A_c, B_c] - [C, D]' [C, D] > 0
+
+for every mode, every corner c and every step v -> v' that begins with c. All of F is quadratic and convex in the slopes and linear in every P,
+so corners are enough. (D is zero but where multipliers stand in for corners: then p is an input and q an output.)
+
+In the coordinates in which ``P_v = I`` it says that a matrix has a spectral norm below one: that is the margin, in floating point. The decision
+is exact: matrices of doubles are rational, so F is formed without rounding and its positivity decided by elimination of integers.
+
+References
+----------
+E. H. Bareiss, "Sylvester's identity and multistep integer-preserving Gaussian elimination", Mathematics of Computation 22 (1968) 565-578.
+A. A. Ahmadi, R. M. Jungers, P. A. Parrilo and M. Roozbehani, "Joint spectral radius and path-complete graph Lyapunov functions",
+SIAM Journal on Control and Optimization 52 (2014) 687-717.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import solve_triangular
+
+Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[Any]
+Corners = Sequence[tuple[Array, Array]]
+_BITS = 96  # of the scaled matrix that elimination decides on; the rounding to them is subtracted
+
+
+def steps(n_corners: int, n_words: int) -> Iterator[tuple[int, int, int]]:
+    """Yield (corner, word, next word) of every step; words are numbers in the base of the corners, oldest corner first."""
+    if n_words == 1:
+        yield from ((c, 0, 0) for c in range(n_corners))
+        return
+    oldest = n_words // n_corners
+    for word in range(n_words):
+        for new in range(n_corners):
+            yield word // oldest, word, (word % oldest) * n_corners + new
+
+
+def margin(roots: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> float:
+    """Return ``1 - max ||.||^2`` over corners in the coordinates where every P is the identity; positive for a proof, up to rounding.
+
+    Parameters
+    ----------
+    roots : ndarray, shape (n_words, n, n)
+        Upper triangular R with ``P = R'R``.
+    corners : sequence of (A, B)
+    C : ndarray, shape (n_z, n)
+    gain : float
+    D : ndarray, shape (n_z, n_w), optional
+        Zero by default.
+    """
+    worst = 0.0
+    for c, word, following in steps(len(corners), len(roots)):
+        A, B = corners[c]
+        top = roots[following] @ np.hstack([_right_divide(A, roots[word]), B / gain])
+        direct = np.zeros((len(C), B.shape[1])) if D is None else D / gain
+        bottom = np.hstack([_right_divide(C, roots[word]), direct])
+        worst = max(worst, float(np.linalg.norm(np.vstack([top, bottom]), 2)))
+    return 1 - worst**2
+
+
+def proven(roots: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> bool:
+    """Tell whether the inequalities hold, in exact arithmetic on the numbers as they are stored."""
+    numbers = [roots, C, np.array(gain), *(matrix for corner in corners for matrix in corner)]
+    if not all(np.isfinite(part).all() for part in numbers):
+        return False
+    D = np.zeros((len(C), corners[0][1].shape[1])) if D is None else D
+    out, level = _gram(_Exact.of(np.hstack([C, D]))), _gram(_Exact.of(np.array([[gain]])))
+    held = [_gram(_Exact.of(R)) for R in roots]
+    for c, word, following in steps(len(corners), len(roots)):
+        A, B = corners[c]
+        n, width = A.shape[0], B.shape[1]
+        moved = _gram(_Exact.of(roots[following]) @ _Exact.of(np.hstack([A, B])))
+        shift = max(part.shift for part in (moved, held[word], out, level))
+        F = -moved.at(shift) - out.at(shift)
+        F[:n, :n] += held[word].at(shift)
+        F[range(n, n + width), range(n, n + width)] += level.at(shift)[0, 0]
+        if not _positive(F):
+            return False
+    return True
+
+
+@dataclass(frozen=True, eq=False)
+class _Exact:
+    """A matrix of integers over a power of two."""
+
+    integers: Integers
+    shift: int
+
+    @classmethod
+    def of(cls, matrix: Array) -> _Exact:
+        mantissa, exponent = np.frexp(np.asarray(matrix, dtype=float))
+        whole, power = (mantissa * 2.0**53).astype(np.int64), exponent.astype(int) - 53
+        lowest = int(power[whole != 0].min()) if whole.any() else 0
+        integers = np.empty(matrix.shape, dtype=object)
+        for place in np.ndindex(*matrix.shape):
+            integers[place] = int(whole[place]) << int(power[place] - lowest) if whole[place] else 0
+        return cls(integers, -lowest)
+
+    def __matmul__(self, other: _Exact) -> _Exact:
+        return _Exact(self.integers @ other.integers, self.shift + other.shift)
+
+    def at(self, shift: int) -> Integers:
+        return np.asarray(self.integers * (1 << (shift - self.shift)), dtype=object)
+
+
+def _gram(matrix: _Exact) -> _Exact:
+    return _Exact(matrix.integers.T @ matrix.integers, 2 * matrix.shift)
+
+
+def _positive(F: Integers) -> bool:
+    """Tell whether a symmetric matrix of integers is positive definite.
+
+    Powers of two bring its diagonal to about 2^96, entries are rounded down, and what rounding can do to an eigenvalue is given away.
+    """
+    n = len(F)
+    if any(F[i, i] <= 0 for i in range(n)):
+        return False
+    half = [-(int(F[i, i]).bit_length() // 2) for i in range(n)]
+    M = np.empty((n, n), dtype=object)
+    for i, j in np.ndindex(n, n):
+        power = half[i] + half[j] + _BITS
+        M[i, j] = int(F[i, j]) << power if power >= 0 else int(F[i, j]) >> -power
+    M[range(n), range(n)] -= n
+    pivot = 1
+    for k in range(n):
+        if M[k, k] <= 0:
+            return False
+        M[k + 1 :, k + 1 :] = (M[k, k] * M[k + 1 :, k + 1 :] - np.outer(M[k + 1 :, k], M[k, k + 1 :])) // pivot
+        pivot = M[k, k]
+    return True
+
+
+def _right_divide(matrix: Array, R: Array) -> Array:
+    return np.asarray(solve_triangular(R, matrix.T, trans="T").T)

@@ -1,0 +1,278 @@
+"""The certificate of the observer as it runs, against truths it does not know."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from kros.core.lti import StateSpace, gain
+from kros.core.norms import hinf_norm
+from kros.lifting import Lifting
+from kros.observer import Observer, one_step_residual, run_observer
+from kros.observer.adversary import attack, attack_running
+from kros.observer.relift import ReliftCertificate, relift_certificate
+from kros.observer.relift_error import ErrorSystem, ReliftScales, error_system
+from kros.observer.relift_ladder import growing_sequence
+from kros.observer.relift_proof import margin, proven
+from kros.observer.relift_report import relift_report
+from kros.observer.relift_sdp import sdp_proposal
+from kros.observer.relift_status import ReliftStatus
+from kros.synthesis import Injection
+
+
+def scalar(a: float, b: float, correction: float = 0.0) -> Observer:
+    """x+ = a x + b sin(x) + u, corrected by a constant gain."""
+    model = np.array([[a, b], [0.0, 0.0]])
+    return Observer(
+        "scalar",
+        Lifting(("x",), ("sin(x)",)),
+        model,
+        np.array([[1.0], [0.0]]),
+        (0,),
+        ("u",),
+        gain([[correction], [0.0]], 1.0),
+        Injection.STATE,
+        1.0,
+    )
+
+
+def random_observer(
+    rng: np.random.Generator, functions: tuple[str, ...], order: int = 3, injection: Injection = Injection.STATE
+) -> Observer:
+    """Three states, a dynamic correction, contracting enough to be certified."""
+    lifting = Lifting(("a", "b", "c"), functions, inputs=("u",))
+    n, p = 3, len(functions)
+    A = np.vstack(
+        [
+            np.hstack([0.7 * np.linalg.qr(rng.standard_normal((n, n)))[0], 0.05 * rng.standard_normal((n, p))]),
+            rng.standard_normal((p, n + p)),
+        ]
+    )
+    B = rng.standard_normal((n + p, 1))
+    width = 1 if injection is Injection.INPUT else n + p
+    K = StateSpace(
+        np.diag(np.linspace(0.2, 0.6, order)),
+        rng.standard_normal((order, 1)),
+        0.05 * rng.standard_normal((width, order)),
+        0.05 * rng.standard_normal((width, 1)),
+        0.01,
+    )
+    return Observer("random", lifting, A, B, (0,), ("u",), K, injection, 0.01)
+
+
+@pytest.mark.parametrize(("a", "b"), [(0.5, 0.2), (-0.4, 0.55), (0.0, 0.9), (0.98, -0.015)])
+def test_a_scalar_error_shrinks_by_hand(a: float, b: float) -> None:
+    found = relift_certificate(scalar(a, b))
+    assert found.certified
+    assert found.gain == pytest.approx(1 / (1 - abs(a) - abs(b)), rel=5e-3)  # a constant residual, slopes at the corner of the sign of a
+    # Alone from rest, |r+| <= (|a| + |b|) |r| + |b| |q|.
+    assert found.mismatch_gain == pytest.approx(abs(b) / (1 - abs(a) - abs(b)), rel=5e-3)
+
+
+@pytest.mark.parametrize(("a", "b"), [(0.5, 0.5), (0.9, -0.2), (1.01, 0.0)])
+def test_a_scalar_error_that_may_grow_is_said_to(a: float, b: float) -> None:
+    found = relift_certificate(scalar(a, b))
+    assert (found.certified, found.status, found.gain) == (False, ReliftStatus.UNSTABLE, None)
+    assert "grows" in found.reason
+
+
+def test_correction_certifies_what_is_unstable_without() -> None:
+    assert relift_certificate(scalar(1.02, 0.1, correction=0.6)).gain == pytest.approx(np.hypot(1, 0.6) / (1 - 0.42 - 0.1), rel=5e-3)
+
+
+@pytest.mark.parametrize("injection", list(Injection)[:2])
+def test_without_lifted_functions_the_gain_is_the_bounded_real_norm(injection: Injection) -> None:
+    rng = np.random.default_rng(3)
+    observer = random_observer(rng, (), order=5, injection=injection)
+    scales = ReliftScales(np.array([2.0, 0.1, 5.0]), np.array([1e-3, 0.3, 1.0]), np.array([0.02]))
+    A, B, K = observer.A, observer.B, observer.controller
+    into, C = (B if injection is Injection.INPUT else np.eye(3)), np.eye(3)[:1]
+    loop = StateSpace(
+        np.block([[A - into @ K.D @ C, -into @ K.C], [K.B @ C, K.A]]),
+        np.block([[np.diag(scales.residual), -into @ K.D * 0.02], [np.zeros((5, 3)), K.B * 0.02]]),
+        np.hstack([np.diag(1 / scales.error), np.zeros((3, 5))]),
+        np.zeros((3, 4)),
+        0.01,
+    )
+    found = relift_certificate(observer, scales=scales)
+    assert found.mismatch_gain == 0.0
+    norm = hinf_norm(loop)
+    assert norm < found.gain <= 1.0011 * norm
+
+
+def test_one_slope_is_certified_up_to_the_circle_criterion_and_not_beyond() -> None:
+    """One slope in a symmetric interval: a common Lyapunov matrix exists exactly where the small gain holds."""
+    rng = np.random.default_rng(1)
+    observer = random_observer(rng, ("sin(a)",), order=2)
+    plain = error_system(observer)
+    through = hinf_norm(StateSpace(plain.A, plain.L, plain.M, np.zeros((1, 1)), plain.dt))
+
+    def steeper(factor: float) -> ErrorSystem:
+        return ErrorSystem(plain.A, plain.L, plain.B, plain.M * factor / through, plain.D, plain.C, plain.dt)
+
+    from kros.observer.relift_riccati import riccati_proposals
+
+    inside = next(riccati_proposals(steeper(0.99)))
+    assert proven(inside.roots, steeper(0.99).corners(), plain.C, inside.gain)
+    assert not list(riccati_proposals(steeper(1.01)))
+
+
+# T. Ando and M.-H. Shih, "Simultaneous contractibility", SIAM J. Matrix Anal. Appl. 19 (1998): gamma A1, gamma A2 are stable under arbitrary switching for
+# gamma < 1, and have a common quadratic Lyapunov function for gamma < 1/sqrt(2) alone.
+ANDO_SHIH = (np.array([[1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, 1.0], [0.0, -1.0]]))
+
+
+@pytest.mark.parametrize(("level", "memory", "feasible"), [(0.70, 0, True), (0.715, 0, False), (0.95, 1, True)])
+def test_memory_reaches_what_one_matrix_cannot(level: float, memory: int, feasible: bool) -> None:
+    corners = [(level * A, np.eye(2)) for A in ANDO_SHIH]
+    middle = level * (ANDO_SHIH[0] + ANDO_SHIH[1]) / 2
+    system = ErrorSystem(middle, np.eye(2), np.eye(2), np.zeros((2, 2)), np.zeros((2, 2)), np.eye(2), 1.0)
+    found, _ = sdp_proposal(system, corners, memory)
+    assert (found is not None and proven(found.roots, corners, system.C, found.gain)) == feasible
+    assert not growing_sequence(corners)
+
+
+def test_brute_force_over_all_slope_sequences_stays_below_the_gain() -> None:
+    """Every sequence of corners of a short horizon, the worst disturbance for each by singular values; climbing on lowers the gain."""
+    observer = random_observer(np.random.default_rng(4), ("sin(a)", "sin(2*b)"), order=1)
+    first, found, system = relift_certificate(observer), relift_certificate(observer, tight=True, memory=0), error_system(observer)
+    assert first.gain is not None
+    assert found.gain is not None
+    assert found.gain < 0.9 * first.gain
+    horizon, worst = 5, 0.0
+    corners = system.corners()
+    for sequence in product(range(len(corners)), repeat=horizon - 1):
+        blocks = np.zeros((horizon, horizon, 3, 4))
+        state = np.zeros((len(system.A), horizon, 4))
+        for k in range(horizon):
+            A, B = corners[sequence[k - 1]] if k else (np.zeros_like(system.A), system.B)
+            state = np.einsum("ij,jab->iab", A, state)
+            state[:, k] += B
+            blocks[k] = np.moveaxis(np.einsum("zi,iab->zab", system.C, state), 1, 0)
+        worst = max(worst, float(np.linalg.norm(blocks.transpose(0, 2, 1, 3).reshape(horizon * 3, -1), 2)))
+    assert 0.3 * found.gain < worst <= found.gain
+
+
+@pytest.mark.parametrize("injection", list(Injection)[:2])
+@pytest.mark.parametrize("functions", [("a[-1]",), ("b[-2]", "a[-1]"), ("sin(2*a)",), ("sin(a + b)", "u[-1]*1"), ("cos(b[-1])",)])
+def test_the_error_system_is_the_observer_as_it_runs(functions: tuple[str, ...], injection: Injection) -> None:
+    """Linear functions of earlier states leave nothing to bound: the frozen response is the error, to rounding. Others stay within the bound."""
+    rng = np.random.default_rng(7)
+    observer = random_observer(rng, functions, injection=injection)
+    states, inputs = np.cumsum(0.1 * rng.standard_normal((400, 5, 3)), axis=0), rng.standard_normal((400, 5, 1))
+    found = relift_certificate(observer)
+    assert found.certified, found.reason
+    rows = relift_report(found, observer, states, inputs, list("vwxyz"))
+    assert all(row.holds for row in rows)
+    estimates = run_observer(observer, states[..., :1], inputs)
+    assert [row.error for row in rows] == pytest.approx(np.sqrt(np.mean(np.sum((states - estimates) ** 2, axis=2), axis=0)), rel=1e-12)
+    if not found.channels:
+        assert [row.frozen for row in rows] == pytest.approx([row.error for row in rows], rel=1e-9)
+    else:
+        assert all(row.frozen != pytest.approx(row.error, rel=1e-6) for row in rows)
+
+
+def test_a_product_of_state_and_input_is_covered_inside_its_box() -> None:
+    lifting = Lifting(("x",), (), (), ("u",), ("u*x",))
+    observer = Observer(
+        "bilinear", lifting, np.array([[0.5]]), np.array([[1.0, 0.3]]), (0,), ("u",), gain([[0.0]], 1.0), Injection.STATE, 1.0
+    )
+    free = relift_certificate(observer)
+    assert free.status is ReliftStatus.UNBOUNDED
+    assert "give a box" in free.reason
+    assert relift_certificate(observer, box={"u": (-1, 1)}).gain == pytest.approx(1 / (1 - 0.8), rel=5e-3)
+    assert relift_certificate(observer, box={"u": (0, 1)}).gain == pytest.approx(1 / (1 - 0.8), rel=5e-3)
+    assert relift_certificate(observer, box={"u": (-1, 0)}).gain == pytest.approx(1 / (1 - 0.5), rel=5e-3)
+
+
+def test_dropped_measurements() -> None:
+    assert relift_certificate(scalar(0.5, 0.1, 0.3), dropped=True).gain == pytest.approx(1 / (1 - 0.6), rel=0.05)
+    lost = relift_certificate(scalar(1.05, 0.1, 0.6), dropped=True)
+    assert lost.status is ReliftStatus.UNSTABLE
+
+
+def test_many_slopes_are_certified_by_multipliers() -> None:
+    functions = tuple(f"0.2*sin({k}*a)" for k in range(1, 5)) + tuple(f"0.2*cos({k}*b)" for k in range(1, 5))
+    observer = random_observer(np.random.default_rng(5), functions, order=2)
+    found = relift_certificate(observer)
+    assert found.certified
+    assert len(found.multipliers) == len(found.channels) == 8
+    assert attack(found, observer, steps=20000).share <= 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_adversary_comes_close_and_never_exceeds(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    observer = random_observer(rng, ("sin(a)", "sin(b + c)")[: 1 + seed % 2], order=seed)
+    found = relift_certificate(observer, scales=ReliftScales(np.ones(3), np.array([0.1, 1.0, 2.0]), np.array([0.5])))
+    worst = attack(found, observer, steps=20000, seed=seed)
+    assert (0.2 if seed % 2 else 0.75) * found.gain < worst.gain <= found.gain  # two slopes: the multipliers lose against the corners
+    assert worst.share <= 1
+    inputs = rng.standard_normal((len(worst.disturbance) + 1, 6, 1))
+    share, _ = attack_running(found, observer, worst.disturbance, rng.standard_normal((6, 3)), inputs, seed=seed)
+    assert 0.1 < share <= 1
+
+
+def test_the_adversary_refutes_a_gain_that_is_too_small() -> None:
+    from dataclasses import replace
+
+    observer = scalar(0.5, 0.2)
+    found = relift_certificate(observer)
+    wrong = replace(found, gain=0.9 * found.gain)
+    assert attack(wrong, observer, steps=5000).share > 1
+    assert (
+        attack_running(
+            wrong, observer, np.full((200, 2), [1.0, 0.0]), np.full((40, 1), 0.0), np.zeros((201, 40, 1)), amplitudes=(1e-4, 1e-2)
+        )[0]
+        > 1
+    )
+
+
+def test_the_proof_is_exact_at_the_edge() -> None:
+    """A = 0, B = C = 1: proven exactly where 1 < P < gamma^2, down to the last bit."""
+    corner, C, up = [(np.zeros((1, 1)), np.ones((1, 1)))], np.ones((1, 1)), np.nextafter(1.0, 2.0)
+    assert proven(np.array([[[up]]]), corner, C, float(np.nextafter(up, 2.0)))
+    assert not proven(np.ones((1, 1, 1)), corner, C, float(np.nextafter(up, 2.0)))  # P = C'C
+    assert not proven(np.array([[[up]]]), corner, C, float(up))  # gamma^2 = P
+    assert not proven(np.array([[[np.nan]]]), corner, C, 2.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_and_floating_margins_agree(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((6, 6))
+    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
+    system = StateSpace(A, rng.standard_normal((6, 2)), rng.standard_normal((2, 6)), np.zeros((2, 2)), 1.0)
+    from kros.observer.relift_riccati import lyapunov_factor
+
+    error = ErrorSystem(A, np.zeros((6, 0)), system.B, np.zeros((0, 6)), np.zeros((0, 2)), system.C, 1.0)
+    norm = hinf_norm(system)
+    R = lyapunov_factor(error, np.zeros(0), 1.01 * norm)
+    assert R is not None
+    for factor in (0.99, 1.002, 1.01, 1.1):
+        args = R[None], [(A, system.B)], system.C, factor * norm
+        assert proven(*args) == (margin(*args) > 0) == (factor >= 1.01) or factor == 1.002
+
+
+def test_the_residual_bound_of_a_recording_holds_sample_by_sample() -> None:
+    """The identity behind it all: e+ = f(x) - f(x_hat) - correction + omega, with the true slope of the sine between the two."""
+    observer = scalar(0.6, 0.3, 0.2)
+    rng = np.random.default_rng(0)
+    x, u = rng.standard_normal((50, 1, 1)), rng.standard_normal((50, 1, 1))
+    estimate = run_observer(observer, x, u)
+    e, omega = x - estimate, one_step_residual(observer.lifting, observer.A, observer.B, x, u)
+    slope = (np.sin(x) - np.sin(estimate))[1:-1] / e[1:-1]
+    assert np.abs(slope).max() <= 1
+    assert e[2:] == pytest.approx((0.6 - 0.2 + 0.3 * slope) * e[1:-1] + omega[1:], abs=1e-12)
+
+
+def test_a_certificate_survives_saving(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    found = relift_certificate(scalar(0.5, 0.2), box={"x": (-1, 2)})
+    found.save(tmp_path)
+    loaded = ReliftCertificate.load(tmp_path)
+    for name in ReliftCertificate.__dataclass_fields__:
+        if name not in ("scales", "box"):
+            np.testing.assert_array_equal(getattr(loaded, name), getattr(found, name))
+    assert proven(loaded.roots, loaded.system(scalar(0.5, 0.2)).corners(), loaded.system(scalar(0.5, 0.2)).C, loaded.gain)

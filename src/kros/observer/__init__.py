@@ -1,20 +1,32 @@
 """The observer as it runs: one-step predictor with retraction and re-lifting, and the baselines it is compared with."""
 
+from .adversary import Attack, attack, attack_running
 from .baselines import kalman_candidates, luenberger_candidates, noise_covariances
 from .difference import FilteredDifference, cutoffs_hz, rates
 from .extended_kalman import ExtendedKalman, start_covariance
 from .learned import Features, Learned, Moments
 from .observer import Observer
+from .relift import ReliftCertificate, relift_certificate
+from .relift_error import ReliftScales
+from .relift_report import ReliftRow, relift_report
+from .relift_status import ReliftStatus
 from .residual import mean_error_dynamics, one_step_residual, residual_spectra
 from .simulate import run_observer, run_observers
 
 __all__ = [
+    "Attack",
     "ExtendedKalman",
     "Features",
     "FilteredDifference",
     "Learned",
     "Moments",
     "Observer",
+    "ReliftCertificate",
+    "ReliftRow",
+    "ReliftScales",
+    "ReliftStatus",
+    "attack",
+    "attack_running",
     "cutoffs_hz",
     "kalman_candidates",
     "luenberger_candidates",
@@ -22,6 +34,8 @@ __all__ = [
     "noise_covariances",
     "one_step_residual",
     "rates",
+    "relift_certificate",
+    "relift_report",
     "residual_spectra",
     "run_observer",
     "run_observers",

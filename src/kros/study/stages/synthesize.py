@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from ...synthesis.certificate import certify
 from ...uncertainty import Form, Structure, UncertainModel
 from ..context import Context
 from ..makers import Product, Task, produce
+from ..relift import Running, certify_running, save_running
 from ..tuning import TUNING_EPISODES, TUNING_UNITS, TuningSet
 from . import calibrate
 
@@ -43,9 +46,20 @@ def run(context: Context) -> list[Path]:
     made = [p.name for p in products if p.synthesis is not None]
     deployed = choose_deployed(context.config.observer.deployed, made)
     folder = context.store.path("observers")
+    running = [r for found in context.run("certify", as_it_runs(tasks, products)) for r in found]
+    files += save_running(folder, running)
+    for found in running:
+        facts[found.name] |= found.facts()
     save_artifact(folder, "observers", {"names": made, "deployed": deployed, "facts": facts})
     Observer.load(folder / f"{deployed}.json").save(folder / "deployed.json")
     return [*files, folder / "observers.json", folder / "deployed.json"]
+
+
+def as_it_runs(tasks: list[Task], products: list[Product]) -> list[Callable[[], list[Running]]]:
+    """Return the work of certifying all observers as they run, one piece for every kind of model."""
+    pairs = list(zip(tasks, products, strict=True))
+    kinds = [[pair for pair in pairs if pair[0].models.name == name] for name in dict.fromkeys(task.models.name for task in tasks)]
+    return [partial(certify_running, [t for t, _ in kind], [p for _, p in kind]) for kind in kinds]
 
 
 def choose_deployed(wanted: str | None, made: list[str]) -> str:

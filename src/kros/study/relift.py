@@ -1,0 +1,110 @@
+"""The certificate of every observer as it runs, with what it says about training episodes; observers of one kind of model share these."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.artifacts import save_artifact
+from ..observer import (
+    Observer,
+    ReliftCertificate,
+    ReliftRow,
+    ReliftScales,
+    ReliftStatus,
+    one_step_residual,
+    relift_certificate,
+    relift_report,
+    run_observers,
+)
+from .makers import Product, Task
+from .tuning import TuningSet
+
+log = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
+_EPISODE_S = 5.0
+_BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has no global slope bounds
+
+
+@dataclass(frozen=True, eq=False)
+class Running:
+    """What is known about one observer as it runs: its certificate and a row for every unit."""
+
+    name: str
+    certificate: ReliftCertificate
+    rows: list[ReliftRow]
+
+    def facts(self) -> dict[str, Any]:
+        """Return what goes into the metrics."""
+        found = self.certificate
+        facts: dict[str, Any] = {"relift_certified": found.certified, "relift_gain": found.gain}
+        if not found.certified:
+            return facts | {"relift_reason": found.reason}
+        return facts | {"relift_mismatch_gain": found.mismatch_gain, "relift_bound_worst": max((r.bound for r in self.rows), default=None)}
+
+
+def certify_running(tasks: Sequence[Task], products: Sequence[Product]) -> list[Running]:
+    """Certify the observers of one kind of model.
+
+    Parameters
+    ----------
+    tasks, products : sequence of Task, of Product
+        Of one kind of model; what could not be made is left out.
+    """
+    observers = [task.observer(p.synthesis) for task, p in zip(tasks, products, strict=True) if p.synthesis is not None]
+    if not observers:
+        return []
+    task, first = tasks[0], observers[0]
+    judge = first_episodes(task.tuning).read().first(_EPISODE_S / task.models.sample_period_s)
+    batch, values = judge.batch, judge.parameters if first.lifting.parameters else None
+    units = [key.unit for key in batch.keys]
+    residual = one_step_residual(first.lifting, first.A, first.B, batch.states, batch.inputs, values)
+    n = first.lifting.n_states
+    scales = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
+    certificates = [certify(observer, scales, task) for observer in observers]
+    estimates = run_observers(observers, judge.measurements(first.measured), batch.inputs, values)
+    return [
+        Running(
+            o.name, c, relift_report(c, o, batch.states, batch.inputs, units, batch.lengths, values, estimates=x) if c.certified else []
+        )
+        for o, c, x in zip(observers, certificates, estimates, strict=True)
+    ]
+
+
+def first_episodes(tuning: TuningSet) -> TuningSet:
+    """Return the first training episode of every unit."""
+    firsts = {key.unit: key for key in reversed(tuning.keys)}
+    return replace(tuning, keys=tuple(key for key in tuning.keys if firsts[key.unit] == key))
+
+
+def certify(observer: Observer, scales: ReliftScales, task: Task) -> ReliftCertificate:
+    """Certify one observer everywhere, or in an operating box where slopes have no bound of their own."""
+    found = relift_certificate(observer, scales=scales)
+    if found.status is ReliftStatus.UNBOUNDED:
+        models = task.models
+        sizes = [
+            *zip(models.lifting.states, models.output_scale, strict=False),
+            *zip(models.recorded_inputs, models.input_scale, strict=False),
+        ]
+        box = {name: (-_BOX * size, _BOX * size) for name, size in sizes}
+        own = {name: (float(np.min(v)), float(np.max(v))) for name, v in models.parameters.items()}
+        found = relift_certificate(observer, box, scales, own)
+    if not found.certified:
+        log.warning("%s: no certificate covers it as it runs. %s", observer.name, found.reason)
+    return found
+
+
+def save_running(folder: Path, found: Sequence[Running]) -> list[Path]:
+    """Write certificates and rows below the folder of the observers."""
+    rows = {r.name: [row.as_dict() for row in r.rows] for r in found}
+    told = {r.name: {"assumptions": r.certificate.assumptions, "method": r.certificate.method} for r in found}
+    save_artifact(folder, "relift", {"rows": rows, "certificates": told})
+    for running in found:
+        running.certificate.save(folder / "relift" / running.name)
+    return [folder / "relift.json"]

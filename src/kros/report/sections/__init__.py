@@ -7,7 +7,7 @@ from typing import Any
 
 from ..content import Section
 from ..run_folder import RunFolder
-from . import calibration, making, models, observers, other_conditions, outliers, recordings, synthesis, uncertainty
+from . import calibration, making, models, observers, other_conditions, outliers, recordings, relift, synthesis, uncertainty
 
 Metrics = Mapping[str, Any]
 
@@ -18,6 +18,7 @@ SECTIONS: tuple[Callable[[RunFolder, Metrics], Section | None], ...] = (
     models.section,
     uncertainty.section,
     synthesis.section,
+    relift.section,
     observers.section,
     other_conditions.section,
     outliers.section,

@@ -1,0 +1,66 @@
+"""What is certified about the observers as they run, and how close their errors come to it."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ...core.artifacts import load_artifact
+from ..content import Cell, Section, Table
+from ..names import number, observer_label
+from ..run_folder import RunFolder
+
+_TEXT = (
+    "An observer that cuts its estimate back to the original states and lifts it anew at every step is not linear, and no linear "
+    "certificate covers it. Its error is driven by the one-step residual alone: what the nominal model misses from one sample to the "
+    "next, whatever the reason. For every unit, known or not, the error's RMS is at most the gain times the residual's, plus what the "
+    "first error costs. The residual is divided by its size in this population and errors by the ranges: on a unit with the typical "
+    "residual the gain itself bounds the error."
+)
+_BOUND = (
+    "The gain holds for the worst course of the residual. From the residual as it was, two things follow: the response of the observer "
+    "with the lifted functions' slopes in the middle of their interval, and, times the mismatch gain, what their movement can add. The "
+    "bounds below take the smaller of both, on the first five seconds of a training episode of every unit."
+)
+
+
+def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
+    """Return the certificates of the observers as they run; None where there are none."""
+    observers = {name: entry for name, entry in metrics.get("observers", {}).items() if entry.get("relift_certified") is not None}
+    if not observers or not (run.folder / "observers" / "relift.json").exists():
+        return None
+    record = load_artifact(run.folder / "observers", "relift")[0]
+    deployed = metrics["study"].get("deployed")
+    failed = [
+        f"No certificate was found for “{observer_label(name)}” as it runs: {entry['relift_reason']}"
+        for name, entry in observers.items()
+        if not entry["relift_certified"]
+    ]
+    rows = [_row(name, entry, record["rows"].get(name, [])) for name, entry in observers.items()]
+    head = ["observer", "gain", "mismatch gain", "bound", "error", "bound", "error"]
+    emphasised = [i for i, name in enumerate(observers) if name == deployed]
+    caption = "Errors in percent of the ranges, RMS over time, the states' squares added."
+    table = Table(head, rows, caption, [("", 3), ("median unit", 2), ("worst unit", 2)], emphasised=emphasised)
+    assumptions = record["certificates"].get(deployed, {}).get("assumptions", [])
+    conditions = [f"Assumed for “{observer_label(deployed)}”: {'; '.join(assumptions)}."] if deployed and assumptions else []
+    tables = [table, *_units(deployed, record["rows"].get(deployed, []))]
+    return Section("relift", "Certified as it runs", [_TEXT, _BOUND, *conditions, *failed], tables)
+
+
+def _row(name: str, entry: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[Cell]:
+    if not rows:
+        return [Cell(observer_label(name)), Cell("none", strong=True), *([Cell("–")] * 5)]
+    values = [statistics.median(row[key] for row in rows) for key in ("bound", "error")]
+    values += [max(row[key] for row in rows) for key in ("bound", "error")]
+    gains = [Cell(number(entry["relift_gain"])), Cell(number(entry.get("relift_mismatch_gain")))]
+    return [Cell(observer_label(name)), *gains, *(Cell(number(100 * v)) for v in values)]
+
+
+def _units(deployed: str | None, rows: Sequence[Mapping[str, Any]]) -> list[Table]:
+    if deployed is None or not rows:
+        return []
+    keys = ("gain_bound", "bound", "error")
+    cells = [[Cell(row["unit"]), Cell(number(row["residual"])), *(Cell(number(100 * row[key])) for key in keys)] for row in rows]
+    head = ["unit", "residual", "bound by the gain (%)", "bound (%)", "error (%)"]
+    return [Table(head, cells, f"Every unit, “{observer_label(deployed)}”; residual relative to the population's.", folded=True)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import subprocess
 import sys
@@ -27,15 +28,31 @@ from kros.observer import Observer
 from kros.report import plot, render, write_figures
 from kros.report.encode import to_svg
 from kros.report.figures import FIGURES, draw_all
+from kros.report.figures.entries import entry_names
 from kros.report.figures.forms import paper_bounds
-from kros.report.figures.outlier_residuals import typical_residuals
+from kros.report.figures.forms_entrywise import entry_bounds
+from kros.report.figures.outlier_scores import referred_range
 from kros.report.figures.spectra import band_shares
 from kros.report.figures.synthesis_bode import scaled_filter
 from kros.report.figures.trajectories import longest_steady, steady_stretches
+from kros.report.figures.uncertain_model import beside
+from kros.report.figures.weights import in_gauge
 from kros.report.run_folder import NotShownError, RunFolder
 from kros.report.theme import Tone
 from kros.synthesis.result import Injection, Status, Synthesis
-from kros.uncertainty import Form, UncertainModel, quantify, residual
+from kros.uncertainty import (
+    Cover,
+    Form,
+    OutlierModel,
+    Tightness,
+    UncertainModel,
+    VariationAndNoise,
+    cover_ratio,
+    quantify,
+    residual,
+    score_outliers,
+)
+from kros.uncertainty.unit_residuals import UnitResiduals
 
 DT = 0.001
 UNITS = ("000000", "001", "002", "003", "0<b>4")
@@ -137,6 +154,7 @@ def write_models(run: Path, uncertain: dict[str, UncertainModel]) -> None:
         uncertain[name].save(run / "uncertainty" / name)
     refined(models("koopman_edmd", "noload", 1)).save(run / "refinement" / "koopman")
     save_artifact(run / "uncertainty", "choice", {"nominal": "001", "worst_off_nominal": "002", "dropped": []})
+    write_diagnostics(run, uncertain)
     rows = [
         {
             "unit": u,
@@ -149,6 +167,44 @@ def write_models(run: Path, uncertain: dict[str, UncertainModel]) -> None:
         for c in ("load", "noload")
     ]
     write_json(run / "outliers" / "scores.json", {"schema": 1, "rows": rows})
+
+
+def noise(model: UncertainModel) -> VariationAndNoise:
+    """Half of the squared residual is noise at low frequency, none at high."""
+    freqs = model.freqs_hz
+    sizes = np.outer([0.0, 0.02, 0.03, 0.02], np.ones(len(freqs)))
+    total = np.full(len(freqs), 1e-3)
+    return VariationAndNoise(
+        model.form, model.unit_ids, 0, 0.95, freqs, sizes, 0.1 * sizes + 1e-3, total, total * np.linspace(0.5, 0, len(freqs))
+    )
+
+
+def scores(condition: str) -> OutlierModel:
+    found = models("koopman_edmd", condition, 1 if condition == "noload" else 2)
+    freqs = np.geomspace(0.1, 400.0, 40)
+    return score_outliers(
+        found.systems().frequency_response(freqs), freqs, unit_ids=UNITS, output_scale=found.output_scale, input_scale=found.input_scale
+    )
+
+
+def beside_others(name: str) -> UnitResiduals:
+    found = models(name, "load", 2)
+    covered = quantify(found, freqs_hz=np.geomspace(0.1, 500, 40), unit_ids=UNITS[1:], max_order=2, density=3, structure="scalar")
+    inside = beside(covered, found)
+    outer = np.concatenate([3 * inside.entries[:1], inside.entries]), np.concatenate([3 * inside.ratio[:1], inside.ratio])
+    return dataclasses.replace(inside, unit_ids=UNITS, outside=UNITS[:1], entries=outer[0], ratio=outer[1])
+
+
+def write_diagnostics(run: Path, uncertain: dict[str, UncertainModel]) -> None:
+    for name, model in uncertain.items():
+        noise(model).save(run / "uncertainty" / name / "noise")
+        Tightness(np.arange(1, 4), np.array([5.0, 2.0, 0.5]), np.array([5.0, 1.0, 0.0]), np.arange(1, 4)).save(
+            run / "uncertainty" / name / "order"
+        )
+        beside(model, models(name, "noload", 1)).save(run / "uncertainty" / name / "units")
+        beside_others(name).save(run / "outliers" / f"{name}@load" / "others")
+    for condition, folder in (("noload", "koopman_edmd"), ("load", "koopman_edmd@load")):
+        scores(condition).save(run / "outliers" / folder)
 
 
 def write_observers(run: Path) -> list[str]:
@@ -408,7 +464,9 @@ def test_phase_figure_shows_the_calibration(finished: tuple[Path, dict[str, Any]
 def test_plot_takes_every_result(uncertain: dict[str, UncertainModel]) -> None:
     population = from_arrays({"a": [np.zeros((50, 5)) + np.arange(50.0)[:, None]]}, CHANNELS, sample_period_s=DT)
     before = dict(matplotlib.rcParams)
-    for result in (population, models("koopman_edmd", "noload", 1), uncertain["linear_edmd"], synthesis(4, "mixed")):
+    order = Tightness(np.arange(1, 3), np.array([5.0, 2.0]), np.zeros(2), np.arange(1, 3))
+    some = (population, models("koopman_edmd", "noload", 1), uncertain["linear_edmd"], synthesis(4, "mixed"))
+    for result in (*some, noise(uncertain["linear_edmd"]), scores("load"), order):
         figure = plot(result)
         assert isinstance(figure, Figure)
         assert figure.axes
@@ -440,14 +498,60 @@ def test_output_forms_of_the_paper_never_fall_below_one(uncertain: dict[str, Unc
     assert all(np.all(bound > 1 - 1e-9) for _, bound in found.values())
 
 
-def test_typical_residuals_are_medians_over_nominals() -> None:
-    found, freqs = models("linear_edmd", "noload", 1), np.array([1.0, 30.0])
-    others = list(UNITS[1:])
-    G = found.systems([*others, "000000"]).frequency_response(freqs) * 3.0 / 2.0
-    levels = typical_residuals(found, Form.INVERSE_INPUT_MULTIPLICATIVE, others, "000000", freqs)
-    for unit in range(5):
-        one_by_one = [np.abs(residual("inverse_input_multiplicative", G[k], G[unit])) for k in range(4) if k != unit]
-        assert levels[unit] == pytest.approx(np.median([20 * np.log10(e) for e in one_by_one], axis=0))
+def test_entries_are_those_of_the_form(uncertain: dict[str, UncertainModel]) -> None:
+    model, found = uncertain["koopman_edmd"], models("koopman_edmd", "noload", 1)
+    bounds = entry_bounds(model, found)
+    freqs, entries = bounds[Form.ADDITIVE]
+    G = found.systems(model.unit_ids).frequency_response(freqs) * 3.0 / 2.0
+    nominal = model.unit_ids.index(model.nominals[Form.ADDITIVE])
+    assert entries == pytest.approx(np.abs(G - G[nominal]).max(axis=0))
+    for form, (_, sizes) in bounds.items():
+        assert sizes.shape[1:] == tuple(len(names) for names in entry_names(form, found))
+        assert np.all(sizes.max(axis=(1, 2)) <= model.bounds[form] * (1 + 1e-9))
+
+
+def test_cover_in_another_gauge_is_the_same_cover(uncertain: dict[str, UncertainModel]) -> None:
+    model = uncertain["linear_edmd"]
+    fitted = model.weight.magnitudes(model.freqs_hz)
+    moved = in_gauge(model.cover, fitted)
+    assert moved.entries() == pytest.approx(model.cover.entries())
+    assert np.log(moved.right).mean(axis=1) == pytest.approx(np.log(fitted.right).mean(axis=1))
+    zero = Cover(np.zeros((3, 2)), np.ones((3, 2)))
+    assert in_gauge(zero, zero).left == pytest.approx(0.0)
+
+
+def test_ranges_of_scores_move_with_them() -> None:
+    model = scores("load")
+    for score in model.scores:
+        low, high = referred_range(score)
+        assert high - low == pytest.approx(score.highest_db - score.lowest_db)
+        assert low - score.score_db == pytest.approx(score.lowest_db - score.excess_db)
+
+
+def test_plots_of_an_uncertain_model_come_in_two_versions(uncertain: dict[str, UncertainModel]) -> None:
+    model, found = uncertain["koopman_edmd"], models("koopman_edmd", "noload", 1)
+    assert len(plot(model).axes) == 2
+    assert len(plot(model, version="sound", models=found).axes) == 3
+    panels = plot(model, version="entrywise", models=found).axes
+    assert len(panels) == 4  # the inverse input form of two inputs
+    bound, fitted = (line.get_ydata() for line in panels[1].lines[:2])
+    assert np.all(fitted >= bound - 1e-9)
+    with pytest.raises(ConfigError, match="pass models="):
+        plot(model, version="entrywise")
+    with pytest.raises(ConfigError, match="'hopeful' is unknown"):
+        plot(model, version="hopeful")
+    with pytest.raises(ConfigError, match="no option 'version'"):
+        plot(found, version="sound")
+
+
+def test_units_beside_weights_are_the_ratios_of_the_cover(uncertain: dict[str, UncertainModel]) -> None:
+    model, found = uncertain["linear_edmd"], models("linear_edmd", "noload", 1)
+    kept = beside(model, found)
+    G = found.systems(model.unit_ids).frequency_response(kept.freqs_hz) * 3.0 / 2.0
+    E = residual(model.form, G[model.nominal], G)
+    weights = model.weight.magnitudes(kept.freqs_hz)
+    assert kept.ratio == pytest.approx(cover_ratio(E, weights.left, weights.right), abs=1e-12)
+    assert kept.ratio.max() <= 1
 
 
 def test_filter_is_scaled_by_the_ranges() -> None:

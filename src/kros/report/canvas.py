@@ -39,11 +39,17 @@ def grid(rows: int, columns: int, row_height_in: float, *, legend_rows: int = 1,
     """
     from matplotlib.figure import Figure
 
+    from .layout import OnePass
+
     top_in = 0.06 + 0.19 * legend_rows
     height = rows * row_height_in + top_in
-    figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.04, h_pad=0.03, wspace=0.03, hspace=0.02, rect=(0, 0, 1, 1 - top_in / height))  # type: ignore[union-attr, call-arg]
-    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+    figure = Figure(figsize=(WIDTH_IN, height))
+    figure.subplots_adjust(
+        left=0.09, right=0.98, bottom=min(0.5 / height, 0.3), top=1 - min((top_in + 0.2) / height, 0.4), wspace=0.15, hspace=0.2
+    )
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    figure.set_layout_engine(OnePass(axes, top_in, options.get("width_ratios"), options.get("height_ratios")))
+    return figure, axes
 
 
 def thin(x: Array, y: Array, buckets: int = _BUCKETS) -> tuple[Array, Array]:
@@ -96,12 +102,12 @@ def decibel(values: npt.ArrayLike) -> Array:
     return 20 * np.log10(np.where(magnitude > 0, magnitude, np.nan))
 
 
-def frequency_axis(axes: Axes, freqs_hz: Array, label: str = "frequency (Hz)") -> None:
-    """Make the horizontal axis logarithmic over the frequencies."""
+def frequency_axis(axes: Axes, freqs_hz: Array, label: str = "frequency (Hz)", most: int = 6) -> None:
+    """Make the horizontal axis logarithmic over the frequencies, with at most `most` numbers."""
     positive = freqs_hz[freqs_hz > 0]
     axes.set_xscale("log")
     axes.set_xlim(positive[0], positive[-1])
-    plain_powers(axes.xaxis, "{x:g}")
+    plain_powers(axes.xaxis, "{x:g}", most)
     axes.set_xlabel(label)
 
 
@@ -111,11 +117,11 @@ def logarithmic(axes: Axes) -> None:
     plain_powers(axes.yaxis, lambda value, _: power_of_ten(value))
 
 
-def plain_powers(axis: Axis, formatter: Any) -> None:
+def plain_powers(axis: Axis, formatter: Any, most: int = 6) -> None:
     """Tick a logarithmic axis at powers of ten only, numbered without mathematical text, which is slow to set."""
     from matplotlib.ticker import LogLocator, NullLocator
 
-    axis.set_major_locator(LogLocator(numticks=6))
+    axis.set_major_locator(LogLocator(numticks=most))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(formatter)
 

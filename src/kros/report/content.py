@@ -69,6 +69,8 @@ class Section:
     figures : sequence of str
     folded : sequence of (str, str)
         Titles and preformatted texts that the reader opens.
+    more : sequence of (str, sequence of str)
+        Titles and names of further figures that the reader opens.
     """
 
     key: str
@@ -77,6 +79,7 @@ class Section:
     tables: Sequence[Table] = ()
     figures: Sequence[str] = ()
     folded: Sequence[tuple[str, str]] = field(default=())
+    more: Sequence[tuple[str, Sequence[str]]] = field(default=())
 
 
 def text_cells(*texts: str) -> list[Cell]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from ..core.artifacts import write_bytes
 from ..data.population import DEFAULT_CONDITION
+from .advice import advice
 from .encode import to_svg
 from .figures import draw_all
 from .names import condition_label
@@ -65,6 +66,7 @@ def page(run: RunFolder, metrics: Mapping[str, Any]) -> str:
         name=run.study.get("name", run.folder.name),
         subtitle=_subtitle(metrics),
         verdict=verdict(metrics, run.measured_states),
+        advice=advice(metrics, run.measured_states),
         sections=[s for s in (section(run, metrics) for section in SECTIONS) if s is not None],
         figures=figures,
         style=Markup(stylesheet()),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import singledispatch
+from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,12 +12,15 @@ from ..core.errors import ConfigError
 from ..data.population import Population
 from ..identify import ModelSet, PhaseCalibration
 from ..synthesis.result import Synthesis
-from ..uncertainty import UncertainModel
+from ..uncertainty import OutlierModel, Tightness, UncertainModel, VariationAndNoise
 from .canvas import decibel, frequency_axis, grid
 from .figures.bode import bode_figure
+from .figures.outlier_scores import scores_figure
 from .figures.phase import phase_figure
 from .figures.trajectories import label_rows
 from .figures.uncertain_model import uncertain_figure
+from .figures.variation import variation_figure
+from .figures.weight_orders import orders_figure
 from .names import Look, method_label, number
 from .theme import Tone, styled
 
@@ -25,13 +29,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def plot(result: Any) -> Figure:
+def plot(result: Any, **options: Any) -> Figure:
     """Return a figure of a result.
 
     Parameters
     ----------
-    result : Population, PhaseCalibration, ModelSet, UncertainModel or Synthesis
+    result : Population, PhaseCalibration, ModelSet, UncertainModel, VariationAndNoise, Tightness, OutlierModel or Synthesis
         A population is shown by the first episode of its first unit.
+    **options
+        Of an uncertain model ``version``, ``"sound"`` (largest singular values, weights and cover) or ``"entrywise"`` (the paper's figures), and
+        ``models``, the `ModelSet` behind it, which shows every unit and which entries need. Of models ``nominal``, a unit that is drawn on top.
 
     Returns
     -------
@@ -41,7 +48,7 @@ def plot(result: Any) -> Figure:
     Raises
     ------
     ConfigError
-        For anything else.
+        For anything else, and for options that the result does not have.
 
     Examples
     --------
@@ -52,13 +59,21 @@ def plot(result: Any) -> Figure:
     >>> len(figure.axes)
     2
     """
-    return _draw(result)
+    draw = _draw.dispatch(type(result))
+    known = list(signature(draw).parameters)[1:]
+    unknown = sorted(set(options) - set(known))
+    if unknown and draw is not _draw.dispatch(object):
+        raise ConfigError(
+            f"Plot: a {type(result).__name__} has no option {', '.join(map(repr, unknown))}; it has {', '.join(known) or 'none'}."
+        )
+    return draw(result, **options)
 
 
 @singledispatch
-def _draw(result: Any) -> Figure:
+def _draw(result: Any, **_: Any) -> Figure:
     raise ConfigError(
-        f"Plot: found a {type(result).__name__}; give a Population, PhaseCalibration, ModelSet, UncertainModel or Synthesis, or render a run folder."
+        f"Plot: found a {type(result).__name__}; give a Population, PhaseCalibration, ModelSet, UncertainModel, VariationAndNoise, Tightness, OutlierModel "
+        "or Synthesis, or render a run folder."
     )
 
 
@@ -82,6 +97,24 @@ def _population(result: Population) -> Figure:
 _draw.register(PhaseCalibration, styled(phase_figure))
 _draw.register(ModelSet, styled(bode_figure))
 _draw.register(UncertainModel, styled(uncertain_figure))
+
+
+@_draw.register(VariationAndNoise)
+@styled
+def _variation(result: VariationAndNoise) -> Figure:
+    return variation_figure({"": result})
+
+
+@_draw.register(Tightness)
+@styled
+def _order(result: Tightness) -> Figure:
+    return orders_figure({"": result})
+
+
+@_draw.register(OutlierModel)
+@styled
+def _scores(result: OutlierModel) -> Figure:
+    return scores_figure({"": result})
 
 
 @_draw.register(Synthesis)

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
+from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.parse import quote, unquote
 
 import numpy as np
 import numpy.typing as npt
@@ -23,9 +23,11 @@ from ..observer import Observer
 from ..synthesis.result import Synthesis
 
 if TYPE_CHECKING:
-    from ..uncertainty import UncertainModel
+    from ..uncertainty import OutlierModel, Tightness, UncertainModel, VariationAndNoise
+    from ..uncertainty.unit_residuals import UnitResiduals
 
 Array = npt.NDArray[Any]
+T = TypeVar("T")
 
 
 class NotShownError(Exception):
@@ -154,6 +156,54 @@ class RunFolder:
         return {f.name: UncertainModel.load(f) for f in folders if "@" not in f.name}
 
     @cached_property
+    def noise(self) -> dict[str, VariationAndNoise]:
+        """Variation and noise, by kind of model."""
+        from ..uncertainty import VariationAndNoise
+
+        reason = "variation and noise were not told apart; it takes two training episodes of every unit"
+        found = {f.name: VariationAndNoise.load(f / "noise") for f in self._folders("uncertainty", "noise/*.json", reason)}
+        return _in_order(found)
+
+    @cached_property
+    def orders(self) -> dict[str, Tightness]:
+        """Overbound over order, by kind of model."""
+        from ..uncertainty import Tightness
+
+        folders = self._folders("uncertainty", "order/*.json", "no weights of different orders have been compared")
+        return _in_order({f.name: Tightness.load(f / "order") for f in folders})
+
+    @cached_property
+    def unit_residuals(self) -> dict[str, UnitResiduals]:
+        """Residuals of all units beside the weights, by kind of model."""
+        from ..uncertainty.unit_residuals import UnitResiduals
+
+        folders = self._folders("uncertainty", "units/*.json", "the residuals of the units were not kept")
+        return _in_order({f.name: UnitResiduals.load(f / "units") for f in folders})
+
+    @cached_property
+    def others(self) -> tuple[str, dict[str, UnitResiduals]]:
+        """Condition of the highest outlier score, and there the residuals of all units beside the cover of the others, by kind of model."""
+        from ..uncertainty.unit_residuals import UnitResiduals
+
+        folders = self._folders(
+            "outliers", "others/*.json", "no unit was compared with the cover of the others; it takes two others in a condition"
+        )
+        found = {f.name.partition("@")[0]: UnitResiduals.load(f / "others") for f in folders}
+        return self._condition(folders[0].name), _in_order(found)
+
+    @cached_property
+    def outlier_models(self) -> dict[str, OutlierModel]:
+        """Scores with all that is known about them, by condition."""
+        from ..uncertainty import OutlierModel
+
+        folders = self._folders("outliers", "outlier_model.json", "outlier scores need at least three units in a condition")
+        return {self._condition(f.name): OutlierModel.load(f) for f in folders}
+
+    def _condition(self, name: str) -> str:
+        """Condition of a folder of models."""
+        return unquote(name.partition("@")[2]) or self.identify_on
+
+    @cached_property
     def choice(self) -> dict[str, Any]:
         """Which unit is nominal and which is worst off nominal."""
         self._require(self.folder / "uncertainty" / "choice.json", "the uncertainty has not been quantified yet")
@@ -241,3 +291,8 @@ class RunFolder:
     def _require(self, path: Path, reason: str) -> None:
         if not path.exists():
             raise NotShownError(reason)
+
+
+def _in_order(found: dict[str, T]) -> dict[str, T]:
+    """Linear before Koopman, kros's own before the paper's recipe."""
+    return dict(sorted(found.items(), key=lambda item: (item[0].endswith("_edmd"), item[0].startswith("koopman"), item[0])))

@@ -22,7 +22,11 @@ FIGURES = (
     "free_run_spectra",
     "trade_off",
     "forms",
+    "variation",
     "weights",
+    "weight_orders",
+    "forms_entrywise",
+    "weights_entrywise",
     "synthesis_bode",
     "certificates",
     "errors_chart",
@@ -30,6 +34,7 @@ FIGURES = (
     "observer_spectra",
     "loaded",
     "outlier_scores",
+    "outlier_ratio",
     "outlier_residuals",
 )
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ...identify import ModelSet
 from ...uncertainty import Form, UncertainModel, bounds
 from ..canvas import decibel, end_labels, frequency_axis, grid, thin_log
-from ..names import best_models, form_label, model_label
+from ..names import best_models, form_label, model_label, number
 from ..run_folder import RunFolder
 from ..theme import Tone
 from .drawing import Drawing
@@ -48,8 +48,21 @@ def draw(run: RunFolder) -> Drawing:
         "their ranges. Thick: the form in use, "
         f"{form_label(first.form.value)}."
     )
+    text += _beyond(chosen)
     text += " Dashed: the paper's variants of both output forms, 0 dB and more everywhere whatever the units do." if variants else ""
     return Drawing(forms_figure(chosen, variants), text)
+
+
+def _beyond(models: Mapping[str, UncertainModel]) -> str:
+    """Name the forms whose peaks are above the figure."""
+    high = max(window(model)[1] for model in models.values())
+    parts = [
+        f"{form_label(form.value)}, {model_label(name)}: {number(peak)} dB"
+        for name, model in models.items()
+        for form, peak in model.peak_db.items()
+        if peak > high
+    ]
+    return f" Peaks above the figure: {'; '.join(parts)}." if parts else ""
 
 
 def is_tall(model: UncertainModel) -> bool:
@@ -84,11 +97,24 @@ def forms_figure(models: Mapping[str, UncertainModel], variants: Mapping[str, Ma
         _panel(panel, model, (variants or {}).get(name, {}))
         panel.set_title(model_label(name))
     axes[0, 0].set_ylabel("largest residual (dB)")
-    for panel, model in zip(axes[0], models.values(), strict=True):
-        ends = [(float(decibel(bound)[-1]), form_label(form.value), FORM_TONES[form].light) for form, bound in model.bounds.items()]
-        if panel is axes[0, -1]:
-            end_labels(panel, ends, spacing=0.06)
+    limits = [window(model) for model in models.values()]
+    axes[0, 0].set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
+    last = list(models.values())[-1]
+    ends = [(float(decibel(bound)[-1]), form_label(form.value), FORM_TONES[form].light) for form, bound in last.bounds.items()]
+    end_labels(axes[0, -1], ends, spacing=0.06)
     return figure
+
+
+def window(model: UncertainModel) -> tuple[float, float]:
+    """Return the levels between which the forms are compared, dB: the form in use is seen whole, others may leave the top."""
+    used = decibel(model.bounds[model.form])
+    levels = np.concatenate([decibel(b) for b in model.bounds.values()])
+    levels = levels[np.isfinite(levels)]
+    if not levels.size:
+        return -_FLOOR_DB, 5.0
+    high = min(float(levels.max()), max(float(np.nanmax(used, initial=-np.inf)) + 20.0, 15.0))
+    low = min(float(np.percentile(levels, 1)), float(np.nanmin(used, initial=np.inf)))
+    return max(low, high - _FLOOR_DB) - 3.0, max(high, 3.0) + 3.0
 
 
 def _panel(axes: Axes, model: UncertainModel, variants: Mapping[Form, tuple[Array, Array]]) -> None:
@@ -110,7 +136,3 @@ def _panel(axes: Axes, model: UncertainModel, variants: Mapping[Form, tuple[Arra
         )
     axes.axhline(0, color=Tone.SOFT.light, lw=0.7)
     frequency_axis(axes, model.freqs_hz)
-    lines = [decibel(b) for b in model.bounds.values()]
-    finite = np.concatenate([line[np.isfinite(line)] for line in lines])
-    if finite.size:
-        axes.set_ylim(max(finite.min(), finite.max() - _FLOOR_DB) - 3, max(finite.max(), 3.0) + 5)

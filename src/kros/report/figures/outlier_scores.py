@@ -1,73 +1,92 @@
-"""Outlier scores of all units against the threshold, a row a condition.
+"""Outlier scores of all units against the threshold, with their range over all nominals, a row a condition.
 
 Needs: outlier scores.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...data.population import natural_key
+from ...uncertainty import OutlierModel, OutlierScore
 from ..canvas import grid
-from ..names import condition_label
-from ..run_folder import NotShownError, RunFolder
+from ..names import condition_label, form_label, number
+from ..run_folder import RunFolder
 from ..theme import Tone
 from .drawing import Drawing
 from .units_axis import units_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 NAME, TITLE = "outlier_scores", "Outlier scores"
 
 
 def draw(run: RunFolder) -> Drawing:
-    """Draw one point a unit, flagged ones filled."""
-    rows = run.outlier_rows
-    if not rows:
-        raise NotShownError("outlier scores need at least three units in a condition")
-    conditions = sorted({r["condition"] for r in rows}, key=natural_key)
-    units = sorted({r["unit"] for r in rows}, key=natural_key)
-    figure, axes = grid(len(conditions), 1, 1.6, legend_rows=0, sharex=True)
-    for panel, condition in zip(axes[:, 0], conditions, strict=True):
-        _panel(panel, [r for r in rows if r["condition"] == condition], units)
+    """Draw one point a unit with its range, flagged ones in the colour of alarm."""
+    found = {c: run.outlier_models[c] for c in sorted(run.outlier_models, key=natural_key)}
+    first = next(iter(found.values()))
+    flagged = sorted({s.unit for m in found.values() for s in m.scores if s.outlier}, key=natural_key)
+    text = (
+        f"How far every unit sticks out of the cover of all the others by its {form_label(first.form.value)} residual: the median over all nominal units, "
+        f"and as a bar the range with each of them as the only nominal. {threshold_text(first)} "
+    )
+    return Drawing(scores_figure(found), text + (f"Above it: {', '.join(flagged)}." if flagged else "No unit is above it."))
+
+
+def threshold_text(model: OutlierModel) -> str:
+    """Return where the threshold comes from, for a sentence."""
+    rate = 100 * model.false_alarm_rate
+    text = (
+        f"Dashed: threshold at a nominal false-alarm rate of {number(rate, 2)} % for each good unit, from a generalised extreme value model of the scores "
+        "of the others"
+    )
+    units = len(model.unit_ids)
+    return (
+        f"{text}; {units} units alone cannot show so rare an event, so the rate rests on that model." if model.extrapolated else f"{text}."
+    )
+
+
+def scores_figure(found: Mapping[str, OutlierModel]) -> Figure:
+    """Draw scores with their ranges.
+
+    Parameters
+    ----------
+    found : mapping of condition to OutlierModel
+    """
+    units = sorted({s.unit for m in found.values() for s in m.scores}, key=natural_key)
+    figure, axes = grid(len(found), 1, 1.6, legend_rows=0, sharex=True)
+    for panel, (condition, model) in zip(axes[:, 0], found.items(), strict=True):
+        _panel(panel, model, units)
         panel.set_title(condition_label(condition))
         panel.set_ylabel("score (dB)")
     units_axis(axes[-1, 0], units)
-    flagged = sorted({r["unit"] for r in rows if r["outlier"]}, key=natural_key)
-    text = "How far every unit sticks out of the cover of all the others, in each condition. Dashed: threshold for the stated rate of false alarms. "
-    return Drawing(figure, text + (f"Above it: {', '.join(flagged)}." if flagged else "No unit is above it."))
+    return figure
 
 
-def _panel(axes: Axes, rows: list[dict[str, Any]], units: list[str]) -> None:
+def referred_range(score: OutlierScore) -> tuple[float, float]:
+    """Return the range of a score over the nominals, referred to the threshold as the score itself is, dB."""
+    shift = score.score_db - score.excess_db
+    return score.lowest_db + shift, score.highest_db + shift
+
+
+def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
     places = {u: i for i, u in enumerate(units)}
-    for row in rows:
-        if row["score"] is None:
-            continue
-        tone = Tone.ALARM if row["outlier"] else Tone.BLUE
-        axes.plot(places[row["unit"]], row["score"], "o", ms=6 if row["outlier"] else 4, color=tone.light)
-        if row["outlier"]:
-            axes.annotate(
-                row["unit"],
-                (places[row["unit"]], row["score"]),
-                xytext=(6, 0),
-                textcoords="offset points",
-                va="center",
-                size=7.5,
-                color=tone.light,
-            )
-    threshold = next((r[key] for r in rows for key in ("threshold", "threshold_db") if r.get(key) is not None), None)
-    if threshold is not None and np.isfinite(threshold):
-        axes.axhline(threshold, color=Tone.SOFT.light, lw=0.9, ls="--")
-        axes.annotate(
-            "threshold",
-            (1, threshold),
-            xycoords=("axes fraction", "data"),
-            xytext=(-2, 3),
-            textcoords="offset points",
-            ha="right",
-            size=7.5,
-        )
+    for score in model.scores:
+        tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
+        low, high = referred_range(score)
+        axes.plot([place, place], [low, high], color=tone.light, lw=3.5, alpha=0.3, solid_capstyle="butt")
+        axes.plot(place, score.score_db, "o", ms=6 if score.outlier else 4, color=tone.light)
+        if score.outlier:
+            at = (place, score.score_db)
+            axes.annotate(score.unit, at, xytext=(7, 4), textcoords="offset points", va="bottom", size=7.5, color=tone.light)
+    if np.isfinite(model.threshold_db):
+        axes.axhline(model.threshold_db, color=Tone.SOFT.light, lw=0.9, ls="--")
+        at = (1, model.threshold_db)
+        text = f"threshold, {number(model.threshold_db)} dB"
+        axes.annotate(text, at, xycoords=("axes fraction", "data"), xytext=(-2, 3), textcoords="offset points", ha="right", size=7.5)
     axes.margins(y=0.15)

@@ -1,6 +1,6 @@
-"""Fitted weights over the optimal cover, left and right, and their product against 0 dB (the paper's Figure 8).
+"""Fitted weights over the optimal cover, left and right, their product against 0 dB, every unit over them (the paper's Figure 8).
 
-Needs: uncertain models.
+Needs: uncertain models; residuals of the units, for the last column.
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ...uncertainty import Form, UncertainModel
-from ..canvas import decibel, end_labels, frequency_axis, grid, thin_log
+from ...uncertainty import Cover, Form, UncertainModel
+from ...uncertainty.unit_residuals import UnitResiduals
+from ..canvas import decibel, frequency_axis, grid, thin_log
 from ..names import best_models, model_label, number
-from ..run_folder import RunFolder
+from ..run_folder import NotShownError, RunFolder
 from ..theme import Tone
 from .drawing import Drawing
+from .entries import ratio_panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,13 +34,19 @@ def draw(run: RunFolder) -> Drawing:
     """Draw one row a model."""
     chosen = {n: run.uncertain[n] for n in best_models(run.uncertain)}
     names = {n: _entry_names(model, run, n) for n, model in chosen.items()}
-    parts = [f"{model_label(n)} at most {number(model.overbound_db_max)} dB above the cover" for n, model in chosen.items()]
+    parts = [f"{model_label(n)} at most {number(model.overbound_db_max)} dB above it" for n, model in chosen.items()]
     text = (
-        "Each residual is bounded by W_left · Δ · W_right with ‖Δ‖ ≤ 1. Lines: weights as used; shaded: the smallest cover that "
-        "any diagonal weights could give, frequency "
-        f"by frequency; {'; '.join(parts)}. Right column: product of both weights; below 0 dB the uncertain set holds no ill-posed unit."
+        "Each residual is W_left · Δ · W_right with ‖Δ‖ ≤ 1. Lines: weights as used. Shaded: the cover with the smallest mean that diagonal weights could "
+        f"have, frequency by frequency ({'; '.join(parts)}, by the mean); one weight may lie below its shade where another lies above. Product of both: "
+        "below 0 dB the uncertain set holds no ill-posed unit."
     )
-    return Drawing(weights_figure(chosen, names), text)
+    try:
+        kept: Mapping[str, UnitResiduals] = run.unit_residuals
+    except NotShownError:
+        kept = {}
+    found = {n: kept[n] for n in chosen if n in kept}
+    text += " Last column: every unit over the weights; at most 0 dB, so all are covered." if found else ""
+    return Drawing(weights_figure(chosen, names, found), text)
 
 
 def _entry_names(model: UncertainModel, run: RunFolder, name: str) -> Sequence[str] | None:
@@ -46,40 +54,58 @@ def _entry_names(model: UncertainModel, run: RunFolder, name: str) -> Sequence[s
     return None if models is None or model.form not in _INPUT_SIDE else models.inputs
 
 
-def weights_figure(models: Mapping[str, UncertainModel], names: Mapping[str, Sequence[str] | None] | None = None) -> Figure:
-    """Draw left and right weights and their product, a row a model.
+def weights_figure(
+    models: Mapping[str, UncertainModel],
+    names: Mapping[str, Sequence[str] | None] | None = None,
+    residuals: Mapping[str, UnitResiduals] | None = None,
+) -> Figure:
+    """Draw left and right weights, their product, and every unit over the weights, a row a model.
 
     Parameters
     ----------
     models : mapping of name to UncertainModel
     names : mapping of name to sequence of str, optional
         Signals behind the entries; numbers where unknown.
+    residuals : mapping of name to UnitResiduals, optional
     """
     square = all(m.weight.left.n_outputs == m.weight.right.n_outputs for m in models.values())
-    figure, axes = grid(len(models), 2 + square, 2.0, legend_rows=0, sharex=True)
+    known = residuals or {}
+    titles = ["left weight", "right weight", *(["product"] if square else []), *(["units over weights"] if known else [])]
+    figure, axes = grid(len(models), len(titles), 2.0, legend_rows=0, sharex=True)
     for row, (name, model) in zip(axes, models.items(), strict=True):
-        _draw_row(row, model, (names or {}).get(name))
+        _draw_row(row, model, (names or {}).get(name), square)
+        if name in known:
+            ratio_panel(row[-1], known[name])
         row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
-    for panel, title in zip(axes[0], ("left weight", "right weight", "product"), strict=False):
+    for panel, title in zip(axes[0], titles, strict=True):
         panel.set_title(title)
     for panel in axes[-1]:
         panel.set_xlabel("frequency (Hz)")
     return figure
 
 
-def _draw_row(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] | None) -> None:
+def _draw_row(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] | None, square: bool) -> None:
     fitted = model.weight.magnitudes(model.freqs_hz)
-    for panel, magnitudes, cover in ((row[0], fitted.left, model.cover.left), (row[1], fitted.right, model.cover.right)):
-        _draw_entries(panel, model.freqs_hz, magnitudes, cover, names)
-    if len(row) > 2:
-        _draw_product(row[2], model.freqs_hz, fitted.left * fitted.right, model.cover.left * model.cover.right)
+    cover = in_gauge(model.cover, fitted)
+    for panel, magnitudes, below in ((row[0], fitted.left, cover.left), (row[1], fitted.right, cover.right)):
+        _draw_entries(panel, model.freqs_hz, magnitudes, below, names)
+    if square:
+        _draw_product(row[2], model.freqs_hz, fitted.left * fitted.right, cover.left * cover.right)
+
+
+def in_gauge(cover: Cover, other: Cover) -> Cover:
+    """Return a cover with the scale between left and right, which is free, of another: their right entries have the same mean in dB."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = np.exp((np.log(other.right) - np.log(cover.right)).mean(axis=1, keepdims=True))
+    scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
+    return Cover(cover.left / scale, cover.right * scale)
 
 
 def _draw_entries(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: Sequence[str] | None) -> None:
     if magnitudes.shape[1] > 1 and np.allclose(magnitudes, magnitudes[:, :1]):  # a scalar weight
         magnitudes, cover, names = magnitudes[:, :1], cover[:, :1], ["every signal"]
     ends = []
-    frequency_axis(axes, freqs_hz, "")
+    frequency_axis(axes, freqs_hz, "", 4)
     for i, tone in zip(range(magnitudes.shape[1]), _TONES, strict=False):
         freqs, line = thin_log(freqs_hz, magnitudes[:, i])
         _, below = thin_log(freqs_hz, cover[:, i])
@@ -102,10 +128,19 @@ def _start_labels(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
 
 
 def _draw_product(axes: Axes, freqs_hz: Array, product: Array, cover: Array) -> None:
-    frequency_axis(axes, freqs_hz, "")
+    frequency_axis(axes, freqs_hz, "", 4)
     freqs, line = thin_log(freqs_hz, product.max(axis=1))
     _, below = thin_log(freqs_hz, cover.max(axis=1))
     axes.plot(freqs, decibel(below), color=Tone.INK.light, lw=3.2, alpha=0.25, solid_capstyle="butt")
     axes.plot(freqs, decibel(line), color=Tone.INK.light, lw=1.2)
     axes.axhline(0, color=Tone.ALARM.light, lw=0.9, ls="--")
-    end_labels(axes, [(0.0, "0 dB", Tone.ALARM.light)])
+    axes.annotate(
+        "0 dB",
+        (0, 0),
+        xycoords=("axes fraction", "data"),
+        xytext=(4, -3),
+        textcoords="offset points",
+        va="top",
+        size=7.5,
+        color=Tone.ALARM.light,
+    )

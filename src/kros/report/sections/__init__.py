@@ -1,4 +1,4 @@
-"""Sections of the report, one file a section, in the order of the paper's argument."""
+"""Sections of the report, one file a section, first what was found, then where it comes from."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ Metrics = Mapping[str, Any]
 
 SECTIONS: tuple[Callable[[RunFolder, Metrics], Section | None], ...] = (
     observers.result,
+    outliers.section,
     recordings.section,
     calibration.section,
     models.section,
@@ -21,7 +22,6 @@ SECTIONS: tuple[Callable[[RunFolder, Metrics], Section | None], ...] = (
     relift.section,
     observers.section,
     other_conditions.section,
-    outliers.section,
     making.section,
 )
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..content import Cell, Section, Table
+from ..figures.entries import entry_names
 from ..names import condition_label, number
-from ..run_folder import RunFolder
+from ..run_folder import NotShownError, RunFolder
+
+_MOST = 5  # flagged units that are described in words
 
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
@@ -17,18 +20,55 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         return None
     flagged = [r for r in rows if r["outlier"]]
     text = (
-        "A unit's score is how far its residual sticks out of the cover of all the others, in whatever direction and at whatever "
-        "frequency it does most. Scores look at the "
-        "recordings only, never at serial or group."
+        "A unit's score is how far its residual sticks out of the cover of all the others, in whatever direction and at whatever frequency it does most. "
+        "Scores look at the recordings only, never at serial or group. Some unit always sticks out most, so there is a threshold; above it a unit is flagged."
     )
     verdict = f"Flagged: {flagged_text(flagged)}." if flagged else "No unit is flagged."
+    paragraphs = [text, verdict, *(conspicuous_text(r, _names(run, r)) for r in flagged[:_MOST])]
+    more = [("As in the paper, entry by entry", ["outlier_residuals"])]
+    return Section("outliers", "Outliers", paragraphs, [_scores(run, rows)], ["outlier_scores", "outlier_ratio"], more=more)
+
+
+def conspicuous_text(row: Mapping[str, Any], names: tuple[Sequence[str], Sequence[str]] | None) -> str:
+    """Say where and how clearly a flagged unit sticks out."""
+    text = f"Unit {row['unit']} ({condition_label(row['condition'])}) scores {number(row['score'])} dB"
+    if row.get("freq_hz") is None:
+        return f"{text}."
+    text += f", most at {number(row['freq_hz'])} Hz{_entry(row, names, ' in the response to {1} of {0}')}"
+    if row.get("lowest_db") is not None:
+        above = "under every choice of the nominal" if row["lowest_db"] > 0 else "under some choices of the nominal only"
+        text += f". It exceeds the others {above}, by {number(row['lowest_db'])} to {number(row['highest_db'])} dB"
+        text += f", and under {100 * row['agreement']:.0f} % of them by more than one nominal alone would take for chance"
+    return f"{text}."
+
+
+def _entry(row: Mapping[str, Any], names: tuple[Sequence[str], Sequence[str]] | None, pattern: str) -> str:
+    """Name the entry of the residual that is largest, with its row and column."""
+    if names is None or row.get("entry") is None:
+        return ""
+    i, j = row["entry"]
+    return pattern.format(names[0][i].replace("_", " "), names[1][j].replace("_", " "))
+
+
+def _names(run: RunFolder, row: Mapping[str, Any]) -> tuple[Sequence[str], Sequence[str]] | None:
+    """Signals behind the entries of the residuals that units are scored by; None where the run does not know."""
+    try:
+        model = run.outlier_models[row["condition"]]
+        return entry_names(model.form, next(m for n, m in run.models.items() if m.lifting.n_lifted == len(model.output_scale)))
+    except (NotShownError, KeyError, StopIteration):
+        return None
+
+
+def _scores(run: RunFolder, rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Scores of all units, highest first, a group of columns a condition."""
     conditions = list(dict.fromkeys(r["condition"] for r in rows))
-    units = list(dict.fromkeys(r["unit"] for r in rows))
     found = {(r["unit"], r["condition"]): r for r in rows}
-    order = sorted(units, key=lambda u: -max((_score(found, u, c) for c in conditions), default=0.0))
-    cells = [[Cell(u), *(_cell(found.get((u, c))) for c in conditions)] for u in order]
-    table = Table(["unit", *(condition_label(c) for c in conditions)], cells, "Outlier scores, highest first", folded=True)
-    return Section("outliers", "Outliers", [text, verdict], [table], ["outlier_scores", "outlier_residuals"])
+    names = {c: _names(run, {"condition": c}) for c in conditions}
+    order = sorted(dict.fromkeys(r["unit"] for r in rows), key=lambda u: -max((_score(found, u, c) for c in conditions), default=0.0))
+    cells = [[Cell(u), *(cell for c in conditions for cell in _cells(found.get((u, c)), names[c]))] for u in order]
+    head = ["unit", *(["score (dB)", "over nominals (dB)", "at (Hz)", "entry"] * len(conditions))]
+    caption = "Outlier scores, highest first; with their range over all nominals, frequency and entry of the residual"
+    return Table(head, cells, caption, [("", 1), *((condition_label(c), 4) for c in conditions)], folded=True)
 
 
 def flagged_text(flagged: list[Mapping[str, Any]]) -> str:
@@ -44,7 +84,15 @@ def _score(found: Mapping[tuple[str, str], Mapping[str, Any]], unit: str, condit
     return float("-inf") if score is None else float(score)
 
 
-def _cell(row: Mapping[str, Any] | None) -> Cell:
+def _cells(row: Mapping[str, Any] | None, names: tuple[Sequence[str], Sequence[str]] | None) -> list[Cell]:
     if row is None:
-        return Cell("–")
-    return Cell(number(row["score"]), strong=row["outlier"], note="flagged" if row["outlier"] else "")
+        return [Cell("–")] * 4
+    known = row.get("lowest_db") is not None
+    shift = row["score"] - row["excess_db"] if known else 0.0  # as the score itself is referred to the threshold
+    span = f"{number(row['lowest_db'] + shift)} to {number(row['highest_db'] + shift)}" if known else "–"
+    return [
+        Cell(number(row["score"]), strong=row["outlier"], note="flagged" if row["outlier"] else ""),
+        Cell(span),
+        Cell(number(row.get("freq_hz"))),
+        Cell(_entry(row, names, "{1} → {0}") or "–"),
+    ]

@@ -23,6 +23,9 @@ _HIGH = (
 )
 
 
+_MANY = 0.5  # share of noise from which on longer recordings are advised
+
+
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     """Return forms, peaks and weights."""
     entries = metrics.get("uncertainty")
@@ -37,7 +40,41 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     tall = any(len(m.output_scale) > len(m.input_scale) for m in run.uncertain.values())
     high = [n for n, e in entries.items() if (e["peak_db"].get(e["form"]) or 0) >= 0]
     paragraphs = [text, *([_PAPER] if tall else []), *([_HIGH.format(names=", ".join(model_label(n) for n in high))] if high else [])]
-    return Section("uncertainty", "Uncertainty", paragraphs, [_peaks(entries), _weights(entries)], ["forms", "weights"])
+    paragraphs += noise_text(entries)
+    tables = [t for t in [_peaks(entries), _noise(entries), _weights(entries)] if t]
+    more = [("As in the paper, entry by entry", ["forms_entrywise", "weights_entrywise"])]
+    return Section("uncertainty", "Uncertainty", paragraphs, tables, ["forms", "variation", "weights", "weight_orders"], more=more)
+
+
+def noise_text(entries: Mapping[str, Any]) -> list[str]:
+    """Say whether longer recordings would make the uncertainty smaller, of the models that the observers use; nothing where it is unknown."""
+    shares = {name: e["noise_share"]["at_peak"] for name, e in entries.items() if "noise_share" in e}
+    if not shares:
+        return []
+    high = [model_label(n) for n, share in shares.items() if share >= _MANY]
+    low = [model_label(n) for n, share in shares.items() if share < _MANY]
+    text = (
+        "Part of every residual is there because recordings end: a unit that is recorded anew gets a slightly different model. Models of resampled episodes "
+        "tell that part from what really differs between units. "
+    )
+    if low:
+        text += f"Where the units differ most, they really differ ({', '.join(low)}): more recordings of the same units would not shrink the set. "
+    if high:
+        text += (
+            f"For {', '.join(high)} most of it is the recordings' length: record longer, or more episodes, before calling it manufacturing."
+        )
+    return [text.strip()]
+
+
+def _noise(entries: Mapping[str, Any]) -> Table | None:
+    rows = []
+    for name, entry in entries.items():
+        if "noise_share" in entry:
+            share = entry["noise_share"]
+            cells = [number(100 * share["at_peak"], 2), number(share["peak_hz"]), number(100 * share["median"], 2)]
+            rows.append([Cell(model_label(name)), *(Cell(c, strong=i == 0 and share["at_peak"] >= _MANY) for i, c in enumerate(cells))])
+    head = ["model", "where units differ most (%)", "that is at (Hz)", "median over frequency (%)"]
+    return Table(head, rows, "Share of the squared residual that finite recordings explain.") if rows else None
 
 
 def _peaks(entries: Mapping[str, Any]) -> Table:

@@ -1,0 +1,93 @@
+"""What to do next, from the metrics: a few sentences, each with the reason it stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from .error_table import ErrorTable, error_table
+from .names import condition_label, model_label, number, observer_label, split_observer
+
+_MANY = 0.5  # share of noise from which on longer recordings are advised
+
+
+def advice(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[str]:
+    """Return what the result asks for; nothing for a run that stopped before an observer was made.
+
+    Parameters
+    ----------
+    metrics : mapping
+        As in ``metrics.json``; any part may be absent.
+    measured : tuple of str
+        Channels that are available at run time.
+    """
+    if metrics["study"].get("deployed") is None:
+        return []
+    return [*_outliers(metrics), *_observer(metrics, measured), *_recordings(metrics)]
+
+
+def _outliers(metrics: Mapping[str, Any]) -> list[str]:
+    """Look at flagged units, the highest score first."""
+    flagged = sorted((r for r in metrics.get("outliers", []) if r["outlier"]), key=lambda r: -float(r["score"]))
+    first: dict[str, Mapping[str, Any]] = {}
+    for row in flagged:
+        first.setdefault(row["unit"], row)
+    units = [f"{u} ({_where(r)})" for u, r in first.items()]
+    if not units:
+        return []
+    filed = {row["unit"] for row in metrics.get("units", []) if row["group"] == "outliers"}
+    text = f"Inspect {', '.join(units[:5])}{' and others' if len(units) > 5 else ''} before shipping."
+    if any(u not in filed for u in first):
+        text += " Flagged units still count in the design; set uncertainty.drop_outliers = true to leave them out."
+    return [text]
+
+
+def _where(row: Mapping[str, Any]) -> str:
+    at = f", differs most at {number(row['freq_hz'])} Hz" if row.get("freq_hz") is not None else ""
+    return f"{condition_label(row['condition'])}{at}"
+
+
+def _observer(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str]:
+    """Export it where it is better than nothing at all."""
+    name = metrics["study"]["deployed"]
+    tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
+    if not tables or name not in tables[0].cells:
+        return []
+    table, other = tables[0], f"{split_observer(name)[0]}/open_loop"
+    hidden = [c for c in table.channels if c not in measured] or list(table.channels)
+    own = [table.cells[name][c].mean for c in hidden]
+    if any(value is None for value in own):
+        return [
+            f"Do not use “{observer_label(name)}”: its estimates diverge. Look at Models first: free runs there should not diverge either."
+        ]
+    better = next((o for o in table.observers if o != name and _smaller(table, o, name, hidden, 0.95)), None)
+    if better is not None:
+        return [
+            f"Look at “{observer_label(better)}” first: it is better in all that is not measured; observer.deployed names the one that is handed over."
+        ]
+    if name != other and other in table.cells and not _smaller(table, name, other, hidden, 0.99):
+        return ["The observer is no better than its model alone: correction from these measurements brings nothing here."]
+    entry = metrics.get("observers", {}).get(name, {})
+    text = "Hand the observer over as C code with “kros export c”, and score new units with “kros check”."
+    if entry.get("relift_certified") is False:
+        text += " No certificate covers it as it runs, so let it run beside the machine before anything depends on it."
+    return [text]
+
+
+def _smaller(table: ErrorTable, one: str, other: str, channels: Sequence[str], ratio: float) -> bool:
+    """Whether the mean errors of one observer are below a ratio of another's, in all channels."""
+    pairs = [(table.cells[one][c].mean, table.cells[other][c].mean) for c in channels if c in table.cells[one]]
+    return len(pairs) == len(channels) and all(a is not None and (b is None or a < ratio * b) for a, b in pairs)
+
+
+def _recordings(metrics: Mapping[str, Any]) -> list[str]:
+    """Say whether more recordings or fewer unlike units would bring the uncertainty of the model in use down."""
+    model = split_observer(metrics["study"]["deployed"])[0]
+    entry = metrics.get("uncertainty", {}).get(model, {})
+    if "noise_share" not in entry:
+        return []
+    share, where = entry["noise_share"]["at_peak"], number(entry["noise_share"]["peak_hz"])
+    differ = f"of how much {model_label(model)} models differ, where they do most ({where} Hz),"
+    if share >= _MANY:
+        return [f"Record longer or more episodes: {100 * share:.0f} % {differ} comes from the recordings' length."]
+    return [f"Longer recordings of these units would change little: {100 * (1 - share):.0f} % {differ} is manufacturing."]

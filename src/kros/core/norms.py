@@ -144,7 +144,7 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
     if lower == 0.0:
         return 0.0
     for _ in range(_MAX_ITERATIONS):
-        candidates = _crossings(continuous, lower * (1 + tol))
+        candidates = crossings(continuous, lower * (1 + tol))
         best = _gains(system, candidates).max(initial=0.0)
         if best <= lower * (1 + tol):
             return float(max(best, lower))
@@ -181,7 +181,7 @@ def _first_frequencies(system: StateSpace) -> Array:
     return np.unique(np.concatenate([[0.0], sizes, np.abs(poles.imag), peaks, grid]))
 
 
-def _crossings(system: StateSpace, gamma: float) -> Array:
+def crossings(system: StateSpace, gamma: float) -> Array:
     """Frequencies at which a singular value may equal `gamma`, with the points between them.
 
     Nearly imaginary eigenvalues count too: a superfluous candidate costs one evaluation, a missed one would cost the bound.

@@ -1,6 +1,6 @@
 """Synthesis: from an uncertain model to a verified correction filter.
 
-    UncertainModel --> ObserverProblem --> h2 | hinf | mixed | worst_case_h2 | kalman --> Synthesis
+    UncertainModel --> ObserverProblem --> h2 | hinf | mixed | worst_case_h2 | worst_case_hinf | kalman --> Synthesis
 
 Nothing leaves this layer unverified: norms and stability are recomputed by `kros.core`, failure is a `SynthesisError` that says why.
 """
@@ -24,9 +24,12 @@ if TYPE_CHECKING:
     from .polishing import polish
     from .reduction import reduce_controller
     from .result import Injection, Status, Synthesis
+    from .robust_gain import RobustGain, robust_gain
     from .shaped import residual_h2
     from .shaping import Bank, shaping_filter
+    from .unit_check import UnitCheck, check_units
     from .worst_case import worst_case_h2
+    from .worst_case_hinf import worst_case_hinf
 
 _HOME = {
     "Bank": "shaping",
@@ -35,8 +38,11 @@ _HOME = {
     "Injection": "result",
     "MuBounds": "mu",
     "ObserverProblem": "observer_problem",
+    "RobustGain": "robust_gain",
     "Status": "result",
     "Synthesis": "result",
+    "UnitCheck": "unit_check",
+    "check_units": "unit_check",
     "dk_iteration": "dk",
     "h2": "h2_optimal",
     "hinf": "hinf_optimal",
@@ -49,8 +55,10 @@ _HOME = {
     "polish": "polishing",
     "reduce_controller": "reduction",
     "residual_h2": "shaped",
+    "robust_gain": "robust_gain",
     "shaping_filter": "shaping",
     "worst_case_h2": "worst_case",
+    "worst_case_hinf": "worst_case_hinf",
 }
 
 __all__ = [
@@ -60,8 +68,11 @@ __all__ = [
     "Injection",
     "MuBounds",
     "ObserverProblem",
+    "RobustGain",
     "Status",
     "Synthesis",
+    "UnitCheck",
+    "check_units",
     "dk_iteration",
     "h2",
     "hinf",
@@ -74,8 +85,10 @@ __all__ = [
     "polish",
     "reduce_controller",
     "residual_h2",
+    "robust_gain",
     "shaping_filter",
     "worst_case_h2",
+    "worst_case_hinf",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)

@@ -121,22 +121,27 @@ class Channels:
         self.contained = is_diagonal(problem.W_L)
         self.behind = None if self.contained else problem.W_L
 
-    def _shaped(self, power: Array) -> Array:
+    def shaped(self, power: Array) -> Array:
         """Power of the channels for the power of w2."""
         return np.sum(np.abs(self.left) ** 2, axis=-1) * power if self.contained else power
 
     def average(self) -> Spectrum:
         """Average over the set; every causal observer costs at least its share of it."""
-        return Spectrum(self._shaped(np.real(np.einsum("fii->fi", self.ball.average()))), self._remainder())
+        return Spectrum(self.shaped(np.real(np.einsum("fii->fi", self.ball.average()))), self._remainder())
 
     def below_average(self) -> Spectrum:
         """Largest diagonal spectrum below the average, where its channels are correlated."""
-        return Spectrum(self._shaped(below(self.ball.average())), self._remainder())
+        return Spectrum(self.shaped(below(self.ball.average())), self._remainder())
+
+    def symmetric_part(self) -> Array:
+        """``q^2 R_l R_l^H`` with ``q = ||R_r M||``: what the ball holds on both sides of its centre, shape (f, b, b)."""
+        q = np.linalg.norm(self.ball.right, 2, axis=(-2, -1))
+        return q[:, None, None] ** 2 * (self.ball.left @ np.conj(np.swapaxes(self.ball.left, -1, -2)))
 
     def worst(self, controller: StateSpace) -> Array:
         """Spectrum of the element of the set that is (locally) worst for a given observer."""
         T = self.problem.error_system(controller).frequency_response(self.freqs_hz)[..., self.problem.port] @ self.left
-        return self._shaped(self.ball.worst_spectrum(T))
+        return self.shaped(self.ball.worst_spectrum(T))
 
     def _remainder(self) -> Array | None:
         """Average spectrum of the remainder, shape (f, n)."""

@@ -203,6 +203,11 @@ class ObserverProblem:
         return self.place.loop(self.W_R, self.scaled_model, self.W_L)
 
     @property
+    def correction_size(self) -> int:
+        """Number of signals of the correction: outputs of K."""
+        return self.nominal.n_inputs if self.injection is Injection.INPUT else self.nominal.n_states
+
+    @property
     def port(self) -> slice:
         """Columns of `error_system` at which ``W_L w2`` acts."""
         m, n = self.nominal.n_inputs, self.nominal.n_states

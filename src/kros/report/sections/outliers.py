@@ -34,11 +34,11 @@ def conspicuous_text(row: Mapping[str, Any], names: tuple[Sequence[str], Sequenc
     text = f"Unit {row['unit']} ({condition_label(row['condition'])}) scores {number(row['score'])} dB"
     if row.get("freq_hz") is None:
         return f"{text}."
-    text += f", most at {number(row['freq_hz'])} Hz{_entry(row, names, ' in the response to {1} of {0}')}"
+    text += f", most at {number(row['freq_hz'])} Hz{_entry(row, names, ' in the response of {0} to {1}')}"
     if row.get("lowest_db") is not None:
         above = "under every choice of the nominal" if row["lowest_db"] > 0 else "under some choices of the nominal only"
         text += f". It exceeds the others {above}, by {number(row['lowest_db'])} to {number(row['highest_db'])} dB"
-        text += f", and under {100 * row['agreement']:.0f} % of them by more than one nominal alone would take for chance"
+        text += f"; under {100 * row['agreement']:.0f} % of them that alone would flag it"
     return f"{text}."
 
 

@@ -88,7 +88,7 @@ def fit_full(
         The optimal diagonal cover in the frames.
     """
     E = residuals(freqs_hz)
-    diagonal, cover = fit_weight(residuals, freqs_hz, sample_period_s, structure=Structure.DIAGONAL, systems=systems, **options)
+    diagonal, cover = _filters(residuals, freqs_hz, sample_period_s, systems=systems, **options)
     p, m = E.shape[2:]
     same = tuple(gain(np.eye(k), sample_period_s) for k in (p, m))
     if not cover.left.any():
@@ -98,10 +98,10 @@ def fit_full(
     for frames in turned:
         if (still.cost - frames.cost) * _NEPER_DB < _WORTH_DB:
             continue
-        found = _in_frames(frames, residuals, freqs_hz, dense, sample_period_s, systems, options)
-        saved = -np.inf if found is None else volume_db(diagonal, freqs_hz) - volume_db(found[0], freqs_hz)
-        if found is not None and saved > 0:
-            return replace(found[0], saved_db=saved), found[1]
+        weight, of_frames = _in_frames(frames, residuals, freqs_hz, dense, sample_period_s, systems, options)
+        saved = volume_db(diagonal, freqs_hz) - volume_db(weight, freqs_hz)
+        if saved > 0:
+            return replace(weight, saved_db=saved), of_frames
     return _full(diagonal, *same), cover
 
 
@@ -112,13 +112,9 @@ def volume_db(weight: Weight, freqs_hz: Array) -> float:
 
 def _in_frames(
     frames: Frames, residuals: Residuals, freqs_hz: Array, dense: Array, dt: float, systems: ResidualSystems | None, options: dict[str, Any]
-) -> tuple[FullWeight, Cover] | None:
-    """Fit the filters in frames, return the weights of the residuals themselves and certify them; None where there is no fit."""
-    try:
-        filters, cover = fit_weight(lambda f: frames.of(with_floor(residuals(f)), f), freqs_hz, dt, structure=Structure.DIAGONAL, **options)
-    except KrosError as error:
-        _LOG.info("Full weights: no fit in one of the frames (%s)", error)
-        return None
+) -> tuple[FullWeight, Cover]:
+    """Fit the filters in frames, return the weights of the residuals themselves and certify them."""
+    filters, cover = _filters(lambda f: frames.of(with_floor(residuals(f)), f), freqs_hz, dt, **options)
     before, after = invert(frames.left), invert(frames.right)
     weight = replace(_full(filters, before, after), left=before @ filters.left, right=filters.right @ after)
 
@@ -136,6 +132,15 @@ def _in_frames(
         lifted, on_grid = scaled(lifted, on_grid * (1 + _MARGIN)), 1 / (1 + _MARGIN)
     assert isinstance(lifted, FullWeight)
     return replace(lifted, cover_max=on_grid, method=proof.method, remaining_margin=1 - max(bound / lift, on_grid)), cover
+
+
+def _filters(residuals: Residuals, freqs_hz: Array, dt: float, **options: Any) -> tuple[Weight, Cover]:
+    """Diagonal weights, or scalar ones where these cannot be fitted."""
+    try:
+        return fit_weight(residuals, freqs_hz, dt, structure=Structure.DIAGONAL, **options)
+    except KrosError as error:
+        _LOG.info("Full weights: equal filters are taken in one of the frames (%s)", error)
+        return fit_weight(residuals, freqs_hz, dt, structure=Structure.SCALAR, **options)
 
 
 def _between(weight: Weight, E: Array, freqs_hz: Array) -> Array:

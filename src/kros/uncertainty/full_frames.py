@@ -34,6 +34,8 @@ LAGS = 2  # of every input of a triangular factor
 _POINTS = 40
 _SQUARINGS = (1, 3, 5)  # q = 2^s + 1 = 3, 9, 33
 _ITERATIONS = 150
+_PULL = 1e-3  # towards covers of equal entries: their scale is shared with T
+_REACH = (20.0, 1e4, 1e4, 1e4, 1e4)  # of covers (nepers), T_L, T_R, c_L, c_R: no step of a line search overflows
 _TOP = np.sqrt(10.0)  # largest t of a lag
 
 
@@ -159,8 +161,8 @@ class _Search:
         total = marginal.sum(axis=(0, 1))
         q = 2**squarings + 1
         cost = x[:p].mean(axis=0) + x[p:].mean(axis=0) + np.log(top) + np.log(total) / (2 * q)
-        value = cost.mean() - np.linalg.slogdet(TL)[1] / p - np.linalg.slogdet(TR)[1] / m
-        of_x = np.concatenate([1 / p - marginal.sum(axis=1) / total, 1 / m - marginal.sum(axis=0) / total]) / n
+        value = cost.mean() + _PULL / 2 * (x**2).sum() / n - np.linalg.slogdet(TL)[1] / p - np.linalg.slogdet(TR)[1] / m
+        of_x = (np.concatenate([1 / p - marginal.sum(axis=1) / total, 1 / m - marginal.sum(axis=0) / total]) + _PULL * x) / n
         slope = np.conj(Y) * scale / (top * total) / n
         of_A, of_B = np.einsum("ijkf,ajkf->iaf", slope, EB), np.einsum("ijkf,ibkf->bjf", slope, AE)
         of_TL = np.einsum("ijf,iaf->ja", U, of_A).real - np.linalg.inv(TL).T / p
@@ -182,9 +184,10 @@ class _Search:
             value, gradient = self.cost(moved, squarings)
             return value, gradient[free]
 
-        found = y[free]
+        found, reach = y[free], np.repeat(_REACH, sizes)[free]
+        options: dict[str, Any] = {"method": "L-BFGS-B", "bounds": np.transpose([-reach, reach]), "options": {"maxiter": _ITERATIONS}}
         for squarings in _SQUARINGS:
-            found = minimize(part, found, args=(squarings,), jac=True, method="L-BFGS-B", options={"maxiter": _ITERATIONS}).x
+            found = minimize(part, found, args=(squarings,), jac=True, **options).x
         y = y.copy()
         y[free] = found
         return y

@@ -58,6 +58,13 @@ class Shaping:
         return at_input, _sum(at_state) if at_state else gain(np.zeros((n, 0)), dt)
 
 
+def default_fit() -> Fit:
+    """Return `kros.uncertainty.fit.fit_magnitude`."""
+    from ..uncertainty.fit import fit_magnitude
+
+    return fit_magnitude
+
+
 def _sum(systems: list[StateSpace]) -> StateSpace:
     """Add the outputs of systems with inputs of their own."""
     stacked = block_diagonal(systems)

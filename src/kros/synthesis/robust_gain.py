@@ -24,7 +24,6 @@ A. Packard and J. Doyle, "The complex structured singular value", Automatica 29 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,7 +78,8 @@ class _Constraint:
         ball = uncertain_ball(problem, freqs_hz)
         noise = response[..., m + n :]
         noise = noise[..., np.concatenate([np.full(len(problem.C), True), problem.scaled_process_noise > 0])]
-        P, Q = (T @ ball.left,), (ball.right,)
+        P: tuple[Array, ...] = (T @ ball.left,)
+        Q: tuple[Array, ...] = (ball.right,)
         if problem.remainder_left is not None and problem.remainder_right is not None:
             P += (response[..., m : m + n] @ problem.remainder_left.frequency_response(freqs_hz),)
             Q += ((problem.remainder_right @ problem.input_weight).frequency_response(freqs_hz),)
@@ -172,9 +172,8 @@ def _walk(problem: ObserverProblem, loop: StateSpace, controller: StateSpace, fo
     plant = problem.generalized_plant()
     closed = to_continuous(plant.close(problem.to_scaled(controller)))
     dt = problem.nominal.dt
-    rows = [np.full(plant.z_parts["z1"], -1)] + [np.full(plant.z_parts[z], k) for k, z in enumerate(("z2", "z3")) if z in plant.z_parts]
-    columns = [np.full(size, {"w2": 0, "w3": 1}.get(name, -1)) for name, size in plant.w_parts.items()]
-    which_row, which_column = np.concatenate(rows), np.concatenate(columns)
+    rows = np.concatenate([np.full(size, {"z2": 0, "z3": 1}.get(name, -1)) for name, size in plant.z_parts.items()])
+    columns = np.concatenate([np.full(size, {"w2": 0, "w3": 1}.get(name, -1)) for name, size in plant.w_parts.items()])
     level, nu = found * (1 + _MARGIN), 0.0
     for _ in range(_WALK):
         here = min(np.arctan(nu) / (np.pi * dt), 0.5 / dt)
@@ -184,15 +183,9 @@ def _walk(problem: ObserverProblem, loop: StateSpace, controller: StateSpace, fo
             if found * (1 + _MARGIN / 2) > level:
                 level, nu = found * (1 + _MARGIN), 0.0
                 continue
-        at_here = _mapped_response(closed, nu)
-
-        def scales(log_tau: Array, level: float = level) -> tuple[Array, Array]:
-            root = np.exp(log_tau / 2)
-            return np.where(which_row < 0, 1.0, root[which_row]), np.where(which_column < 0, 1 / level, 1 / root[which_column])
-
-        up, down = scales(_calmest(lambda x: float(np.linalg.norm(at_here * scales(x)[0][:, None] * scales(x)[1], 2)), log_tau[0]))
-        scaled = StateSpace(closed.A, closed.B * down, closed.C * up[:, None], closed.D * up[:, None] * down, 0.0)
-        reached = _holds_until(scaled, nu)
+        scaling = _Scaling(rows, columns, level)
+        up, down = scaling.of(_calmest(scaling, closed.frequency_response([nu / (2 * np.pi)])[0], log_tau[0]))
+        reached = _holds_until(StateSpace(closed.A, closed.B * down, closed.C * up[:, None], closed.D * up[:, None] * down, 0.0), nu)
         if reached == np.inf:
             return RobustGain(level, found, freq_hz)
         if reached <= nu * (1 + 1e-9):
@@ -204,12 +197,27 @@ def _walk(problem: ObserverProblem, loop: StateSpace, controller: StateSpace, fo
     )
 
 
-def _mapped_response(system: StateSpace, nu: float) -> Array:
-    return np.asarray(system.frequency_response([nu / (2 * np.pi)])[0])
+@dataclass(frozen=True, eq=False)
+class _Scaling:
+    """Factors of rows and columns; `rows` and `columns` hold the number of the perturbation, -1 for the performance."""
+
+    rows: Array
+    columns: Array
+    level: float
+
+    def of(self, log_tau: Array) -> tuple[Array, Array]:
+        """Return the factors for some multipliers."""
+        root = np.exp(log_tau / 2)
+        return np.where(self.rows < 0, 1.0, root[self.rows]), np.where(self.columns < 0, 1 / self.level, 1 / root[self.columns])
 
 
-def _calmest(size: Callable[[Array], float], point: Array) -> Array:
-    """Multipliers that leave the most room below the level: compass search on a quasiconvex function."""
+def _calmest(scaling: _Scaling, response: Array, point: Array) -> Array:
+    """Multipliers that leave the most room below the level at one frequency: compass search on a quasiconvex function."""
+
+    def size(log_tau: Array) -> float:
+        up, down = scaling.of(log_tau)
+        return float(np.linalg.norm(response * up[:, None] * down, 2))
+
     value, step = size(point), 1.0
     while step > 1e-2:
         tried = [point + step * sign * direction for direction in np.eye(len(point)) for sign in (1, -1)]

@@ -30,7 +30,7 @@ from ..core.norms import h2_norm
 from .causal import causal_h2
 from .certificate import certify
 from .constant_gain import predictor
-from .disturbance import Channels, Fit, Shaping, design_grid, symmetric
+from .disturbance import Channels, Fit, Shaping, default_fit, design_grid, symmetric
 from .h2_optimal import h2
 from .observer_problem import ObserverProblem
 from .result import Injection, Status, Synthesis
@@ -82,7 +82,7 @@ def worst_case_h2(
         When the set is not well posed, the pair undetectable, a model unstable, or a design does not survive verification.
     """
     problem.require_sound()
-    fit = fit or _default_fit()
+    fit = fit or default_fit()
     options = {"order": order, "max_order": max_order, "tolerance_db": tolerance_db}
     channels, sharp = Channels(problem, design_grid(problem)), symmetric(problem)
     spectrum = channels.average()
@@ -127,12 +127,6 @@ def _result(problem: ObserverProblem, best: tuple[float, float, StateSpace], low
         solver="riccati",
         notes=("The spectral radius is that of the nominal loop; it says nothing about robustness. The certificate is worst_case_h2.",),
     )
-
-
-def _default_fit() -> Fit:
-    from ..uncertainty.fit import fit_magnitude
-
-    return fit_magnitude
 
 
 def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:

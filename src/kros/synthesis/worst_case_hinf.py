@@ -8,7 +8,8 @@ For given multipliers the bound of `robust_gain` says how large the disturbance 
 
 (sums of covariances are sums of quadratic bounds). K is in T alone, so with rational factors of the spectra it is a standard H-infinity problem,
 solved by Riccati equations with a search over the level. Without a loop and remainder ``t = 1`` and nothing depends on K: one problem, exact
-but for the fit. Otherwise t follows from the K of the round before. Every K is certified independently, the best is kept.
+but for the fit. Otherwise t follows from the K of the round before. Every K is certified independently, the best is kept; no
+correction at all is one of them.
 
 *Lower bound.* Theta and -Theta are both in the ball and the norm is convex, so ``||[T X M, T_n]||`` is at least ``||[T R_l q, T_n]||`` for some
 member, whatever T. What no causal estimate of ``W_p x`` beats for filters below ``q R_l`` is therefore a bound for every observer; it is the largest
@@ -28,7 +29,7 @@ from ..core.lti import StateSpace, block_diagonal, gain
 from ..core.norms import hinf_norm
 from .ball import below
 from .certificate import certify
-from .disturbance import Channels, Fit, Shaping, Spectrum, design_grid
+from .disturbance import Channels, Fit, Shaping, Spectrum, default_fit, design_grid
 from .generalized_plant import GeneralizedPlant
 from .hinf_optimal import hinf
 from .observer_plants import shape_inputs
@@ -78,12 +79,11 @@ def worst_case_hinf(
         When the set is not well posed, the pair undetectable, a model unstable, or no design survives verification.
     """
     problem.require_sound()
-    if fit is None:
-        from ..uncertainty.fit import fit_magnitude as fit
+    fit = fit or default_fit()
     options = {"order": order, "max_order": max_order, "tolerance_db": tolerance_db}
     channels = Channels(problem, design_grid(problem))
-    loop = problem.error_system(gain(np.zeros((problem.correction_size, len(problem.C))), problem.nominal.dt))
-    best: tuple[RobustGain, StateSpace] | None = None
+    nothing = gain(np.zeros((problem.correction_size, len(problem.C))), problem.nominal.dt)
+    loop, best = problem.error_system(nothing), (robust_gain(problem, nothing), nothing)
     reasons, elapsed = [], 0.0
     for _ in range(refinements + 1):
         spectrum = dominating(channels, loop)
@@ -98,10 +98,10 @@ def worst_case_hinf(
             break
         finally:
             elapsed += time.perf_counter() - start
-        if best is None or value.value < best[0].value:
+        if value.value < best[0].value:
             best = value, controller
         loop = problem.error_system(controller)
-    if best is None:
+    if reasons and best[1] is nothing:
         raise SynthesisError(f"Worst-case H-infinity synthesis: no design survived verification ({'; '.join(reasons)}).")
     low = Spectrum(channels.shaped(below(channels.symmetric_part())), None)
     lower = lower_bound(problem, channels.lowered(channels.shaping(low, fit, "below", options), low), tolerance)

@@ -18,7 +18,7 @@ from ...identify import ModelSet
 from ...observer import Observer
 from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...synthesis.certificate import certify
-from ...uncertainty import Form, Structure, UncertainModel
+from ...uncertainty import UncertainModel
 from ..context import Context
 from ..makers import Product, Task, produce
 from ..relift import Running, certify_running, save_running
@@ -85,7 +85,9 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     methods = set(config.observer.baselines + config.synthesis.methods)
     if name not in context.edmd_names:
         methods.discard("mixed")  # the paper's synthesis is made for the paper's models: see the page on limits
-    ordered = [m for m in ("open_loop", "kalman_white", "kalman_tuned", "luenberger", "mixed", "worst_case_h2", "residual_h2") if m in methods]
+    ordered = [
+        m for m in ("open_loop", "kalman_white", "kalman_tuned", "luenberger", "mixed", "worst_case_h2", "residual_h2") if m in methods
+    ]
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings["max_order"] = config.uncertainty.max_order
     return [
@@ -98,20 +100,12 @@ def usable_problem(
     models: ModelSet, unit: str, uncertain: UncertainModel, noise: Array, context: Context
 ) -> tuple[ObserverProblem | None, str]:
     """Return the synthesis problem of one kind of model, or None and why there is none."""
-    if uncertain.form is not Form.INVERSE_INPUT_MULTIPLICATIVE:
-        refusal = f"synthesis knows the inverse input multiplicative form only, and the study uses {uncertain.form.value}"
-    elif uncertain.weight.structure in (Structure.FULL, Structure.ENTRYWISE):
-        refusal = (
-            f"synthesis knows weights with one filter per channel only, and those of the study are {uncertain.weight.structure.value} "
-            f"(for a {uncertain.weight.perturbation.value} perturbation); set uncertainty.structure to 'auto', 'diagonal' or 'scalar'"
-        )
-    else:
-        problem = observer_problem(models, unit, uncertain, noise, context)
-        try:
-            problem.require_sound()
-            return problem, ""
-        except SynthesisError as error:
-            refusal = str(error)
+    problem = observer_problem(models, unit, uncertain, noise, context)
+    try:
+        problem.require_sound()
+        return problem, ""
+    except SynthesisError as error:
+        refusal = str(error)
     log.warning("%s: there are no robust observers and no certificates: %s", models.name, refusal)
     return None, refusal
 
@@ -132,6 +126,7 @@ def observer_problem(models: ModelSet, unit: str, uncertain: UncertainModel, noi
         remainder_left=remainder.left if remainder is not None else None,
         remainder_right=remainder.right if remainder is not None else None,
         injection=Injection(context.config.synthesis.injection),
+        form=uncertain.form,
     )
 
 

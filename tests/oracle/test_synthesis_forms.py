@@ -1,0 +1,290 @@
+"""All six forms: the interconnection is the perturbed plant, the bound holds for every perturbation and is close to the worst one found."""
+
+import numpy as np
+import pytest
+
+from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
+from kros.synthesis import Injection, ObserverProblem, check_units, worst_case_h2, worst_case_hinf
+from kros.synthesis.causal import causal_h2, perturbed
+from kros.synthesis.certificate import certify, density
+from kros.synthesis.perturbation import PLACES
+from kros.synthesis.robust_gain import robust_gain
+from kros.synthesis.unit_check import unit_error
+from kros.uncertainty import Form, rebuild, residual
+
+DT, N, M = 0.05, 3, 2
+FREQS = np.array([0.0, 0.03, 0.7, 3.0, 9.9])
+
+
+def random_system(rng, p, m, order, radius=0.9):
+    """A stable system whose largest gain is one."""
+    A = rng.standard_normal((order, order))
+    A *= radius / max(np.abs(np.linalg.eigvals(A)).max(), 1e-9)
+    system = StateSpace(A, rng.standard_normal((order, m)), rng.standard_normal((p, order)), rng.standard_normal((p, m)), DT)
+    size = hinf_norm(system) * (1 + 1e-6)
+    return StateSpace(A, system.B, system.C / size, system.D / size, DT)
+
+
+def scaled_by(system, factor):
+    return StateSpace(system.A, system.B, system.C * factor, system.D * factor, system.dt)
+
+
+def weight(rng, rows, columns, structure, order=1):
+    if structure == "full":
+        return random_system(rng, rows, columns, order + 1)
+    one = random_system(rng, 1, 1, order)
+    return block_diagonal([one if structure == "scalar" else random_system(rng, 1, 1, order) for _ in range(rows)])
+
+
+def problem(form, seed=0, structure="full", injection=Injection.STATE, remainder=True, **changes):
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((N, N))
+    A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
+    nominal = StateSpace(A, rng.standard_normal((N, M)), np.eye(N), np.zeros((N, M)), DT)
+    rows, columns = PLACES[Form(form)].sizes(N, M)
+    parts = {
+        "nominal": nominal,
+        "C": np.eye(N)[:1],
+        "W_L": weight(rng, rows, rows, structure),
+        "W_R": weight(rng, columns, columns, "diagonal" if structure == "diagonal" else structure)
+        if structure != "scalar"
+        else gain(np.eye(columns), DT),
+        "input_scale": rng.uniform(0.5, 2, M),
+        "output_scale": rng.uniform(0.5, 2, N),
+        "noise": np.array([0.1]),
+        "injection": injection,
+        "form": form,
+    }
+    if structure == "full":
+        parts |= {"W_u": random_system(rng, M, M, 2), "W_p": random_system(rng, 2, N, 2)}
+    if remainder:
+        parts |= {"remainder_left": scaled_by(weight(rng, N, N, "full"), 0.2), "remainder_right": random_system(rng, M, M, 1)}
+    case = ObserverProblem(**{**parts, **changes})
+    if case.loop is None:
+        return case
+    return ObserverProblem(**{**parts, "W_L": scaled_by(parts["W_L"], 0.6 / hinf_norm(case.loop)), **changes})
+
+
+def observer(rng, case):
+    """A filter that keeps the nominal loop stable."""
+    rows = M if case.injection is Injection.INPUT else N
+    K = random_system(rng, rows, 1, 2)
+    for size in 0.3 ** np.arange(20):
+        if case.error_system(scaled_by(K, size)).is_stable():
+            return scaled_by(K, size)
+    raise AssertionError
+
+
+def brute_force(case, K, delta, rest, freqs):
+    """Response of ``W_p (x - x_hat)`` to (w1, n) from the definitions, frequency by frequency, in physical units."""
+    z = np.exp(2j * np.pi * freqs * DT)
+    A, B, C = case.nominal.A, case.nominal.B, case.C
+    x_scale, u_scale = np.diag(case.output_scale), np.diag(case.input_scale)
+    J = B if case.injection is Injection.INPUT else np.eye(N)
+    out = []
+    for k in range(len(freqs)):
+
+        def at(system, k=k):
+            return system.frequency_response(freqs[[k]])[0]
+
+        R = np.linalg.inv(z[k] * np.eye(N) - A)
+        G = np.linalg.inv(x_scale) @ R @ B @ u_scale
+        E = at(case.W_L) @ at(delta) @ at(case.W_R)
+        Gp = rebuild(case.form, G, E)
+        if rest is not None:
+            Gp = Gp + at(case.remainder_left) @ at(rest) @ at(case.remainder_right)
+        u = u_scale @ at(case.input_weight)  # inputs of the machine per unit of w1
+        x = x_scale @ Gp @ at(case.input_weight)
+        # x_hat = R (B u + J K (C x + n - C x_hat))
+        gain_ = R @ J @ at(K)
+        left = np.linalg.inv(np.eye(N) + gain_ @ C)
+        e_w1 = x - left @ (R @ B @ u + gain_ @ C @ x)
+        e_n = -left @ gain_ @ np.diag(case.noise)
+        W_p = at(case.W_p) if isinstance(case.W_p, StateSpace) else case.W_p
+        out.append(W_p @ np.hstack([e_w1, e_n]))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
+@pytest.mark.parametrize("form", Form)
+def test_interconnection_is_the_perturbed_plant(form, injection):
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        case = problem(form, seed, injection=injection)
+        K = observer(rng, case)
+        delta = random_system(rng, case.W_L.n_inputs, case.W_R.n_outputs, 2)
+        rest = random_system(rng, N, M, 2)
+        closed = case.generalized_plant().close(case.to_scaled(K))
+        found = perturbed(case, closed, delta, rest)
+        assert found.is_stable()
+        expected = brute_force(case, K, delta, rest, FREQS)
+        assert found.frequency_response(FREQS) == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("form", Form)
+def test_plant_is_minimal(form):
+    """Controllable and observable; the copies of the plant that a naive interconnection has (two, and the observer) are gone."""
+    case = problem(form, 1)
+    system = case.generalized_plant().open_loop()
+    n = system.n_states
+    for pair in ((system.A, system.B), (system.A.T, system.C.T)):
+        for pole in np.linalg.eigvals(system.A):
+            assert np.linalg.matrix_rank(np.hstack([pair[0] - pole * np.eye(n), pair[1]]), tol=1e-9) == n
+    weights = [case.W_L, case.W_R, case.W_u, case.W_p, case.remainder_left, case.remainder_right]
+    copies = 1 if PLACES[form].sees_input else 2
+    assert n == copies * N + sum(w.n_states for w in weights)
+
+
+def contraction(x, b, a):
+    U, _, Vh = np.linalg.svd((x[: a * b] + 1j * x[a * b :]).reshape(b, a), full_matrices=False)
+    return U @ Vh
+
+
+def worst_found(rng, T, N_, M_, norm="fro", noise=None, starts=15, steps=40):
+    """Search over perturbations with orthonormal rows or columns: to the polar factor of the gradient, from many random starts, best kept."""
+    b, a = T.shape[1], M_.shape[0]
+    noise = np.zeros((len(T), 0)) if noise is None else noise
+    best = 0.0
+    for _ in range(starts):
+        delta = contraction(rng.standard_normal(2 * a * b), b, a)
+        for _ in range(steps):
+            loop = np.linalg.inv(np.eye(a) - N_ @ delta)
+            error = np.hstack([T @ delta @ loop @ M_, noise])
+            best = max(best, np.linalg.norm(error, norm))
+            if norm == 2:  # the gradient of the largest singular value
+                U, s, Vh = np.linalg.svd(error)
+                error = s[0] * np.outer(U[:, 0], Vh[0])
+            left = T @ (np.eye(b) + delta @ loop @ N_)
+            U, _, Vh = np.linalg.svd(left.conj().T @ error[:, : M_.shape[1]] @ (loop @ M_).conj().T, full_matrices=False)
+            delta = U @ Vh
+    return best
+
+
+def noise_columns(case, response):
+    return response[..., N + M : N + M + 1]
+
+
+@pytest.mark.parametrize(("structure", "limit"), [("scalar", 1.01), ("diagonal", 1.2), ("full", 1.2)])
+@pytest.mark.parametrize("form", Form)
+def test_bound_against_the_worst_perturbation_found(form, structure, limit):
+    """Never below, and close: at frequencies one by one, which is harder than for the norm."""
+    rng = np.random.default_rng(5)
+    case = problem(form, 5, structure, remainder=False, **({} if structure == "full" else {"n_original": 2}))
+    K = observer(rng, case)
+    freqs = np.array([0.5, 4.0])
+    loop = case.error_system(K)
+    response = loop.frequency_response(freqs)
+    bound = np.sqrt(density(case, loop, freqs) - np.sum(np.abs(noise_columns(case, response)) ** 2, axis=(-2, -1)))
+    for k in range(len(freqs)):
+        at = freqs[[k]]
+        loop_ = np.zeros((case.W_R.n_outputs, case.W_L.n_inputs)) if case.loop is None else case.loop.frequency_response(at)[0]
+        T = response[k][:, case.port] @ case.W_L.frequency_response(at)[0]
+        found = worst_found(rng, T, loop_, case.chain.frequency_response(at)[0])
+        assert found <= bound[k] * (1 + 1e-9)
+        assert bound[k] <= found * limit
+
+
+@pytest.mark.parametrize("form", Form)
+def test_causal_perturbations_are_members_below_the_bound(form):
+    case = problem(form, 2)
+    rng = np.random.default_rng(2)
+    K = observer(rng, case)
+    value, causal = certify(case, K)[0], causal_h2(case, K)
+    closed = case.generalized_plant().close(case.to_scaled(K))
+    assert 0.3 * value < causal <= value
+    for _ in range(5):
+        delta, rest = random_system(rng, case.W_L.n_inputs, case.W_R.n_outputs, 2), random_system(rng, N, M, 2)
+        assert h2_norm(perturbed(case, closed, delta, rest)) <= value
+
+
+@pytest.mark.parametrize("form", [Form.ADDITIVE, Form.INVERSE_ADDITIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE])
+def test_gain_is_that_of_the_worst_perturbation(form):
+    """Exact: some perturbation found by search attains it at the frequency where it is attained, and none exceeds it anywhere."""
+    rng = np.random.default_rng(3)
+    case = problem(form, 3, remainder=False)
+    K = observer(rng, case)
+    proof = robust_gain(case, K)
+    assert proof.attained <= proof.value <= 1.002 * proof.attained
+    freqs = np.array([proof.freq_hz, 0.1, 2.0])
+    response = case.error_system(K).frequency_response(freqs)
+    found = []
+    for k in range(len(freqs)):
+        at = freqs[[k]]
+        loop_ = np.zeros((case.W_R.n_outputs, case.W_L.n_inputs)) if case.loop is None else case.loop.frequency_response(at)[0]
+        T = response[k][:, case.port] @ case.W_L.frequency_response(at)[0]
+        found.append(worst_found(rng, T, loop_, case.chain.frequency_response(at)[0], 2, noise_columns(case, response)[k], starts=10))
+    assert max(found) <= proof.value
+    assert found[0] >= 0.99 * proof.attained
+
+
+def test_gain_with_a_remainder_bounds_random_members():
+    case = problem(Form.INVERSE_INPUT_MULTIPLICATIVE, 4)
+    rng = np.random.default_rng(4)
+    K = observer(rng, case)
+    proof = robust_gain(case, K)
+    closed = case.generalized_plant().close(case.to_scaled(K))
+    for _ in range(10):
+        delta, rest = random_system(rng, case.W_L.n_inputs, case.W_R.n_outputs, 2), random_system(rng, N, M, 2)
+        assert hinf_norm(perturbed(case, closed, delta, rest)) <= proof.value
+    alone = robust_gain(
+        ObserverProblem(**{f: getattr(case, f) for f in case.__dataclass_fields__} | {"remainder_left": None, "remainder_right": None}), K
+    )
+    assert alone.value < proof.value
+
+
+@pytest.mark.parametrize("form", Form)
+def test_designs_of_every_form_are_certified(form):
+    case = problem(form, 1, "diagonal", remainder=False)
+    nothing = gain(np.zeros((N, 1)), DT)
+    h2_, hinf_ = worst_case_h2(case, fit=Constant), worst_case_hinf(case, fit=Constant)
+    assert h2_.lower_bound <= h2_.worst_case_h2 == pytest.approx(certify(case, h2_.controller)[0])
+    assert h2_.causal_h2 <= h2_.worst_case_h2
+    assert hinf_.lower_bound <= hinf_.worst_case_hinf == pytest.approx(robust_gain(case, hinf_.controller).value)
+    assert hinf_.worst_case_hinf <= robust_gain(case, nothing).value * 1.002
+    for found in (h2_, hinf_):
+        assert case.error_system(found.controller).is_stable()
+
+
+def test_performance_weight_with_states():
+    """The H2 controller of the whole plant beats the predictor, which is blind to past errors, and no bound is crossed."""
+    base = problem(Form.INPUT_MULTIPLICATIVE, 6, "diagonal", remainder=False)
+    slow = block_diagonal([StateSpace(np.array([[0.97]]), np.array([[1.0]]), np.array([[0.2]]), np.array([[0.05]]), DT)] * N)
+    fields = {f: getattr(base, f) for f in base.__dataclass_fields__}
+    dynamic = ObserverProblem(**fields | {"W_p": slow})
+    found = worst_case_h2(dynamic, fit=Constant, causal=False)
+    static = worst_case_h2(base, fit=Constant, causal=False)
+    assert found.lower_bound <= found.worst_case_h2 * (1 + 1e-9)
+    assert found.worst_case_h2 <= certify(dynamic, static.controller)[0] * (1 + 1e-6)
+
+
+class Constant:
+    """Shaping by a constant: crude on purpose, since no claim may depend on the fit."""
+
+    def __init__(self, freqs_hz, magnitude, dt, side="above", **_):
+        self.system = gain([[magnitude.max() if side == "above" else magnitude.min()]], dt)
+
+
+@pytest.mark.parametrize("form", Form)
+def test_units_that_make_the_weights_are_below_the_bounds(form):
+    """Weights from the residuals of random units; their true errors, without any knowledge of forms, stay below."""
+    rng = np.random.default_rng(8)
+    A = np.diag([0.9, 0.7])
+    nominal = StateSpace(A, np.array([[0.3, 0.1], [-0.1, 0.4]]), np.eye(2), np.zeros((2, 2)), DT)
+    A_p = A + 0.003 * rng.standard_normal((4, 2, 2))
+    B_p = nominal.B * (1 + 0.015 * rng.standard_normal((4, 2, 2)))
+    units = StateSpace(A_p, B_p, np.broadcast_to(np.eye(2), (4, 2, 2)), np.zeros((4, 2, 2)), DT)
+    freqs = np.linspace(0, 0.5 / DT, 400)
+    E = residual(form, nominal.frequency_response(freqs), units.frequency_response(freqs))
+    size = float(np.linalg.norm(E, 2, axis=(-2, -1)).max()) * 1.001
+    case = ObserverProblem(nominal, np.eye(2)[:1], gain(size * np.eye(2), DT), gain(np.eye(2), DT), [1, 1], [1, 1], [1e-3], form=form)
+    K = worst_case_h2(case, fit=Constant, causal=False).controller
+    table = check_units(case, K, units, ["a", "b", "c", "d"])
+    assert table.holds
+    assert np.all(table.density_ratio <= 1)
+    assert [row["unit"] for row in table.rows()] == ["a", "b", "c", "d"]
+    k = 2
+    response = units[k].frequency_response(freqs) - nominal.frequency_response(freqs)
+    S = case.error_system(K).frequency_response(freqs)[..., 2:4]
+    assert unit_error(case, K, A_p[k], B_p[k]).frequency_response(freqs) == pytest.approx(S @ response, abs=1e-9)
+    small = ObserverProblem(nominal, case.C, gain(1e-3 * size * np.eye(2), DT), case.W_R, [1, 1], [1, 1], [1e-3], form=form)
+    assert not check_units(small, K, units).holds  # the check can fail

@@ -11,7 +11,9 @@ from .relift_error import ReliftScales
 from .relift_report import ReliftRow, relift_report
 from .relift_status import ReliftStatus
 from .residual import mean_error_dynamics, one_step_residual, residual_spectra
+from .residual_design import ResidualModel, one_step_rows, residual_models
 from .simulate import run_observer, run_observers
+from .tune import Tuned, tune_observer
 
 __all__ = [
     "Attack",
@@ -25,6 +27,8 @@ __all__ = [
     "ReliftRow",
     "ReliftScales",
     "ReliftStatus",
+    "ResidualModel",
+    "Tuned",
     "attack",
     "attack_running",
     "cutoffs_hz",
@@ -33,11 +37,14 @@ __all__ = [
     "mean_error_dynamics",
     "noise_covariances",
     "one_step_residual",
+    "one_step_rows",
     "rates",
     "relift_certificate",
     "relift_report",
+    "residual_models",
     "residual_spectra",
     "run_observer",
     "run_observers",
     "start_covariance",
+    "tune_observer",
 ]

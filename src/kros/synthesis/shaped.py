@@ -48,6 +48,7 @@ def residual_h2(
     tolerance_percent: float = 1.0,
     worst_unit: bool = False,
     n_lifted: int | None = None,
+    max_order: int | None = None,
 ) -> Synthesis:
     """Return the correction filter that is optimal for the residuals of a population.
 
@@ -74,6 +75,8 @@ def residual_h2(
         Minimise the largest error of a unit in place of the mean.
     n_lifted : int, optional
         Rows of the correction; those of lifted functions are zero, since the functions are computed anew from the states.
+    max_order : int, optional
+        Most states of the correction, whatever the tolerance.
 
     Returns
     -------
@@ -113,7 +116,7 @@ def residual_h2(
         raise SynthesisError(
             "Residual-shaped observer: the error of the optimal observer is not bounded; check the nominal model and what is measured."
         )
-    K = problem.reduced(full, K, tolerance_percent)
+    K = problem.reduced(full, K, tolerance_percent, max_order)
     norm, radius = problem.norm(full, K), float(problem.error_system(K).spectral_radius())
     note += f", {problem.bank.delays} delays, lags {problem.bank.poles}"
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
@@ -138,6 +141,19 @@ def residual_h2(
         solver="riccati",
         notes=(note,),
     )
+
+
+def promised_errors(A: Array, C: Array, spectra: Spectra, noise: Array, scale: Array, dt: float, bank: Bank = BANKS[1]) -> Array:
+    """Return the root mean square error of every state, as a share of its range, that a residual-shaped observer would have on the spectra as measured.
+
+    Parameters as in `residual_h2`; the mean over units is taken, the order is not reduced. Infinite where there is no observer.
+    """
+    problem = _Problem(A / scale[:, None] * scale, C * scale, noise, spectra / np.outer(scale, scale), bank, dt)
+    try:
+        K = problem.correction(problem.filter(np.full(len(spectra), 1 / len(spectra))))
+    except SynthesisError:
+        return np.full(len(A), np.inf)
+    return np.asarray(np.sqrt(problem.unit_errors(K).mean(axis=0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,13 +254,14 @@ class _Problem:
         gain = 100 * (1 - np.sqrt(best / first))
         return chosen, f"worst of {len(self.spectra)} units, whose predicted error is {gain:.1f} % below that under equal weights"
 
-    def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float) -> StateSpace:
-        """The correction filter of lowest order whose errors under the full shaping filter are within the tolerance.
+    def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, max_order: int | None = None) -> StateSpace:
+        """The correction filter of lowest order whose errors under the full shaping filter are within the tolerance, or of the highest one allowed.
 
         Balanced truncation of the shaping filter, its output weighted by the error dynamics of the full observer (weighting one side alone
         keeps it stable), and new gains at every order that bisection tries.
         """
-        if not shaping.n_states or tolerance_percent <= 0:
+        most = shaping.n_states if max_order is None else max_order
+        if not shaping.n_states or (tolerance_percent <= 0 and most >= shaping.n_states):
             return K
         best, loop = self.deviations(shaping, K), self.loop(shaping, K)
         weighted = loop.C / best[:, None]
@@ -255,17 +272,21 @@ class _Problem:
         usable = int(np.sum(h > _NEGLIGIBLE * h[0]))
         left, right = (U[:, :usable] / np.sqrt(h[:usable])).T @ S, R @ Vh[:usable].T / np.sqrt(h[:usable])
         allowed = (1 + tolerance_percent / 100) * best[self.hidden]
-        low, high = -1, usable + 1
-        while high - low > 1:
-            k = (low + high) // 2
-            trial = self.correction(
+
+        def of_order(k: int) -> StateSpace:
+            return self.correction(
                 replace(shaping, A=left[:k] @ shaping.A @ right[:, :k], B=left[:k] @ shaping.B, C=shaping.C @ right[:, :k])
             )
+
+        low, high = -1, min(usable, most) + 1
+        while high - low > 1:
+            k = (low + high) // 2
+            trial = of_order(k)
             if np.all(self.deviations(shaping, trial)[self.hidden] <= allowed):
                 K, high = trial, k
             else:
                 low = k
-        return K
+        return K if K.n_states <= most else of_order(min(usable, most))
 
 
 def _root(matrix: Array) -> Array:

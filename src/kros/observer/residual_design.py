@@ -1,0 +1,155 @@
+r"""Which model a residual-shaped observer should run: rows that were identified for free runs, or rows fitted to single steps.
+
+Models that are refined for long free runs predict well as a whole, and their rows may be poor by themselves: on drives the position of the
+next sample is missed by a hundred times more than a row fitted by least squares to single steps misses it, and a filter has to undo that from the
+measurement. The rows of lifted models are independent in the one-step residual, so every choice of rows comes from two residuals,
+
+    omega_i = x_i(k + 1) - [A_i | B_i] [theta(x); u]          with [A_i | B_i] as identified, or by least squares.
+
+Choices are ordered by the error that the Kalman predictor for their measured spectra promises; nothing has to be simulated for that. A model
+with rows of both kinds is no member of any uncertain set, and need not be stable by itself: the correction makes the observer stable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError
+from ..lifting import Lifting
+from ..synthesis.shaped import promised_errors
+from .residual import mean_error_dynamics, one_step_residual, residual_spectra
+
+Array = npt.NDArray[np.float64]
+_MOST_HIDDEN = 3  # beyond it, all hidden states or none are refitted
+_THIN = 3
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualModel:
+    """A model for a residual-shaped observer, with what its synthesis needs.
+
+    Parameters
+    ----------
+    refitted : tuple of int
+        Rows that were fitted to single steps; none for the model as identified.
+    A : ndarray, shape (n_lifted, n_lifted)
+    B : ndarray, shape (n_lifted, m)
+    dynamics : ndarray, shape (n, n)
+        Mean error dynamics of the original states.
+    spectra : ndarray, shape (unit, f, n, n), complex
+        Of every unit's one-step residual.
+    promised : ndarray, shape (n,)
+        Root mean square error of every state that the Kalman predictor for these spectra promises, as a share of the range.
+    """
+
+    refitted: tuple[int, ...]
+    A: Array
+    B: Array
+    dynamics: Array
+    spectra: npt.NDArray[Any]
+    promised: Array
+
+
+def one_step_rows(
+    lifting: Lifting, states: Array, inputs: Array, lengths: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None
+) -> tuple[Array, Array]:
+    """Fit the original states' rows of the model to single steps of all recordings by least squares.
+
+    Parameters
+    ----------
+    lifting : Lifting
+    states : ndarray, shape (n_samples, batch, n)
+    inputs : ndarray, shape (n_samples, batch, m)
+    lengths : array_like of int, shape (batch,)
+        Samples of every episode that count.
+    parameters : mapping of str to array_like, shape (batch,)
+
+    Returns
+    -------
+    A : ndarray, shape (n, n_lifted)
+    B : ndarray, shape (n, m)
+
+    Raises
+    ------
+    DataError
+        When there are fewer steps than coefficients.
+    """
+    h, lengths = lifting.history, np.asarray(lengths, dtype=int)
+    x, u = np.swapaxes(states, 0, 1), np.swapaxes(inputs, 0, 1)
+    values = {name: np.asarray(value, dtype=float)[..., None] for name, value in (parameters or {}).items()}
+    window, u = lifting.windows(x, u)[:, :-1], u[:, h:-1]
+    regressors = np.concatenate([lifting.lift(window, values), lifting.lift_inputs(u, window, values)], axis=-1)
+    counted = np.arange(regressors.shape[1]) < (lengths - h - 1)[:, None]
+    counted[:, np.arange(regressors.shape[1]) % _THIN != 0] = False
+    regressors, following = regressors[counted], x[:, h + 1 :][counted]
+    if len(regressors) < regressors.shape[1]:
+        raise DataError(f"One-step rows: {regressors.shape[1]} coefficients need as many steps, found {len(regressors)}; record more.")
+    size = np.maximum(np.sqrt(np.mean(regressors**2, axis=0)), np.finfo(float).tiny)
+    W = np.linalg.lstsq(regressors / size, following, rcond=None)[0].T / size
+    return W[:, : lifting.n_lifted], W[:, lifting.n_lifted :]
+
+
+def residual_models(
+    lifting: Lifting,
+    A: Array,
+    B: Array,
+    measured: Sequence[int],
+    states: Array,
+    inputs: Array,
+    lengths: npt.ArrayLike,
+    units: Sequence[str],
+    parameters: Mapping[str, npt.ArrayLike] | None,
+    noise: Array,
+    scale: Array,
+    dt: float,
+) -> list[ResidualModel]:
+    """Return the model as identified and with rows fitted to single steps, the one that promises the smallest hidden errors first.
+
+    Measured rows are refitted with every choice of hidden ones.
+
+    Parameters
+    ----------
+    lifting : Lifting
+    A : ndarray, shape (n_lifted, n_lifted)
+    B : ndarray, shape (n_lifted, m)
+    measured : sequence of int
+    states : ndarray, shape (n_samples, batch, n)
+    inputs : ndarray, shape (n_samples, batch, m)
+    lengths : array_like of int, shape (batch,)
+    units : sequence of str, length batch
+    parameters : mapping of str to array_like, shape (batch,)
+    noise : ndarray, shape (q,)
+        Standard deviation of the measurement noise.
+    scale : ndarray, shape (n,)
+        Range of every state.
+    dt : float, s
+    """
+    n = lifting.n_states
+    hidden = [i for i in range(n) if i not in measured] or list(range(n))
+    fitted = one_step_rows(lifting, states, inputs, lengths, parameters)
+    both = [(A, B), (np.vstack([fitted[0], A[n:]]), np.vstack([fitted[1], B[n:]]))]
+    residual = np.concatenate([one_step_residual(lifting, *model, states, inputs, parameters) for model in both], axis=-1)
+    spectra = residual_spectra(residual, np.asarray(lengths) - 1 - lifting.history, units)
+    models = []
+    for rows in _choices(tuple(measured), hidden):
+        picked = [i + n * (i in rows) for i in range(n)]
+        own = [M.copy() for M in both[0]]
+        for matrix, other in zip(own, both[1], strict=True):
+            matrix[list(rows)] = other[list(rows)]
+        dynamics = mean_error_dynamics(lifting, own[0], states, inputs, parameters)
+        chosen = spectra[..., picked, :][..., picked]
+        promised = promised_errors(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, dt)
+        models.append(ResidualModel(rows, own[0], own[1], dynamics, chosen, promised))
+    return sorted(models, key=lambda m: float(np.sum(np.log(np.maximum(m.promised[hidden], np.finfo(float).tiny)))))
+
+
+def _choices(measured: tuple[int, ...], hidden: Sequence[int]) -> list[tuple[int, ...]]:
+    others = [i for i in hidden if i not in measured]
+    sizes = range(len(others) + 1) if len(others) <= _MOST_HIDDEN else (0, len(others))
+    return [(), *(tuple(sorted(measured + some)) for size in sizes for some in combinations(others, size))]

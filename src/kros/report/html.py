@@ -15,7 +15,7 @@ from .names import condition_label
 from .run_folder import RunFolder
 from .sections import SECTIONS
 from .theme import Tone
-from .verdict import verdict
+from .verdict import findings, trust
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
@@ -65,8 +65,11 @@ def page(run: RunFolder, metrics: Mapping[str, Any]) -> str:
     return environment.get_template("report.html.jinja").render(
         name=run.study.get("name", run.folder.name),
         subtitle=_subtitle(metrics),
-        verdict=verdict(metrics, run.measured_states),
-        advice=advice(metrics, run.measured_states),
+        verdict={
+            "What was found": findings(metrics, run.measured_states),
+            "Can it be trusted": trust(metrics),
+            "What to do next": advice(metrics, run.measured_states),
+        },
         sections=[s for s in (section(run, metrics) for section in SECTIONS) if s is not None],
         figures=figures,
         style=Markup(stylesheet()),

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..data.population import DEFAULT_CONDITION
 from .error_table import ErrorTable, error_table
-from .names import BASELINES, condition_label, number, observer_label, split_observer
+from .names import BASELINES, condition_label, form_label, minus, number, observer_label, split_observer
 from .sections.outliers import flagged_text
 
 
@@ -21,7 +21,17 @@ def verdict(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[
     measured : tuple of str
         Channels that are available at run time; their errors are left to the table.
     """
-    return [*_recorded(metrics), *_handed_over(metrics, measured), *_certificate(metrics), *_flagged(metrics)]
+    return [*findings(metrics, measured), *trust(metrics)]
+
+
+def findings(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[str]:
+    """Return what was recorded, what is handed over and how well it works, and who is flagged."""
+    return [*_recorded(metrics), *_handed_over(metrics, measured), *_flagged(metrics)]
+
+
+def trust(metrics: Mapping[str, Any]) -> list[str]:
+    """Return what stands behind the numbers; nothing where no observer was made."""
+    return [*_covered(metrics), *_certificate(metrics)]
 
 
 def _recorded(metrics: Mapping[str, Any]) -> list[str]:
@@ -94,6 +104,19 @@ def _ratio(own: float | None, theirs: float) -> str:
     if ratio > 1.95:
         return f" ({number(ratio, 2)} times as much)"
     return f" ({100 * (ratio - 1):.0f} % more)" if ratio > 1 else f" ({100 * (1 - ratio):.0f} % less)"
+
+
+def _covered(metrics: Mapping[str, Any]) -> list[str]:
+    """The uncertain set of the observer that is handed over."""
+    model = split_observer(metrics["study"].get("deployed") or "")[0]
+    entry = metrics.get("uncertainty", {}).get(model)
+    if entry is None or entry["peak_db"].get(entry["form"]) is None:
+        return []
+    peak, cover = minus(f"{entry['peak_db'][entry['form']]:.1f}"), entry["weight"]["cover_max"]
+    held = "its weights cover every unit that counts" if cover is not None and cover <= 1 else "its weights do not cover every unit"
+    return [
+        f"The set of machines it is designed for ({form_label(entry['form'])}) has residuals of at most {peak} dB around unit {entry['nominal']}; {held}."
+    ]
 
 
 def _certificate(metrics: Mapping[str, Any]) -> list[str]:

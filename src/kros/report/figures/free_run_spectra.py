@@ -39,7 +39,7 @@ def draw(run: RunFolder) -> Drawing:
     text = "Power spectral densities of the free-run errors, mean over all held-out episodes."
     if band_hz and len(chosen) == 2:
         own, other = (run.arrays[f"spectrum/model/{n}"] for n in reversed(chosen))
-        shares = share_text(band_shares(freqs, own, other, channels, band_hz))
+        shares = share_text(band_shares(freqs, own, other, channels, band_hz), channels)
         text += (
             f" Shaded: the band around the gearbox frequency at top speed, where the {model_label(chosen[1])} model leaves, relative to the "
             f"{model_label(chosen[0])} one, this much power: {shares}. Linear scales end at the largest value above 10 Hz."

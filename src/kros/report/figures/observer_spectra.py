@@ -57,4 +57,4 @@ def _compared(run: RunFolder, names: list[str], role: str) -> str:
         return ""
     first, second = (run.arrays[f"spectrum/{role}/{run.identify_on}/{n}"] for n in (own, twin))
     shares = band_shares(run.arrays["freqs_hz"], first, second, states(run)[:4], run.evaluation["band_hz"])
-    return f", where off nominal {observer_label(own)} leaves, relative to {observer_label(twin)}, this much power: {share_text(shares)}"
+    return f", where off nominal {observer_label(own)} leaves, relative to {observer_label(twin)}, this much power: {share_text(shares, states(run))}"

@@ -82,9 +82,10 @@ def band_shares(freqs_hz: Array, own: Array, other: Array, channels: Sequence[Ch
     return {c.name: float(power[0][i] / power[1][i]) for i, c in enumerate(channels) if power[1][i] > 0 and np.isfinite(power[0][i])}
 
 
-def share_text(shares: Mapping[str, float]) -> str:
-    """Return shares for a sentence: ``velocity 20 %, current 3 %``."""
-    return ", ".join(f"{name} {number(100 * share, 2)} %" for name, share in shares.items())
+def share_text(shares: Mapping[str, float], channels: Sequence[Channel]) -> str:
+    """Return shares for a sentence: ``velocity 20 %, current 3 %``; what is measured needs no estimate and is left out."""
+    hidden = {c.name for c in channels if not c.measured} or set(shares)
+    return ", ".join(f"{name} {number(100 * share, 2)} %" for name, share in shares.items() if name in hidden)
 
 
 def density_label(channel: Channel) -> str:

@@ -31,11 +31,21 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Balanced:
-    """A plant (with D22 = 0) in balanced coordinates, z1 divided by `size`, with the diagonal `spread` of X and Y to expect."""
+    """A plant (with D22 = 0) in balanced coordinates, z1 divided by `size`, with the diagonal `spread` of X and Y to expect.
+
+    Its control is the original one divided by `controls`, its measurement the original one divided by `measurements`.
+    """
 
     plant: GeneralizedPlant
     size: float
     spread: Array
+    controls: Array
+    measurements: Array
+
+    def controller(self, K: StateSpace) -> StateSpace:
+        """Return the controller of the original plant."""
+        c, m = self.controls[:, None], self.measurements
+        return StateSpace(K.A, K.B / m, c * K.C, c * K.D / m, K.dt)
 
 
 def balance(plant: GeneralizedPlant) -> Balanced:
@@ -65,17 +75,20 @@ def balance(plant: GeneralizedPlant) -> Balanced:
     size = float(np.sqrt(np.trace(closed.C @ P @ closed.C.T) + np.sum(closed.D**2)))
     scale = np.ones(plant.sizes[3])
     scale[rows] = 1 / max(size, 1e-300)
+    measurements = np.sqrt(np.diag(plant.C2 @ E @ plant.C2.T + plant.D21 @ plant.D21.T))
+    controls = size / np.linalg.norm(plant.D12[rows], axis=0)
     balanced = replace(
         plant,
         A=T @ plant.A @ back,
         B1=T @ plant.B1,
-        B2=T @ plant.B2,
+        B2=T @ plant.B2 * controls,
         C1=(plant.C1 * scale[:, None]) @ back,
-        C2=plant.C2 @ back,
+        C2=plant.C2 @ back / measurements[:, None],
         D11=plant.D11 * scale[:, None],
-        D12=plant.D12 * scale[:, None],
+        D12=plant.D12 * scale[:, None] * controls,
+        D21=plant.D21 / measurements[:, None],
     )
-    return Balanced(balanced, size, s)
+    return Balanced(balanced, size, s, controls, measurements)
 
 
 def covariances(plant: GeneralizedPlant, K: StateSpace) -> tuple[Array, Array, Array]:

@@ -1,180 +1,185 @@
-r"""The linear matrix inequalities of mixed H2/H-infinity synthesis with a common Lyapunov matrix, in discrete time.
+r"""The linear matrix inequalities of mixed H2/H-infinity synthesis in discrete time, with one Lyapunov matrix or with two.
 
-With ``Q = [[X, M], [M', *]]`` and ``Q^-1 = [[Y, N], [N', *]]`` the change of variables (Scherer, Gahinet and Chilali 1997; Caverly and
-Forbes, *LMI properties and applications*, 5.4.4)
+With a matrix ``G`` (the common Lyapunov matrix, or a slack) partitioned as the plant and the controller, ``G = [[X, *], [U, *]]`` and
+``G^-1 = [[Y', *], [V', *]]``, the change of variables
 
-    C_n = D^c C2 X + C^c M',   B_n = Y B2 D^c + N B^c,   D_n = D^c,
-    A_n = Y (A + B2 D^c C2) X + N B^c C2 X + Y B2 C^c M' + N A^c M'
+    C_n = D^c C2 X + C^c U,   B_n = Y B2 D^c + V B^c,   D_n = D^c,   S = Y X + V U,
+    A_n = Y (A + B2 D^c C2) X + V B^c C2 X + Y B2 C^c U + V A^c U - S
 
-makes ``P = [[X, I], [I, Y]]`` and the closed-loop matrices A~, B~, C~, D~ affine. Sampled plants have A close to I, and then the inequality
-between P and A~ is a small difference of large matrices. So the unknown is ``V = A~ - P`` and the rows are combined accordingly (a congruence):
+makes ``G~ = [[X, I], [S, Y]]`` and the closed-loop matrices A~, B~, C~, D~ affine. Sampled plants have A close to I, and then the inequality
+between G~ and A~ is a small difference of large matrices. So the unknown is ``W = A~ - G~`` and the rows are combined accordingly (a congruence):
 
-    H2:    [[-V-V', V, B~1], [., P, 0], [., ., I]] > 0,   [[Z, C~1, D~11], [., P, 0], [., ., I]] > 0,   min tr Z
-    Hinf:  [[-V-V', V, B~2, -C~2'], [., P, 0, C~2'], [., ., I, D~22'], [., ., ., gamma^2 I]] > 0
+    H2:    [[-W-W', W+P-G~', B~1], [., G~+G~'-P, 0], [., ., I]] > 0,   [[Z, C~1, D~11], [., G~+G~'-P, 0], [., ., I]] > 0,   min tr Z
+    Hinf:  [[-W-W', W+P-G~', B~2, -C~2'], [., G~+G~'-P, 0, C~2'], [., ., I, D~22'], [., ., ., gamma^2 I]] > 0
 
-In balanced coordinates P has the diagonal (s, s); rows and columns are divided by its root. Strictness is ``>= eps I``, never ``>= eps``.
+*Common*: ``P = G~`` symmetric, S = I, in both. *Extended*: a P for each channel, X, Y and S free; never worse than common, with three times the
+variables. In balanced coordinates G~ has the diagonal (s, s); rows and columns are divided by its root.
+
+References
+----------
+C. Scherer, P. Gahinet, M. Chilali, IEEE Trans. Automatic Control 42 (1997) 896-911. M. C. de Oliveira, J. C. Geromel, J. Bernussou, "Extended
+H2 and H-infinity norm characterizations and controller parametrizations for discrete-time systems", Int. J. Control 75 (2002) 666-679.
 
 Symbols
 -------
-X, Y, A_n (through A_n - I), B_n, C_n, D_n, Z : the variables
+X, Y, S, A_n, B_n, C_n, D_n, Z, P1, P2 : the variables
 """
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.lti import StateSpace
-from .generalized_plant import GeneralizedPlant
+from .balance import Balanced
+from .barrier import Block
 
 Array = npt.NDArray[Any]
+Values = dict[str, Array]
 
-_STRICT = 1e-9
-# Least eigenvalue of the scaled P: keeps I - X Y away from singular, without which the controller cannot be recovered. It costs about as much.
+# Least eigenvalue of the scaled Lyapunov matrices: keeps S - Y X away from singular, without which the controller cannot be recovered.
 _MARGIN = 1e-3
 
 
-def _cvxpy() -> Any:
-    """Import cvxpy when it is needed: it takes a second. Its own annotations do not describe what it exports."""
-    return import_module("cvxpy")
-
-
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """What a solver returned: its word, the value of tr Z, and the controller that follows (for D22 = 0)."""
-
-    word: str
-    value: float
-    controller: StateSpace
-
-
-@dataclass(frozen=True, eq=False)
-class Attempt:
-    """A rung of the ladder: solver and its settings."""
-
-    solver: str
-    settings: dict[str, Any]
-
-
-def ladder(time_limit_s: float, *, last_resort: bool) -> list[Attempt]:
-    """Return the solvers to try, in order, each with the time limit; the slow first-order solver is the last resort.
-
-    Clarabel with dense blocks and a supernodal factorisation is fastest; a moderate accuracy is enough, since everything is verified.
-    """
-    cp = _cvxpy()
-
-    installed = cp.installed_solvers()
-    if last_resort:
-        return [Attempt("SCS", {"time_limit_secs": time_limit_s, "eps": 1e-6, "max_iters": 200000})] if "SCS" in installed else []
-    accuracy = {"tol_gap_abs": 1e-4, "tol_gap_rel": 1e-4, "tol_feas": 1e-6}
-    common = {"time_limit": time_limit_s, "direct_solve_method": "faer", **accuracy}
-    attempts = [
-        Attempt("CLARABEL", {**common, "chordal_decomposition_enable": False}),
-        Attempt("CLARABEL", {**common, "chordal_decomposition_enable": True}),
-        Attempt("CLARABEL", {**common, "chordal_decomposition_enable": False, "static_regularization_constant": 1e-7}),
-        Attempt("MOSEK", {"mosek_params": {"MSK_DPAR_OPTIMIZER_MAX_TIME": time_limit_s}}),
-    ]
-    return [a for a in attempts if a.solver in installed]
-
-
 class MixedInequalities:
-    """The inequalities of one plant, built once and handed to several solvers.
+    """The inequalities of one balanced plant (D22 = 0) at one level, for any solver.
 
     Parameters
     ----------
-    plant : GeneralizedPlant
-        Balanced, with D22 = 0.
-    sizes : ndarray, shape (n,)
-        Diagonal of X and Y to be expected.
+    balanced : Balanced
     gamma : float
         Level of the H-infinity constraint.
+    extended : bool
+        Two Lyapunov matrices and a slack instead of one common matrix.
     """
 
-    def __init__(self, plant: GeneralizedPlant, sizes: Array, gamma: float) -> None:
-        cp = _cvxpy()
+    balanced: Balanced
+    gamma: float
+    extended: bool = False
 
-        self.plant = plant
-        n, _, n_u, _, n_y = plant.sizes
-        self.X, self.Y = cp.Variable((n, n), symmetric=True), cp.Variable((n, n), symmetric=True)
-        self.An, self.Bn = cp.Variable((n, n)), cp.Variable((n, n_y))
-        self.Cn, self.Dn = cp.Variable((n_u, n)), cp.Variable((n_u, n_y))
-        n_z1 = plant.C1[plant.rows(1)].shape[0]
-        self.Z = cp.Variable((n_z1, n_z1), symmetric=True)
-        self._scale = np.diag(1 / np.sqrt(np.concatenate([sizes, sizes])))
-        self.problem = cp.Problem(cp.Minimize(cp.trace(self.Z)), self._constraints(gamma))
+    @property
+    def shapes(self) -> dict[str, tuple[int, int, bool]]:
+        """Rows, columns and symmetry of every variable, in order."""
+        p, free = self.balanced.plant, not self.extended
+        n, _, n_u, _, n_y = p.sizes
+        n_z1 = p.C1[p.rows(1)].shape[0]
+        shapes = {"X": (n, n, free), "Y": (n, n, free), "An": (n, n, False), "Bn": (n, n_y, False), "Cn": (n_u, n, False)}
+        shapes |= {"Dn": (n_u, n_y, False), "Z": (n_z1, n_z1, True)}
+        return shapes if free else {**shapes, "S": (n, n, False), "P1": (2 * n, 2 * n, True), "P2": (2 * n, 2 * n, True)}
 
-    def _common(self) -> tuple[Any, Any]:
-        """P and V = A~ - P, scaled."""
-        cp = _cvxpy()
+    @property
+    def size(self) -> int:
+        """Number of scalar variables."""
+        return sum(_count(*shape) for shape in self.shapes.values())
 
-        p, eye = self.plant, np.eye(self.plant.sizes[0])
+    def values(self, x: Array) -> Values:
+        """Matrices from scalar variables, shape (..., n); the leading axes stay."""
+        found, position = {}, 0
+        for name, (rows, columns, symmetric) in self.shapes.items():
+            part = x[..., position : position + _count(rows, columns, symmetric)]
+            position += part.shape[-1]
+            if symmetric:
+                matrix = np.zeros((*x.shape[:-1], rows, columns))
+                upper = np.triu_indices(rows)
+                matrix[..., upper[0], upper[1]] = part
+                matrix[..., upper[1], upper[0]] = part
+            else:
+                matrix = part.reshape(*x.shape[:-1], rows, columns)
+            found[name] = matrix
+        return found
+
+    def start(self) -> Array:
+        """Variables of no correction, with the Lyapunov matrices that are expected."""
+        values = {name: np.zeros(shape[:2]) for name, shape in self.shapes.items()}
+        n = len(self.balanced.spread)
+        values["X"] = values["Y"] = 2 * np.diag(self.balanced.spread)
+        values["Z"] = 2 * np.eye(len(values["Z"]))
+        if self.extended:
+            values["S"] = np.eye(n)
+            values["P1"] = values["P2"] = np.block([[values["X"], np.eye(n)], [np.eye(n), values["Y"]]])
+        parts = [values[k][np.triu_indices(rows)] if symmetric else values[k].ravel() for k, (rows, _, symmetric) in self.shapes.items()]
+        return np.concatenate(parts)
+
+    def objective(self) -> Array:
+        """Coefficients of tr Z."""
+        return np.trace(self.values(np.eye(self.size))["Z"], axis1=-2, axis2=-1)
+
+    def blocks(self) -> list[Block]:
+        """Return the inequalities as affine functions of the scalar variables."""
+        constants, whole = self._matrices(np.zeros((1, self.size))), self._matrices(np.eye(self.size))
+        return [Block(c, (m - c)[:, None]) for c, m in zip(constants, whole, strict=True)]
+
+    def _matrices(self, x: Array) -> list[Array]:
+        """Matrices of all inequalities at the points x, shape (k, n); each (k, d, d)."""
+        p, v = self.balanced.plant, self.values(x)
+        n, eye = p.sizes[0], np.eye(p.sizes[0])
+        scale = 1 / np.sqrt(np.concatenate([self.balanced.spread] * 2))
+        frame = scale[:, None] * scale
         less = p.A - eye
-        P = cp.bmat([[self.X, eye], [eye, self.Y]])
-        V = cp.bmat([[less @ self.X + p.B2 @ self.Cn, less + p.B2 @ self.Dn @ p.C2], [self.An, self.Y @ less + self.Bn @ p.C2]])
-        return self._scale @ P @ self._scale, self._scale @ V @ self._scale
+        G = frame * _blocks([[v["X"], eye], [v.get("S", eye), v["Y"]]])
+        W = frame * _blocks([[less @ v["X"] + p.B2 @ v["Cn"], less + p.B2 @ v["Dn"] @ p.C2], [v["An"], v["Y"] @ less + v["Bn"] @ p.C2]])
+        Gt, Wt = G.swapaxes(-1, -2), W.swapaxes(-1, -2)
+        found = []
+        for channel in (1, 2):
+            P = frame * v[f"P{channel}"] if self.extended else G
+            B, C, D = self._channel(channel, v, scale)
+            if channel == 2 and not (B.shape[-1] and C.shape[-2]):
+                continue
+            Bt, Ct, Dt, one = (m.swapaxes(-1, -2) for m in (B, C, D, np.eye(B.shape[-1])))
+            corner, slack, off = -W - Wt, G + Gt - P, W + P - Gt
+            zero = np.zeros((2 * n, B.shape[-1]))
+            if channel == 1 or self.extended:
+                found.append(P - _MARGIN * np.eye(2 * n))
+            if channel == 1:
+                found.append(_blocks([[corner, off, B], [off.swapaxes(-1, -2), slack, zero], [Bt, zero.T, one]]))
+                found.append(_blocks([[v["Z"], C, D], [Ct, slack, zero], [Dt, zero.T, one]]))
+            else:
+                level = self.gamma**2 * np.eye(C.shape[-2])
+                found.append(
+                    _blocks([[corner, off, B, -Ct], [off.swapaxes(-1, -2), slack, zero, Ct], [Bt, zero.T, one, Dt], [-C, C, D, level]])
+                )
+        return found
 
-    def _channel(self, rows: slice, columns: slice) -> tuple[Any, Any, Any]:
+    def _channel(self, channel: int, v: Values, scale: Array) -> tuple[Array, Array, Array]:
         """B~, C~, D~ of one channel, scaled; disturbances without effect on it are left out."""
-        cp = _cvxpy()
-
-        part = self.plant.channel(rows, columns)
+        p = self.balanced.plant
+        part = p.channel(p.rows(channel), p.columns(channel))
         used = np.any(np.vstack([part.B1, part.D21, part.D11]), axis=0)
         B1, D21, D11 = part.B1[:, used], part.D21[:, used], part.D11[:, used]
-        B = cp.vstack([B1 + part.B2 @ self.Dn @ D21, self.Y @ B1 + self.Bn @ D21])
-        C = cp.hstack([part.C1 @ self.X + part.D12 @ self.Cn, part.C1 + part.D12 @ self.Dn @ part.C2])
-        return self._scale @ B, C @ self._scale, D11 + part.D12 @ self.Dn @ D21
+        B = np.concatenate([B1 + part.B2 @ v["Dn"] @ D21, v["Y"] @ B1 + v["Bn"] @ D21], axis=-2)
+        C = np.concatenate([part.C1 @ v["X"] + part.D12 @ v["Cn"], part.C1 + part.D12 @ v["Dn"] @ part.C2], axis=-1)
+        return scale[:, None] * B, C * scale, D11 + part.D12 @ v["Dn"] @ D21
 
-    def _constraints(self, gamma: float) -> list[Any]:
-        cp = _cvxpy()
+    def controller(self, x: Array) -> StateSpace:
+        """Controller of the plant before balancing (for D22 = 0) from the variables; ``V U = S - Y X``.
 
-        p = self.plant
-        P, V = self._common()
-        B, C, D = self._channel(p.rows(1), p.columns(1))
-        n, n_w = P.shape[0], B.shape[1]
-        zero, eye = np.zeros((n, n_w)), np.eye(n_w)
-        blocks = [
-            cp.bmat([[-V - V.T, V, B], [V.T, P, zero], [B.T, zero.T, eye]]),
-            cp.bmat([[self.Z, C, D], [C.T, P, zero], [D.T, zero.T, eye]]),
-        ]
-        if p.C1[p.rows(2)].shape[0] and p.B1[:, p.columns(2)].shape[1]:
-            B, C, D = self._channel(p.rows(2), p.columns(2))
-            n_w, level = B.shape[1], gamma**2 * np.eye(C.shape[0])
-            zero = np.zeros((n, n_w))
-            blocks.append(cp.bmat([[-V - V.T, V, B, -C.T], [V.T, P, zero, C.T], [B.T, zero.T, np.eye(n_w), D.T], [-C, C, D, level]]))
-        strict = [(b + b.T) / 2 - _STRICT * np.eye(b.shape[0]) >> 0 for b in blocks]
-        return [*strict, (P + P.T) / 2 - _MARGIN * np.eye(n) >> 0]
+        Raises
+        ------
+        LinAlgError
+            When ``S - Y X`` is singular.
+        """
+        p, v = self.balanced.plant, self.values(x)
+        X, Y, Bn, Cn, Dn = (v[name] for name in ("X", "Y", "Bn", "Cn", "Dn"))
+        S = v.get("S", np.eye(len(X)))
+        left, s, right = np.linalg.svd(S - Y @ X)
+        V, U = left * np.sqrt(s), np.sqrt(s)[:, None] * right
+        C = np.linalg.solve(U.T, (Cn - Dn @ p.C2 @ X).T).T
+        B = np.linalg.solve(V, Bn - Y @ p.B2 @ Dn)
+        middle = v["An"] + S - V @ B @ p.C2 @ X - Y @ p.B2 @ C @ U - Y @ (p.A + p.B2 @ Dn @ p.C2) @ X
+        A = np.linalg.solve(V, np.linalg.solve(U.T, middle.T).T)
+        return self.balanced.controller(StateSpace(A, B, C, Dn, p.dt))
 
-    def solve(self, attempt: Attempt) -> Solution | str:
-        """Solve with one solver; return the solution, or the reason why there is none."""
-        cp = _cvxpy()
 
-        try:
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", message="Solution may be inaccurate")  # the status says so, and verification follows
-                self.problem.solve(solver=attempt.solver, **attempt.settings)
-        except (cp.error.SolverError, ValueError, ArithmeticError) as error:
-            return f"{attempt.solver}: {error}"
-        if self.X.value is None or self.problem.value is None or not np.isfinite(self.problem.value):
-            return f"{attempt.solver}: {self.problem.status}"
-        try:
-            return Solution(str(self.problem.status), float(self.problem.value), self._recover())
-        except np.linalg.LinAlgError as error:
-            return f"{attempt.solver}: the controller cannot be recovered ({error})"
+def _count(rows: int, columns: int, symmetric: bool) -> int:
+    return rows * (rows + 1) // 2 if symmetric else rows * columns
 
-    def _recover(self) -> StateSpace:
-        """Controller (for D22 = 0) from the variables; ``M N' = I - X Y``."""
-        p = self.plant
-        X, Y, Bn, Cn, Dn = (v.value for v in (self.X, self.Y, self.Bn, self.Cn, self.Dn))
-        eye = np.eye(len(X))
-        U, s, Vh = np.linalg.svd(eye - X @ Y)
-        M, N = U * np.sqrt(s), Vh.T * np.sqrt(s)
-        C = np.linalg.solve(M, (Cn - Dn @ p.C2 @ X).T).T
-        B = np.linalg.solve(N, Bn - Y @ p.B2 @ Dn)
-        middle = self.An.value + eye - N @ B @ p.C2 @ X - Y @ p.B2 @ C @ M.T - Y @ (p.A + p.B2 @ Dn @ p.C2) @ X
-        A = np.linalg.solve(M, np.linalg.solve(N, middle).T).T
-        return StateSpace(A, B, C, Dn, p.dt)
+
+def _blocks(rows: list[list[Array]]) -> Array:
+    """Block matrix of stacks of matrices, whose leading axes are broadcast."""
+    batch = np.broadcast_shapes(*(m.shape[:-2] for row in rows for m in row))
+    wide = [np.concatenate([np.broadcast_to(m, (*batch, *m.shape[-2:])) for m in row], axis=-1) for row in rows]
+    return np.concatenate(wide, axis=-2)

@@ -1,11 +1,17 @@
-r"""Mixed H2/H-infinity synthesis (7)-(8): ``min ||T11||_2`` subject to ``||T22||_inf < gamma``, by matrix inequalities, verified.
+r"""Mixed H2/H-infinity synthesis (7)-(8): ``min ||T11||_2`` subject to ``||T22||_inf < gamma``, every number recomputed.
 
-The inequalities use one Lyapunov matrix for both channels; their value bounds ``||T11||_2`` from above, often by far. Scaling the second
-channel (``w2 -> a w2``, ``z2 -> z2 / a``) leaves the problem as it is and changes that bound, so several ``a`` may be tried.
+    H2 optimum without the constraint --(constraint met)--> optimal
+        |
+        v
+    matrix inequalities: common and extended, several scalings of channel 2  -->  candidates
+    H-infinity controllers of both channels together                         -->  candidates
+        |
+        v
+    verification on the full plant --> local improvement --> verification --> lower bound and gap
 
-*For the paper's observer problem (37)-(39) the scaling must stay at 1.* There ``T11`` does not depend on the uncertainty and ``T22`` not on K:
-the exact optimum is "no correction", and what makes the published gain useful is the common Lyapunov matrix, which adds the response to w2
-to the cost. A small ``a`` only removes that term.
+The inequalities with one Lyapunov matrix for both channels bound ``||T11||_2`` from above, often by far. Scaling the second channel
+(``w2 -> a w2``, ``z2 -> z2 / a``) leaves the problem as it is and changes that bound; so does a Lyapunov matrix for each channel. The unscaled
+common inequalities are always among the candidates, so that nothing is ever worse than they are.
 """
 
 from __future__ import annotations
@@ -13,42 +19,29 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
+from scipy.linalg import LinAlgError
 
-from ..core.errors import ConfigError, SynthesisError
-from ..core.lti import StateSpace
-from ..core.norms import h2_norm, hinf_norm
-from .balance import Balanced, balance
-from .certificate import certify
+from ..core.errors import ConfigError, KrosError, SynthesisError
+from .balance import balance
+from .channels import Verified, scaled, verify
 from .generalized_plant import GeneralizedPlant
-from .h2_optimal import absorb_feedthrough, h2, stability_margin
-from .mixed_lmi import Attempt, MixedInequalities, Solution, ladder
+from .h2_optimal import absorb_feedthrough, h2
+from .hinf_optimal import hinf
+from .mixed_lmi import MixedInequalities
+from .mixed_polish import polish
 from .observer_problem import ObserverProblem
 from .reduction import truncate
 from .result import Status, Synthesis
+from .solvers import Answer, Program, climb
+from .youla import hinf_lower_bound, mixed_lower_bound
 
-Array = npt.NDArray[Any]
 _SCALINGS = (1.0, 4.0, 16.0)
-_LAST_RESORT_S = 5.0  # a first-order solver that needs longer has not returned a stabilising controller in our tests
+_LAST_SCALINGS = (64.0, 256.0)
+_POLISHED = 2
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class _Verified:
-    """A controller that passed verification, with its recomputed norms and how it came about."""
-
-    controller: StateSpace
-    h2: float
-    hinf: float
-    margin: float
-    word: str
-    solver: str
-    value: float
-    scaling: float
 
 
 def mixed(
@@ -58,41 +51,49 @@ def mixed(
     scalings: Sequence[float] | None = None,
     max_states: int = 8,
     time_limit_s: float = 20.0,
+    polished: bool = True,
     noise_floor: float = 1e-3,
     penalty_floor: float = 3e-2,
+    solvers: Sequence[str] | None = None,
 ) -> Synthesis:
     """Return a controller with a small H2 norm in channel 1 and an H-infinity norm below `gamma` in channel 2.
 
     Parameters
     ----------
     plant : GeneralizedPlant or ObserverProblem
-        A regular discrete plant with its channel partition (`n_w1`, `n_z1`); or an observer problem, whose reduced and regularised plant is
-        then used, and whose result is a filter in physical units with a certified ``worst_case_h2``.
+        A discrete plant with its channel partition (`n_w1`, `n_z1`), regular in channel 1; or an observer problem, whose reduced and
+        regularised plant is then used, and whose result is a filter in physical units with a certified ``worst_case_h2``.
     gamma : float
         Level of the H-infinity constraint.
     scalings : sequence of float
-        Scalings of the second channel to try; the best verified result is kept. Default 1, 4 and 16; for observer problems 1, see above.
+        Scalings of the second channel to try; the best verified result is kept. Default 1, 4, 16, and larger ones where these fail. For
+        observer problems see `mixed_observer`.
     max_states : int
         Stable plants are reduced to this number by balanced truncation for the inequalities only (their cost grows with the sixth power of
-        the states, and states of no consequence make them ill-conditioned); where every solver fails, to two fewer. The controller is
-        verified on the full plant.
+        the states, and states of no consequence make them ill-conditioned). The controller is verified on the full plant.
     time_limit_s : float
-        For each call of a solver.
+        For the whole search; what was found by then is returned.
+    polished : bool
+        Improve the best candidates locally. Observer problems are never polished.
     noise_floor : float
         For observer problems: least measurement noise in the inequalities, as a fraction of the measured channel's range; tenfold where the
         solver fails. Inequalities do not resolve an encoder's 1e-7. The certificate uses the true noise.
     penalty_floor : float
         For observer problems: least weight of the scaled correction in the inequalities.
+    solvers : sequence of str, optional
+        Rungs of the ladder, see `kros.synthesis.solvers.installed`.
 
     Returns
     -------
     Synthesis
-        ``h2_norm`` of T11 and ``hinf_norm`` of T22 recomputed on the full plant; ``lower_bound`` is the H2 optimum without the constraint.
+        ``h2_norm`` of T11 and ``hinf_norm`` of T22 recomputed on the full plant; ``lower_bound`` holds for every controller of any order.
 
     Raises
     ------
+    ConfigError
+        When an option is out of range.
     SynthesisError
-        When the plant is not regular, or no solver returned a controller that survives verification (each reason is given).
+        When the plant is not regular, or no controller survives verification (each reason is given).
 
     Examples
     --------
@@ -103,39 +104,152 @@ def mixed(
     >>> mixed(plant).hinf_norm < 1
     True
     """
+    tried = _SCALINGS if scalings is None else tuple(scalings)
+    if gamma <= 0 or not tried or min(tried) <= 0 or time_limit_s <= 0 or max_states < 1:
+        raise ConfigError(
+            f"Mixed synthesis: gamma = {gamma}, scalings = {tried}, time_limit_s = {time_limit_s}, max_states = {max_states} should all be positive."
+        )
     if isinstance(plant, ObserverProblem):
-        options = {"gamma": gamma, "scalings": scalings or (1.0,), "max_states": max_states, "time_limit_s": time_limit_s}
-        return _for_observer(plant, noise_floor, penalty_floor, options)
-    scalings = _SCALINGS if scalings is None else scalings
+        from .mixed_observer import for_observer
+
+        return for_observer(
+            plant,
+            noise_floor,
+            penalty_floor,
+            gamma=gamma,
+            scalings=scalings,
+            max_states=max_states,
+            time_limit_s=time_limit_s,
+            solvers=solvers,
+        )
     if plant.dt == 0:
         raise SynthesisError("Mixed synthesis works in discrete time, found a continuous plant (dt = 0); sample it.")
-    if gamma <= 0 or not scalings or min(scalings) <= 0 or time_limit_s <= 0 or max_states < 1:
-        raise ConfigError(
-            f"Mixed synthesis: gamma = {gamma}, scalings = {tuple(scalings)}, time_limit_s = {time_limit_s}, max_states = {max_states} should all be positive."
-        )
     start = time.perf_counter()
-    reasons: list[str] = []
+    end = start + time_limit_s
+    free = h2(performance(plant))
+    unconstrained = verify(plant, free.controller, gamma, "H2 optimum without the constraint", "riccati")
+    if isinstance(unconstrained, Verified):
+        note = "The H2 optimum meets the constraint: it is the optimum of the mixed problem."
+        return _synthesis(unconstrained, free.lower_bound, Status.OPTIMAL, [note], start)
     notes: list[str] = []
-    found: list[_Verified] = []
-    smaller = max(max_states - 2, 1)
-    tried: set[int] = set()
-    for limit, last_resort in ((max_states, False), (smaller, False), (smaller, True)):
-        small, notes = _reduced(plant, limit)
-        if (last_resort and any("infeasible" in reason for reason in reasons)) or (not last_resort and small.sizes[0] in tried):
-            continue
-        tried.add(small.sizes[0])
-        attempts = ladder(min(time_limit_s, _LAST_RESORT_S) if last_resort else time_limit_s, last_resort=last_resort)
-        found = [v for a in scalings for v in [_best_for(plant, small, gamma, a, attempts, reasons)] if v is not None]
-        if found:
-            break
+    reasons: list[str] = []
+    quick = ("BARRIER",) if solvers is None else solvers
+    found = by_inequalities(plant, gamma, tried, max_states, end, reasons, notes, quick, extended=True)
+    found += by_hinf(plant, gamma, end, reasons)
+    if not found and scalings is None:
+        found = by_inequalities(plant, gamma, _LAST_SCALINGS, max_states, end, reasons, notes, solvers)
     if not found:
-        told = "; ".join(dict.fromkeys(reason.split(". Try another solver")[0] for reason in reasons))
-        raise SynthesisError(f"Mixed synthesis: no controller survived; {told}. Raise gamma, max_states, noise or the time limit.")
+        raise _failure(plant, gamma, reasons)
+    if polished:
+        found += _improved(plant, found, gamma, end)
     best = min(found, key=lambda v: v.h2)
-    return _synthesis(plant, best, notes, time.perf_counter() - start)
+    lower = free.lower_bound or 0.0
+    if best.h2 > 1.01 * lower and time.perf_counter() < end:
+        lower = max(lower, mixed_lower_bound(plant, gamma, best.h2, time_limit_s=min(end - time.perf_counter(), 3.0)))
+    notes.append(f"Found by: {best.origin}.")
+    return _synthesis(best, lower, Status.CERTIFIED if best.optimal else Status.INACCURATE, notes, start)
 
 
-def _reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant, list[str]]:
+def performance(plant: GeneralizedPlant) -> GeneralizedPlant:
+    """Return the plant of channel 1 alone."""
+    return plant.channel(plant.rows(1), plant.columns(1))
+
+
+def by_inequalities(
+    plant: GeneralizedPlant,
+    gamma: float,
+    scalings: Sequence[float],
+    max_states: int,
+    end: float,
+    reasons: list[str],
+    notes: list[str],
+    solvers: Sequence[str] | None = None,
+    extended: bool = False,
+) -> list[Verified]:
+    """Candidates from the matrix inequalities, one for each scaling that works; with two Lyapunov matrices too where that is asked for."""
+    small, done = reduced(plant, max_states)
+    notes += done
+    found: list[Verified] = []
+    for kind in (False, True) if extended else (False,):
+        # With a Lyapunov matrix for each channel the scaling hardly matters.
+        for a in scalings[:1] if kind else scalings:
+            left = end - time.perf_counter()
+            if left <= 0:
+                reasons.append("the time limit was reached")
+                return found
+            try:
+                balanced = balance(scaled(small, a))
+                inequalities = MixedInequalities(balanced, gamma, kind)
+                program = Program(inequalities.objective(), inequalities.blocks(), inequalities.start())
+            except (SynthesisError, LinAlgError, ValueError) as error:
+                reasons.append(f"scaling {a:g}: {error}")
+                continue
+            label = f"{'extended' if kind else 'common'} inequalities, scaling {a:g}"
+
+            def check(
+                answer: Answer, inequalities: MixedInequalities = inequalities, size: float = balanced.size, label: str = label
+            ) -> Verified | str:
+                assert answer.x is not None
+                try:
+                    K = absorb_feedthrough(inequalities.controller(answer.x), plant.D22)
+                except (LinAlgError, KrosError) as error:
+                    return f"{answer.solver}: the controller cannot be recovered ({error})"
+                origin = f"{answer.solver} ({answer.word}), {label}, their value {size * np.sqrt(max(answer.value, 0.0)):.6g}"
+                return verify(plant, K, gamma, origin, answer.solver.lower(), answer.optimal)
+
+            result = climb(program, check, time_limit_s=left, rungs=solvers)
+            reasons += [f"{label}, {told}" for told in result.told]
+            if result.accepted is not None:
+                found.append(result.accepted)
+    return found
+
+
+def by_hinf(plant: GeneralizedPlant, gamma: float, end: float, reasons: list[str]) -> list[Verified]:
+    """Candidates from H-infinity synthesis of both channels together, channel 1 with less and less weight."""
+    found: list[Verified] = []
+    one_z, one_w = plant.rows(1), plant.columns(1)
+    for share in (0.3, 0.1, 0.03, 0.01, 1e-3):
+        if time.perf_counter() > end:
+            break
+        left, right = np.ones(plant.sizes[3]), np.ones(plant.sizes[1])
+        left[one_z], right[one_w] = share, share
+        weighted = replace(
+            plant,
+            B1=plant.B1 * right,
+            D21=plant.D21 * right,
+            C1=plant.C1 * left[:, None],
+            D12=plant.D12 * left[:, None],
+            D11=plant.D11 * left[:, None] * right,
+        )
+        try:
+            K = hinf(weighted, gamma=gamma * (1 - 1e-3)).controller
+        except KrosError as error:
+            reasons.append(f"H-infinity synthesis, channel 1 times {share:g}: {error}")
+            continue
+        verdict = verify(plant, K, gamma, f"H-infinity synthesis, channel 1 times {share:g}", "riccati")
+        if isinstance(verdict, Verified):
+            found.append(verdict)
+            if len(found) == 2:
+                break
+    return found
+
+
+def _improved(plant: GeneralizedPlant, found: list[Verified], gamma: float, end: float) -> list[Verified]:
+    """Best candidates after local improvement."""
+    better = []
+    for v in sorted(found, key=lambda v: v.h2)[:_POLISHED]:
+        left = end - time.perf_counter()
+        if left <= 0:
+            break
+        verdict = verify(
+            plant, polish(plant, v.controller, gamma, left / 2), gamma, f"{v.origin}; then local improvement", v.solver, v.optimal
+        )
+        if isinstance(verdict, Verified):
+            better.append(verdict)
+    return better
+
+
+def reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant, list[str]]:
     """Plant for the inequalities, and what was done to it."""
     n = plant.sizes[0]
     if not plant.open_loop().is_stable():
@@ -149,103 +263,33 @@ def _reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant
     ]
 
 
-def _best_for(
-    plant: GeneralizedPlant, small: GeneralizedPlant, gamma: float, scaling: float, attempts: Sequence[Attempt], reasons: list[str]
-) -> _Verified | None:
-    """Climb the ladder of solvers for one scaling until a controller survives verification."""
-    balanced = balance(_scaled(small, scaling))
-    inequalities = MixedInequalities(balanced.plant, balanced.spread, gamma)
-    for attempt in attempts:
-        solution = inequalities.solve(attempt)
-        verdict = solution if isinstance(solution, str) else _verify(plant, balanced, solution, gamma, attempt.solver, scaling)
-        if isinstance(verdict, _Verified):
-            return verdict
-        _log.info("Mixed synthesis, scaling %g: %s", scaling, verdict)
-        reasons.append(f"scaling {scaling:g}, {verdict}")
-    return None
-
-
-def _scaled(plant: GeneralizedPlant, a: float) -> GeneralizedPlant:
-    """Scale channel 2: ``w2 -> a w2``, ``z2 -> z2 / a``."""
-    left, right = np.ones(plant.sizes[3]), np.ones(plant.sizes[1])
-    left[plant.rows(2)], right[plant.columns(2)] = 1 / a, a
-    D11 = plant.D11 * left[:, None] * right
-    return replace(plant, B1=plant.B1 * right, D21=plant.D21 * right, C1=plant.C1 * left[:, None], D12=plant.D12 * left[:, None], D11=D11)
-
-
-def _verify(plant: GeneralizedPlant, balanced: Balanced, solution: Solution, gamma: float, solver: str, scaling: float) -> _Verified | str:
-    """Recompute everything on the full plant; return what was found, or why it is rejected."""
-    K = absorb_feedthrough(solution.controller, plant.D22)
-    closed = plant.close(K)
-    margin = stability_margin(closed)
-    if margin >= 1:
-        return f"{solver} ({solution.word}): closed loop unstable, spectral radius {margin:.6g}"
-    norm, peak = h2_norm(part(plant, closed, 1)), hinf_norm(part(plant, closed, 2))
-    if peak >= gamma:
-        return f"{solver} ({solution.word}): ||T22|| = {peak:.6g} is not below {gamma:g}"
-    value = float(np.sqrt(max(solution.value, 0.0))) * balanced.size
-    return _Verified(K, norm, peak, margin, solution.word, solver, value, scaling)
-
-
-def part(plant: GeneralizedPlant, closed: StateSpace, channel: int) -> StateSpace:
-    """Cut T11 (channel 1) or T22 (channel 2) out of the closed loop."""
-    rows, columns = plant.rows(channel), plant.columns(channel)
-    return StateSpace(closed.A, closed.B[:, columns], closed.C[rows], closed.D[rows][:, columns], closed.dt)
-
-
-def _synthesis(plant: GeneralizedPlant, best: _Verified, notes: list[str], elapsed: float) -> Synthesis:
-    lower = h2(plant.channel(plant.rows(1), plant.columns(1))).lower_bound
-    useful = lower is not None and lower > 1e-9 * best.h2
-    notes.append(
-        f"Value of the inequalities {best.value:.6g} (bound of the H2 norm with the common Lyapunov matrix), channel scaling {best.scaling:g}."
+def _failure(plant: GeneralizedPlant, gamma: float, reasons: list[str]) -> SynthesisError:
+    least = hinf_lower_bound(plant)
+    if least >= gamma:
+        return SynthesisError(
+            f"Mixed synthesis: gamma = {gamma:g} is infeasible, no controller has ||T22|| below {least:.6g}; raise gamma, or make the weights of "
+            "channel 2 smaller."
+        )
+    told = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
+    return SynthesisError(
+        f"Mixed synthesis: no controller survived; {told}. No controller has ||T22|| below {least:.6g}; raise gamma = {gamma:g}, max_states, noise or "
+        "the time limit."
     )
+
+
+def _synthesis(best: Verified, lower: float | None, status: Status, notes: list[str], start: float) -> Synthesis:
+    useful = lower is not None and lower > 1e-9 * best.h2
+    bound = min(lower, best.h2) if lower is not None else None
     return Synthesis(
         method="mixed",
         controller=best.controller,
-        status=Status.CERTIFIED if best.word == "optimal" else Status.INACCURATE,
+        status=status,
         h2_norm=best.h2,
         hinf_norm=best.hinf,
-        lower_bound=lower,
-        gap_percent=100 * (best.h2 / lower - 1) if useful and lower else None,
+        lower_bound=bound,
+        gap_percent=100 * (best.h2 / bound - 1) if useful and bound else None,
         spectral_radius=best.margin,
-        solve_s=elapsed,
-        solver=best.solver.lower(),
+        solve_s=time.perf_counter() - start,
+        solver=best.solver,
         notes=tuple(notes),
-    )
-
-
-def _for_observer(problem: ObserverProblem, noise_floor: float, penalty_floor: float, options: dict[str, Any]) -> Synthesis:
-    """Solve the reduced observer problem on noise that the inequalities resolve; certify the filter on the set, in physical units."""
-    problem.require_sound()
-    ranges = np.abs(problem.C) @ problem.output_scale
-    reasons = []
-    for floor in (noise_floor, 10 * noise_floor):
-        noisy = replace(problem, noise=np.maximum(problem.noise, floor * ranges))
-        try:
-            found = mixed(noisy.mixed_plant(noise_floor=0.0, penalty_floor=penalty_floor), **options)
-        except SynthesisError as error:
-            reasons.append(f"with measurement noise of {floor:g} of the range: {error}")
-        else:
-            return _certified(problem, noisy, found)
-    raise SynthesisError(" ".join(reasons))
-
-
-def _certified(problem: ObserverProblem, noisy: ObserverProblem, found: Synthesis) -> Synthesis:
-    """Certify what was found on the noisy problem for the true one."""
-    controller = noisy.to_physical(found.controller)
-    value, error = certify(problem, controller)
-    return replace(
-        found,
-        controller=controller,
-        injection=problem.injection,
-        worst_case_h2=value,
-        quadrature_error=error,
-        spectral_radius=float(problem.error_system(controller).spectral_radius()),
-        lower_bound=None,
-        gap_percent=None,
-        notes=(
-            *found.notes,
-            "T11 contains the measurement noise only and T22 does not depend on K; worst_case_h2 is the meaningful number. "
-            "The spectral radius is that of the nominal loop and says nothing about robustness.",
-        ),
     )

@@ -32,7 +32,8 @@ def observer_lines(result: RunResult) -> list[str]:
         means = []
         for channel in channels:
             values = [r["error_percent"] for r in rows if r["observer"] == name and r["channel"] == channel]
-            means.append(f"{sum(values) / len(values):12.4g}" if None not in values else f"{'diverged':>12}")
+            mean = "–" if not values else ("diverged" if None in values else f"{sum(values) / len(values):.4g}")  # some estimate one channel
+            means.append(f"{mean:>12}")
         mark = "  <- deployed" if name == metrics["study"].get("deployed") else ""
         lines.append(f"{name:<{width}}  {''.join(means)}{mark}")
     return lines

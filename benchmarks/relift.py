@@ -4,7 +4,8 @@
 
 Prints one JSON line a population, then what holds over all of them. Studies run up to the synthesis of their observers and are kept in the
 cache, so that work on the certificate repeats quickly; `--only-studies` stops there. Every observer is attacked with at least `--steps` simulated
-steps by `attack` (energy gain of the error system, slopes and disturbances chosen against it), and, as it runs, by `attack_running`.
+steps by `attack` (energy gain of the error system, slopes and disturbances chosen against it), and, as it runs, by `attack_running`. Shares are of what the
+certificate allows: above one it would be refuted.
 """
 
 from __future__ import annotations
@@ -18,13 +19,19 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from kros.core.artifacts import write_json
+import numpy as np
+
+from kros.core.artifacts import read_json, write_json
+from kros.data import read_parquet
+from kros.evaluate import EpisodeBatch
+from kros.observer import Observer, ReliftScales, attack, attack_running, one_step_residual, relift_certificate, relift_report
 from kros.study import run_study, validate_config
 from kros.study.config import Stage
 from kros.study.context import Context, Silent
 from kros.study.demo import simulate_to
 from kros.study.executors import open_executor
 from kros.study.makers import produce
+from kros.study.stages import calibrate
 from kros.study.stages.synthesize import tasks_of
 from kros.study.store import Store
 
@@ -48,12 +55,24 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--cache", type=Path, default=Path("runs/relift"))
-    parser.add_argument("--only-studies", action="store_true")
+    parser.add_argument("--only-studies", action="store_true", help="make the studies and stop")
+    parser.add_argument("--no-studies", action="store_true", help="take what the cache has")
     options = parser.parse_args()
+    rows = []
     for seed, loop, spread in product(options.seeds, options.loop, options.spread):
+        folder = options.cache / f"{loop}-{spread:g}-{seed}"
+        if options.no_studies and not (folder / "run" / "observers" / "made.json").exists():
+            continue
         start = time.perf_counter()
-        run = study(options.cache / f"{loop}-{spread:g}-{seed}", seed, loop, spread, options)
-        tell({"loop": loop, "spread": spread, "seed": seed, "study": run.name, "study_s": round(time.perf_counter() - start, 1)})
+        run = study(folder, seed, loop, spread, options)
+        told: dict[str, Any] = {"loop": loop, "spread": spread, "seed": seed, "study_s": round(time.perf_counter() - start, 1)}
+        if not options.only_studies:
+            found = certified(folder, run, options)
+            rows.append(found)
+            told |= found
+        tell(told)
+    if rows:
+        tell(summary(rows))
 
 
 def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.Namespace) -> Path:
@@ -74,6 +93,88 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
                 made.append([task.name, product.facts.get("reason")])
         write_json(run / "observers" / "made.json", made)
     return run
+
+
+def certified(folder: Path, run: Path, options: argparse.Namespace) -> dict[str, Any]:
+    """Certify and attack every observer of one population."""
+    config = validate_config({**STUDY, "data": {"source": str((folder / "recordings").absolute()), "reader": "parquet"}}, folder)
+    with open_executor(1) as executor:
+        context = Context(config, Store(run), executor, Silent())
+        facts, calibration, population = context.facts, calibrate.load(context), read_parquet(folder / "recordings")
+        keys = [facts.keys("train", unit, facts.identify_on)[0] for unit in facts.pooled]
+        batch = EpisodeBatch.read(population, keys)
+    phases = {} if calibration is None else {"phase": np.array([calibration.units[k.unit].phase_rad for k in keys])}
+    noise = np.array([facts.resolution["position"] / np.sqrt(12)])
+    found = {}
+    for name, reason in read_json(run / "observers" / "made.json"):
+        if reason is not None:
+            found[name] = {"reason": reason}
+            continue
+        observer = Observer.load(run / "observers" / f"{name}.json")
+        values = phases if observer.lifting.parameters else None
+        found[name] = judged(observer, batch, values, noise, options)
+    return found
+
+
+def judged(observer: Observer, batch: EpisodeBatch, values: Any, noise: np.ndarray, options: argparse.Namespace) -> dict[str, Any]:
+    """Return what is certified about one observer, how close its errors come, and how close the adversary does."""
+    residual = one_step_residual(observer.lifting, observer.A, observer.B, batch.states, batch.inputs, values)
+    scales = ReliftScales.typical(np.abs(batch.states).max(axis=(0, 1)), residual, noise)
+    start = time.process_time()
+    certificate = relift_certificate(observer, scales=scales)
+    told: dict[str, Any] = {
+        "states": observer.lifting.n_states + observer.controller.n_states,
+        "cpu_s": round(time.process_time() - start, 3),
+    }
+    if certificate.gain is None:
+        return told | {"certified": False, "reason": certificate.reason}
+    rows = relift_report(certificate, observer, batch.states, batch.inputs, [k.unit for k in batch.keys], batch.lengths, values)
+    start = time.process_time()
+    worst = attack(certificate, observer, steps=options.steps)
+    share, steps = attack_running(certificate, observer, worst.disturbance, batch.states[0], batch.inputs, values)
+    told |= {
+        "certified": True,
+        "gain": certificate.gain,
+        "lower_bound": certificate.lower_bound,
+        "mismatch_gain": certificate.mismatch_gain,
+    }
+    told |= {"error_of_bound": [r.error / r.bound for r in rows], "error_of_gain_bound": [r.error / r.gain_bound for r in rows]}
+    told |= {
+        "attack": worst.share,
+        "attack_running": share,
+        "steps": worst.steps + steps,
+        "attack_s": round(time.process_time() - start, 2),
+    }
+    return {key: rounded(value) for key, value in told.items()}
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what holds over all populations, observer by observer."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    told: dict[str, Any] = {"populations": len(rows)}
+    for name in names:
+        made = [row[name] for row in rows if name in row and "reason" not in row[name]]
+        tried = [row[name] for row in rows if name in row and "cpu_s" in row[name]]
+        told[name] = {"made": len(tried), "certified": len(made)}
+        if made:
+            told[name] |= {
+                "gain_over_lower_bound_max": rounded(max(m["gain"] / m["lower_bound"] for m in made)),
+                "attack_share": [rounded(f([m["attack"] for m in made])) for f in (min, max)],
+                "attack_running_share": [rounded(f([m["attack_running"] for m in made])) for f in (min, max)],
+                "error_of_bound": [rounded(f([v for m in made for v in m["error_of_bound"]])) for f in (min, np.median, max)],
+                "error_of_gain_bound": [rounded(f([v for m in made for v in m["error_of_gain_bound"]])) for f in (min, np.median, max)],
+                "states_max": max(m["states"] for m in made),
+                "cpu_s_max": max(m["cpu_s"] for m in made),
+                "steps_min": min(m["steps"] for m in made),
+            }
+    return told
+
+
+def rounded(value: Any) -> Any:
+    """Return numbers with six digits."""
+    if isinstance(value, list):
+        return [rounded(v) for v in value]
+    return float(f"{value:.6g}") if isinstance(value, float | np.floating) else value
 
 
 def tell(row: dict[str, Any]) -> None:

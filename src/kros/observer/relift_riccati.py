@@ -32,6 +32,9 @@ _GRID = 200
 _STEPS = (1.001, 1.003, 1.01, 1.03, 1.1, 1.3, 2.0)
 _SPARE = 0.25  # share of the distance to one that the extra output may take
 _TOLERANCE = 1e-8
+_FLOOR = 1e-12
+_REFINEMENTS = 2
+_DOUBLINGS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +82,9 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
     outputs = np.vstack([root[:, None] * system.M, system.C])
     feed = np.zeros((len(outputs), inputs.shape[1]))
     feed[:width, width:] = root[:, None] * system.D / gain
-    size = np.sqrt(np.maximum(np.diag(gramian(system.A, inputs, system.dt)), 0.0))
-    size[size == 0] = 1.0
-    A, inputs, outputs = system.A / size[:, None] * size, inputs / size[:, None], outputs * size
-    n = len(A)
+    T, back = _reachable_coordinates(system.A, inputs, system.dt)
+    n = len(T)
+    A, inputs, outputs = np.eye(n) + back @ (system.A - np.eye(n)) @ T, back @ inputs, outputs @ T
     room = 1 - (hinf_norm(StateSpace(A, inputs, outputs, feed, system.dt), _TOLERANCE) * (1 + _TOLERANCE)) ** 2
     if room <= 0:
         return None
@@ -92,10 +94,38 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
     S, W = outputs.T @ feed, feed.T @ feed - np.eye(inputs.shape[1])
     try:
         P = solve_discrete_are(A, inputs, Q, W, s=S)
-        R = np.linalg.cholesky((P + P.T) / 2).T
+        for _ in range(_REFINEMENTS):
+            P = _newton_step(P, A, inputs, Q, W, S)
+        R = np.linalg.cholesky(P).T
     except (np.linalg.LinAlgError, ValueError):
         return None
-    return np.asarray(R / size)
+    return np.asarray(np.linalg.qr(R @ back, mode="r"))
+
+
+def _reachable_coordinates(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
+    """Return T and its inverse, for coordinates in which a reachability Gramian is the identity.
+
+    A Lyapunov matrix is then at most gamma^2 there, however poorly some states are reached.
+    """
+    W = gramian(A, B, dt)
+    size = np.sqrt(np.maximum(np.diag(W), 0.0))
+    size[size == 0] = 1.0
+    values, vectors = np.linalg.eigh(W / np.outer(size, size))
+    root = np.sqrt(np.maximum(values, _FLOOR * values.max()))
+    return size[:, None] * vectors * root, (vectors / root).T / size
+
+
+def _newton_step(P: Array, A: Array, B: Array, Q: Array, W: Array, S: Array) -> Array:
+    """Refine a stabilising solution: the Stein equation of its closed loop, summed by doubling."""
+    K = -np.linalg.solve(W + B.T @ P @ B, B.T @ P @ A + S.T)
+    closed, total = A + B @ K, Q + S @ K + K.T @ S.T + K.T @ W @ K
+    for _ in range(_DOUBLINGS):
+        step = closed.T @ total @ closed
+        total = total + step
+        if np.abs(step).max(initial=0.0) <= 1e-17 * np.abs(total).max(initial=0.0):
+            break
+        closed = closed @ closed
+    return np.asarray((total + total.T) / 2)
 
 
 def _plain(system: ErrorSystem) -> StateSpace:

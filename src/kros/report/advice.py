@@ -54,7 +54,7 @@ def _observer(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str
     if not tables or name not in tables[0].cells:
         return []
     table, other = tables[0], f"{split_observer(name)[0]}/open_loop"
-    hidden = [c for c in table.channels if c not in measured] or list(table.channels)
+    hidden = [c for c in table.channels if c not in measured and c in table.cells[name]] or list(table.cells[name])
     own = [table.cells[name][c].mean for c in hidden]
     if any(value is None for value in own):
         return [
@@ -76,7 +76,8 @@ def _observer(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str
 
 def _smaller(table: ErrorTable, one: str, other: str, channels: Sequence[str], ratio: float) -> bool:
     """Whether the mean errors of one observer are below a ratio of another's, in all channels."""
-    pairs = [(table.cells[one][c].mean, table.cells[other][c].mean) for c in channels if c in table.cells[one]]
+    known = [c for c in channels if c in table.cells[one] and c in table.cells[other]]
+    pairs = [(table.cells[one][c].mean, table.cells[other][c].mean) for c in known]
     return len(pairs) == len(channels) and all(a is not None and (b is None or a < ratio * b) for a, b in pairs)
 
 

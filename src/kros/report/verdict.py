@@ -50,7 +50,7 @@ def _handed_over(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[
     if not tables or name not in tables[0].cells:
         return [*sentences, "It has not been evaluated."]
     table = tables[0]
-    hidden = [c for c in table.channels if c not in measured] or list(table.channels)
+    hidden = [c for c in table.channels if c not in measured and c in table.cells[name]] or list(table.cells[name])
     source = f"From {' and '.join(measured)} alone it" if measured else "It"
     known = [c for c in hidden if table.cells[name][c].mean is not None]
     if not known:
@@ -88,7 +88,7 @@ def _comparison(table: ErrorTable, name: str, method: str, label: str, channels:
     )
     if other is None or other == name:
         return []
-    theirs = {c: table.cells[other][c].mean for c in channels}
+    theirs = {c: table.cells[other][c].mean for c in channels if c in table.cells[other]}
     if any(value is None for value in theirs.values()):
         return [f"{label} diverges on some units."]
     parts = [f"{c.replace('_', ' ')} {number(v)} %{_ratio(table.cells[name][c].mean, v)}" for c, v in theirs.items() if v is not None]

@@ -32,8 +32,8 @@ def observer_lines(result: RunResult) -> list[str]:
         means = []
         for channel in channels:
             values = [r["error_percent"] for r in rows if r["observer"] == name and r["channel"] == channel]
-            mean = "–" if not values else ("diverged" if None in values else f"{sum(values) / len(values):.4g}")  # some estimate one channel
-            means.append(f"{mean:>12}")
+            known = "diverged" if None in values else f"{sum(values) / max(len(values), 1):.4g}"
+            means.append(f"{known if values else '–':>12}")  # some observers estimate one channel only
         mark = "  <- deployed" if name == metrics["study"].get("deployed") else ""
         lines.append(f"{name:<{width}}  {''.join(means)}{mark}")
     return lines

@@ -63,7 +63,9 @@ def _order(cells: Mapping[str, ErrorCell], channels: Sequence[str]) -> float:
 
 def _draw_row(axes: Axes, place: int, cell: ErrorCell | None, observer: str) -> None:
     colour = observer_look(observer).colour
-    if cell is None or cell.mean is None:
+    if cell is None:  # not what this observer estimates
+        return
+    if cell.mean is None:
         axes.annotate("diverged", (0.98, place), xycoords=("axes fraction", "data"), ha="right", va="center", size=7, color=Tone.SOFT.light)
         return
     if cell.worst is not None:

@@ -36,8 +36,9 @@ from .mu_scalings import scalings
 Array = npt.NDArray[Any]
 
 _POINTS = 200
-_REFINEMENTS = 6
-_PEAKS = 3
+_REFINEMENTS = 12
+_PEAKS = 2
+_FLAT = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +166,9 @@ def _between(freqs: Array, upper: Array) -> Array:
     """Points on both sides of the highest local maxima."""
     padded = np.concatenate([[-np.inf], upper, [-np.inf]])
     peaks = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]))
+    lowest = np.minimum(padded[peaks], padded[peaks + 2])
+    lowest = np.where(np.isfinite(lowest), lowest, np.maximum(padded[peaks], padded[peaks + 2]))
+    peaks = peaks[lowest < upper[peaks] * (1 - _FLAT)]  # others are resolved
     peaks = peaks[np.argsort(-upper[peaks])][:_PEAKS]
     left, right = peaks[peaks > 0], peaks[peaks < len(freqs) - 1]
     gaps = np.concatenate([np.stack([freqs[left - 1], freqs[left]]), np.stack([freqs[right], freqs[right + 1]])], axis=1)

@@ -28,8 +28,8 @@ Array = npt.NDArray[Any]
 
 _SWEEPS = 20
 _ROUNDS = 40
-_NEWTON = 12
-_STEP = 0.2  # lambda comes this close to what the centre attains
+_NEWTON = 40
+_STEP = 0.1  # lambda comes this close to what the centre attains
 _CLOSE = 1e-7
 _RIDGE = 1e-13
 
@@ -55,7 +55,10 @@ def scalings(M: Array, structure: Structure, diagonal: bool = False) -> Scalings
     scale = np.maximum(np.linalg.norm(M, axis=(-2, -1)), 1e-300)[:, None, None]
     M = M / scale
     E_L, E_R = structure.basis(diagonal)
-    x = _osborne(M, structure, len(E_L))
+    start_L, start_R = _osborne(M, structure)
+    M = start_L[:, :, None] * M / start_R[:, None, :]
+    x = np.zeros((len(M), len(E_L)))
+    x[:, np.abs(np.trace(E_L, axis1=1, axis2=2)) > 0] = 0.5
     best = _attained(M, x, E_L, E_R)
     best_x, level = x, best * 1.2 + 1e-30
     active = np.arange(len(M))
@@ -70,7 +73,8 @@ def scalings(M: Array, structure: Structure, diagonal: bool = False) -> Scalings
         active = active[gained]
         if not active.size or E_L.shape[0] == 1:
             break
-    X_L, X_R = np.tensordot(best_x, E_L, 1), np.tensordot(best_x, E_R, 1)
+    X_L = start_L[:, :, None] * np.tensordot(best_x, E_L, 1) * start_L[:, None, :]
+    X_R = start_R[:, :, None] * np.tensordot(best_x, E_R, 1) * start_R[:, None, :]
     return Scalings(np.sqrt(np.maximum(best, 0.0)) * scale[:, 0, 0], X_L, X_R)
 
 
@@ -82,25 +86,18 @@ def _attained(M: Array, x: Array, E_L: Array, E_R: Array) -> Array:
     return np.asarray(np.linalg.norm(scaled, 2, axis=(-2, -1)) ** 2)
 
 
-def _osborne(M: Array, structure: Structure, size: int) -> Array:
-    """Coordinates of the scalings that balance the norms of the blocks, the largest of them one half; shape (f, size)."""
+def _osborne(M: Array, structure: Structure) -> tuple[Array, Array]:
+    """Scalings of the signals of z, shape (f, z), and of w that balance the norms of the blocks, the largest of them one."""
     seen, driven = structure.seen(), structure.driven()
-    squared = np.array([[np.sum(np.abs(M[:, r, c]) ** 2, axis=(-2, -1)) for c in driven] for r in seen]).transpose(2, 0, 1)
     n = len(seen)
-    squared = squared * (1 - np.eye(n)) + 1e-12
-    d = np.ones((len(M), n))
-    for _ in range(_SWEEPS):
+    squared = np.array([[np.sum(np.abs(M[:, r, c]) ** 2, axis=(-2, -1)) for c in driven] for r in seen]).transpose(2, 0, 1)
+    squared = (squared + 1e-12) * (1 - np.eye(n))
+    d = np.ones((len(M), n))  # squares of the scalings
+    for _ in range(_SWEEPS if n > 1 else 0):
         for i in range(n):
-            row, column = (
-                (squared[:, i, :] / d).sum(axis=1) - squared[:, i, i] / d[:, i],
-                (squared[:, :, i] * d).sum(axis=1) - squared[:, i, i] * d[:, i],
-            )
-            d[:, i] = np.sqrt(column / row) if n > 1 else 1.0
-    d = 0.5 * d / d.max(axis=1, keepdims=True)
-    x = np.zeros((len(M), size))
-    sizes = [b.rows if b.repeated else 1 for b in structure.blocks]
-    x[:, : sum(sizes)] = np.repeat(d, sizes, axis=1)
-    return x
+            d[:, i] = np.sqrt(np.sum(squared[:, :, i] * d, axis=1) / np.sum(squared[:, i, :] / d, axis=1))
+    d = np.sqrt(d / d.max(axis=1, keepdims=True))
+    return np.repeat(d, [b.columns for b in structure.blocks], axis=1), np.repeat(d, [b.rows for b in structure.blocks], axis=1)
 
 
 def _centre(M: Array, x: Array, level: Array, E_L: Array, E_R: Array) -> Array:

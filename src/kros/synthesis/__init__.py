@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .unit_check import UnitCheck, check_units
     from .worst_case import worst_case_h2
     from .worst_case_hinf import worst_case_hinf
+    from .youla import YoulaBound, youla_bound
 
 _HOME = {
     "Bank": "shaping",
@@ -42,6 +43,7 @@ _HOME = {
     "Status": "result",
     "Synthesis": "result",
     "UnitCheck": "unit_check",
+    "YoulaBound": "youla",
     "check_units": "unit_check",
     "dk_iteration": "dk",
     "h2": "h2_optimal",
@@ -59,6 +61,7 @@ _HOME = {
     "shaping_filter": "shaping",
     "worst_case_h2": "worst_case",
     "worst_case_hinf": "worst_case_hinf",
+    "youla_bound": "youla",
 }
 
 __all__ = [
@@ -72,6 +75,7 @@ __all__ = [
     "Status",
     "Synthesis",
     "UnitCheck",
+    "YoulaBound",
     "check_units",
     "dk_iteration",
     "h2",
@@ -89,6 +93,7 @@ __all__ = [
     "shaping_filter",
     "worst_case_h2",
     "worst_case_hinf",
+    "youla_bound",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)

@@ -124,6 +124,10 @@ def mixed(
         )
     if plant.dt == 0:
         raise SynthesisError("Mixed synthesis works in discrete time, found a continuous plant (dt = 0); sample it.")
+    if not plant.sizes[0]:
+        raise SynthesisError(
+            "Mixed synthesis needs a plant with states, found none; without dynamics the best gain is a small convex problem."
+        )
     start = time.perf_counter()
     end = start + time_limit_s
     free = h2(performance(plant))
@@ -136,10 +140,14 @@ def mixed(
     quick = ("BARRIER",) if solvers is None else solvers
     found = by_inequalities(plant, gamma, tried, max_states, end, reasons, notes, quick, extended=True)
     found += by_hinf(plant, gamma, end, reasons)
-    if not found and scalings is None:
-        found = by_inequalities(plant, gamma, _LAST_SCALINGS, max_states, end, reasons, notes, solvers)
     if not found:
-        raise _failure(plant, gamma, reasons)
+        require_attainable(plant, gamma)
+        found = by_inequalities(plant, gamma, _LAST_SCALINGS if scalings is None else tried, max_states, end, reasons, notes, solvers)
+    if not found:
+        told = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
+        raise SynthesisError(
+            f"Mixed synthesis: no controller survived; {told}. Raise gamma = {gamma:g}, max_states, noise or the time limit."
+        )
     if polished:
         found += _improved(plant, found, gamma, end)
     best = min(found, key=lambda v: v.h2)
@@ -252,8 +260,15 @@ def _improved(plant: GeneralizedPlant, found: list[Verified], gamma: float, end:
 def reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant, list[str]]:
     """Plant for the inequalities, and what was done to it."""
     n = plant.sizes[0]
-    if not plant.open_loop().is_stable():
-        return plant, [f"The plant is unstable and was not reduced: {n} states in the inequalities."] if n > max_states else []
+    radius = float(plant.open_loop().spectral_radius())
+    if radius >= 1:
+        # What can be reached and seen does not depend on the size of A.
+        shrunk, _ = truncate(replace(plant, A=plant.A / (1.1 * radius)), n)
+        small = replace(shrunk, A=shrunk.A * (1.1 * radius)) if shrunk.sizes[0] < n else plant
+        kept = small.sizes[0]
+        return small, [
+            f"The plant is unstable and was made minimal only: {kept} of {n} states in the inequalities."
+        ] if n > max_states else []
     small, tail = truncate(plant, max_states)
     kept = small.sizes[0]
     if kept == n:
@@ -263,18 +278,14 @@ def reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant,
     ]
 
 
-def _failure(plant: GeneralizedPlant, gamma: float, reasons: list[str]) -> SynthesisError:
+def require_attainable(plant: GeneralizedPlant, gamma: float) -> None:
+    """Raise a `SynthesisError` when a bound shows that no controller attains the level."""
     least = hinf_lower_bound(plant)
     if least >= gamma:
-        return SynthesisError(
+        raise SynthesisError(
             f"Mixed synthesis: gamma = {gamma:g} is infeasible, no controller has ||T22|| below {least:.6g}; raise gamma, or make the weights of "
             "channel 2 smaller."
         )
-    told = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
-    return SynthesisError(
-        f"Mixed synthesis: no controller survived; {told}. No controller has ||T22|| below {least:.6g}; raise gamma = {gamma:g}, max_states, noise or "
-        "the time limit."
-    )
 
 
 def _synthesis(best: Verified, lower: float | None, status: Status, notes: list[str], start: float) -> Synthesis:

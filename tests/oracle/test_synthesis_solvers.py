@@ -1,0 +1,130 @@
+"""The barrier method and the ladder of solvers against closed forms and against Clarabel."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_lyapunov
+
+from kros.core import SynthesisError
+from kros.synthesis import GeneralizedPlant, h2, hinf, mixed
+from kros.synthesis.barrier import Block, Ending, minimise
+from kros.synthesis.solvers import Program, climb, installed, solve
+
+
+def largest_eigenvalue(matrix):
+    """``min t`` subject to ``t I - M >= 0``."""
+    d = len(matrix)
+    return Program(np.ones(1), [Block(-matrix[None], np.eye(d)[None, None])], np.zeros(1))
+
+
+def random_symmetric(seed, d=6):
+    M = np.random.default_rng(seed).standard_normal((d, d))
+    return (M + M.T) / 2
+
+
+@pytest.mark.parametrize("solver", installed())
+def test_every_solver_finds_the_largest_eigenvalue(solver):
+    M = random_symmetric(0)
+    answer = solve(largest_eigenvalue(M), solver, 10.0, 1e-6)
+    assert answer.value == pytest.approx(np.linalg.eigvalsh(M)[-1], rel=1e-4)
+
+
+def test_lower_bound_and_value_enclose_the_optimum():
+    for seed in range(5):
+        M, truth = random_symmetric(seed), np.linalg.eigvalsh(random_symmetric(seed))[-1]
+        program = largest_eigenvalue(M)
+        for rtol in (1e-1, 1e-3, 1e-6):
+            found = minimise(program.c, program.blocks, program.start, rtol=rtol)
+            assert found.lower <= truth <= found.value
+            assert found.value - found.lower <= rtol * abs(found.value) * (1 + 1e-9)
+
+
+def test_lyapunov_inequality_has_the_gramian_as_its_optimum():
+    rng = np.random.default_rng(1)
+    A, B = rng.standard_normal((4, 4)), rng.standard_normal((4, 2))
+    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
+    rows, columns = np.triu_indices(4)
+    units = np.zeros((len(rows), 4, 4))
+    units[np.arange(len(rows)), rows, columns] = units[np.arange(len(rows)), columns, rows] = 1
+    block = Block(-(B @ B.T)[None], (units - A @ units @ A.T)[:, None])
+    found = minimise(np.trace(units, axis1=1, axis2=2), [block], np.zeros(len(rows)), rtol=1e-7)
+    assert found.value == pytest.approx(np.trace(solve_discrete_lyapunov(A, B @ B.T)), rel=1e-5)
+
+
+def test_quadratic_objective_and_several_blocks():
+    # Projection of (2, 1) on the unit disc cut by x >= 0.5 and y >= 0.6.
+    disc = Block(np.eye(3)[None], np.array([[[[0, 1, 0], [1, 0, 0], [0, 0, 0.0]]], [[[0, 0, 1], [0, 0, 0], [1, 0, 0.0]]]]))
+    sides = Block(np.array([[[-0.5]], [[-0.6]]]), np.array([[[[1.0]], [[0.0]]], [[[0.0]], [[1.0]]]]))
+    found = minimise(np.array([-2.0, -1.0]), [disc, sides], np.zeros(2), Q=np.eye(2), rtol=1e-8)
+    assert found.x == pytest.approx([0.8, 0.6], abs=1e-4)
+
+
+def test_infeasible_is_told_from_stalled_and_from_time():
+    contradiction = Block(np.array([[[-1.0]], [[0.5]]]), np.array([[[[1.0]], [[-1.0]]]]))  # x >= 1 and x <= 0.5
+    assert minimise(np.ones(1), [contradiction], np.zeros(1)).ending is Ending.INFEASIBLE
+    program = largest_eigenvalue(random_symmetric(0))
+    assert minimise(program.c, program.blocks, program.start, time_limit_s=0.0).ending is Ending.TIME
+    assert minimise(program.c, [Block(b.constant, 0 * b.basis) for b in program.blocks], program.start).x is None
+
+
+def test_nothing_is_accepted_that_fails_its_check_and_all_rungs_are_told():
+    program = largest_eigenvalue(random_symmetric(0))
+    result = climb(program, lambda answer: f"{answer.solver}: rejected", rungs=["BARRIER", "CLARABEL"])
+    assert result.accepted is None
+    assert result.told == ["BARRIER: rejected", "CLARABEL: rejected"]
+    accepted = climb(program, lambda answer: answer.value if answer.solver == "CLARABEL" else "not this one")
+    assert accepted.answer.solver == "CLARABEL"
+    assert climb(program, lambda answer: 1.0, time_limit_s=1e-12).told[0].startswith("BARRIER: not tried")
+
+
+def plant(**changes):
+    parts = {
+        "A": np.diag([0.9, 0.5]),
+        "B1": [[1.0, 0, 0.3], [1.0, 0, 0]],
+        "B2": [[1.0], [0.5]],
+        "C1": [[1.0, 1.0], [0, 0], [0.3, 0]],
+        "C2": [[1.0, 0.5]],
+        "D11": np.zeros((3, 3)),
+        "D12": [[0], [0.5], [0]],
+        "D21": [[0, 0.5, 0]],
+        "D22": [[0.0]],
+        "dt": 1.0,
+        "n_w1": 2,
+        "n_z1": 2,
+    }
+    return GeneralizedPlant(**{**parts, **changes})
+
+
+def test_mixed_within_a_tiny_time_limit_ends_with_a_reason():
+    start = time.process_time()
+    with pytest.raises(SynthesisError, match="time limit"):
+        mixed(plant(), gamma=0.12, time_limit_s=1e-6)
+    assert time.process_time() - start < 10, "the limit is for the search; this is a guard against hanging, not a measurement"
+
+
+def test_a_plant_that_cannot_be_stabilised_is_named():
+    for method in (h2, hinf, mixed):
+        with pytest.raises(SynthesisError, match=r"A1a: \(A, B2\) stabilisable \(mode 1.2"):
+            method(plant(A=np.diag([0.9, 1.2]), B2=[[1.0], [0.0]]))
+
+
+def test_ill_conditioned_units_are_solved_alike():
+    T = np.diag([1e7, 1e-7])
+    p = plant()
+    other = replace(p, A=T @ p.A @ np.linalg.inv(T), B1=T @ p.B1, B2=T @ p.B2, C1=p.C1 @ np.linalg.inv(T), C2=p.C2 @ np.linalg.inv(T))
+    assert mixed(other, gamma=0.13).h2_norm == pytest.approx(mixed(p, gamma=0.13).h2_norm, rel=1e-2)
+
+
+def test_states_that_nothing_reaches_or_sees_do_no_harm():
+    p = plant()
+    wide = replace(
+        p,
+        A=np.diag([0.9, 0.5, 0.3]),
+        B1=np.vstack([p.B1, np.zeros((1, 3))]),
+        B2=np.vstack([p.B2, [[0.0]]]),
+        C1=np.hstack([p.C1, [[1.0], [0], [0]]]),
+        C2=np.hstack([p.C2, [[0.0]]]),
+    )
+    assert mixed(wide, gamma=0.13).h2_norm == pytest.approx(mixed(p, gamma=0.13).h2_norm, rel=1e-2)

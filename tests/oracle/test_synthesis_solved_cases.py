@@ -1,0 +1,120 @@
+"""Cases whose solution is in print, put as a stranger would put them: by the matrices of the generalized plant."""
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+from kros.core import StateSpace, SynthesisError, hinf_norm
+from kros.synthesis import GeneralizedPlant, Status, h2, hinf, mixed, youla_bound
+
+
+@pytest.mark.parametrize(("q", "sigma"), [(1.0, 1.0), (60.0, 0.1), (1e4, 1e4)])
+def test_lqg_without_guaranteed_margins(q, sigma):
+    """J. C. Doyle, "Guaranteed margins for LQG regulators", IEEE Trans. Automatic Control 23 (1978) 756-757."""
+    ones = np.ones((2, 1))
+    plant = GeneralizedPlant(
+        [[1.0, 1.0], [0.0, 1.0]],
+        np.hstack([np.sqrt(sigma) * ones, np.zeros((2, 1))]),
+        [[0.0], [1.0]],
+        np.vstack([np.sqrt(q) * ones.T, np.zeros((1, 2))]),
+        [[1.0, 0.0]],
+        np.zeros((2, 2)),
+        [[0.0], [1.0]],
+        [[0.0, 1.0]],
+        [[0.0]],
+        0.0,
+    )
+    K = h2(plant).controller
+    assert pytest.approx(-(2 + np.sqrt(4 + q)) * ones.T, rel=1e-6) == K.C
+    assert pytest.approx((2 + np.sqrt(4 + sigma)) * ones, rel=1e-6) == K.B
+
+
+def siso(numerator, *denominators):
+    """Product of ``numerator`` and first-order lags as matrices."""
+    system = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[numerator]], 0.0)
+    for tau in denominators:
+        system = StateSpace([[-1 / tau]], [[1 / tau]], [[1.0]], [[0.0]], 0.0) @ system
+    return system
+
+
+def performance(M, bandwidth, A):
+    """``(s/M + w_B) / (s + w_B A)``."""
+    return StateSpace([[-bandwidth * A]], [[1.0]], [[bandwidth * (1 - A / M)]], [[1 / M]], 0.0)
+
+
+def test_mixed_sensitivity_of_the_disturbance_process():
+    """S. Skogestad, I. Postlethwaite, *Multivariable Feedback Control*, 2nd edition, example 2.17, design 1: min ||(w_P S, K S)||_inf."""
+    G, W = siso(200.0, 10.0, 0.05, 0.05), performance(1.5, 10.0, 1e-4)
+    n, k = G.n_states, W.n_states
+    plant = GeneralizedPlant(
+        block_diag(G.A, W.A) - np.block([[np.zeros((n, n + k))], [W.B @ G.C, np.zeros((k, k))]]),
+        np.vstack([np.zeros((n, 1)), W.B]),
+        np.vstack([G.B, np.zeros((k, 1))]),
+        np.block([[-W.D @ G.C, W.C], [np.zeros((1, n + k))]]),
+        np.hstack([-G.C, np.zeros((1, k))]),
+        np.vstack([W.D, [[0.0]]]),
+        [[0.0], [1.0]],
+        [[1.0]],
+        [[0.0]],
+        0.0,
+    )
+    found = hinf(plant)
+    assert found.status is Status.OPTIMAL
+    assert found.hinf_norm == pytest.approx(1.37, abs=6e-3)  # two decimals are printed
+    assert hinf_norm(plant.close(found.controller)) == pytest.approx(found.hinf_norm)
+
+
+def one_state(**changes):
+    parts = {
+        "A": [[0.8]],
+        "B1": [[1.0, 0.0]],
+        "B2": [[1.0]],
+        "C1": [[1.0], [0.0]],
+        "C2": [[1.0]],
+        "D11": np.zeros((2, 2)),
+        "D12": [[0.0], [1.0]],
+        "D21": [[0.0, 1.0]],
+        "D22": [[0.0]],
+        "dt": 1.0,
+    }
+    return GeneralizedPlant(**{**parts, **changes})
+
+
+@pytest.mark.parametrize("method", [h2, hinf, mixed])
+@pytest.mark.parametrize(
+    ("changes", "label"),
+    [
+        ({"D12": [[0.0], [0.0]]}, "A2a: D12 of full column rank.*penalty"),
+        ({"D21": [[0.0, 0.0]]}, "A2b: D21 of full row rank.*noise"),
+        ({"B2": [[1.0, 1.0]], "D12": [[0.0, 0.0], [1.0, 1.0]], "D22": [[0.0, 0.0]]}, "A2a.*rank 1, 2 controls"),
+    ],
+)
+def test_singular_plants_are_refused_by_name(method, changes, label):
+    with pytest.raises(SynthesisError, match=label):
+        method(one_state(**changes))
+
+
+def test_singular_but_stable_plants_have_a_youla_bound():
+    # Nothing is measured with noise and nothing is paid for control: u = -0.8 y cancels the pole, and only w itself is left.
+    singular = one_state(D12=[[0.0], [0.0]], D21=[[0.0, 0.0]])
+    assert youla_bound(singular, 4, "h2", centre="open_loop").value == pytest.approx(1.0, rel=1e-6)
+    assert youla_bound(singular, 4, "hinf", centre="open_loop").value == pytest.approx(1.0, rel=1e-3)
+
+
+def test_mixed_names_what_it_cannot_do():
+    with pytest.raises(SynthesisError, match="continuous plant"):
+        mixed(one_state(A=[[-1.0]], dt=0.0))
+    empty = GeneralizedPlant(
+        np.zeros((0, 0)),
+        np.zeros((0, 2)),
+        np.zeros((0, 1)),
+        np.zeros((2, 0)),
+        np.zeros((1, 0)),
+        np.eye(2),
+        [[0], [1.0]],
+        [[0, 1.0]],
+        [[0]],
+        1.0,
+    )
+    with pytest.raises(SynthesisError, match="needs a plant with states"):
+        mixed(empty)

@@ -6,17 +6,20 @@ from .difference import FilteredDifference, cutoffs_hz, rates
 from .extended_kalman import ExtendedKalman, start_covariance
 from .learned import Features, Learned, Moments
 from .observer import Observer
+from .phase_lock import Tracked, track_parameter
 from .relift import ReliftCertificate, relift_certificate
 from .relift_error import ReliftScales
 from .relift_report import ReliftRow, relift_report
 from .relift_status import ReliftStatus
 from .residual import mean_error_dynamics, one_step_residual, residual_spectra
 from .residual_design import ResidualModel, one_step_rows, residual_models
+from .runtime import Estimate, Runtime
 from .simulate import run_observer, run_observers
 from .tune import Tuned, tune_observer
 
 __all__ = [
     "Attack",
+    "Estimate",
     "ExtendedKalman",
     "Features",
     "FilteredDifference",
@@ -28,6 +31,8 @@ __all__ = [
     "ReliftScales",
     "ReliftStatus",
     "ResidualModel",
+    "Runtime",
+    "Tracked",
     "Tuned",
     "attack",
     "attack_running",
@@ -46,5 +51,6 @@ __all__ = [
     "run_observer",
     "run_observers",
     "start_covariance",
+    "track_parameter",
     "tune_observer",
 ]

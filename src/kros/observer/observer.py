@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +27,11 @@ from ..core.errors import DataError, DimensionError
 from ..core.lti import StateSpace, gain
 from ..lifting import Lifting
 from ..synthesis.result import Injection
+from .runtime import Runtime
 from .simulate import run_observer
+
+if TYPE_CHECKING:
+    from .running import RunningObserver
 
 Array = npt.NDArray[np.float64]
 
@@ -52,6 +57,8 @@ class Observer:
     sample_period_s : float
     parameters : mapping of str to float
         Default values of the lifting's parameters, the nominal unit's.
+    runtime : Runtime
+        Delay of the measurement, limits, and the gain of filtered estimates.
     """
 
     name: str
@@ -64,6 +71,7 @@ class Observer:
     injection: Injection
     sample_period_s: float
     parameters: Mapping[str, float] = field(default_factory=dict)
+    runtime: Runtime = field(default_factory=Runtime)
 
     def __post_init__(self) -> None:
         if self.B.shape[1] != len(self.inputs) + len(self.lifting.input_functions):
@@ -78,6 +86,7 @@ class Observer:
                 f"Observer {self.name}: the controller should map {len(self.measured)} innovations to {width} corrections ({self.injection.value} injection), "
                 f"found {K.n_inputs} to {K.n_outputs}."
             )
+        self.runtime.require_fit(self.name, self.lifting.n_states, len(self.measured), width)
 
     @classmethod
     def open_loop(
@@ -88,24 +97,44 @@ class Observer:
         return cls(name, lifting, A, B, measured, inputs, controller, Injection.STATE, sample_period_s)
 
     @property
+    def into(self) -> Array:
+        """Where the correction enters, shape (n_lifted, width)."""
+        return self.B if self.injection is Injection.INPUT else np.eye(self.A.shape[0])
+
+    @property
+    def filter_gain(self) -> Array:
+        """Gain from the innovation to the filtered estimate, ``x_hat(k|k) = x_hat(k) + L_f (y - C x_hat(k))``; shape (n, q).
+
+        As declared in `runtime`; else what the correction says of it. The direct correction of the next estimate is that of this one, carried
+        through the model: ``A_s L_f = (into D^c)_s`` by least squares. For a Kalman predictor of a linear model this is its filter, exactly;
+        memory of the correction and slopes of lifted functions are left out.
+        """
+        if self.runtime.filter_gain is not None:
+            return self.runtime.filter_gain
+        n = self.lifting.n_states
+        return np.asarray(np.linalg.lstsq(self.A[:n, :n], (self.into @ self.controller.D)[:n], rcond=1e-9)[0])
+
+    @property
     def one_step(self) -> Array:
         """The map from [theta, x^c, u, y] to [x_hat+, x^c+], shape (n + n_c, n_lifted + n_c + m + q)."""
-        K, n = self.controller, self.lifting.n_states
+        K, n, into = self.controller, self.lifting.n_states, self.into
         C = np.eye(self.A.shape[0])[list(self.measured)]
-        into = self.B if self.injection is Injection.INPUT else np.eye(self.A.shape[0])
         plant = np.hstack([self.A - into @ K.D @ C, into @ K.C, self.B, into @ K.D])[:n]
         controller = np.hstack([-K.B @ C, K.A, np.zeros((K.n_states, self.B.shape[1])), K.B])
         return np.vstack([plant, controller])
 
     def initial(self, y: npt.ArrayLike) -> Array:
-        """Return the first estimate: the first measurement, other states zero; shape (..., n)."""
+        """Return the first estimate: the first measurement where there is one, other states zero; shape (..., n)."""
         y = np.asarray(y, dtype=float)
+        y = np.where(np.isfinite(y), y, 0.0)
         x = np.zeros((*y.shape[:-1], self.lifting.n_states))
         x[..., list(self.measured)] = y
         return x
 
     def start(self, y: npt.ArrayLike, parameters: Mapping[str, float] | None = None) -> RunningObserver:
         """Return a running observer that starts at a first measurement, shape (q,)."""
+        from .running import RunningObserver
+
         return RunningObserver(self, np.atleast_1d(np.asarray(y, dtype=float)), {**self.parameters, **(parameters or {})})
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
@@ -128,6 +157,7 @@ class Observer:
             "sample_period_s": self.sample_period_s,
             "model": {"A": self.A, "B": self.B},
             "controller": {key: getattr(self.controller, key) for key in "ABCD"},
+            **self.runtime.content(),
         }
         write_json(path, plain(content))
 
@@ -159,57 +189,5 @@ class Observer:
             injection,
             dt,
             defaults,
+            Runtime.from_content(content),
         )
-
-
-class RunningObserver:
-    """An observer with its state, for one machine.
-
-    Parameters
-    ----------
-    observer : Observer
-    y : ndarray, shape (q,)
-        First measurement.
-    parameters : mapping of str to float
-        The machine's own lifting parameters.
-    """
-
-    def __init__(self, observer: Observer, y: Array, parameters: Mapping[str, float]) -> None:
-        self.observer = observer
-        self.parameters = dict(parameters)
-        self._map = observer.one_step
-        self.reset(y)
-
-    @property
-    def estimate(self) -> Array:
-        """Estimate of the states, shape (n,)."""
-        return self._state[: self.observer.lifting.n_states].copy()
-
-    def reset(self, y: npt.ArrayLike) -> None:
-        """Start again at a measurement, shape (q,)."""
-        self._earlier: Array | None = None
-        self._state = np.concatenate(
-            [self.observer.initial(np.atleast_1d(np.asarray(y, dtype=float))), np.zeros(self.observer.controller.n_states)]
-        )
-
-    def step(self, y: npt.ArrayLike, u: npt.ArrayLike) -> Array:
-        """Take the measurement and input at k, return the estimate for k + 1.
-
-        Parameters
-        ----------
-        y : array_like, shape (q,)
-        u : array_like, shape (m,)
-
-        Returns
-        -------
-        ndarray, shape (n,)
-        """
-        lifting = self.observer.lifting
-        n, u = lifting.n_states, np.atleast_1d(np.asarray(u, dtype=float))
-        if self._earlier is None:
-            self._earlier = lifting.window.hold(self._state[:n], u)
-        window = np.concatenate([self._state[:n], self._earlier])
-        theta, lifted_u = lifting.lift(window, self.parameters), lifting.lift_inputs(u, window, self.parameters)
-        self._state = self._map @ np.concatenate([theta, self._state[n:], lifted_u, np.atleast_1d(y)])
-        self._earlier = lifting.window.advance(window, u)
-        return self.estimate

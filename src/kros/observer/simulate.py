@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DimensionError
+from .careful import run_carefully
+from .runtime import Estimate
 
 if TYPE_CHECKING:
     from .observer import Observer
@@ -16,23 +18,36 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 
-def run_observer(observer: Observer, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+def run_observer(
+    observer: Observer,
+    y: Array,
+    u: Array,
+    parameters: Mapping[str, npt.ArrayLike] | None = None,
+    estimate: Estimate | str = Estimate.PREDICT,
+) -> Array:
     """Run an observer over a batch of episodes, one Python step per sample for the whole batch.
 
     Parameters
     ----------
     observer : Observer
     y : ndarray, shape (n_samples, batch, q)
+        Row k is what arrives at k; NaN or infinite where a measurement is missing, which then corrects nothing.
     u : ndarray, shape (n_samples, batch, m)
     parameters : mapping of str to array_like, shape (batch,)
         Lifting parameters of the machine behind each episode; the observer's own where absent.
+    estimate : Estimate or "predict" or "filter"
+        Row k of a prediction is the estimate of the state at k from what arrived up to k - 1; of a filtered estimate, up to k.
 
     Returns
     -------
     ndarray, shape (n_samples, batch, n)
-        Row k is the estimate of the state at k from data up to k - 1; row 0 is the start.
+        Row 0 of a prediction is the start.
     """
-    return run_observers([observer], y, u, parameters)[0]
+    wanted = Estimate(estimate)
+    if wanted is Estimate.PREDICT:
+        return run_observers([observer], y, u, parameters)[0]
+    require_recordings(f"observer {observer.name}", observer.inputs, y, u)
+    return run_carefully(observer, y, u, parameters, wanted)
 
 
 def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
@@ -57,6 +72,8 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
         raise DimensionError(
             f"Running {len(observers)} observers side by side: they differ in lifting, measured states or inputs; run them one by one."
         )
+    if any(o.runtime.delay or o.runtime.limited for o in observers) or not np.isfinite(y).all():
+        return np.stack([run_carefully(o, y, u, parameters, Estimate.PREDICT) for o in observers])
     n, n_lifted, m, k = lifting.n_states, lifting.n_lifted, observer.B.shape[1], len(observers)
     order = max(o.controller.n_states for o in observers)
     values = {**observer.parameters, **(parameters or {})}

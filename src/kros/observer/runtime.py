@@ -1,0 +1,124 @@
+"""What an observer needs to know of the machine it runs on: how late measurements are, and what no estimate may exceed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError, DimensionError
+
+Array = npt.NDArray[np.float64]
+
+
+class Estimate(str, Enum):
+    """Which estimate is wanted.
+
+    PREDICT
+        Of the state at k from what arrived up to k - 1, as in the paper.
+    FILTER
+        Of the state at k from what arrived up to k.
+    """
+
+    PREDICT = "predict"
+    FILTER = "filter"
+
+
+@dataclass(frozen=True, eq=False)
+class Runtime:
+    """Surroundings of a running observer.
+
+    Parameters
+    ----------
+    delay : int
+        Samples by which measurements are late: what arrives at k was measured at ``k - delay``. The estimate is corrected as of then and
+        predicted forward through the model.
+    lower, upper : ndarray, shape (n,), optional
+        Limits of the estimate, state by state.
+    correction : ndarray, shape (width,), optional
+        Largest size of every correction.
+    filter_gain : ndarray, shape (n, q), optional
+        Gain of filtered estimates, in place of the one that follows from the correction.
+
+    Raises
+    ------
+    DataError
+        When the delay is negative, or a limit is not a number or crosses its partner.
+    """
+
+    delay: int = 0
+    lower: Array | None = None
+    upper: Array | None = None
+    correction: Array | None = None
+    filter_gain: Array | None = None
+
+    def __post_init__(self) -> None:
+        if int(self.delay) != self.delay or self.delay < 0:
+            raise DataError(f"Runtime of an observer: the delay of {self.delay} should be a whole number of samples, at least 0.")
+        for name in _ARRAYS:
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, np.asarray(value, dtype=float))
+                if np.isnan(getattr(self, name)).any():
+                    raise DataError(
+                        f"Runtime of an observer: {name} contains what is not a number; leave limits out, or make them infinite."
+                    )
+        if self.lower is not None and self.upper is not None and np.any(self.lower > self.upper):
+            raise DataError(f"Runtime of an observer: lower limits {self.lower} should not exceed the upper ones {self.upper}.")
+        if self.correction is not None and np.any(self.correction < 0):
+            raise DataError(f"Runtime of an observer: the largest corrections {self.correction} should be positive.")
+
+    @property
+    def limited(self) -> bool:
+        """Whether anything is limited."""
+        return any(limit is not None for limit in (self.lower, self.upper, self.correction))
+
+    def clip_estimate(self, x: Array) -> Array:
+        """Return estimates within their limits, shape (..., n)."""
+        if self.lower is None and self.upper is None:
+            return x
+        return np.asarray(np.clip(x, self.lower, self.upper))
+
+    def clip_correction(self, y_c: Array) -> Array:
+        """Return corrections within their limits, shape (..., width)."""
+        return y_c if self.correction is None else np.asarray(np.clip(y_c, -self.correction, self.correction))
+
+    def require_fit(self, name: str, n: int, q: int, width: int) -> None:
+        """Refuse limits of another size than the observer's."""
+        wanted = {"lower": (n,), "upper": (n,), "correction": (width,), "filter_gain": (n, q)}
+        for key, shape in wanted.items():
+            value = getattr(self, key)
+            if value is not None and value.shape != shape:
+                raise DimensionError(f"Observer {name}: runtime.{key} should have shape {shape}, found {value.shape}.")
+
+    def content(self) -> dict[str, Any]:
+        """Return what an observer's file holds of it: nothing where everything is as by default."""
+        arrays = {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
+        found = ({"delay": int(self.delay)} if self.delay else {}) | {k: _finite(v) for k, v in arrays.items()}
+        return {"runtime": found} if found else {}
+
+    @classmethod
+    def from_content(cls, content: Mapping[str, Any]) -> Runtime:
+        """Read what `content` returned; a limit that is null is infinite."""
+        found = dict(content.get("runtime", {}))
+        for name in _ARRAYS:
+            if name in found:
+                values = np.array(found[name], dtype=object)
+                values[values == None] = -np.inf if name == "lower" else np.inf  # noqa: E711
+                found[name] = values.astype(float)
+        return cls(**found)
+
+
+_ARRAYS = ("lower", "upper", "correction", "filter_gain")
+
+
+def _finite(value: Array) -> list[Any]:
+    """JSON has no infinity: null stands for it."""
+    plain = value.astype(object)
+    plain[~np.isfinite(value)] = None
+    nested: list[Any] = plain.tolist()
+    return nested

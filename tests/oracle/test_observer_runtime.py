@@ -1,0 +1,170 @@
+"""The running observer against textbook filters, delayed truth, and the phase of a simulated drive."""
+
+import json
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError, DataError, DimensionError
+from kros.core.lti import StateSpace, gain
+from kros.lifting import Lifting
+from kros.observer import Observer, Runtime, run_observer, track_parameter
+from kros.synthesis import Injection, kalman
+
+DT = 0.001
+LIFTING = Lifting(("position", "velocity", "current"), ("sin(10*position + phase)",), ("phase",))
+LATE = Lifting(("x", "v"), ("x[-2]*v", "sin(x)"), (), ("u",))
+
+
+def observer(lifting=LIFTING, runtime=None, injection=Injection.STATE, order=2, m=2, seed=0):
+    rng = np.random.default_rng(seed)
+    nl = lifting.n_lifted
+    A, B = 0.3 * rng.normal(size=(nl, nl)), rng.normal(size=(nl, m))
+    width = nl if injection is Injection.STATE else m
+    K = StateSpace(
+        0.3 * rng.normal(size=(order, order)),
+        rng.normal(size=(order, 1)),
+        rng.normal(size=(width, order)),
+        0.1 * rng.normal(size=(width, 1)),
+        DT,
+    )
+    return Observer(
+        "o", lifting, A, B, (0,), ("a", "b")[:m], K, injection, DT, {"phase": 0.3} if lifting is LIFTING else {}, runtime or Runtime()
+    )
+
+
+def recordings(m=2, n_samples=40, batch=2, seed=1):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(n_samples, batch, 1)), rng.normal(size=(n_samples, batch, m))
+
+
+def test_filtered_estimate_of_a_kalman_predictor_is_the_kalman_filter():
+    F, G, C = np.array([[0.9, 0.2], [-0.1, 0.8]]), np.array([[0.0], [1.0]]), np.eye(1, 2)
+    Q, R = np.diag([0.1, 0.3]), np.array([[0.2]])
+    o = Observer("k", Lifting(("x", "v")), F, G, (0,), ("u",), kalman(F, C, Q, R, DT).controller, Injection.STATE, DT)
+    P = np.eye(2)
+    for _ in range(3000):  # the covariance recursion, to its steady state
+        gain_now = P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
+        P = F @ (P - gain_now @ C @ P) @ F.T + Q
+    np.testing.assert_allclose(o.filter_gain, gain_now, atol=1e-9)
+    y, u = recordings(m=1)
+    filtered, x = run_observer(o, y, u, estimate="filter"), run_observer(o, y, u)
+    np.testing.assert_allclose(filtered, x + (y - x[..., :1]) @ gain_now.T, atol=1e-9)
+    np.testing.assert_allclose(x[1:], filtered[:-1] @ F.T + u[:-1] @ G.T, atol=1e-9)  # predicting from the filtered state is the prediction
+
+
+@pytest.mark.parametrize("estimate", ["predict", "filter"])
+@pytest.mark.parametrize("delay", [0, 1, 4, 50])
+@pytest.mark.parametrize("lifting", [LIFTING, LATE], ids=["drive", "delays"])
+def test_batched_and_single_runs_agree_with_gaps_delays_and_limits(lifting, delay, estimate):
+    n, m = lifting.n_states, 2 if lifting is LIFTING else 1
+    limits = {"lower": np.full(n, -0.8), "upper": np.array([np.inf, 0.5, 0.7][:n]), "correction": np.full(lifting.n_lifted, 0.2)}
+    o = observer(lifting, Runtime(delay, **limits), m=m)
+    y, u = recordings(m)
+    y[[5, 6, 20]] = np.nan
+    y[30, 0] = np.inf
+    found = run_observer(o, y, u, estimate=estimate)
+    assert np.isfinite(found).all()
+    assert found[1:, :, 1].max() <= 0.5
+    for i in range(y.shape[1]):
+        running, single = o.start(y[0, i]), []
+        for k in range(len(y)):
+            single.append(running.estimate if estimate == "predict" else running.filter(y[k, i]))
+            running.step(y[k, i], u[k, i])
+        np.testing.assert_allclose(found[:, i], single, rtol=1e-10, atol=1e-10)
+
+
+def test_a_late_measurement_of_an_exact_model_costs_nothing():
+    F, G = np.array([[1.0, 0.01], [-0.5, 0.95]]), np.array([[0.0], [1.0]])
+    plain, K = Lifting(("x", "v")), gain([[0.6], [5.0]], DT)
+    u, x = np.random.default_rng(4).normal(size=(400, 1, 1)), np.zeros((400, 1, 2))
+    for k in range(399):
+        x[k + 1] = x[k] @ F.T + u[k] @ G.T
+    late = np.concatenate([np.repeat(x[:1, :, :1], 7, axis=0), x[:-7, :, :1]])
+    wrong = Observer("o", plain, F, G, (0,), ("u",), K, Injection.STATE, DT)
+    right = Observer("o", plain, F, G, (0,), ("u",), K, Injection.STATE, DT, runtime=Runtime(delay=7))
+    np.testing.assert_allclose(run_observer(right, late, u), x, atol=1e-9)
+    assert np.abs(run_observer(wrong, late, u) - x).max() > 0.1
+
+
+def test_a_missing_measurement_corrects_nothing():
+    o = observer(order=0)
+    y, u = recordings()
+    silent = Observer.open_loop("s", LIFTING, o.A, o.B, (0,), ("a", "b"), DT)
+    y[1:] = np.nan
+    y[0] = 0.0
+    np.testing.assert_allclose(run_observer(o, y, u, {"phase": 0.3}), run_observer(silent, np.zeros_like(y), u, {"phase": 0.3}), atol=1e-12)
+    assert np.isfinite(o.start([np.nan]).estimate).all()
+
+
+def test_the_file_holds_the_runtime_and_older_files_are_read(tmp_path):
+    runtime = Runtime(3, lower=[-1, -np.inf, -2], upper=[1, 2, np.inf], correction=[1, 2, 3, 4], filter_gain=np.ones((3, 1)))
+    o = observer(runtime=runtime)
+    o.save(tmp_path / "o.json")
+    again = Observer.load(tmp_path / "o.json").runtime
+    assert again.delay == 3
+    for name in ("lower", "upper", "correction", "filter_gain"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(runtime, name))
+    observer().save(tmp_path / "plain.json")
+    assert "runtime" not in json.loads((tmp_path / "plain.json").read_text())
+    assert Observer.load(tmp_path / "plain.json").runtime.delay == 0
+
+
+def test_a_runtime_that_makes_no_sense_is_refused():
+    with pytest.raises(DataError, match="whole number"):
+        Runtime(delay=-1)
+    with pytest.raises(DataError, match="should not exceed"):
+        Runtime(lower=[1.0], upper=[0.0])
+    with pytest.raises(DataError, match="not a number"):
+        Runtime(lower=[np.nan])
+    with pytest.raises(DimensionError, match=r"runtime.lower should have shape \(3,\)"):
+        observer(runtime=Runtime(lower=[1.0]))
+
+
+def test_phase_locked_loop_finds_the_phase_in_both_directions():
+    """Drives that turn at a speed while the gearbox shakes them; the measurement is the position."""
+    lifting = Lifting(("position", "velocity"), ("sin(100*position + phase)",), ("phase",))
+    A, B = np.array([[1.0, DT, 0.0], [0.0, 0.97, 0.02], [0, 0, 0]]), np.array([[0.0], [0.03], [0.0]])
+    speeds, off, true = np.array([2.0, 2.0, -2.0, -2.0]), np.array([1.0, -1.0, 1.0, -1.0]), 0.7
+    rng, u = np.random.default_rng(0), np.broadcast_to(speeds[:, None], (3000, 4, 1))
+    x = np.zeros((3000, 4, 2))
+    x[0, :, 1] = speeds
+    for k in range(2999):
+        x[k + 1] = lifting.lift(x[k], {"phase": true}) @ A[:2].T + u[k] @ B[:2].T + 1e-3 * rng.normal(size=(4, 2)) * [0, 1]
+    K = kalman(A[:2, :2], np.eye(1, 2), np.diag([1e-12, 1e-6]), np.array([[1e-11]]), DT).controller
+    o = Observer("o", lifting, A, B, (0,), ("u",), gain(np.vstack([K.D, [[0.0]]]), DT), Injection.STATE, DT)
+    tracked = track_parameter(o, x[..., :1], u, {"phase": true + off}, settle_s=0.3)
+    np.testing.assert_allclose(tracked.values[0], true + off)
+    np.testing.assert_allclose(tracked.values[2000:].mean(axis=0), true, atol=0.05)
+    as_at_first = run_observer(o, x[..., :1], u, {"phase": true + off})
+    assert np.all(np.std((tracked.estimates - x)[2000:, :, 1], axis=0) < 0.7 * np.std((as_at_first - x)[2000:, :, 1], axis=0))
+
+
+def test_phase_locked_loop_finds_the_phase_of_a_simulated_drive():
+    from kros.core.artifacts import plain
+    from kros.observer import one_step_rows
+    from kros.plants.harmonic_drive import HarmonicDrivePopulation
+
+    simulated = HarmonicDrivePopulation(n_units=1, n_episodes=1, seconds=8.0, conditions=("noload",), seed=3).simulate()
+    values = simulated.population.read(simulated.population.episodes[0])[:, None]
+    states, inputs = values[..., :3], np.ascontiguousarray(values[..., 3:])
+    true = plain(simulated.truth.as_dict())["units"]["001001"]["phase_rad"][0]
+    lifting = Lifting(("position", "velocity", "current"), ("sin(100*position + phase)",), ("phase",))
+    rows = one_step_rows(lifting, states, inputs, [len(states)], {"phase": [true]})
+    A, B = np.vstack([rows[0], np.zeros((1, 4))]), np.vstack([rows[1], np.zeros((1, 2))])
+    K = kalman(A[:3, :3], np.eye(1, 3), np.diag([1e-13, 1e-6, 1e-5]), np.array([[1e-12]]), DT).controller
+    o = Observer("o", lifting, A, B, (0,), ("a", "b"), gain(np.vstack([K.D, [[0.0]]]), DT), Injection.STATE, DT)
+    assert states[..., 1].min() < -1 < 1 < states[..., 1].max()  # it turns both ways
+    twice = np.repeat(states[..., :1], 2, axis=1), np.repeat(inputs, 2, axis=1)
+    tracked = track_parameter(o, *twice, {"phase": true + np.array([1.0, -1.0])}, settle_s=1.0)
+    np.testing.assert_allclose(
+        tracked.values[4000:].mean(axis=0), true, atol=0.2
+    )  # the lag of the drive depends on speed, the phase takes it up
+
+
+def test_what_cannot_be_followed_is_refused():
+    y, u = recordings()
+    with pytest.raises(ConfigError, match="'angle'"):
+        track_parameter(observer(), y, u, name="angle")
+    with pytest.raises(ConfigError, match="a delay of 2"):
+        track_parameter(observer(runtime=Runtime(2)), y, u)

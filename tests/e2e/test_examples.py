@@ -65,3 +65,17 @@ def test_without_recordings_it_says_what_to_do(name):
     done = subprocess.run([sys.executable, EXAMPLES / name], env=environment, capture_output=True, text=True)
     assert done.returncode == 1
     assert "Set KROS_DATA" in done.stderr
+
+
+def test_output_feedback_keeps_its_performance_on_every_pendulum(tmp_path):
+    command = [sys.executable, EXAMPLES / "output_feedback" / "run.py", "--out", tmp_path, "--units", "6", "--iterations", "1"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    facts = json.loads((tmp_path / "metrics.json").read_text())
+    nominal, robust, small = (facts[name] for name in ("nominal H2", "robust", "robust, reduced"))
+    assert facts["uncertainty"]["cover_max"] <= 1
+    assert nominal["mu"][0] > 1 > robust["mu"][1]
+    assert small["order"] == 8 < robust["order"]
+    assert small["mu"][1] < 1
+    assert robust["settled_error_percent"]["worst"] < nominal["settled_error_percent"]["worst"] < 20
+    assert (tmp_path / "step.svg").stat().st_size > 10_000

@@ -125,7 +125,7 @@ class UncertaintyConfig(_Section):
 class SynthesisConfig(_Section):
     """Observer synthesis."""
 
-    methods: tuple[Literal["mixed", "worst_case_h2", "residual_h2"], ...] = ("mixed", "worst_case_h2", "residual_h2")
+    methods: tuple[Literal["mixed", "worst_case_h2", "worst_case_hinf", "residual_h2"], ...] = ("mixed", "worst_case_h2", "residual_h2")
     injection: Literal["state", "input"] = "state"
     input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
     noise: dict[str, float] = Field(default_factory=dict, description="standard deviation of the measurement noise per measured channel")

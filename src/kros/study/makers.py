@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,12 @@ import numpy.typing as npt
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, block_diagonal, gain
 from ..identify import ModelSet
-from ..observer import Observer, mean_error_dynamics, noise_covariances, one_step_residual, residual_spectra
-from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, residual_h2, worst_case_h2
+from ..observer import Observer, noise_covariances
+from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, worst_case_h2, worst_case_hinf
+from ..synthesis.causal import causal_h2
 from ..uncertainty import fit_magnitude
 from .baselines import kalman_tuned, make_luenberger
+from .residual_maker import OwnModel, make_residual_h2
 from .tuning import TuningSet, rank
 
 Array = npt.NDArray[np.float64]
@@ -29,7 +32,7 @@ class Task:
     """Everything a worker needs for one observer.
 
     `problem` is None where there is no usable uncertain set, and `refusal` says why; `noise` is the standard deviation of every
-    measurement's noise.
+    measurement's noise, `covered` names the units whose differences the set covers.
     """
 
     name: str
@@ -43,15 +46,17 @@ class Task:
     input_weight: float | str
     time_limit_s: float
     max_order: int
+    covered: tuple[str, ...] = ()
 
     def observer(self, synthesis: Synthesis) -> Observer:
         """Return the observer as it runs."""
         models, row = self.models, self.models.index(self.unit)
+        own = synthesis if isinstance(synthesis, OwnModel) else None
         return Observer(
             name=self.name,
             lifting=models.lifting,
-            A=models.A[row],
-            B=models.B[row],
+            A=models.A[row] if own is None or own.A is None else own.A,
+            B=models.B[row] if own is None or own.B is None else own.B,
             measured=models.measured,
             inputs=models.recorded_inputs,
             controller=synthesis.controller,
@@ -118,56 +123,58 @@ def make_mixed(task: Task) -> Made:
 
 
 def make_worst_case_h2(task: Task) -> Made:
-    """Worst-case H2 in the surroundings asked for, or in those that do best on training episodes.
-
-    How the inputs are spread over frequency and how much white noise there is nobody knows beforehand; the process noise of the tuned
-    Kalman filter is chosen on the same episodes and by the same rule.
-    """
+    """Worst-case H2 in the surroundings asked for, or in those that do best on training episodes."""
     problem = task.require_problem()
     if task.input_weight != TUNED:
         surroundings = Surroundings(task.input_weight)
         assumed = surroundings.of(problem)
         return worst_case_h2(assumed, max_order=task.max_order), surroundings.facts(), assumed
-    judge, fit = task.tuning.read(), remembering(fit_magnitude)
+    rough = partial(worst_case_h2, max_order=2, tolerance_db=3.0, refinements=0, fit=remembering(fit_magnitude), causal=False)
+    surroundings, synthesis = best_surroundings(task, problem, rough)
+    assumed = surroundings.of(problem)
+    accurate = worst_case_h2(assumed, max_order=task.max_order, causal=False)  # of higher order: for its lower bound
+    lower = max((b for b in (synthesis.lower_bound, accurate.lower_bound) if b is not None), default=None)
+    gap = None if lower is None or synthesis.worst_case_h2 is None else 100 * (synthesis.worst_case_h2 / lower - 1)
+    causal = causal_h2(assumed, synthesis.controller)
+    return replace(synthesis, lower_bound=lower, gap_percent=gap, causal_h2=causal), surroundings.facts(), assumed
+
+
+def make_worst_case_hinf(task: Task) -> Made:
+    """Worst-case H-infinity in the surroundings asked for, or in those that do best on training episodes; of low order, to keep the search short."""
+    problem, surroundings = task.require_problem(), Surroundings(IDENTITY)
+    rough = partial(worst_case_hinf, max_order=2, tolerance_db=3.0, refinements=0, fit=remembering(fit_magnitude))
+    if task.input_weight == TUNED:
+        surroundings, _ = best_surroundings(task, problem, partial(rough, bounded=False))
+    else:
+        surroundings = Surroundings(task.input_weight)
+    assumed = surroundings.of(problem)
+    return rough(assumed), surroundings.facts(), assumed
+
+
+def best_surroundings(
+    task: Task, problem: ObserverProblem, design: Callable[[ObserverProblem], Synthesis]
+) -> tuple[Surroundings, Synthesis]:
+    """Return the surroundings whose observer does best on training episodes, and that observer.
+
+    How the inputs are spread over frequency and how much white noise there is nobody knows beforehand; the process noise of the tuned
+    Kalman filter is chosen on the same episodes and by the same rule.
+    """
+    judge = task.tuning.read()
     limit = judge.percent(task.observer(open_loop(task)[0]))
     best: tuple[tuple[bool, float], Surroundings, Synthesis] | None = None
+    reason = ""
     for surroundings in candidates(task.models.sample_period_s):
-        synthesis = worst_case_h2(surroundings.of(problem), max_order=2, tolerance_db=3.0, refinements=0, fit=fit)
+        try:
+            synthesis = design(surroundings.of(problem))
+        except SynthesisError as error:
+            reason = str(error)
+            continue
         verdict = rank(judge.percent(task.observer(synthesis)), limit, task.models.measured)
         if best is None or verdict < best[0]:
             best = (verdict, surroundings, synthesis)
-    assert best is not None
-    _, surroundings, synthesis = best
-    assumed = surroundings.of(problem)
-    accurate = worst_case_h2(assumed, max_order=task.max_order)  # of higher order: for its lower bound
-    lower = max((b for b in (synthesis.lower_bound, accurate.lower_bound) if b is not None), default=None)
-    gap = None if lower is None or synthesis.worst_case_h2 is None else 100 * (synthesis.worst_case_h2 / lower - 1)
-    return replace(synthesis, lower_bound=lower, gap_percent=gap), surroundings.facts(), assumed
-
-
-def make_residual_h2(task: Task) -> Made:
-    """Kalman gains for the one-step residuals that the nominal's model leaves on the training episodes of all units."""
-    models, row = task.models, task.models.index(task.unit)
-    judge, lifting, n = task.tuning.read(), models.lifting, models.lifting.n_states
-    batch, values = judge.batch, judge.parameters if lifting.parameters else None
-    residual = one_step_residual(lifting, models.A[row], models.B[row], batch.states, batch.inputs, values)
-    spectra = residual_spectra(residual, batch.lengths - 1 - lifting.history, [key.unit for key in batch.keys])
-    synthesis = residual_h2(
-        mean_error_dynamics(lifting, models.A[row], batch.states, batch.inputs, values),
-        task.selector[:, :n],
-        spectra,
-        task.noise,
-        models.output_scale[:n],
-        models.sample_period_s,
-        n_lifted=lifting.n_lifted,
-    )
-    limit = judge.percent(task.observer(open_loop(task)[0]))
-    _, share = rank(judge.percent(task.observer(synthesis)), limit, models.measured)
-    if not np.isfinite(share):
-        raise SynthesisError(
-            "Residual-shaped observer: it diverges on the training episodes, where it is retracted and lifted at every step."
-        )
-    return synthesis, {"training_error_to_open_loop": share, "order_reduction_percent": synthesis.gap_percent}, task.problem
+    if best is None:
+        raise SynthesisError(reason)
+    return best[1:]
 
 
 def remembering(fit: Callable[..., Any]) -> Callable[..., Any]:
@@ -226,6 +233,7 @@ def candidates(sample_period_s: float) -> list[Surroundings]:
 
 MAKERS: dict[str, Callable[[Task], Made]] = {
     "worst_case_h2": make_worst_case_h2,
+    "worst_case_hinf": make_worst_case_hinf,
     "mixed": make_mixed,
     "residual_h2": make_residual_h2,
     "open_loop": open_loop,

@@ -26,7 +26,7 @@ Array = npt.NDArray[Any]
 Fit = Callable[..., Any]
 
 _GRID = 400
-_FLOOR = 1e-14
+_FLOOR, _NOTHING = 1e-14, 1e-30
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,10 @@ class Channels:
         def factor(power: Array) -> StateSpace:
             systems = []
             for column in power.T:
-                magnitude = np.sqrt(np.maximum(column, _FLOOR * max(column.max(), 1e-300)))
+                if column.max() <= _NOTHING:
+                    systems.append(gain([[0.0]], self.problem.nominal.dt))
+                    continue
+                magnitude = np.sqrt(np.maximum(column, _FLOOR * column.max()))
                 systems.append(fit(self.freqs_hz, magnitude, self.problem.nominal.dt, side=side, **options).system)
             return block_diagonal(systems)
 

@@ -32,7 +32,7 @@ import numpy.typing as npt
 
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace
-from ..core.norms import crossings, to_continuous
+from ..core.norms import crossings, gramian, to_continuous
 from .disturbance import design_grid, uncertain_ball
 from .observer_problem import ObserverProblem
 
@@ -170,26 +170,34 @@ def _first_grid(problem: ObserverProblem, loop: StateSpace) -> Array:
 def _walk(problem: ObserverProblem, loop: StateSpace, controller: StateSpace, found: float, freq_hz: float) -> RobustGain:
     """Prove the level from DC to Nyquist; raise it where a frequency in between turns out to be worse."""
     plant = problem.generalized_plant()
-    closed = to_continuous(plant.close(problem.to_scaled(controller)))
+    closed = to_continuous(_evened(plant.close(problem.to_scaled(controller))))
     dt = problem.nominal.dt
     rows = np.concatenate([np.full(size, {"z2": 0, "z3": 1}.get(name, -1)) for name, size in plant.z_parts.items()])
     columns = np.concatenate([np.full(size, {"w2": 0, "w3": 1}.get(name, -1)) for name, size in plant.w_parts.items()])
     level, nu = found * (1 + _MARGIN), 0.0
+    log_tau: Array | None = None
     for _ in range(_WALK):
-        here = min(np.arctan(nu) / (np.pi * dt), 0.5 / dt)
-        gain, log_tau = _Constraint.of(problem, loop, np.array([here])).best()
-        if gain[0] > found:
-            found, freq_hz = float(gain[0]), float(here)
-            if found * (1 + _MARGIN / 2) > level:
-                level, nu = found * (1 + _MARGIN), 0.0
-                continue
         scaling = _Scaling(rows, columns, level)
-        up, down = scaling.of(_calmest(scaling, closed.frequency_response([nu / (2 * np.pi)])[0], log_tau[0]))
+        response = closed.frequency_response([nu / (2 * np.pi)])[0]
+        log_tau, size = (None, np.inf) if log_tau is None else _calmest(scaling, response, log_tau)
+        warm = size < 1 - _MARGIN / 3
+        if not warm:
+            here = min(np.arctan(nu) / (np.pi * dt), 0.5 / dt)
+            gain, best = _Constraint.of(problem, loop, np.array([here])).best()
+            if gain[0] * (1 + _MARGIN / 2) > level:
+                found, freq_hz = float(gain[0]), float(here)
+                level, nu, log_tau = found * (1 + _MARGIN), 0.0, None
+                continue
+            log_tau, _ = _calmest(scaling, response, best[0])
+        assert log_tau is not None
+        up, down = scaling.of(log_tau)
         reached = _holds_until(StateSpace(closed.A, closed.B * down, closed.C * up[:, None], closed.D * up[:, None] * down, 0.0), nu)
         if reached == np.inf:
             return RobustGain(level, found, freq_hz)
         if reached <= nu * (1 + 1e-9):
-            break
+            if not warm:
+                break
+            log_tau = None
         nu = reached
     raise SynthesisError(
         f"Certificate: the worst-case gain of {found:.6g} at {freq_hz:.6g} Hz could not be proven above {np.arctan(nu) / (np.pi * dt):.6g} Hz; "
@@ -211,8 +219,8 @@ class _Scaling:
         return np.where(self.rows < 0, 1.0, root[self.rows]), np.where(self.columns < 0, 1 / self.level, 1 / root[self.columns])
 
 
-def _calmest(scaling: _Scaling, response: Array, point: Array) -> Array:
-    """Multipliers that leave the most room below the level at one frequency: compass search on a quasiconvex function."""
+def _calmest(scaling: _Scaling, response: Array, point: Array) -> tuple[Array, float]:
+    """Multipliers that leave the most room below the level at one frequency, and the gain: compass search on a quasiconvex function."""
 
     def size(log_tau: Array) -> float:
         up, down = scaling.of(log_tau)
@@ -227,7 +235,14 @@ def _calmest(scaling: _Scaling, response: Array, point: Array) -> Array:
             point, value = tried[k], sizes[k]
         else:
             step /= 2
-    return point
+    return point, value
+
+
+def _evened(system: StateSpace) -> StateSpace:
+    """States in units of their own spread, for the sake of the eigenvalues."""
+    size = np.sqrt(np.maximum(np.diag(gramian(system.A, system.B, system.dt)), 1e-300))
+    size = np.where(size > 1e-12 * size.max(initial=0.0), size, 1.0)
+    return StateSpace(system.A * size / size[:, None], system.B / size[:, None], system.C * size, system.D, system.dt)
 
 
 def _holds_until(system: StateSpace, nu: float) -> float:

@@ -49,6 +49,7 @@ def worst_case_hinf(
     refinements: int = 1,
     tolerance: float = 1e-3,
     fit: Fit | None = None,
+    bounded: bool = True,
 ) -> Synthesis:
     """Return an observer filter with a certified H-infinity norm for every member of the uncertain set.
 
@@ -66,6 +67,8 @@ def worst_case_hinf(
         Relative width of the search over the level.
     fit : callable, optional
         As in `worst_case_h2`.
+    bounded : bool
+        Look for a lower bound as well.
 
     Returns
     -------
@@ -103,8 +106,10 @@ def worst_case_hinf(
         loop = problem.error_system(controller)
     if reasons and best[1] is nothing:
         raise SynthesisError(f"Worst-case H-infinity synthesis: no design survived verification ({'; '.join(reasons)}).")
-    low = Spectrum(channels.shaped(below(channels.symmetric_part())), None)
-    lower = lower_bound(problem, channels.lowered(channels.shaping(low, fit, "below", options), low), tolerance)
+    lower = None
+    if bounded:
+        low = Spectrum(channels.shaped(below(channels.symmetric_part())), None)
+        lower = lower_bound(problem, channels.lowered(channels.shaping(low, fit, "below", options), low), tolerance)
     return _result(problem, *best, lower, elapsed / (refinements + 1))
 
 

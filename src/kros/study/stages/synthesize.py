@@ -16,18 +16,19 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import SynthesisError
 from ...identify import ModelSet
 from ...observer import Observer
-from ...synthesis import Injection, ObserverProblem, Synthesis
+from ...synthesis import Injection, ObserverProblem, Synthesis, check_units
 from ...synthesis.certificate import certify
 from ...uncertainty import UncertainModel
 from ..context import Context
 from ..makers import Product, Task, produce
 from ..relift import Running, certify_running, save_running
+from ..residual_maker import OwnModel
 from ..tuning import TUNING_EPISODES, TUNING_UNITS, TuningSet
 from . import calibrate
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-PREFERRED = ("worst_case_h2", "mixed", "residual_h2", "kalman_tuned", "luenberger", "kalman_white", "open_loop")
+PREFERRED = ("worst_case_h2", "worst_case_hinf", "mixed", "residual_h2", "kalman_tuned", "luenberger", "kalman_white", "open_loop")
 
 
 def run(context: Context) -> list[Path]:
@@ -35,24 +36,34 @@ def run(context: Context) -> list[Path]:
     tasks = [task for name in context.model_names for task in tasks_of(context, name)]
     products = list(context.map("synthesize", produce, tasks))
     files, facts = [], {}
+    certificates = iter(context.run("certify", certificates_of(tasks, products)))
     for task, product in zip(tasks, products, strict=True):
         facts[task.name] = dict(product.facts)
         if product.synthesis is None:
             if product.facts["reason"] != task.refusal:
                 log.warning("%s could not be made: %s", task.name, product.facts["reason"])
         else:
-            facts[task.name] |= certificate(task, product.synthesis, certified_problem(task, tasks, products))
+            facts[task.name] |= next(certificates)
             files += save(context, task, product.synthesis)
     made = [p.name for p in products if p.synthesis is not None]
     deployed = choose_deployed(context.config.observer.deployed, made)
     folder = context.store.path("observers")
-    running = [r for found in context.run("certify", as_it_runs(tasks, products)) for r in found]
+    running = [r for found in context.run("certify as it runs", as_it_runs(tasks, products)) for r in found]
     files += save_running(folder, running)
     for found in running:
         facts[found.name] |= found.facts()
     save_artifact(folder, "observers", {"names": made, "deployed": deployed, "facts": facts})
     Observer.load(folder / f"{deployed}.json").save(folder / "deployed.json")
     return [*files, folder / "observers.json", folder / "deployed.json"]
+
+
+def certificates_of(tasks: list[Task], products: list[Product]) -> list[Callable[[], dict[str, Any]]]:
+    """Return the work of certifying every observer that was made for the uncertain set."""
+    return [
+        partial(certificate, task, product.synthesis, certified_problem(task, tasks, products))
+        for task, product in zip(tasks, products, strict=True)
+        if product.synthesis is not None
+    ]
 
 
 def as_it_runs(tasks: list[Task], products: list[Product]) -> list[Callable[[], list[Running]]]:
@@ -81,15 +92,18 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     unit = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
     folder = context.store.path("uncertainty", name)
     noise = measurement_noise(context, models)
-    problem, refusal = usable_problem(models, unit, UncertainModel.load(folder), noise, context)
+    uncertain = UncertainModel.load(folder)
+    problem, refusal = usable_problem(models, unit, uncertain, noise, context)
     methods = set(config.observer.baselines + config.synthesis.methods)
     if name not in context.edmd_names:
         methods.discard("mixed")  # the paper's synthesis is made for the paper's models: see the page on limits
     ordered = [
-        m for m in ("open_loop", "kalman_white", "kalman_tuned", "luenberger", "mixed", "worst_case_h2", "residual_h2") if m in methods
+        m
+        for m in ("open_loop", "kalman_white", "kalman_tuned", "luenberger", "mixed", "worst_case_h2", "worst_case_hinf", "residual_h2")
+        if m in methods
     ]
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
-    settings["max_order"] = config.uncertainty.max_order
+    settings |= {"max_order": config.uncertainty.max_order, "covered": uncertain.unit_ids}
     return [
         Task(f"{name}/{method}", method, models, unit, problem, refusal, noise, tuning_set(context, models), **settings)
         for method in ordered
@@ -157,8 +171,10 @@ def certified_problem(task: Task, tasks: list[Task], products: list[Product]) ->
 
 
 def certificate(task: Task, synthesis: Synthesis, problem: ObserverProblem | None) -> dict[str, Any]:
-    """Recompute what can be said about an observer, however it was made."""
+    """Recompute what can be said about an observer, however it was made, and whether it holds for every unit's model."""
     facts: dict[str, Any] = {"order": synthesis.controller.n_states, "spectral_radius_max": None, "worst_case_h2": None}
+    if isinstance(synthesis, OwnModel):
+        return facts | {"reason": synthesis.reason}
     if problem is None:
         return facts | {"reason": task.refusal}
     problem = replace(problem, injection=synthesis.injection)
@@ -166,10 +182,18 @@ def certificate(task: Task, synthesis: Synthesis, problem: ObserverProblem | Non
     facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
     try:
         facts["worst_case_h2"] = certify(problem, synthesis.controller)[0]
+        found = check_units(problem, synthesis.controller, task.models.systems(task.covered), task.covered)
     except SynthesisError as error:
         log.warning("%s: no certificate, %s", task.name, error)
-        facts["reason"] = str(error)
-    return facts
+        return facts | {"reason": str(error)}
+    if not found.holds:
+        log.warning("%s: the error of a unit's model is %.3g times its certified bound", task.name, found.largest_ratio)
+    facts |= {"worst_case_hinf": found.worst_case_hinf, "causal_h2": synthesis.causal_h2}
+    return facts | {
+        "bound_holds": found.holds,
+        "unit_to_bound_max": found.largest_ratio,
+        "unit_to_density_max": float(found.density_ratio.max(initial=0.0)),
+    }
 
 
 def save(context: Context, task: Task, synthesis: Synthesis) -> list[Path]:

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
-from .small import adjoint, entries_first, multiply, sigma_max_first
+from .small import adjoint, entries_first, multiply, sigma_max_first, squared
 
 Array = npt.NDArray[Any]
 
@@ -102,7 +102,9 @@ def as_structure(structure: Structure | str) -> Structure:
         raise ConfigError(f"Weight structure {structure!r} is unknown; choose {', '.join(repr(s.value) for s in Structure)}.") from error
 
 
-def optimal_cover(E: Array, structure: Structure | str = Structure.DIAGONAL, pull: float = _PULL) -> Cover:
+def optimal_cover(
+    E: Array, structure: Structure | str = Structure.DIAGONAL, pull: float = _PULL, squarings: tuple[int, ...] = _SQUARINGS
+) -> Cover:
     """Return the cover with the smallest mean log magnitudes.
 
     Parameters
@@ -112,6 +114,8 @@ def optimal_cover(E: Array, structure: Structure | str = Structure.DIAGONAL, pul
         Scalar; every other one has the diagonal cover.
     pull : float
         Pull towards equal entries, relative to the cost: a larger one gives covers that cost more and vary less over frequency.
+    squarings : tuple of int
+        s of the smoothed maxima, `q = 2^s + 1`, one after the other; fewer are quicker, and the cover is the less optimal.
 
     Returns
     -------
@@ -123,7 +127,7 @@ def optimal_cover(E: Array, structure: Structure | str = Structure.DIAGONAL, pul
     size = sigma_max_first(first).max(axis=0)
     if as_structure(structure) is Structure.SCALAR:
         return Cover(np.repeat(size[:, None], p, axis=1), np.ones((len(size), m)))
-    x = _descend(first, size, p, pull, free_right=True)
+    x = _descend(first, size, p, pull, free_right=True, squarings=squarings)
     right = np.exp(x[p:] - x[p:].mean(axis=0)).T
     right = right / right[:, [int(np.argmax(np.median(right, axis=0)))]]
     return Cover(_scaled_left(first, np.exp(x[:p]).T, right), right)
@@ -151,7 +155,7 @@ def _scaled_left(first: Array, left: Array, right: Array) -> Array:
     return left * sigma_max_first(first / left.T[:, None, None, :] / right.T[None, :, None, :]).max(axis=0)[:, None]
 
 
-def _descend(first: Array, size: Array, p: int, pull: float, *, free_right: bool) -> Array:
+def _descend(first: Array, size: Array, p: int, pull: float, *, free_right: bool, squarings: tuple[int, ...] = _SQUARINGS) -> Array:
     """Minimise the smoothed cost over x of shape (p' + m', frequency); the right part only where it is free.
 
     Newton's method runs on part of the frequencies and of the units, and x is interpolated: the scale s, which is recomputed for all
@@ -165,9 +169,9 @@ def _descend(first: Array, size: Array, p: int, pull: float, *, free_right: bool
     E = first[..., chosen] / size[chosen]
     E = E[:, :, _largest(sigma_max_first(E))]
     x = np.zeros((n, len(chosen)))
-    for squarings in _SQUARINGS:
+    for power in squarings:
         for _ in range(_NEWTON):
-            x, moved = _newton(_Smooth(E, p, n if free_right else p, squarings, pull), x)
+            x, moved = _newton(_Smooth(E, p, n if free_right else p, power, pull), x)
             if moved < 1e-3:
                 break
     return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
@@ -193,7 +197,7 @@ class _Smooth:
         """Return the cost, shape (frequency,), and its gradient, shape (free, frequency)."""
         p, m = self.p, len(x) - self.p
         M = self.E * np.exp(-x[:p])[:, None, None, :] * np.exp(-x[p:])[None, :, None, :]
-        top = sigma_max_first(M).max(axis=0)
+        top = np.sqrt(squared(M).sum(axis=(0, 1)).max(axis=0))  # no smaller than the largest singular value, and at most four times
         M = M / top
         wide = p <= m
         power = multiply(M, adjoint(M)) if wide else multiply(adjoint(M), M)

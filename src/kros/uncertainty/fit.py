@@ -217,28 +217,6 @@ def invert(system: StateSpace) -> StateSpace:
     return StateSpace(system.A - B @ system.C, B, -D @ system.C, D, system.dt)
 
 
-def rough(tau: Array, magnitude: Array, order: int) -> RationalMagnitude | None:
-    """Return a squared magnitude of one order above data, in the basis with as many knots: close to the best one, and quickly.
-
-    Parameters
-    ----------
-    tau : ndarray, shape (n_points,)
-    magnitude : ndarray, shape (n_points,), positive
-    order : int
-    """
-    targets = np.maximum(magnitude, _FLOOR * magnitude.max()) ** 2
-    unit = np.exp(np.mean(np.log(targets)))
-    targets = targets / unit
-    found = None
-    if order > 0:
-        knots = _knots(tau, targets, order, 0.05)
-        found = Grid.build(tau, targets, knots, np.zeros(0)).match(targets**-0.5)
-    if found is None or found.negative_at():
-        bound = _minimax(tau, targets, order, None, np.inf)
-        found = None if bound is None else bound.rational
-    return None if found is None else RationalMagnitude(found.numerator * unit, found.denominator, found.knots)
-
-
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """Data of one fit, in physical values; the programs work on `targets`."""

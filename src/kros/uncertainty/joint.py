@@ -1,40 +1,44 @@
 r"""Joint fit: all magnitudes of a diagonal weight at once, tight against the cost of the optimal cover and not against one of its choices.
 
 A cover has more freedom than its cost shows: whole families of covers are within a fraction of a decibel of the optimum, and units that take
-turns put kinks in each. Fitting one cover entry by entry follows kinks that nobody needs. Here the coefficients of all entries are moved
-together, to minimise
+turns put kinks in each. Fitting one cover entry by entry follows kinks that nobody needs. Here the parameters of all entries (`sections`) are
+moved together, to minimise
 
     max_f ( mean_i log W_L,i + mean_j log W_R,j - optimal(f) )  +  max_(f, k) log sigma_max(W_L^-1 E_k W_R^-1)
 
 where the second term is what soundness at all frequencies costs in scale. Square weights pay a twentieth of their peak, the largest
-`W_L,i W_R,i`, besides: it decides among covers of equal cost, and a large one brings an inverse form close to an ill-posed set. Sequential
-linear programs: logarithms of the magnitudes are linearised in the coefficients of numerators and denominators, and log sigma along its
-singular vectors, `d log sigma = -sum |u_i|^2 d log W_L,i - sum |v_j|^2 d log W_R,j`. A step is taken only where the true value falls, so that
-every iterate is a sound weight after scaling and none is worse than the start.
+`W_L,i W_R,i`, besides: it decides among covers of equal cost, and a large one brings an inverse form close to an ill-posed set.
+
+Every maximum is smoothed, `T log sum exp(. / T)`, with a temperature T that falls as the fit settles. Its Hessian is dominated by the spread
+of the gradients of what is nearly worst, `(sum w g g^T - (sum w g)(sum w g)^T) / T`, so that damped Gauss-Newton steps suffice, where linear
+programs over single maxima zigzag. Singular values move along their vectors,
+`d log sigma = -sum |u_i|^2 d log W_L,i - sum |v_j|^2 d log W_R,j`. Every iterate is a sound weight after scaling by what it exceeds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from .spectral import RationalMagnitude, basis
+from .sections import Sections
 
 Array = npt.NDArray[Any]
 
-_NEPER_DB = 20 * np.log10(np.e)
-_STEPS = 40
-_GUARDS = 3
-_TRUST = 0.3  # largest first step of a coefficient, relative to where its numerator or denominator would turn negative
-_WIDEST, _NARROWEST = 0.9, 1e-3
-_GAIN_DB = 0.01  # a step that promises less is not taken
+NEPER_DB = 20 * np.log10(np.e)
 _PEAK = 0.05  # price of the peak
-_DIRECTIONS = 3  # singular vectors per frequency that constrain a step
+_FARTHEST = 1.5  # largest change of a parameter in a step
+_SETTLED = 0.02  # gain of a step, in temperatures, below which the temperature falls
+_TRIES = 8
+_NEGLIGIBLE = 1e-6  # weight of a term in a smoothed maximum
+_BEYOND = 7.0  # log tau that places may go beyond the frequencies
+_DAMPING = (1e-6, 1e-2)  # smallest and first
+_PLACES, _DIPOLE = 60, np.log(2.0)  # where further sections are tried, and their width
+_TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,163 +47,211 @@ class JointFit:
 
     Parameters
     ----------
-    residuals : ndarray, shape (unit, frequency, p', m'), complex
+    residuals : ndarray, shape (n, p', m'), complex
+        Of units at frequencies.
+    at : ndarray of int, shape (n,)
+        The frequency each belongs to.
     tau : ndarray, shape (frequency,)
     optimal : ndarray, shape (frequency,), nepers
-        Cost of the optimal cover: mean log left plus mean log right.
-    guard : ndarray, shape (n,)
-        Further tau at which numerators and denominators are kept positive.
+        Cost of the optimal cover, mean log left plus mean log right; infinite where nothing has to be tight.
     price : float
         Of the peak of square weights.
     """
 
     residuals: Array
+    at: Array
     tau: Array
     optimal: Array
-    guard: Array
     price: float = _PEAK
 
-    def fit(self, start: Sequence[RationalMagnitude]) -> tuple[list[RationalMagnitude], float]:
-        """Return squared magnitudes that are positive at all frequencies, and their excess cost in dB.
+    @property
+    def n_left(self) -> int:
+        """Number of left entries."""
+        return int(self.residuals.shape[1])
 
-        Where the result of `improve` turns negative between the guarded points, its roots are guarded too; at last the start is taken.
+    def descend(self, start: Sections, temperatures: Sequence[float], steps: int, enough_db: float = -np.inf) -> Fitted:
+        """Return better sections of the same orders, raised to be sound at the frequencies of the fit.
 
         Parameters
         ----------
-        start : sequence of RationalMagnitude, p' + m'
-            Left ones first, positive at all frequencies.
+        start : Sections
+            Left entries first.
+        temperatures : sequence of float, nepers
+            One after the other.
+        steps : int
+            At each temperature, at most.
+        enough_db : float, dB
+            Excess cost at which it stops.
         """
-        guarded = self
-        for _ in range(_GUARDS):
-            found, excess = guarded.improve(start)
-            bad = [x for r in found for x in r.negative_at()]
-            if not bad:
-                return found, excess
-            guarded = replace(guarded, guard=np.concatenate([guarded.guard, bad, [np.sqrt(x * y) for x, y in pairwise(sorted(bad))]]))
-        return guarded.improve(start, steps=0)
+        state, damping = _State.of(self, start), _DAMPING[1]
+        for temperature in temperatures:
+            for _ in range(steps):
+                if state.fitted().excess_db <= enough_db:
+                    return state.fitted()
+                before = state.value(temperature)
+                state, damping = state.step(temperature, damping)
+                if before - state.value(temperature) < _SETTLED * temperature:
+                    break
+        return state.fitted()
 
-    def improve(self, start: Sequence[RationalMagnitude], steps: int = _STEPS) -> tuple[list[RationalMagnitude], float]:
-        """Return better squared magnitudes, left ones first, of the same orders; scaled to be sound at `tau`, and their excess cost in dB."""
-        every = np.concatenate([self.tau, self.guard])
-        state = _State.of(self, [basis(every, r.knots) for r in start], [(r.numerator, r.denominator) for r in start])
-        if state is None:
-            return list(start), float("inf")
-        trust = _TRUST
-        for _ in range(steps):
-            step = state.program(trust)
-            if step is None or step.promise * _NEPER_DB < _GAIN_DB:
-                break
-            moved = _State.of(self, state.phi, step.pairs)
-            gain = -np.inf if moved is None else state.value - moved.value
-            if moved is not None and gain > 0:
-                state = moved
-            trust = min(_WIDEST, 1.6 * trust) if gain > 0.5 * step.promise else trust if gain > 0.2 * step.promise else trust / 3
-            if trust < _NARROWEST:
-                break
-        lift = float(np.exp(2 * state.sigma.max()))
-        n_left = self.residuals.shape[2]
-        found = [
-            RationalMagnitude(a * (lift if i < n_left else 1.0), b, r.knots)
-            for i, ((a, b), r) in enumerate(zip(state.pairs, start, strict=True))
-        ]
-        return found, float(state.excess.max() + state.sigma.max()) * _NEPER_DB
+    def ends(self) -> tuple[float, float]:
+        """Places that sections may take."""
+        inner = np.log(self.tau[(self.tau > 0) & (self.tau < 1e12)])
+        return float(inner.min() - _BEYOND), float(inner.max() + _BEYOND)
+
+    def evaluate(self, start: Sections) -> Fitted:
+        """Return sections raised to be sound."""
+        return _State.of(self, start).fitted()
+
+    def grown(self, start: Sections, temperature: float) -> Sections:
+        """Return the same magnitudes with a pair of poles and zeros more in every entry that has any, where moving them apart gains most."""
+        low, high = self.ends()
+        entries, places = np.flatnonzero(start.orders > 0), np.linspace(low + _BEYOND, high - _BEYOND, _PLACES)
+        probe = Sections.spread([places[[i]] for i in range(_PLACES)], [2] * _PLACES, _DIPOLE)
+        slopes = probe.slopes(self.tau)[_PLACES:]
+        apart = slopes[: 2 * _PLACES : 2], slopes[2 * _PLACES :: 2]  # of the zeros: by place and by width
+        weights = _State.of(self, start).weights(temperature)[entries]
+        gain = sum(np.abs(weights @ s.T) / np.linalg.norm(s, axis=1) for s in apart)
+        return start.with_pairs(entries, places[np.argmax(gain, axis=1)], _DIPOLE)
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
-    pairs: list[tuple[Array, Array]]
-    promise: float
+class Fitted:
+    """Sections that are sound at the frequencies of a fit.
+
+    Parameters
+    ----------
+    sections : Sections
+    excess_db : float, dB
+        Largest excess cost.
+    """
+
+    sections: Sections
+    excess_db: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Terms:
+    """One kind of terms under a smoothed maximum: values, frequencies, and how much every entry moves each."""
+
+    values: Array  # (n,)
+    at: Array  # (n,)
+    shares: Array  # (n, entry)
+    price: float
+
+    def weights(self, temperature: float) -> Array:
+        weight = np.exp((self.values - self.values.max()) / temperature)
+        return np.asarray(weight / weight.sum())
+
+    def smoothed(self, temperature: float) -> float:
+        top = float(self.values.max())
+        return self.price * (top + temperature * float(np.log(np.exp((self.values - top) / temperature).sum())))
+
+    def derivatives(self, temperature: float, slopes: Array, owner: Array) -> tuple[Array, Array]:
+        """Gradient and Gauss-Newton Hessian."""
+        weight = self.weights(temperature)
+        some = np.flatnonzero(weight > _NEGLIGIBLE)
+        rows = self.shares[some][:, owner].T * slopes[:, self.at[some]]
+        scaled = rows * weight[some]
+        gradient = scaled.sum(axis=1)
+        return self.price * gradient, self.price / temperature * (scaled @ rows.T - np.outer(gradient, gradient))
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Coefficients, and what they give at every frequency."""
+    """Sections, and what they give at every frequency."""
 
     data: JointFit
-    phi: list[Array]  # guard included
-    pairs: list[tuple[Array, Array]]
-    product: Array  # log of left_i right_i, (entry, frequency), none for weights that are not square
+    sections: Sections
     excess: Array  # (frequency,)
-    sigma: Array  # log singular values, (unit, frequency, rank)
-    left: Array  # squared moduli of the entries of the singular vectors, (unit, frequency, p', rank)
-    right: Array  # (unit, frequency, rank, m')
+    sigma: Array  # log singular values, (n, rank)
+    shares: Array  # squared moduli of the entries of the singular vectors, left then right, (n, rank, entry)
+    product: Array  # log of left_i right_i, (entry, frequency), none for weights that are not square
 
     @classmethod
-    def of(cls, data: JointFit, phi: list[Array], pairs: list[tuple[Array, Array]]) -> _State | None:
-        """Evaluate; None where a numerator or denominator is not positive."""
-        logs, count = np.empty((len(pairs), len(data.tau))), len(data.tau)
-        for i, (basis_i, (a, b)) in enumerate(zip(phi, pairs, strict=True)):
-            n, d = basis_i @ a, basis_i @ b
-            if min(n.min(), d.min()) <= 0:
-                return None
-            logs[i] = (np.log(n[:count]) - np.log(d[:count])) / 2
-        p, m = data.residuals.shape[2:]
-        M = data.residuals * np.exp(-logs[:p]).T[None, :, :, None] * np.exp(-logs[p:]).T[None, :, None, :]
-        if not np.isfinite(M).all():
-            return None
-        u, s, v = np.linalg.svd(M, full_matrices=False)
-        sigma = np.log(np.maximum(s, 1e-300))
-        excess = logs[:p].mean(axis=0) + logs[p:].mean(axis=0) - data.optimal
-        product = logs[:p] + logs[p:] if p == m else logs[:0]
-        return cls(data, phi, pairs, product, excess, sigma, np.abs(u) ** 2, np.abs(v) ** 2)
+    def of(cls, data: JointFit, sections: Sections) -> _State:
+        logs, p = sections.logs(data.tau), data.n_left
+        left, right = logs[:p], logs[p:]
+        scaled = data.residuals * np.exp(-left.T)[data.at][:, :, None] * np.exp(-right.T)[data.at][:, None, :]
+        excess = left.mean(axis=0) + right.mean(axis=0) - data.optimal
+        return cls(data, sections, excess, *_singular(scaled), left + right if len(left) == len(right) else left[:0])
 
-    @property
-    def value(self) -> float:
-        """What is minimised, nepers."""
-        scale = self.sigma.max()
-        return float(self.excess.max() + scale + (self.data.price * (self.product.max() + scale) if self.product.size else 0.0))
-
-    def program(self, trust: float) -> _Step | None:
-        """Solve the linear program around this point."""
-        from scipy.optimize import linprog
-
-        reach, slopes, n_left = 4 * trust, self._slopes(), self.data.residuals.shape[2]
-        near = np.flatnonzero(self.excess > self.excess.max() - reach)
-        cost = slopes[:n_left, near].mean(axis=0) + slopes[n_left:, near].mean(axis=0)
-        unit, freq, rank = self._binding(reach)
-        sound = -np.einsum("ki,ikx->kx", self.left[unit, freq, :, rank], slopes[:n_left, freq])
-        sound -= np.einsum("kj,jkx->kx", self.right[unit, freq, rank], slopes[n_left:, freq])
-        entry, high = np.nonzero(self.product > self.product.max(initial=-np.inf) - reach)
-        peak = slopes[entry, high] + slopes[n_left + entry, high]
-        count, price = slopes.shape[-1], self.data.price if self.product.size else 0.0
-        blocks = [np.hstack([rows, np.tile(-np.eye(3)[i], (len(rows), 1))]) for i, rows in enumerate((cost, sound, peak))]
-        result = linprog(
-            np.append(np.zeros(count), [1.0, 1.0 + price, price]),
-            A_ub=np.vstack(blocks),
-            b_ub=-np.concatenate([self.excess[near], self.sigma[unit, freq, rank], self.product[entry, high]]),
-            bounds=[(-trust, trust)] * count + [(None, None)] * 2 + [(None, None) if price else (0.0, 0.0)],
-            method="highs",
-            options={"time_limit": 2.0, "presolve": False},
+    @cached_property
+    def terms(self) -> tuple[_Terms, ...]:
+        """What is smoothed: cost, soundness, and the peak of square weights."""
+        p, price = self.data.n_left, self.data.price if self.product.size else 0.0
+        m = len(self.sections.level) - p
+        inside = np.flatnonzero(np.isfinite(self.excess))
+        mean = np.concatenate([np.full(p, 1 / p), np.full(m, 1 / m)])
+        n, rank = self.sigma.shape
+        found = (
+            _Terms(self.excess[inside], inside, np.broadcast_to(mean, (len(inside), p + m)), 1.0),
+            _Terms(self.sigma.ravel(), np.repeat(self.data.at, rank), -self.shares.reshape(n * rank, -1), 1.0 + price),
         )
-        if result.x is None:
-            return None
-        moves = np.split(result.x[:count], np.cumsum([2 * p.shape[1] for p in self.phi])[:-1])
-        pairs = []
-        for (a, b), phi, move in zip(self.pairs, self.phi, moves, strict=True):
-            up, down = _sizes(phi, a), _sizes(phi, b)
-            pairs.append((a + move[: len(a)] * up, b + move[len(a) :] * down))
-        return _Step(pairs, self.value - float(result.fun))
+        if not price:
+            return found
+        both, count = np.tile(np.eye(p), 2), self.product.shape[1]
+        return *found, _Terms(self.product.ravel(), np.tile(np.arange(count), p), np.repeat(both, count, axis=0), price)
 
-    def _slopes(self) -> Array:
-        """Derivatives of the log magnitudes in the scaled coefficients, shape (entry, frequency, coefficient)."""
-        widths = [2 * p.shape[1] for p in self.phi]
-        ends = np.cumsum(widths)
-        out = np.zeros((len(self.phi), len(self.data.tau), int(ends[-1])))
-        for i, (phi, (a, b)) in enumerate(zip(self.phi, self.pairs, strict=True)):
-            here = phi[: len(self.data.tau)]
-            n, d = (here @ a)[:, None], (here @ b)[:, None]
-            out[i, :, ends[i] - widths[i] : ends[i]] = np.hstack([here * _sizes(phi, a) / n, -here * _sizes(phi, b) / d]) / 2
-        return out
+    def value(self, temperature: float) -> float:
+        """What is minimised, nepers."""
+        return sum(t.smoothed(temperature) for t in self.terms)
 
-    def _binding(self, reach: float) -> tuple[Array, Array, Array]:
-        """Units, frequencies and ranks of the singular values within reach of the largest, the largest few of each frequency."""
-        unit, freq, rank = np.nonzero(self.sigma > self.sigma.max() - min(reach, 0.7))
-        order = np.lexsort((-self.sigma[unit, freq, rank], freq))
-        unit, freq, rank = unit[order], freq[order], rank[order]
-        first = np.arange(len(freq)) - np.searchsorted(freq, freq) < _DIRECTIONS
-        return unit[first], freq[first], rank[first]
+    def weights(self, temperature: float) -> Array:
+        """How much every log magnitude moves what is minimised, shape (entry, frequency)."""
+        out = np.zeros((len(self.data.tau), len(self.sections.level)))
+        for terms in self.terms:
+            np.add.at(out, terms.at, terms.price * terms.weights(temperature)[:, None] * terms.shares)
+        return out.T
+
+    def step(self, temperature: float, damping: float) -> tuple[_State, float]:
+        """One damped Gauss-Newton step, and the damping of the next."""
+        slopes, owner = self.sections.slopes(self.data.tau), self.sections.owner
+        parts = [t.derivatives(temperature, slopes, owner) for t in self.terms]
+        gradient, hessian = sum(p[0] for p in parts), sum(p[1] for p in parts)
+        hessian = hessian + self.sections.curvature(self.data.tau, self.weights(temperature))
+        size = np.diag(hessian)
+        size = np.maximum(size, 1e-3 * size.max() + _TINY)
+        before, ends = self.value(temperature), self.data.ends()
+        for _ in range(_TRIES):
+            move = -np.linalg.solve(hessian + np.diag(damping * size + 1e-12 * size.max()), gradient)
+            move *= min(1.0, _FARTHEST / max(float(np.abs(move).max()), _TINY))
+            trial = _State.of(self.data, self.sections.moved(move, ends))
+            if trial.value(temperature) < before:
+                return trial, max(damping / 4, _DAMPING[0])
+            damping *= 4
+        return self, damping
+
+    def fitted(self) -> Fitted:
+        lift = float(self.sigma.max())
+        excess = float(self.excess[np.isfinite(self.excess)].max()) + lift
+        return Fitted(self.sections.lifted(slice(0, self.data.n_left), lift), excess * NEPER_DB)
 
 
-def _sizes(phi: Array, coefficients: Array) -> Array:
-    """How far every coefficient may move alone before the sum turns negative somewhere."""
-    return ((phi @ coefficients)[:, None] / np.maximum(phi, 1e-300)).min(axis=0)
+def _singular(matrices: Array) -> tuple[Array, Array]:
+    """Log singular values, shape (n, rank), and squared moduli of the entries of their vectors, shape (n, rank, p' + m'), from Gram matrices."""
+    adjoint = np.conj(np.swapaxes(matrices, 1, 2))
+    wide = matrices.shape[1] <= matrices.shape[2]
+    squared, short = np.linalg.eigh(matrices @ adjoint if wide else adjoint @ matrices)
+    long = np.abs((adjoint if wide else matrices) @ short) ** 2
+    long /= np.maximum(long.sum(axis=1, keepdims=True), _TINY)
+    parts = (np.abs(short) ** 2, long) if wide else (long, np.abs(short) ** 2)
+    return np.log(np.maximum(squared, _TINY)) / 2, np.swapaxes(np.concatenate(parts, axis=1), 1, 2)
+
+
+def follow(tau: Array, logs: Array, start: Sections, ends: tuple[float, float], steps: int) -> Sections:
+    """Return sections that follow log magnitudes (entry, frequency) in the least-squares sense, by Levenberg and Marquardt's steps."""
+    owner, damping = start.owner, 1e-2
+    rest = logs - start.logs(tau)
+    for _ in range(steps):
+        slopes = start.slopes(tau)
+        gradient = (slopes * rest[owner]).sum(axis=1)
+        hessian = (slopes @ slopes.T) * (owner[:, None] == owner)
+        move = np.linalg.solve(hessian + np.diag(damping * np.diag(hessian) + 1e-9 * len(tau)), gradient)
+        trial = start.moved(np.clip(move, -_FARTHEST, _FARTHEST), ends)
+        after = logs - trial.logs(tau)
+        if (after**2).sum() < (rest**2).sum():
+            start, rest, damping = trial, after, damping / 4
+        else:
+            damping *= 8
+    return start

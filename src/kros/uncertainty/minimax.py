@@ -73,10 +73,6 @@ class Grid:
                 break
         return found
 
-    def match(self, start: Array) -> RationalMagnitude | None:
-        """Return the bound that the first iteration ends with."""
-        return self._start(start)[1]
-
     def _iterate(self, scale: Array) -> tuple[RationalMagnitude | None, float]:
         scale, best, gamma = self._start(scale)
         for _ in range(_STEPS):

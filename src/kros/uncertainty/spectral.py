@@ -57,11 +57,6 @@ class RationalMagnitude:
         phi = basis(np.asarray(tau, float), self.knots)
         return (phi @ self.numerator) / (phi @ self.denominator)
 
-    def negative_at(self) -> list[float]:
-        """Return where numerator or denominator touches zero between DC and Nyquist: from their roots, not by sampling; none if positive."""
-        ends = [tau for k, tau in ((0, 0.0), (-1, float("inf"))) if min(self.numerator[k], self.denominator[k]) <= 0]
-        return ends + [x for c in (self.numerator, self.denominator) for x in on_half_line(roots(c, self.knots)[0])]
-
 
 def basis(tau: Array, knots: Array) -> Array:
     """Return phi, shape (..., order + 1)."""

@@ -2,32 +2,29 @@ r"""Weights: diagonal systems left and right that bound the residuals of all uni
 
     E_k = W_L Delta_k W_R,   ||Delta_k|| <= 1      w2 ──> W_L ──>   and   ──> W_R ──> z2
 
-One right entry is one (the gauge of `cover`), so that p' + m' - 1 magnitudes are fitted. Diagonal weights start from a cover that is pulled
-towards equal entries, smoothed over about an eighth of a decade and fitted entry by entry; then all coefficients move together (`joint`),
-against the cost of the optimal cover, of which no single choice has to be followed. Where the excess stays large, other pulls and other
-right entries are tried. What counts is the check at the end: on a grid ten times denser with DC and Nyquist, and between its points as far as
-the residuals allow (`certificate`), for the systems as returned. Where it fails, the worst frequencies and units join the fit, and at last the
-left weight is scaled until it touches.
+All entries of diagonal weights are fitted together (`diagonal`, `joint`), against the cost of the optimal cover, of which no single choice has
+to be followed. What counts is the check at the end: on a grid ten times denser with DC and Nyquist, and between its points as far as the
+residuals allow (`certificate`), for the systems as returned. Where it fails, the worst frequencies and units join the fit, and at last the left
+weight is scaled until it touches.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import KrosError
 from ..core.frequency import bilinear_squared, dense_grid
 from ..core.lti import StateSpace, block_diagonal, gain
 from .certificate import Method, ResidualSystems, certify
-from .cover import Cover, Perturbation, Structure, as_structure, cover_ratio, optimal_cover, optimal_left
-from .fit import fit_magnitude, rough
-from .joint import JointFit
-from .spectral import RationalMagnitude, roots, spectral_factor
+from .cover import Cover, Perturbation, Structure, as_structure, cover_ratio, optimal_cover
+from .diagonal import Problem, fit_sections, refit
+from .fit import fit_magnitude
+from .sections import Sections
 
 Array = npt.NDArray[Any]
 Residuals = Callable[[Array], Array]
@@ -37,14 +34,9 @@ _MARGIN = 1e-9
 _LIFT = 1.02  # a deficit up to here is lifted, a larger one refines the grid
 _ROUNDS = 4
 _WORST = 20  # frequencies added in a round
-_SMOOTHING_DECADES = 0.15
-_FLOOR = 1e-8  # magnitudes below this fraction of the largest count as this fraction (-160 dB)
-_GOOD = 1.5  # no other start is tried below this many tolerances
-_PULLS = (0.1, 1.0)
 _POINTS = 160  # of the grid in the joint fit
+_MISSED_DB = 0.05  # a cost higher than this between the points of the fit brings further ones
 _TAIL = 16  # points towards DC and Nyquist, four a decade
-_GUARD = 2000  # points at which it stays positive
-_UNITS = 6  # per frequency in the joint fit; the check sees all
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,9 +141,11 @@ def fit_weight(
     dense = checking_grid(freqs_hz, sample_period_s, density)
     checked = _Checked(dense, residuals(dense))
     fitter = _Fitter(sample_period_s, max_order, tolerance_db, (freqs_hz[0], freqs_hz[-1]))
-    together = structure is Structure.DIAGONAL and best.left.any()
-    weight = _fit_diagonal(fitter, residuals, checked) if together else _fit_scalar(fitter, freqs_hz, E, checked, structure)
-    weight = _finish(weight, residuals, checked, systems)
+    if structure is Structure.DIAGONAL and best.left.any():
+        unscaled = _fit_diagonal(fitter, residuals, freqs_hz, E, best, checked)
+    else:
+        unscaled = _fit_scalar(fitter, freqs_hz, E, checked, structure)
+    weight = _finish(unscaled, residuals, checked, systems)
     excess = overbound_db(weight, freqs_hz, best)
     kept = weight.within_tolerance if structure is Structure.SCALAR else excess <= tolerance_db
     return replace(
@@ -204,6 +198,12 @@ class _Fitter:
         """Whether frequencies are within the band that was asked for."""
         return (freqs_hz >= self.band_hz[0]) & (freqs_hz <= self.band_hz[1])
 
+    def weight(self, sections: Sections, n_left: int) -> Weight:
+        """Return the systems, not yet checked."""
+        systems, orders = sections.systems(self.sample_period_s), tuple(int(n) for n in sections.orders)
+        left, right = block_diagonal(systems[:n_left]), block_diagonal(systems[n_left:])
+        return Weight(left, right, orders[:n_left], orders[n_left:], Structure.DIAGONAL, np.nan, np.nan)
+
 
 def _fit_scalar(fitter: _Fitter, freqs_hz: Array, E: Array, checked: _Checked, structure: Structure) -> Weight:
     """One magnitude for the largest singular values, fitted again with the frequencies at which it is exceeded."""
@@ -221,128 +221,62 @@ def _fit_scalar(fitter: _Fitter, freqs_hz: Array, E: Array, checked: _Checked, s
     return weight
 
 
-def _fit_diagonal(fitter: _Fitter, residuals: Residuals, checked: _Checked) -> Weight:
-    """Joint fit from several starts, and again with the frequencies and units at which it is exceeded."""
-    size = optimal_cover(checked.E, Structure.SCALAR).left[:, 0]
-    chosen = np.concatenate([np.flatnonzero(~fitter.inside(checked.freqs_hz)), _telling(checked.freqs_hz, size)])
-    chosen = np.unique(chosen)
-    freqs, some = checked.freqs_hz[chosen], checked.E[:, chosen]
-    best = optimal_cover(some)
-    units = _leading(cover_ratio(some, best.left, best.right))
-    found: _Candidate | None = None
-    for start in _starts(fitter, freqs, some[units]):
-        candidate = _Candidate.of(start, _joint(freqs, some[units], fitter, checked.freqs_hz))
-        if candidate is not None and (found is None or candidate.excess_db < found.excess_db):
-            found = candidate
-        if found is not None and found.excess_db <= _GOOD * fitter.tolerance_db:
-            break
-    if found is None:
-        raise KrosError("Weights: no fit of the diagonal cover is positive at all frequencies; ask for scalar weights or another order.")
-    weight = found.weight(fitter, some.shape[2])
+def _fit_diagonal(fitter: _Fitter, residuals: Residuals, freqs_hz: Array, E: Array, best: Cover, checked: _Checked) -> Weight:
+    """Joint fit, and again with the frequencies and units at which it is exceeded or costs more than it should."""
+    problem = _problem(fitter, freqs_hz, E, best, checked)
+    found = fit_sections(problem, fitter.max_order, fitter.tolerance_db)
+    weight = fitter.weight(found.sections, E.shape[2])
     for _ in range(_ROUNDS):
-        bends = found.bends_hz(fitter.sample_period_s)
+        bends = np.arctan(np.sqrt(found.sections.bends())) / (np.pi * fitter.sample_period_s)
         seen = checked.with_points(bends, residuals(bends))
-        ratio = seen.ratio(weight)
-        if ratio.max() <= _LIFT:
+        ratio, used = seen.ratio(weight), weight.magnitudes(freqs_hz)
+        excess = (used.cost_db() - best.cost_db()) - found.excess_db
+        if ratio.max() <= _LIFT and not (excess > _MISSED_DB).any():
             break
-        _LOG.debug("Weight: exceeded %.3f times between grid points, refining the grid", ratio.max())
-        freqs, some = seen.added(_peaks(ratio.max(axis=0)), freqs, some)
-        units = np.union1d(units, _leading(ratio))
-        again = _Candidate.of(found.rationals, _joint(freqs, some[units], fitter, seen.freqs_hz))
-        if again is None:
-            break
-        found, weight = again, again.weight(fitter, some.shape[2])
+        _LOG.debug("Weight: exceeded %.3f times, by %.2f dB in cost between the points of the fit", ratio.max(), excess.max())
+        exceeded, costly = _peaks(ratio.max(axis=0)), _peaks(10 ** (np.nan_to_num(excess, nan=0.0, posinf=0.0) / 20))
+        problem = problem.joined(_problem_at(fitter, seen.freqs_hz[exceeded], seen.E[:, exceeded], freqs_hz, best, ratio[:, exceeded]))
+        problem = problem.joined(_problem_at(fitter, freqs_hz[costly], E[:, costly], freqs_hz, best))
+        found = refit(problem, found.sections)
+        weight = fitter.weight(found.sections, E.shape[2])
     return weight
 
 
-def _joint(freqs_hz: Array, E: Array, fitter: _Fitter, guard_hz: Array) -> JointFit:
-    """Joint fit where there is something to be covered: tight within the band, sound beyond it."""
-    best = optimal_cover(E)
-    some = best.left.min(axis=1) > 0
-    left = np.maximum(best.left[some], _FLOOR * best.left.max(axis=0))
-    optimal = np.log(left).mean(axis=1) + np.log(best.right[some]).mean(axis=1)
-    optimal[~fitter.inside(freqs_hz[some])] = np.inf
-    guard_hz = np.append(guard_hz[:: max(1, len(guard_hz) // _GUARD)], guard_hz[-1])
-    tau, guard = (bilinear_squared(f, fitter.sample_period_s) for f in (freqs_hz[some], guard_hz))
-    return JointFit(E[:, some], tau, optimal, guard)
+def _problem(fitter: _Fitter, freqs_hz: Array, E: Array, best: Cover, checked: _Checked) -> Problem:
+    """Where the size of the residuals bends and where the cover does; sound beyond the band, where nothing has to be tight."""
+    size, beyond = optimal_cover(E, Structure.SCALAR).left[:, 0], np.flatnonzero(~fitter.inside(checked.freqs_hz))
+    cost = np.sqrt(np.maximum(10 ** (best.cost_db() / 10), 0.0))
+    chosen = np.union1d(
+        _telling(freqs_hz, size, _POINTS // 2), _telling(freqs_hz, np.where(best.left.min(axis=1) > 0, cost, 0.0), _POINTS // 2)
+    )
+    inner = _problem_at(fitter, freqs_hz[chosen], E[:, chosen], freqs_hz, best)
+    return inner.joined(_problem_at(fitter, checked.freqs_hz[beyond], checked.E[:, beyond], freqs_hz, best))
 
 
-def _telling(freqs_hz: Array, size: Array) -> Array:
-    """Indices of both ends, the highest peaks, and points as dense as the size of the residuals bends, a share of them evenly spaced."""
+def _problem_at(fitter: _Fitter, freqs_hz: Array, E: Array, grid_hz: Array, best: Cover, ratio: Array | None = None) -> Problem:
+    """Residuals at some frequencies, with the cost of the optimal cover from the grid; frequencies where there is nothing to cover are left out."""
+    known = np.flatnonzero(best.left.min(axis=1) > 0)
+    cost = np.log(best.left[known]).mean(axis=1) + np.log(best.right[known]).mean(axis=1)
+    optimal = np.where(fitter.inside(freqs_hz), np.interp(freqs_hz, grid_hz[known], cost), np.inf)
+    near = known[np.searchsorted(grid_hz[known], freqs_hz).clip(0, len(known) - 1)]
+    ratio = cover_ratio(E, best.left[near], best.right[near]) if ratio is None else ratio
+    some = np.abs(E).max(axis=(0, 2, 3), initial=0.0) > 0
+    return Problem(freqs_hz[some], bilinear_squared(freqs_hz[some], fitter.sample_period_s), E[:, some], optimal[some], ratio[:, some])
+
+
+def _telling(freqs_hz: Array, size: Array, count: int) -> Array:
+    """Indices of both ends, the highest peaks, and points as dense as a size bends, a share of them evenly spaced."""
     inner = np.flatnonzero((size > 0) & (freqs_hz > 0))
     ends = [0, len(freqs_hz) - 1]
-    if len(inner) < _POINTS:
+    if len(inner) < count:
         return np.unique(np.concatenate([inner, ends]))
     level = np.log(size[inner])
     peaks = np.flatnonzero((level[1:-1] >= level[:-2]) & (level[1:-1] > level[2:])) + 1
     peaks = peaks[np.argsort(-level[peaks])[:_WORST]]
     bend = np.abs(np.gradient(np.gradient(level, np.log(freqs_hz[inner])))) + 1e-12
     share = np.cumsum(bend / bend.sum() + 1 / len(inner)) / 2
-    spread = np.interp((np.arange(_POINTS) + 0.5) / _POINTS, share, np.arange(len(inner))).round().astype(int)
+    spread = np.interp((np.arange(count) + 0.5) / count, share, np.arange(len(inner))).round().astype(int)
     return np.unique(np.concatenate([inner[peaks], inner[spread], ends]))
-
-
-def _starts(fitter: _Fitter, freqs_hz: Array, E: Array) -> Iterator[list[RationalMagnitude]]:
-    """Covers fitted entry by entry, for several pulls and gauges."""
-    for pull in _PULLS:
-        cover = optimal_cover(E, pull=pull)
-        some = cover.left.min(axis=1) > 0
-        inside, tau = fitter.inside(freqs_hz[some]), bilinear_squared(freqs_hz[some], fitter.sample_period_s)
-        for reference in np.argsort(-np.median(cover.right[some], axis=0), kind="stable")[:2]:
-            right = _level(_smoothed(cover.regauged(int(reference)).right[some], freqs_hz[some]), inside)
-            left = optimal_left(E[:, some], right, pull)
-            left = np.maximum(left, _level(left, inside))
-            orders = [fitter.max_order] * left.shape[1] + [0 if j == reference else fitter.max_order for j in range(right.shape[1])]
-            start = [rough(tau, values, order) for values, order in zip([*left.T, *right.T], orders, strict=True)]
-            if all(r is not None for r in start):
-                yield [r for r in start if r is not None]
-
-
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    """Squared magnitudes, left ones first, with their systems."""
-
-    rationals: Sequence[RationalMagnitude]
-    excess_db: float
-    joint: JointFit = field(repr=False)
-
-    @classmethod
-    def of(cls, start: Sequence[RationalMagnitude], joint: JointFit) -> _Candidate | None:
-        """Improve a start; None where it is not positive at the frequencies."""
-        rationals, excess = joint.fit(start)
-        return cls(rationals, excess, joint) if np.isfinite(excess) else None
-
-    def bends_hz(self, sample_period_s: float) -> Array:
-        """Frequencies nearest to the poles and zeros: a peak or a notch between grid points is there."""
-        found = np.array([t for r in self.rationals for c in (r.numerator, r.denominator) for t in roots(c, r.knots)[0]], complex)
-        tau = found[found.real > 0].real
-        return np.unique(np.arctan(np.sqrt(tau)) / (np.pi * sample_period_s))
-
-    def weight(self, fitter: _Fitter, n_left: int) -> Weight:
-        """Return the systems, not yet checked."""
-        dt = fitter.sample_period_s
-        systems = [spectral_factor(r, dt) for r in self.rationals]
-        orders = tuple(len(r.knots) for r in self.rationals)
-        left, right = block_diagonal(systems[:n_left]), block_diagonal(systems[n_left:])
-        return Weight(left, right, orders[:n_left], orders[n_left:], Structure.DIAGONAL, np.nan, np.nan)
-
-
-def _level(values: Array, inside: Array) -> Array:
-    """Values within the band, and beyond it the one at its end."""
-    band = np.flatnonzero(inside)
-    return values[np.clip(np.arange(len(values)), band[0], band[-1])]
-
-
-def _leading(ratio: Array) -> Array:
-    """Indices of the units that are among the largest anywhere."""
-    return np.unique(np.argsort(-ratio, axis=0)[:_UNITS])
-
-
-def _smoothed(values: Array, freqs_hz: Array) -> Array:
-    """Gaussian average of log values over log frequency; columns are smoothed one by one."""
-    x = np.log10(np.maximum(freqs_hz, freqs_hz[freqs_hz > 0].min(initial=np.inf)))
-    kernel = np.exp(-0.5 * ((x[:, None] - x) / _SMOOTHING_DECADES) ** 2) * (np.gradient(x).clip(0.0) if len(x) > 1 else 1.0)
-    return np.exp(kernel @ np.log(values) / kernel.sum(axis=1, keepdims=True))
 
 
 def overbound_db(weight: Weight, freqs_hz: Array, cover: Cover) -> float:

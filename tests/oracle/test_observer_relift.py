@@ -194,11 +194,11 @@ def test_dropped_measurements() -> None:
 
 
 def test_many_slopes_are_certified_by_multipliers() -> None:
-    functions = tuple(f"0.2*sin({k}*a)" for k in range(1, 5)) + tuple(f"0.2*cos({k}*b)" for k in range(1, 5))
+    functions = tuple(f"0.2*sin({k}*a)" for k in range(1, 5)) + tuple(f"0.2*cos({k}*b)" for k in range(1, 4))
     observer = random_observer(np.random.default_rng(5), functions, order=2)
     found = relift_certificate(observer)
     assert found.certified
-    assert len(found.multipliers) == len(found.channels) == 8
+    assert len(found.multipliers) == len(found.channels) == 7
     assert attack(found, observer, steps=20000).share <= 1
 
 

@@ -29,6 +29,10 @@ from .relift_multipliers import best_multipliers
 
 Array = npt.NDArray[np.float64]
 _GRID = 200
+_LOG_RANGE = (
+    -5.0,
+    20.0,
+)  # of what is above the least multiplier; closer to it, a peak between frequencies of the grid would break the proof
 _STEPS = (1.001, 1.003, 1.01, 1.03, 1.1, 1.3, 2.0)
 _SPARE = 0.25  # share of the distance to one that the extra output may take
 _TOLERANCE = 1e-8
@@ -174,6 +178,6 @@ def _single(H: Array) -> tuple[Array, float]:
     if lowest == 0.0:  # the slope does not reach the output
         return np.ones(1), float(np.linalg.norm(H[:, 1:, 1:], 2, axis=(1, 2)).max())
     found = minimize_scalar(
-        lambda log: _level(H, np.array([lowest * (1 + np.exp(log))])), bounds=(-20.0, 20.0), method="bounded", options={"xatol": 1e-2}
+        lambda log: _level(H, np.array([lowest * (1 + np.exp(log))])), bounds=_LOG_RANGE, method="bounded", options={"xatol": 1e-2}
     )
     return np.array([lowest * (1 + np.exp(found.x))]), float(np.sqrt(found.fun))

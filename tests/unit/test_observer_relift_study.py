@@ -1,0 +1,106 @@
+"""What a study makes of the certificate as it runs: operating boxes, facts, the section of the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kros.core.errors import DimensionError
+from kros.core.lti import gain
+from kros.data.population import EpisodeKey
+from kros.lifting import Lifting
+from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certificate, relift_report
+from kros.report.run_folder import RunFolder
+from kros.report.sections.relift import section
+from kros.study.relift import Running, certify, first_episodes, save_running
+from kros.study.tuning import TuningSet
+from kros.synthesis import Injection
+
+
+def observer(name: str, formula: str, slope: float) -> Observer:
+    """x+ = 0.8 x + slope * formula + u, without a correction."""
+    model = np.array([[0.8, slope], [0.0, 0.0]])
+    parameters = ("phase",) if "phase" in formula else ()
+    return Observer(
+        name,
+        Lifting(("x",), (formula,), parameters),
+        model,
+        np.array([[1.0], [0.0]]),
+        (0,),
+        ("u",),
+        gain(np.zeros((2, 1)), 1.0),
+        Injection.STATE,
+        1.0,
+    )
+
+
+@pytest.fixture
+def task() -> Any:
+    lifting = Lifting(("x",), ("x**2",))
+    models = SimpleNamespace(
+        lifting=lifting,
+        output_scale=np.array([2.0, 4.0]),
+        recorded_inputs=("u",),
+        input_scale=np.ones(1),
+        parameters={"phase": np.array([0.1, 0.4])},
+    )
+    return SimpleNamespace(models=models)
+
+
+def test_slopes_without_a_bound_get_an_operating_box(task: Any, caplog: pytest.LogCaptureFixture) -> None:
+    scales = ReliftScales(np.ones(1), np.ones(1), np.ones(1))
+    found = certify(observer("square", "x**2", 0.01), scales, task)
+    assert found.box["x"] == (-3.0, 3.0)
+    assert found.gain == pytest.approx(1 / (1 - 0.8 - 0.06), rel=5e-3)
+    assert any("x in [-3, 3]" in text for text in found.assumptions)
+    steep = certify(observer("steep", "x**2", 0.1), scales, task)
+    assert steep.status is ReliftStatus.UNSTABLE
+    assert "steep: no certificate covers it as it runs" in caplog.text
+
+
+def test_global_slopes_need_no_box_and_no_phase(task: Any) -> None:
+    found = certify(observer("sine", "sin(x + phase)", 0.1), ReliftScales(np.ones(1), np.ones(1), np.ones(1)), task)
+    assert found.certified
+    assert not found.box
+    assert "any value of phase" in found.assumptions
+
+
+def test_one_episode_of_every_unit() -> None:
+    keys = tuple(EpisodeKey(unit, "on", episode) for unit in ("a", "b") for episode in ("1", "2"))
+    tuning = TuningSet(None, keys, {})  # type: ignore[arg-type]
+    assert [(k.unit, k.episode) for k in first_episodes(tuning).keys] == [("a", "1"), ("b", "1")]
+
+
+def test_an_observer_without_certificate_has_no_report() -> None:
+    square = observer("square", "x**2", 0.1)
+    with pytest.raises(DimensionError, match="certify it first"):
+        relift_report(relift_certificate(square), square, np.zeros((5, 1, 1)), np.zeros((5, 1, 1)), ["a"])
+
+
+def test_wrong_scales_are_refused() -> None:
+    with pytest.raises(DimensionError, match="needs 1 errors"):
+        relift_certificate(observer("sine", "sin(x)", 0.1), scales=ReliftScales(np.ones(2), np.ones(1), np.ones(1)))
+    with pytest.raises(DimensionError, match="finite sizes above zero"):
+        ReliftScales(np.zeros(1), np.ones(1), np.ones(1))
+
+
+def test_the_report_tells_gains_bounds_and_failures(tmp_path: Path) -> None:
+    good, bad = observer("koopman/open_loop", "sin(x)", 0.1), observer("koopman/worst_case_h2", "sin(x)", 0.5)
+    states = np.cumsum(np.random.default_rng(0).standard_normal((50, 2, 1)), axis=0)
+    certificate = relift_certificate(good)
+    rows = relift_report(certificate, good, states, np.zeros((50, 2, 1)), ["a", "b"])
+    running = [Running(good.name, certificate, rows), Running(bad.name, relift_certificate(bad), [])]
+    assert [r.facts()["relift_certified"] for r in running] == [True, False]
+    assert running[0].facts()["relift_bound_worst"] == max(r.bound for r in rows)
+    save_running(tmp_path / "observers", running)
+    metrics = {"study": {"deployed": good.name}, "observers": {r.name: r.facts() for r in running}}
+    found = section(RunFolder(tmp_path), metrics)
+    assert found is not None
+    assert any("No certificate was found for" in text and "grows" in text for text in found.paragraphs)
+    assert [row[1].text for row in found.tables[0].rows] == ["10.0", "none"]
+    assert [row[0].text for row in found.tables[1].rows] == ["a", "b"]
+    assert section(RunFolder(tmp_path), {"study": {}, "observers": {}}) is None

@@ -14,7 +14,7 @@ from ..synthesis.result import Synthesis
 Array = npt.NDArray[np.float64]
 _SWEEP_DECADES = (-6, 10)
 _PER_DECADE = 1
-_FASTER = (1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.3, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0, 32.0)
+_FASTER = (1.25, 1.6, 2.0, 3.2, 5.0, 8.0, 13.0, 20.0)
 
 
 def noise_covariances(residual_covariance: Array, resolution: Array) -> tuple[Array, Array]:

@@ -136,7 +136,7 @@ class SynthesisConfig(_Section):
 class ObserverConfig(_Section):
     """Which observers are compared, and which one is handed over.
 
-    The extended Kalman filter runs on lifted models, where alone it differs from the tuned Kalman filter; ``filtered_difference`` and
+    The extended Kalman filter runs on the first lifted model (on a linear one it is the tuned Kalman filter); ``filtered_difference`` and
     ``learned`` need no model.
     """
 

@@ -125,15 +125,15 @@ def run(context: Context) -> list[Path]:
 
 
 def baseline_makers(context: Context, models: dict[str, ModelSet]) -> dict[str, Callable[[], Baseline]]:
-    """Return what makes every baseline that is no correction of a model: extended filters of lifted models, and those without a model."""
+    """Return what makes every baseline that is no correction of a model: the extended filter of the first lifted model, and those without a model."""
     asked, first = context.config.observer.baselines, next(iter(models.values()))
     nominal = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
     tuning = tuning_set(context, first)
     makers: dict[str, Callable[[], Baseline]] = {}
     if "ekf" in asked:
-        for name, found in models.items():
-            if found.lifting.functions or found.lifting.input_functions:
-                makers[f"{name}/ekf"] = partial(make_extended, tuning, found, nominal, measurement_noise(context, found))
+        lifted = [name for name, found in models.items() if found.lifting.functions or found.lifting.input_functions]
+        for name in lifted[:1]:
+            makers[f"{name}/ekf"] = partial(make_extended, tuning, models[name], nominal, measurement_noise(context, models[name]))
     if "filtered_difference" in asked:
         makers["filtered_difference"] = partial(make_difference, tuning, first.measured)
     if "learned" in asked:

@@ -1,0 +1,114 @@
+"""Maker of the residual-shaped observer: it may run rows of its own, fitted to single steps, where they promise smaller errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import SynthesisError
+from ..observer import Observer, ResidualModel, residual_models
+from ..synthesis import Synthesis, residual_h2
+from .tuning import rank
+
+if TYPE_CHECKING:
+    from .makers import Made, Task
+
+Array = npt.NDArray[np.float64]
+MAX_ORDER = 12
+_COMPARED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class OwnModel(Synthesis):
+    """A synthesis for a model of its own in place of the nominal unit's; no uncertain set around the nominal says anything about it.
+
+    Parameters
+    ----------
+    A : ndarray, shape (n_lifted, n_lifted)
+    B : ndarray, shape (n_lifted, m)
+    """
+
+    A: Array | None = None
+    B: Array | None = None
+
+    @property
+    def reason(self) -> str:
+        """Why there is no certificate for the uncertain set."""
+        return "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
+
+
+def make_residual_h2(task: Task) -> Made:
+    """Kalman gains for the one-step residuals that a model leaves on the training episodes of all units.
+
+    The model is the nominal unit's, or that with some rows fitted to single steps. Those that promise the smallest errors of the hidden states are
+    compared on the training episodes, by the same rule as all observers that are tuned.
+    """
+    judge, nominal = (
+        task.tuning.read(),
+        Observer.open_loop(
+            task.name,
+            task.models.lifting,
+            task.models.A[task.models.index(task.unit)],
+            task.models.B[task.models.index(task.unit)],
+            task.models.measured,
+            task.models.recorded_inputs,
+            task.models.sample_period_s,
+        ),
+    )
+    models = promising(task)[:_COMPARED]
+    made = [design(task, model) for model in models]
+    percents = judge.percent_of_all([nominal, *(task.observer(synthesis) for synthesis in made)])
+    ranks = [rank(percent, percents[0], task.models.measured) for percent in percents[1:]]
+    best = min(range(len(made)), key=lambda i: ranks[i])
+    if not np.isfinite(ranks[best][1]):
+        raise SynthesisError(
+            "Residual-shaped observer: it diverges on the training episodes, where it is retracted and lifted at every step."
+        )
+    facts: dict[str, Any] = {"training_error_to_open_loop": ranks[best][1], "order_reduction_percent": made[best].gap_percent}
+    names = [task.models.lifting.states[i] for i in models[best].refitted]
+    return made[best], facts | {"rows_fitted_to_single_steps": names}, task.problem
+
+
+def promising(task: Task) -> list[ResidualModel]:
+    """Return the models that may be run, the one that promises the smallest errors first; those that promise nothing are left out."""
+    models, row, judge = task.models, task.models.index(task.unit), task.tuning.read()
+    n, batch = models.lifting.n_states, judge.batch
+    found = residual_models(
+        models.lifting,
+        models.A[row],
+        models.B[row],
+        models.measured,
+        batch.states,
+        batch.inputs,
+        batch.lengths,
+        [key.unit for key in batch.keys],
+        judge.parameters if models.lifting.parameters else None,
+        task.noise,
+        models.output_scale[:n],
+        models.sample_period_s,
+    )
+    usable = [model for model in found if np.isfinite(model.promised).all()]
+    if not usable:
+        raise SynthesisError("Residual-shaped observer: no model promises bounded errors; check what is measured and the recordings.")
+    return usable
+
+
+def design(task: Task, model: ResidualModel) -> Synthesis:
+    """Return the synthesis for a model."""
+    models, n = task.models, task.models.lifting.n_states
+    made = residual_h2(
+        model.dynamics,
+        task.selector[:, :n],
+        model.spectra,
+        task.noise,
+        models.output_scale[:n],
+        models.sample_period_s,
+        n_lifted=models.lifting.n_lifted,
+        max_order=MAX_ORDER,
+    )
+    if not model.refitted:
+        return made
+    return OwnModel(**{f.name: getattr(made, f.name) for f in fields(Synthesis)}, A=model.A, B=model.B)

@@ -116,5 +116,10 @@ class AffineLoop:
         P, Q = gramian(loop.A, loop.B, loop.dt), gramian(loop.A.T, loop.C.T, loop.dt)
         seen = np.einsum("ij,jk,ik->i", C_y, P, C_y) + np.sum(D_y**2, axis=1)
         driven = np.einsum("ji,jk,ki->i", B_u, Q, B_u) + np.sum(D_u**2, axis=0)
-        product = np.outer(driven, seen)
-        return 1 / np.sqrt(np.maximum(product, 1e-24 * product.max(initial=0.0) + 1e-300))
+        return typical(driven, seen)
+
+
+def typical(driven: Array, seen: Array) -> Array:
+    """Return ``1 / sqrt(driven_i seen_j)``, bounded where nothing is driven or seen."""
+    product = np.outer(driven, seen)
+    return np.asarray(1 / np.sqrt(np.maximum(product, 1e-24 * product.max(initial=0.0) + 1e-300)))

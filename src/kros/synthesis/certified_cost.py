@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from ..core.linalg import qr_triangle
 from ..core.lti import StateSpace
-from .affine_loop import AffineLoop
+from .affine_loop import AffineLoop, typical
 from .disturbance import uncertain_ball
 from .observer_problem import ObserverProblem
 
@@ -145,14 +145,25 @@ class CertifiedCost:
         They come from quadrature, since the spectrum is not rational: ``R R' = sum_k w_k x_k x_k^H`` over the responses x_k to each component.
         """
         _, _, n_u, _, n_y = self.loop.plant.sizes
+        left, driven = self._signals(theta)
+        return self._root(driven[:, n_y:]), self._root(_hermitian(left[:, :, n_u:]))
+
+    def typical(self, theta: Array) -> Array:
+        """Size of every entry of Theta that changes the cost by about as much as any other; see `AffineLoop.typical`."""
+        left, driven = self._signals(theta)
+        seen = np.einsum("f,fij->i", self.weight, np.abs(driven) ** 2)
+        return typical(np.einsum("f,fij->j", self.weight, np.abs(left) ** 2), seen)
+
+    def _signals(self, theta: Array) -> tuple[Array, Array]:
+        """Responses of the error to what Theta drives, and of what Theta sees to the set's average disturbance and the noise."""
         left, _, right = self.loop.responses(theta, self.freqs_hz)
         energy = np.linalg.norm(self.q, axis=-1) / np.sqrt(self.left.shape[-1])
-        at_port = right[:, n_y:, self.port] @ self.W_L
-        driven = [at_port @ self.center, at_port @ self.left * energy[:, None, None], right[:, n_y:, self.state.stop :]]
+        at_port = right[:, :, self.port] @ self.W_L
+        driven = [at_port @ self.center, at_port @ self.left * energy[:, None, None], right[:, :, self.state.stop :]]
         if self.remainder is not None:
             W_r, q = self.remainder
-            driven.append(right[:, n_y:, self.state] @ W_r * (np.linalg.norm(q, axis=-1) / np.sqrt(W_r.shape[-1]))[:, None, None])
-        return self._root(np.concatenate(driven, axis=-1)), self._root(_hermitian(left[:, :, n_u:]))
+            driven.append(right[:, :, self.state] @ W_r * (np.linalg.norm(q, axis=-1) / np.sqrt(W_r.shape[-1]))[:, None, None])
+        return left, np.concatenate(driven, axis=-1)
 
     def _root(self, responses: Array) -> Array:
         columns = (np.sqrt(self.weight)[:, None, None] * responses).transpose(1, 0, 2).reshape(responses.shape[1], -1)

@@ -93,9 +93,9 @@ def polish(
     return purpose(problem).restated(synthesis, K, "polished", time.perf_counter() - start)
 
 
-def descend(cost: Cost, loop: AffineLoop, theta: Array, iterations: int) -> Array:
-    """Lower a cost from Theta, in entries of typical size."""
-    size, first = loop.typical(theta), cost(theta)[0]
+def descend(cost: Cost, size: Array, theta: Array, iterations: int) -> Array:
+    """Lower a cost from Theta, its entries counted in their typical size."""
+    first = cost(theta)[0]
 
     def scaled(x: Array) -> tuple[float, Array]:
         value, gradient = cost(theta + size * x.reshape(theta.shape))
@@ -110,7 +110,7 @@ def _polished_observer(problem: ObserverProblem, controller: StateSpace, rounds:
     for _ in range(rounds):
         cost = CertifiedCost.around(problem, K)
         theta = cost.loop.theta(K)
-        step = descend(cost, cost.loop, theta, iterations) - theta
+        step = descend(cost, cost.typical(theta), theta, iterations) - theta
         found, trial = float("inf"), K
         for halving in range(_HALVINGS):
             trial = cost.loop.controller(theta + 0.5**halving * step)
@@ -142,7 +142,7 @@ def _polished_plant(plant: GeneralizedPlant, controller: StateSpace, bound: floa
                 return loop.h2_squared(t, rows, columns)
         else:
             cost = BoundedCost.around(loop, theta, bound, barrier * value)
-        trial = descend(cost, loop, theta, iterations)
+        trial = descend(cost, loop.typical(theta), theta, iterations)
         found = loop.h2_squared(trial, rows, columns)[0]
         if found < value:
             theta, value = trial, found

@@ -217,6 +217,14 @@ def invert(system: StateSpace) -> StateSpace:
     return StateSpace(system.A - B @ system.C, B, -D @ system.C, D, system.dt)
 
 
+def majorant(tau: Array, magnitude: Array, order: int) -> RationalMagnitude | None:
+    """Return the best squared magnitude of an order above data at points in tau, none where the programs fail; both shape (n_points,)."""
+    targets = np.maximum(magnitude, _FLOOR * magnitude.max()) ** 2
+    unit = np.exp(np.mean(np.log(targets)))
+    found = _minimax(tau, targets / unit, order, None, np.inf)
+    return None if found is None else replace(found.rational, numerator=found.rational.numerator * unit)
+
+
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """Data of one fit, in physical values; the programs work on `targets`."""
@@ -233,7 +241,13 @@ class _Problem:
         tau, targets, unit, keep = self._targets()
         hopeless = np.inf if last else 10 ** (_HOPELESS * tolerance_db / 10)
         found = _minimax(tau, targets, order, lower, hopeless)
-        return (None, lower) if found is None else (self._finish(found.rational, unit, keep, tolerance_db), found)
+        if found is None:
+            return None, lower
+        try:
+            return self._finish(found.rational, unit, keep, tolerance_db), found
+        except KrosError as error:  # positive on the grid and zero at Nyquist: no system with an inverse, another order is
+            _LOG.debug("Magnitude fit: order %d has no spectral factor (%s)", order, error)
+            return None, lower
 
     def with_poles(self, found: Array, tolerance_db: float) -> FittedMagnitude:
         """Fit the numerator for given roots of the denominator in tau: one linear program, and further points where it is not positive."""

@@ -130,6 +130,9 @@ class SynthesisConfig(_Section):
     input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
     noise: dict[str, float] = Field(default_factory=dict, description="standard deviation of the measurement noise per measured channel")
     penalty: float = Field(1e-3, gt=0)
+    max_states: int | None = Field(
+        None, ge=0, description="most states of the filter of worst_case_h2; reduced and polished where it has more"
+    )
     time_limit_s: float = Field(60.0, gt=0)
 
 

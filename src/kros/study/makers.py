@@ -14,7 +14,7 @@ from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, block_diagonal, gain
 from ..identify import ModelSet
 from ..observer import Observer, noise_covariances
-from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, worst_case_h2, worst_case_hinf
+from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, reduce_controller, worst_case_h2, worst_case_hinf
 from ..synthesis.causal import causal_h2
 from ..uncertainty import fit_magnitude
 from .baselines import kalman_tuned, make_luenberger
@@ -46,6 +46,7 @@ class Task:
     input_weight: float | str
     time_limit_s: float
     max_order: int
+    max_states: int | None
     covered: tuple[str, ...] = ()
 
     def observer(self, synthesis: Synthesis) -> Observer:
@@ -128,15 +129,23 @@ def make_worst_case_h2(task: Task) -> Made:
     if task.input_weight != TUNED:
         surroundings = Surroundings(task.input_weight)
         assumed = surroundings.of(problem)
-        return worst_case_h2(assumed, max_order=task.max_order), surroundings.facts(), assumed
+        return of_few_states(task, assumed, worst_case_h2(assumed, max_order=task.max_order)), surroundings.facts(), assumed
     rough = partial(worst_case_h2, max_order=2, tolerance_db=3.0, refinements=0, fit=remembering(fit_magnitude), causal=False)
     surroundings, synthesis = best_surroundings(task, problem, rough)
     assumed = surroundings.of(problem)
     accurate = worst_case_h2(assumed, max_order=task.max_order, causal=False)  # of higher order: for its lower bound
     lower = max((b for b in (synthesis.lower_bound, accurate.lower_bound) if b is not None), default=None)
     gap = None if lower is None or synthesis.worst_case_h2 is None else 100 * (synthesis.worst_case_h2 / lower - 1)
-    causal = causal_h2(assumed, synthesis.controller)
-    return replace(synthesis, lower_bound=lower, gap_percent=gap, causal_h2=causal), surroundings.facts(), assumed
+    synthesis = replace(synthesis, lower_bound=lower, gap_percent=gap, causal_h2=causal_h2(assumed, synthesis.controller))
+    return of_few_states(task, assumed, synthesis), surroundings.facts(), assumed
+
+
+def of_few_states(task: Task, problem: ObserverProblem, synthesis: Synthesis) -> Synthesis:
+    """Return the observer's filter with at most `max_states` states, polished at that order."""
+    if task.max_states is None or synthesis.controller.n_states <= task.max_states:
+        return synthesis
+    small = reduce_controller(problem, synthesis, task.max_states, polished=True)
+    return replace(small, causal_h2=causal_h2(problem, small.controller))
 
 
 def make_worst_case_hinf(task: Task) -> Made:

@@ -103,7 +103,7 @@ def tasks_of(context: Context, name: str) -> list[Task]:
         if m in methods
     ]
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
-    settings |= {"max_order": config.uncertainty.max_order, "covered": uncertain.unit_ids}
+    settings |= {"max_order": config.uncertainty.max_order, "max_states": config.synthesis.max_states, "covered": uncertain.unit_ids}
     return [
         Task(f"{name}/{method}", method, models, unit, problem, refusal, noise, tuning_set(context, models), **settings)
         for method in ordered

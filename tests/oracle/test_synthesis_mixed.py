@@ -15,6 +15,7 @@ from kros.synthesis.certificate import certify
 from kros.synthesis.channels import part, scaled, verify
 from kros.synthesis.mixed_lmi import MixedInequalities
 from kros.synthesis.mixed_optimal import by_inequalities
+from kros.synthesis.paper_plant import paper_plant, reduced_plant
 from kros.synthesis.reduction import truncate
 from kros.synthesis.solvers import Program, solve
 from kros.synthesis.youla import hinf_lower_bound, youla_bound
@@ -207,6 +208,29 @@ def test_drive_like_observers_are_solved_and_certified(seed, order, injection):
     assert found.worst_case_h2 < certify(case, nothing)[0]
 
 
+def test_the_published_plant_itself():
+    """18 states, singular and degenerate: T11 vanishes for every controller, T22 does not contain it; what is returned stabilises and says so."""
+    case = drive_problem(0, Injection.INPUT, 5)
+    A, B, C, W_p = case.scaled
+    nominal = StateSpace(A, B, np.eye(4), np.zeros((4, 2)), DT)
+    plant = paper_plant(nominal, C, gain(W_p, DT), gain(np.eye(2), DT), case.W_L)
+    assert plant.sizes[0] == 18
+    found = mixed(plant)
+    assert found.h2_norm < 1e-4 * h2_norm(part(plant, replace(plant, C2=0 * plant.C2).close(gain(np.zeros((2, 1)), DT)), 2))
+    assert found.hinf_norm == pytest.approx(hinf_norm(case.W_L), rel=1e-6)
+    assert plant.close(found.controller).is_stable()
+    assert any("T11 is the same for every controller" in note for note in found.notes)
+
+
+def test_splitting_the_weight_differently_changes_nothing():
+    """(W_L, W_R) and (W_L / c, c W_R) are the same set, and give the same observer."""
+    case = drive_problem(1, Injection.INPUT, 1)
+    W = case.W_L
+    other = replace(case, W_L=StateSpace(W.A, W.B, W.C / 20, W.D / 20, DT), W_R=gain(20 * np.eye(2), DT))
+    one, two = mixed(case, max_states=6), mixed(other, max_states=6)
+    assert two.worst_case_h2 == pytest.approx(one.worst_case_h2, rel=1e-2)
+
+
 def test_shrinking_the_channel_of_an_observer_only_undoes_the_correction():
     case = drive_problem(0, Injection.INPUT, 1)
     plain, shrunk = mixed(case, max_states=6), mixed(case, scalings=(1e-2,), max_states=6)
@@ -216,8 +240,6 @@ def test_shrinking_the_channel_of_an_observer_only_undoes_the_correction():
 
 
 def test_mixed_plant_is_the_published_one_with_noise_and_penalty():
-    from kros.synthesis.paper_plant import reduced_plant
-
     case = drive_problem(1, Injection.INPUT, 2)
     A, B, C, W_p = case.scaled
     nominal = StateSpace(A, B, np.eye(4), np.zeros((4, 2)), DT)

@@ -165,8 +165,8 @@ def test_mixed_refuses_what_it_cannot_do():
         mixed(plant(), gamma=0)
     with pytest.raises(ConfigError, match="scalings"):
         mixed(plant(), scalings=())
-    with pytest.raises(SynthesisError, match="A2a"):
-        mixed(plant(D12=[[0.0], [0.0]]))
+    with pytest.raises(SynthesisError, match="A1a"):
+        mixed(plant(A=[[1.1]], B2=[[0.0]], D12=[[0.0], [0.0]]))
 
 
 def test_mixed_says_why_nothing_survives():

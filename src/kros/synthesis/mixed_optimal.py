@@ -32,6 +32,7 @@ from .h2_optimal import absorb_feedthrough, h2
 from .hinf_optimal import hinf
 from .mixed_lmi import MixedInequalities
 from .mixed_polish import polish
+from .mixed_singular import is_degenerate, is_singular, on_the_plant, regularised
 from .observer_problem import ObserverProblem
 from .reduction import truncate
 from .result import Status, Synthesis
@@ -61,7 +62,8 @@ def mixed(
     Parameters
     ----------
     plant : GeneralizedPlant or ObserverProblem
-        A discrete plant with its channel partition (`n_w1`, `n_z1`), regular in channel 1; or an observer problem, whose reduced and
+        A discrete plant with its channel partition (`n_w1`, `n_z1`), with penalty and noise in channel 1 (otherwise see
+        `mixed_singular`); or an observer problem, whose reduced and
         regularised plant is then used, and whose result is a filter in physical units with a certified ``worst_case_h2``.
     gamma : float
         Level of the H-infinity constraint.
@@ -130,6 +132,8 @@ def mixed(
         )
     start = time.perf_counter()
     end = start + time_limit_s
+    if is_singular(plant):
+        return _singular(plant, gamma, tried, max_states, start, end, polished, solvers)
     free = h2(performance(plant))
     unconstrained = verify(plant, free.controller, gamma, "H2 optimum without the constraint", "riccati")
     if isinstance(unconstrained, Verified):
@@ -156,6 +160,48 @@ def mixed(
         lower = max(lower, mixed_lower_bound(plant, gamma, best.h2, time_limit_s=min(end - time.perf_counter(), 3.0)))
     notes.append(f"Found by: {best.origin}.")
     return _synthesis(best, lower, Status.CERTIFIED if best.optimal else Status.INACCURATE, notes, start)
+
+
+def _singular(
+    plant: GeneralizedPlant,
+    gamma: float,
+    scalings: Sequence[float],
+    max_states: int,
+    start: float,
+    end: float,
+    polished: bool,
+    solvers: Sequence[str] | None,
+) -> Synthesis:
+    """Solve a plant without penalty or noise in channel 1; there is no lower bound but for a degenerate one."""
+    regular, degenerate = regularised(plant), is_degenerate(plant)
+    notes: list[str] = []
+    reasons: list[str] = []
+    for tried in [(a,) for a in (*scalings, *_LAST_SCALINGS)] if degenerate else [tuple(scalings)]:
+        found = by_inequalities(regular, gamma, tried, max_states, end, reasons, notes, solvers, extended=not degenerate)
+        found = on_the_plant(plant, found, gamma)
+        if found:
+            break
+    if not degenerate or not found:
+        found += on_the_plant(plant, by_hinf(regular, gamma, end, reasons), gamma)
+    if not found:
+        require_attainable(regular, gamma)
+        told = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
+        raise SynthesisError(
+            f"Mixed synthesis of a singular plant: no controller survived; {told}. Add penalty and noise to channel 1, or raise gamma."
+        )
+    if degenerate:
+        notes.append(
+            "T11 is the same for every controller, so each that meets the constraint is optimal; this one is that of the inequalities."
+        )
+    elif polished:
+        found += _improved(plant, found, gamma, end)
+    best = min(found, key=lambda v: v.h2)
+    notes.append(
+        "Channel 1 has no control penalty or no measurement noise; small ones were added for the search, the norms are of the plant as given."
+    )
+    notes.append(f"Found by: {best.origin}.")
+    lower = best.h2 if degenerate else None
+    return _synthesis(best, lower, Status.CERTIFIED if best.optimal else Status.INACCURATE, list(dict.fromkeys(notes)), start)
 
 
 def performance(plant: GeneralizedPlant) -> GeneralizedPlant:
@@ -269,10 +315,14 @@ def reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant,
         return small, [
             f"The plant is unstable and was made minimal only: {kept} of {n} states in the inequalities."
         ] if n > max_states else []
-    small, tail = truncate(plant, max_states)
+    # Truncation counts all signals alike, so measurements are taken in units of their noise.
+    noise = np.linalg.norm(plant.D21[:, plant.columns(1)], axis=1)
+    unit = np.where(noise > 0, noise, 1.0)[:, None]
+    small, tail = truncate(replace(plant, C2=plant.C2 / unit, D21=plant.D21 / unit, D22=plant.D22 / unit), max_states)
     kept = small.sizes[0]
     if kept == n:
         return plant, []
+    small = replace(small, C2=small.C2 * unit, D21=plant.D21, D22=plant.D22)
     return small, [
         f"Inequalities on {kept} of {n} states (discarded Hankel singular values sum to {tail:.2g} of the largest); verified on all."
     ]

@@ -18,7 +18,7 @@ from ...identify import ModelSet
 from ...observer import Observer
 from ...synthesis import Injection, ObserverProblem, Synthesis, check_units
 from ...synthesis.certificate import certify
-from ...uncertainty import UncertainModel
+from ...uncertainty import Structure, UncertainModel
 from ..context import Context
 from ..makers import Product, Task, produce
 from ..relift import Running, certify_running, save_running
@@ -114,12 +114,18 @@ def usable_problem(
     models: ModelSet, unit: str, uncertain: UncertainModel, noise: Array, context: Context
 ) -> tuple[ObserverProblem | None, str]:
     """Return the synthesis problem of one kind of model, or None and why there is none."""
-    problem = observer_problem(models, unit, uncertain, noise, context)
-    try:
-        problem.require_sound()
-        return problem, ""
-    except SynthesisError as error:
-        refusal = str(error)
+    if uncertain.weight.structure in (Structure.FULL, Structure.ENTRYWISE):
+        refusal = (
+            f"synthesis needs weights with one filter per channel, and those of the study are {uncertain.weight.structure.value} "
+            f"(for a {uncertain.weight.perturbation.value} perturbation); set uncertainty.structure to 'auto', 'diagonal' or 'scalar'"
+        )
+    else:
+        problem = observer_problem(models, unit, uncertain, noise, context)
+        try:
+            problem.require_sound()
+            return problem, ""
+        except SynthesisError as error:
+            refusal = str(error)
     log.warning("%s: there are no robust observers and no certificates: %s", models.name, refusal)
     return None, refusal
 

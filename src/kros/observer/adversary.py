@@ -59,7 +59,7 @@ class Attack:
 
 
 def attack(certificate: ReliftCertificate, observer: Observer, *, steps: int = 100_000, seed: int = 0) -> Attack:
-    """Search for disturbances and slopes that exceed a certificate.
+    """Search for disturbances and slopes that exceed a certificate; no measurement is dropped.
 
     Parameters
     ----------

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import Injection, ObserverProblem, check_units, worst_case_h2, worst_case_hinf
@@ -10,7 +11,7 @@ from kros.synthesis.certificate import certify, density
 from kros.synthesis.perturbation import PLACES
 from kros.synthesis.robust_gain import robust_gain
 from kros.synthesis.unit_check import unit_error
-from kros.uncertainty import Form, rebuild, residual
+from kros.uncertainty import Form, quantify, rebuild, residual
 
 DT, N, M = 0.05, 3, 2
 FREQS = np.array([0.0, 0.03, 0.7, 3.0, 9.9])
@@ -288,3 +289,41 @@ def test_units_that_make_the_weights_are_below_the_bounds(form):
     assert unit_error(case, K, A_p[k], B_p[k]).frequency_response(freqs) == pytest.approx(S @ response, abs=1e-9)
     small = ObserverProblem(nominal, case.C, gain(1e-3 * size * np.eye(2), DT), case.W_R, [1, 1], [1, 1], [1e-3], form=form)
     assert not check_units(small, K, units).holds  # the check can fail
+
+
+def drives(spread, n_units=6):
+    """Position, velocity and current of drives under a cascaded loop, from targets of position and velocity; at spread 1 by 5-15 %."""
+    rng = np.random.default_rng(0)
+    A, B = np.zeros((n_units, 3, 3)), np.zeros((n_units, 3, 2))
+    for k in range(n_units):
+        inertia, friction, torque, lag = [0.5, 6.0, 40.0, 2e-3] * np.exp(spread * np.array([0.05, 0.15, 0.05, 0.1]) * rng.normal(size=4))
+        a = np.array([[-0.5, 1, 0], [0, -friction / inertia, torque / inertia], [-14.4 / lag, -1.2 / lag, -1 / lag]])
+        b = np.array([[0.5, 0], [0, 0], [14.4 / lag, 1.3 / lag]])
+        step = expm(np.block([[a, b], [np.zeros((2, 5))]]) * 1e-3)
+        A[k], B[k] = step[:3, :3], step[:3, 3:]
+    return StateSpace(A, B, np.broadcast_to(np.eye(3), A.shape), np.zeros(B.shape), 1e-3)
+
+
+@pytest.mark.parametrize(("spread", "form"), [(1.0, "additive"), (3.0, "additive")])
+def test_every_simulated_drive_is_below_the_bounds(spread, form):
+    """Weights as the uncertainty stage makes them, remainder included: no drive has a larger error than the certificate says."""
+    units = drives(spread)
+    uncertain = quantify(units, form, freqs_hz=np.geomspace(1e-2, 499, 80), structure="scalar", max_order=2, tolerance_db=3.0, density=3)
+    rest = uncertain.remainder
+    case = ObserverProblem(
+        nominal=units[uncertain.nominal],
+        C=np.eye(3)[:1],
+        W_L=uncertain.weight.left,
+        W_R=uncertain.weight.right,
+        input_scale=np.ones(2),
+        output_scale=np.ones(3),
+        noise=[1e-4],
+        remainder_left=None if rest is None else rest.left,
+        remainder_right=None if rest is None else rest.right,
+        form=form,
+    )
+    found = worst_case_h2(case, max_order=2, tolerance_db=3.0, refinements=0)
+    table = check_units(case, found.controller, units)
+    assert table.holds
+    assert found.lower_bound <= found.worst_case_h2
+    assert np.count_nonzero(table.h2_norm) == 5  # all but the nominal one

@@ -39,6 +39,8 @@ from .robust_gain import RobustGain, robust_gain
 
 Array = npt.NDArray[Any]
 
+_DENSER = 10
+
 
 def worst_case_hinf(
     problem: ObserverProblem,
@@ -106,15 +108,13 @@ def worst_case_hinf(
         loop = problem.error_system(controller)
     if reasons and best[1] is nothing:
         raise SynthesisError(f"Worst-case H-infinity synthesis: no design survived verification ({'; '.join(reasons)}).")
-    lower = None
-    if bounded:
-        low = Spectrum(channels.shaped(below(channels.symmetric_part())), None)
-        lower = lower_bound(problem, channels.lowered(channels.shaping(low, fit, "below", options), low), tolerance)
+    lower = _lower_bound(channels, fit, options, tolerance) if bounded else None
     return _result(problem, *best, lower, elapsed / (refinements + 1))
 
 
 def _result(problem: ObserverProblem, value: RobustGain, controller: StateSpace, lower: float | None, elapsed: float) -> Synthesis:
     loop = problem.error_system(controller)
+    lower = None if lower is None else min(lower, value.attained)
     n_d = problem.nominal.n_inputs + problem.nominal.n_states
     in_h2, error = certify(problem, controller)
     return Synthesis(
@@ -168,6 +168,14 @@ def dominating(channels: Channels, loop: StateSpace) -> Spectrum:
     if len(Q) == 1:
         return Spectrum(phi, None)
     return Spectrum(phi, np.sum(np.abs(left) ** 2, axis=-1) * (_norm(Q[1]) ** 2 / share[1])[:, None])
+
+
+def _lower_bound(channels: Channels, fit: Fit, options: dict[str, Any], tolerance: float) -> float | None:
+    """Fit from below, lowered on a grid ten times denser."""
+    freqs = channels.freqs_hz
+    dense = Channels(channels.problem, np.geomspace(freqs[0], freqs[-1], _DENSER * len(freqs)))
+    low, check = (Spectrum(c.shaped(below(c.symmetric_part())), None) for c in (channels, dense))
+    return lower_bound(channels.problem, dense.lowered(channels.shaping(low, fit, "below", options), check), tolerance)
 
 
 def lower_bound(problem: ObserverProblem, shaping: Shaping, tolerance: float) -> float | None:

@@ -11,7 +11,7 @@ Orders: of at most four to begin with. Within the tolerance they are lowered ent
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from .cover import Cover, optimal_cover
+from .fit import majorant
 from .joint import NEPER_DB, Fitted, JointFit, follow
 from .sections import Sections
+from .small import entries_first, sigma_max_first
 
 Array = npt.NDArray[Any]
 
@@ -42,6 +44,7 @@ _JUMPS = 3
 _START_ORDER = 4
 _IDLE_DB = 6.0  # poles and zeros that do more than this are not tried to be left out
 _STALLED = 0.97
+_UNSATISFIED = 1.4  # tolerances beyond which scalar weights are a start, too
 _ENOUGH = 0.95  # of the tolerance: what is found between the points of the fit costs a little more
 
 
@@ -73,8 +76,10 @@ class Problem:
         return JointFit(self.residuals[leading.ravel(), kept[at]], at, self.tau[kept], self.optimal[kept])
 
     def some(self, step: int) -> Array:
-        """Indices of some frequencies, the ends among them."""
-        return np.unique(np.append(np.arange(0, len(self.tau), step), len(self.tau) - 1))
+        """Indices of some frequencies, the ends and the peaks of the cost among them."""
+        cost = np.where(np.isfinite(self.optimal), self.optimal, -np.inf)
+        peaks = np.flatnonzero((cost[1:-1] > cost[:-2]) & (cost[1:-1] >= cost[2:])) + 1
+        return np.unique(np.concatenate([np.arange(0, len(self.tau), step), peaks, [len(self.tau) - 1]]))
 
     def joined(self, other: Problem) -> Problem:
         """Return both, frequencies increasing and none twice; of equal ones the other's stay."""
@@ -111,7 +116,10 @@ def fit_sections(problem: Problem, max_order: int, tolerance_db: float) -> Fitte
         Excess cost at which lower orders are good enough.
     """
     joint, order = problem.joint(), max_order if max_order <= _START_ORDER else _START_ORDER - max_order % 2
-    found = _jumped(joint, _first(problem, joint, order, tolerance_db), tolerance_db)
+    found = _jumped(joint, _first(problem, joint, _starts(problem, joint, order), tolerance_db), tolerance_db)
+    if found.excess_db > _UNSATISFIED * tolerance_db:
+        other = _first(problem, joint, _from_scalar(problem, joint, order), tolerance_db)
+        found = min(found, _jumped(joint, other, tolerance_db), key=_excess)
     while found.excess_db > tolerance_db and order + 2 <= max_order:
         order += 2
         higher = joint.descend(joint.grown(found.sections, _JUMP[1]), _JUMP[:1] + _POLISH, _POLISH_STEPS)
@@ -124,10 +132,10 @@ def refit(problem: Problem, known: Sections) -> Fitted:
     return problem.joint().descend(known, _POLISH, _POLISH_STEPS)
 
 
-def _first(problem: Problem, joint: JointFit, order: int, tolerance_db: float) -> Fitted:
+def _first(problem: Problem, joint: JointFit, starts: Iterable[Sections], tolerance_db: float) -> Fitted:
     """Best of several starts, the first within the tolerance."""
     coarse, screened = problem.joint(2, _COARSE), []
-    for start in _starts(problem, joint, order):
+    for start in starts:
         screened.append(coarse.descend(start, _SCREEN, _SCREEN_STEPS, tolerance_db))
         if screened[-1].excess_db <= tolerance_db:
             break
@@ -148,6 +156,20 @@ def _starts(problem: Problem, joint: JointFit, order: int) -> Iterator[Sections]
         for even in _EVEN if order > 1 else _EVEN[:1]:
             places = [_knots(problem.tau, row, (n + 1) // 2, even) for row, n in zip(logs, orders, strict=True)]
             yield follow(problem.tau, logs, Sections.spread(places, orders, _WIDTH), joint.ends(), _FOLLOW)
+
+
+def _from_scalar(problem: Problem, joint: JointFit, order: int) -> Iterator[Sections]:
+    """The scalar magnitude of the order in all left entries, and ones with poles upon zeros in the right ones."""
+    inside, (p, m) = np.isfinite(problem.optimal), problem.residuals.shape[2:]
+    size = _level(sigma_max_first(entries_first(problem.residuals)).max(axis=0), inside)
+    scalar = majorant(problem.tau, size, order)
+    if scalar is None:
+        return
+    cover = optimal_cover(problem.residuals[:, problem.some(_COARSE)], pull=_PULLS[1], squarings=_QUICK)
+    for reference in np.argsort(-np.median(cover.right, axis=0), kind="stable")[:_GAUGES]:
+        orders = [0] * p + [0 if j == reference else order for j in range(m)]
+        places = [_knots(problem.tau, np.log(size), (n + 1) // 2, _EVEN[0]) for n in orders]
+        yield Sections.spread(places, orders, _WIDTH).like(np.arange(p), scalar)
 
 
 def _jumped(joint: JointFit, found: Fitted, tolerance_db: float) -> Fitted:

@@ -20,13 +20,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.lti import StateSpace
-from .spectral import cascade
+from .spectral import RationalMagnitude, cascade, roots
 
 Array = npt.NDArray[Any]
 
 _FAR = 1e30  # tau at Nyquist
 _NARROW, _WIDE = np.log(4 * 3e-3**2), 40.0  # y: damping of 0.003, and two real ones 17 decades apart
 _TINY = 1e-300
+_REAL = 1e-9  # relative imaginary part below which a root counts as real
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +76,18 @@ class Sections:
         ]
         entry, sign, pair, place = (np.array(column) for column in zip(*rows, strict=True)) if rows else (np.zeros(0),) * 4
         return cls(np.zeros(len(places)), entry.astype(int), sign, pair.astype(bool), place.astype(float), np.full(len(rows), width))
+
+    def like(self, entries: Array, magnitude: RationalMagnitude) -> Sections:
+        """Return the same with poles, zeros and level of a magnitude in some entries."""
+        others, level = ~np.isin(self.entry, entries), self.level.copy()
+        level[entries] = np.log(magnitude.numerator[0] / magnitude.denominator[0]) / 2
+        columns = [[getattr(self, x)[others]] for x in ("entry", "sign", "pair", "place", "width")]
+        for sign, coefficients in ((1.0, magnitude.numerator), (-1.0, magnitude.denominator)):
+            for pair, place, width in _paired([np.sqrt(-complex(t)) for t in roots(coefficients, magnitude.knots)[0]]):
+                for column, value in zip(columns, (entries, sign, pair, place, width), strict=True):
+                    column.append(np.broadcast_to(value, len(entries)))
+        entry, sign_, pair_, place_, width_ = (np.concatenate(column) for column in columns)
+        return Sections(level, entry, sign_, pair_, place_, width_)
 
     @property
     def orders(self) -> Array:
@@ -234,3 +247,12 @@ class Idle:
     pole: int
     span: float
     middle: float
+
+
+def _paired(found: list[complex]) -> list[tuple[bool, float, float]]:
+    """Return sections of roots, negated: complex pairs, real ones with their neighbours, and the middle one alone where their number is odd."""
+    real = sorted(r.real for r in found if abs(r.imag) <= _REAL * abs(r))
+    rows = [(True, 2 * np.log(abs(r)), np.log(4 * (r.real / abs(r)) ** 2 + _TINY)) for r in found if r.imag > _REAL * abs(r)]
+    if len(real) % 2:
+        rows.append((False, 2 * np.log(real.pop(len(real) // 2)), 0.0))
+    return rows + [(True, np.log(a * b), np.log((a + b) ** 2 / (a * b))) for a, b in zip(real[::2], real[1::2], strict=True)]

@@ -105,9 +105,11 @@ def decibel(values: npt.ArrayLike) -> Array:
 def frequency_axis(axes: Axes, freqs_hz: Array, label: str = "frequency (Hz)", most: int = 6) -> None:
     """Make the horizontal axis logarithmic over the frequencies, with at most `most` numbers."""
     positive = freqs_hz[freqs_hz > 0]
-    axes.set_xscale("log")
-    axes.set_xlim(positive[0], positive[-1])
-    plain_powers(axes.xaxis, "{x:g}", most)
+    limits = (float(positive[0]), float(positive[-1]))
+    if axes.get_xscale() != "log" or axes.get_xlim() != limits:  # shared axes are told once: each call goes through all of them
+        axes.set_xscale("log")
+        axes.set_xlim(*limits)
+        plain_powers(axes.xaxis, "{x:g}", most)
     axes.set_xlabel(label)
 
 

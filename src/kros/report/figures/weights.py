@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ...uncertainty import Cover, Form, UncertainModel
+from ...uncertainty import Cover, Form, Structure, UncertainModel
 from ...uncertainty.unit_residuals import UnitResiduals
 from ..canvas import decibel, frequency_axis, grid, thin_log
 from ..names import best_models, model_label, number
 from ..run_folder import NotShownError, RunFolder
 from ..theme import Tone
 from .drawing import Drawing
-from .entries import ratio_panel
+from .entries import ratio_panel, short
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -86,7 +86,11 @@ def weights_figure(
 
 def _draw_row(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] | None, square: bool) -> None:
     fitted = model.weight.magnitudes(model.freqs_hz)
-    cover = in_gauge(model.cover, fitted)
+    cover = model.cover
+    if model.weight.structure is Structure.ENTRYWISE:
+        names = names and [f"{short(column)} → {short(row)}" for row in names for column in names]
+    else:
+        cover = in_gauge(cover, fitted)
     for panel, magnitudes, below in ((row[0], fitted.left, cover.left), (row[1], fitted.right, cover.right)):
         _draw_entries(panel, model.freqs_hz, magnitudes, below, names)
     if square:
@@ -104,6 +108,7 @@ def in_gauge(cover: Cover, other: Cover) -> Cover:
 def _draw_entries(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: Sequence[str] | None) -> None:
     if magnitudes.shape[1] > 1 and np.allclose(magnitudes, magnitudes[:, :1]):  # a scalar weight
         magnitudes, cover, names = magnitudes[:, :1], cover[:, :1], ["every signal"]
+    labels = names if names and len(names) == magnitudes.shape[1] else [str(i + 1) for i in range(magnitudes.shape[1])]
     ends = []
     frequency_axis(axes, freqs_hz, "", 4)
     for i, tone in zip(range(magnitudes.shape[1]), _TONES, strict=False):
@@ -111,7 +116,7 @@ def _draw_entries(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, 
         _, below = thin_log(freqs_hz, cover[:, i])
         axes.plot(freqs, decibel(below), color=tone.light, lw=3.2, alpha=0.3, solid_capstyle="butt")
         axes.plot(freqs, decibel(line), color=tone.light, lw=1.2)
-        ends.append((float(decibel(line)[0]), (names[i] if names else str(i + 1)).replace("_", " "), tone.light))
+        ends.append((float(decibel(line)[0]), labels[i].replace("_", " "), tone.light))
     if np.allclose(magnitudes, 1.0):
         axes.set_ylim(-20, 10)
     _start_labels(axes, ends)

@@ -39,6 +39,7 @@ log = logging.getLogger(__name__)
 
 _NOISE_POINTS, _ORDER_POINTS, _POINTS = 80, 120, 240  # frequencies
 _MOST_UNITS = 60  # whose models are resampled
+_ENTRY_ORDER = 3  # of fits to single entries, which are looked at and decide nothing
 _FURTHER_ORDERS = 1  # beyond those that a weight may have
 
 
@@ -137,7 +138,7 @@ def beside_weights(models: ModelSet, uncertain: UncertainModel, config: Uncertai
         models.sample_period_s,
         unit_ids=uncertain.unit_ids,
         nominal_id=uncertain.nominal_id,
-        max_order=config.max_order,
+        max_order=min(config.max_order, _ENTRY_ORDER),
         tolerance_db=config.tolerance_db,
     )
 
@@ -186,6 +187,6 @@ def against_others(models: ModelSet, others: list[str], outside: list[str], nomi
         unit_ids=everyone,
         nominal_id=nominal,
         outside=outside,
-        max_order=config.max_order,
+        max_order=min(config.max_order, _ENTRY_ORDER),
         tolerance_db=config.tolerance_db,
     )

@@ -68,7 +68,7 @@ def test_without_recordings_it_says_what_to_do(name):
 
 
 def test_output_feedback_keeps_its_performance_on_every_pendulum(tmp_path):
-    command = [sys.executable, EXAMPLES / "output_feedback" / "run.py", "--out", tmp_path, "--units", "6", "--iterations", "1"]
+    command = [sys.executable, EXAMPLES / "output_feedback" / "run.py", "--out", tmp_path, "--units", "4", "--iterations", "1"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "metrics.json").read_text())

@@ -159,6 +159,8 @@ def test_what_is_refused():
     split = random_plant(np.random.default_rng(5), n_w1=2, n_z1=2)
     with pytest.raises(SynthesisError, match="below the bound"):
         polish(split, optimum, bound=1e-3)
+    with pytest.raises(ConfigError, match="continuous"):
+        polish(replace(plant, dt=0.0), optimum)
     with pytest.raises(ConfigError, match="rounds = 0"):
         polish(plant, optimum, rounds=0)
     with pytest.raises(ConfigError, match="bound is for general plants"):

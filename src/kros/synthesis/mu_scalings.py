@@ -60,7 +60,7 @@ def scalings(M: Array, structure: Structure, diagonal: bool = False) -> Scalings
     x = np.zeros((len(M), len(E_L)))
     x[:, np.abs(np.trace(E_L, axis1=1, axis2=2)) > 0] = 0.5
     best = _attained(M, x, E_L, E_R)
-    best_x, level = x, best * 1.2 + 1e-30
+    best_x, level = x.copy(), best * 1.2 + 1e-30
     active = np.arange(len(M))
     for _ in range(_ROUNDS):
         x[active] = _centre(M[active], x[active], level[active], E_L, E_R)

@@ -68,7 +68,7 @@ def polish(
     Raises
     ------
     ConfigError
-        When `bound` is given for an observer problem, or an option is not positive.
+        When `bound` is given for an observer problem, an option is not positive, or the plant is continuous.
     SynthesisError
         When the start is unstable or above the bound.
 
@@ -83,6 +83,8 @@ def polish(
     """
     if rounds < 1 or iterations < 1 or (bound is not None and not bound > 0):
         raise ConfigError(f"Polish: rounds = {rounds}, iterations = {iterations} and bound = {bound} should be positive.")
+    if isinstance(problem, GeneralizedPlant) and problem.dt == 0:
+        raise ConfigError("Polish works in discrete time, found a continuous plant (dt = 0); sample it.")
     start = time.perf_counter()
     if isinstance(problem, ObserverProblem):
         if bound is not None:

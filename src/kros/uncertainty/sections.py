@@ -85,7 +85,7 @@ class Sections:
         for sign, coefficients in ((1.0, magnitude.numerator), (-1.0, magnitude.denominator)):
             for pair, place, width in _paired([np.sqrt(-complex(t)) for t in roots(coefficients, magnitude.knots)[0]]):
                 for column, value in zip(columns, (entries, sign, pair, place, width), strict=True):
-                    column.append(np.broadcast_to(value, len(entries)))
+                    column.append(np.broadcast_to(np.asarray(value), len(entries)))
         entry, sign_, pair_, place_, width_ = (np.concatenate(column) for column in columns)
         return Sections(level, entry, sign_, pair_, place_, width_)
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.errors import ConfigError
 from ..core.frequency import bilinear_squared, dense_grid
 from ..core.lti import StateSpace, block_diagonal, gain
 from .certificate import Method, ResidualSystems, certify
@@ -103,6 +104,7 @@ def fit_weight(
     tolerance_db: float = 1.0,
     density: int = 10,
     systems: ResidualSystems | None = None,
+    poles: npt.ArrayLike | None = None,
 ) -> tuple[Weight, Cover]:
     """Fit weights to residuals that can be evaluated at any frequency.
 
@@ -114,21 +116,31 @@ def fit_weight(
     sample_period_s : float, s
     structure : Structure or str
     max_order : int
-        Largest order of a diagonal entry.
+        Largest order of an entry, up to about eight.
     tolerance_db : float, dB
-        Overbound at which a lower order is good enough.
+        Overbound at which lower orders are good enough: of scalar weights the smallest order within it is taken; of diagonal ones orders start
+        at four, are lowered entry by entry while the overbound stays within it, and raised by two in all entries where it does not.
     density : int
         How much denser the grid of the final check is.
     systems : ResidualSystems, optional
         The systems behind the residuals: the bound is then tested at all frequencies, by level sets, and not on a grid alone.
+    poles : array_like of complex, optional
+        Poles in z that scalar weights must have, see `fit_magnitude`. (Zeros at DC or Nyquist a weight cannot have: it would cover nothing there.)
 
     Returns
     -------
     Weight
     Cover
         The optimal cover at `freqs_hz`, against which the overbound is measured.
+
+    Raises
+    ------
+    ConfigError
+        Poles are given for weights that are not scalar.
     """
     structure = as_structure(structure)
+    if poles is not None and structure is not Structure.SCALAR:
+        raise ConfigError(f"Weights: poles can be given for scalar weights, found structure {structure.value!r}; leave them out.")
     if structure in (Structure.ENTRYWISE, Structure.FULL):
         from .entrywise import fit_entrywise  # both are made of scalar and diagonal weights
         from .full import fit_full
@@ -144,7 +156,7 @@ def fit_weight(
     if structure is Structure.DIAGONAL and best.left.any():
         unscaled = _fit_diagonal(fitter, residuals, freqs_hz, E, best, checked)
     else:
-        unscaled = _fit_scalar(fitter, freqs_hz, E, checked, structure)
+        unscaled = _fit_scalar(fitter, freqs_hz, E, checked, structure, poles)
     weight = _finish(unscaled, residuals, checked, systems)
     excess = overbound_db(weight, freqs_hz, best)
     kept = weight.within_tolerance if structure is Structure.SCALAR else excess <= tolerance_db
@@ -205,12 +217,12 @@ class _Fitter:
         return Weight(left, right, orders[:n_left], orders[n_left:], Structure.DIAGONAL, np.nan, np.nan)
 
 
-def _fit_scalar(fitter: _Fitter, freqs_hz: Array, E: Array, checked: _Checked, structure: Structure) -> Weight:
+def _fit_scalar(fitter: _Fitter, freqs_hz: Array, E: Array, checked: _Checked, structure: Structure, poles: npt.ArrayLike | None) -> Weight:
     """One magnitude for the largest singular values, fitted again with the frequencies at which it is exceeded."""
     dt, p, m = fitter.sample_period_s, E.shape[2], E.shape[3]
     for _ in range(_ROUNDS):
         size = optimal_cover(E, Structure.SCALAR).left[:, 0]
-        fit = fit_magnitude(freqs_hz, size, dt, max_order=fitter.max_order, tolerance_db=fitter.tolerance_db)
+        fit = fit_magnitude(freqs_hz, size, dt, max_order=fitter.max_order, tolerance_db=fitter.tolerance_db, poles=poles)
         left = block_diagonal([fit.system] * p)
         weight = Weight(left, gain(np.eye(m), dt), (fit.order,) * p, (0,) * m, structure, np.nan, np.nan, fit.within_tolerance)
         ratio = checked.ratio(weight).max(axis=0)

@@ -1,0 +1,124 @@
+"""Diagonal weights: sections against finite differences and their systems, joint fits against data that can be represented exactly."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kros.core import StateSpace
+from kros.core.errors import ConfigError
+from kros.uncertainty import Form, fit_weight, quantify
+from kros.uncertainty.sections import Sections
+
+DT = 1e-3
+FREQS = np.geomspace(5e-2, 500.0, 150)
+W = 1j * np.tan(np.pi * np.minimum(FREQS, 499.999) * DT)
+
+
+def some_sections() -> Sections:
+    rng = np.random.default_rng(0)
+    pair = np.array([1, 1, 1, 1, 0, 0], bool)
+    return Sections(rng.normal(size=2), np.array([0, 0, 1, 1, 1, 1]), np.tile([1.0, -1.0], 3), pair, *rng.normal(size=(2, 6)))
+
+
+def differences(function, size: int) -> np.ndarray:
+    return np.array([(function(e) - function(-e)) / 2e-6 for e in 1e-6 * np.eye(size)])
+
+
+def test_slopes_and_curvature_are_those_of_finite_differences() -> None:
+    sections, tau = some_sections(), np.geomspace(1e-3, 1e3, 40)
+    weights, owner = np.random.default_rng(1).normal(size=(2, 40)), sections.owner
+    far = (-50.0, 50.0)
+    slope = differences(lambda x: sections.moved(x, far).logs(tau)[owner].ravel(), len(owner)).reshape(len(owner), len(owner), 40)
+    np.testing.assert_allclose(np.einsum("iif->if", slope), sections.slopes(tau), atol=1e-8)
+    hessian = differences(lambda x: (weights[owner] * sections.moved(x, far).slopes(tau)).sum(axis=1), len(owner))
+    found = sections.curvature(tau, weights)
+    for k in range(6):  # the positive part, section by section
+        rows = [2 + k, 8 + k] if sections.pair[k] else [2 + k]
+        values, vectors = np.linalg.eigh((hessian + hessian.T)[np.ix_(rows, rows)] / 2)
+        np.testing.assert_allclose(found[np.ix_(rows, rows)], (vectors * values.clip(0)) @ vectors.T, atol=1e-7)
+
+
+def test_systems_have_the_magnitudes_of_the_sections_and_are_stable_with_their_inverses() -> None:
+    sections = some_sections()
+    for system, logs in zip(sections.systems(DT), sections.logs(np.abs(W) ** 2), strict=True):
+        np.testing.assert_allclose(np.log(np.abs(system.frequency_response(FREQS)[:-1, 0, 0])), logs[:-1], atol=1e-10)
+        assert system.is_stable()
+        assert StateSpace(system.A - system.B @ system.C / system.D, system.B, system.C, system.D, DT).is_stable()
+    assert sections.orders.tolist() == [2, 3]
+
+
+def test_poles_on_zeros_change_nothing_until_they_are_taken_out_again() -> None:
+    sections, tau = some_sections(), np.geomspace(1e-3, 1e3, 40)
+    more = sections.with_pairs(np.array([0, 1]), np.array([0.3, -0.4]), 0.7)
+    np.testing.assert_allclose(more.logs(tau), sections.logs(tau), atol=1e-12)
+    assert more.orders.tolist() == [4, 5]
+    for entry in (0, 1):
+        more = more.without(more.idlest(entry, tau))
+    np.testing.assert_allclose(more.logs(tau), sections.logs(tau), atol=1e-12)
+
+
+def lags_and_leads(freqs: np.ndarray) -> np.ndarray:
+    """Diagonal residuals of one unit whose moduli are of order two and one."""
+    w = 1j * np.tan(np.pi * np.minimum(np.asarray(freqs), 500 - 1e-9) * DT)
+    first = (w + 3e-3) * (w + 0.3) / ((w + 3e-2) * (w + 2.0))
+    return np.einsum("if,ij->fij", np.stack([first, 0.5 * (w + 0.1) / (w + 0.01)]), np.eye(2))[None]
+
+
+def test_diagonal_residuals_that_can_be_represented_are_met_with_lower_orders() -> None:
+    weight, cover = fit_weight(lags_and_leads, FREQS, DT, tolerance_db=0.3)
+    assert weight.overbound_db_max <= 0.3
+    assert weight.within_tolerance
+    assert (
+        sum(weight.left_orders) + sum(weight.right_orders) < 12
+    )  # three would do; what is left out is sought step by step, not the fewest
+    used = weight.magnitudes(FREQS).entries()
+    exact = np.abs(np.einsum("kfii->fi", lags_and_leads(FREQS)))
+    assert (np.einsum("fii->fi", used) >= exact * (1 - 1e-9)).all()
+    np.testing.assert_allclose(cover.cost_db(), 20 * np.log10(exact).mean(axis=1), atol=0.02)
+
+
+def test_higher_orders_are_taken_where_four_are_not_enough() -> None:
+    freqs = np.geomspace(5e-2, 500.0, 60)
+
+    def peaks(at: np.ndarray) -> np.ndarray:
+        w = 1j * np.tan(np.pi * np.minimum(at, 499.999) * DT)
+        return np.prod([(w**2 + 2 * a * w + a**2) / (w**2 + 0.5 * a * w + a**2) for a in (2e-3, 3e-2, 0.4)], axis=0)[None, :, None, None]
+
+    four, _ = fit_weight(peaks, freqs, DT, density=2)
+    six, _ = fit_weight(peaks, freqs, DT, density=2, max_order=6)
+    assert max(four.left_orders) <= 4 < max(six.left_orders) <= 6
+    assert six.overbound_db_max < four.overbound_db_max
+
+
+def test_poles_of_scalar_weights_may_be_given() -> None:
+    weight, _ = fit_weight(lags_and_leads, FREQS, DT, structure="scalar", poles=[0.9, 0.5], density=2)
+    np.testing.assert_allclose(np.sort(weight.left.poles().real), [0.5, 0.5, 0.9, 0.9], atol=1e-9)
+    assert weight.cover_max <= 1
+    with pytest.raises(ConfigError, match="scalar"):
+        fit_weight(lags_and_leads, FREQS, DT, poles=[0.9])
+
+
+def benchmark():
+    path = Path(__file__).parents[2] / "benchmarks" / "covers.py"
+    spec = importlib.util.spec_from_file_location("covers", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("form", ["additive", "inverse_output_multiplicative"])
+def test_bounds_hold_by_the_means_of_the_benchmark(form: str) -> None:
+    rng = np.random.default_rng(2)
+    A = np.array([[0.9, 0.05], [-0.1, 0.7]]) * (1 + 0.01 * rng.normal(size=(4, 2, 2)))
+    B = np.array([[0.1, 0.02], [0.0, 0.3]]) * (1 + 0.05 * rng.normal(size=(4, 2, 2)))
+    units = StateSpace(A, B, np.broadcast_to(np.eye(2), A.shape), np.zeros(A.shape), DT)
+    found = quantify(units, Form(form), np.geomspace(0.1, 500.0, 60), max_order=2, tolerance_db=2.0)
+    covers = benchmark()
+    assert covers.independent_cover_max(found, units) <= 1 + 1e-6
+    lowered = found.weight.mapped(lambda s: StateSpace(s.A, s.B, 0.9 * s.C, 0.9 * s.D, s.dt))
+    assert covers.independent_cover_max(replace(found, weight=lowered), units) > 1

@@ -18,7 +18,7 @@ from kros.observer.relift_ladder import growing_sequence
 from kros.observer.relift_proof import margin, proven
 from kros.observer.relift_report import relift_report
 from kros.observer.relift_sdp import sdp_proposal
-from kros.observer.relift_status import ReliftStatus
+from kros.observer.relift_status import Dropped, ReliftStatus
 from kros.synthesis import Injection
 
 
@@ -188,8 +188,8 @@ def test_a_product_of_state_and_input_is_covered_inside_its_box() -> None:
 
 
 def test_dropped_measurements() -> None:
-    assert relift_certificate(scalar(0.5, 0.1, 0.3), dropped=True).gain == pytest.approx(1 / (1 - 0.6), rel=0.05)
-    lost = relift_certificate(scalar(1.05, 0.1, 0.6), dropped=True)
+    assert relift_certificate(scalar(0.5, 0.1, 0.3), dropped=Dropped.EITHER).gain == pytest.approx(1 / (1 - 0.6), rel=0.05)
+    lost = relift_certificate(scalar(1.05, 0.1, 0.6), dropped=Dropped.INNOVATION)
     assert lost.status is ReliftStatus.UNSTABLE
 
 

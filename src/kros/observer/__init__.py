@@ -10,7 +10,7 @@ from .phase_lock import Tracked, track_parameter
 from .relift import ReliftCertificate, relift_certificate
 from .relift_error import ReliftScales
 from .relift_report import ReliftRow, relift_report
-from .relift_status import ReliftStatus
+from .relift_status import Dropped, ReliftStatus
 from .residual import mean_error_dynamics, one_step_residual, residual_spectra
 from .residual_design import ResidualModel, one_step_rows, residual_models
 from .runtime import Estimate, Runtime
@@ -19,6 +19,7 @@ from .tune import Tuned, tune_observer
 
 __all__ = [
     "Attack",
+    "Dropped",
     "Estimate",
     "ExtendedKalman",
     "Features",

@@ -26,9 +26,9 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
 from .observer import Observer
-from .relift_error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, without_correction
+from .relift_error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, without_measurement
 from .relift_ladder import MOST_CORNERS, frozen_gain, mismatch_gain, prove
-from .relift_status import ReliftStatus
+from .relift_status import Dropped, ReliftStatus
 
 Array = npt.NDArray[np.float64]
 
@@ -134,7 +134,7 @@ def relift_certificate(
     parameters: Box | None = None,
     *,
     clipped: bool = False,
-    dropped: bool = False,
+    dropped: Dropped = Dropped.NEVER,
     memory: int = 1,
     mismatch: bool = True,
     tight: bool = False,
@@ -153,8 +153,8 @@ def relift_certificate(
         Ranges of the lifting's parameters; any value by default, so that the certificate holds for every unit.
     clipped : bool
         The lifted functions see the estimate clipped to the box; then only the true state has to stay inside.
-    dropped : bool
-        Any measurement may be missing, in any pattern: the innovation is then zero, and the filter's correction applied or withheld.
+    dropped : Dropped
+        What the observer does without a measurement, where any may be missing, in any pattern.
     memory : int
         How many coming slopes the Lyapunov function may know, where one matrix does not do.
     mismatch : bool
@@ -193,7 +193,7 @@ def relift_certificate(
         channels=(),
         margin=None,
         scales=scales or ReliftScales.ones(observer),
-        assumptions=_assumptions(observer, box, parameters, clipped=clipped, dropped=dropped),
+        assumptions=_assumptions(observer, box, parameters, dropped, clipped=clipped),
         box=dict(box or {}),
         parameters=dict(parameters or {}),
         clipped=clipped,
@@ -204,7 +204,7 @@ def relift_certificate(
         system = empty.system(observer)
     except UnboundedSlopeError as error:
         return replace(empty, reason=f"No certificate: {error}.", solve_s=time.perf_counter() - start)
-    modes = [system, *(without_correction(observer, system) if dropped else [])]
+    modes = [system, *without_measurement(observer, system, dropped)]
     few = system.corner_count <= MOST_CORNERS
     places = np.array(list(product((-1.0, 1.0), repeat=system.L.shape[1]))) if few else np.zeros((0, system.L.shape[1]))
     found, reason, status = prove(modes, memory, time_limit_s, tight=tight)
@@ -227,19 +227,26 @@ def relift_certificate(
     )
 
 
-def _assumptions(observer: Observer, box: Box | None, parameters: Box | None, **options: bool) -> tuple[str, ...]:
+_WITHOUT = {
+    Dropped.INNOVATION: "the innovation is then zero, and the filter's own correction is applied",
+    Dropped.CORRECTION: "the innovation is then zero, and no correction is applied",
+    Dropped.EITHER: "the innovation is then zero, and the filter's own correction is applied or withheld",
+}
+
+
+def _assumptions(observer: Observer, box: Box | None, parameters: Box | None, dropped: Dropped, *, clipped: bool) -> tuple[str, ...]:
     """Return what has to hold, in words."""
     told = ["the machine and the observer have the same inputs", "machine and observer lift with the same parameters"]
     if parameters:
         told.append(f"parameters within {_ranges(parameters)}")
     elif observer.lifting.parameters:
         told.append(f"any value of {', '.join(observer.lifting.parameters)}")
-    if box and options["clipped"]:
+    if box and clipped:
         told.append(f"the true state stays within {_ranges(box)}, and lifted functions see the estimate clipped to it")
     elif box:
         told.append(f"true and estimated state stay within {_ranges(box)}")
-    if options["dropped"]:
-        told.append("any measurement may be missing; the innovation is then zero, and the filter's correction applied or withheld")
+    if dropped is not Dropped.NEVER:
+        told.append(f"any measurement may be missing; {_WITHOUT[dropped]}")
     return tuple(told)
 
 

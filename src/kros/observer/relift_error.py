@@ -33,6 +33,7 @@ from ..core.lti import StateSpace
 from ..lifting.intervals import bounds_of
 from ..synthesis.result import Injection
 from .observer import Observer
+from .relift_status import Dropped
 
 Array = npt.NDArray[np.float64]
 Box = Mapping[str, Any]
@@ -235,8 +236,8 @@ def slope_box(
     return (np.minimum(lower, 0.0), np.maximum(upper, 0.0)) if clipped else (lower, upper)
 
 
-def without_correction(observer: Observer, system: ErrorSystem) -> list[ErrorSystem]:
-    """Return the dynamics of a step whose measurement is dropped: the innovation is zero, and the filter's correction is applied or withheld."""
+def without_measurement(observer: Observer, system: ErrorSystem, dropped: Dropped) -> list[ErrorSystem]:
+    """Return the dynamics of a step whose measurement is missing, one system for each thing that the observer may do then."""
     K, n, q = observer.controller, observer.lifting.n_states, len(observer.measured)
     h = len(system.A) - K.n_states
     into = (observer.B if observer.injection is Injection.INPUT else np.eye(observer.A.shape[0]))[:n]
@@ -246,4 +247,5 @@ def without_correction(observer: Observer, system: ErrorSystem) -> list[ErrorSys
     B[:, -q:] = 0.0
     withheld = A.copy()
     withheld[:n, h:] = 0.0
-    return [replace(system, A=A, B=B), *([replace(system, A=withheld, B=B)] if K.n_states else [])]
+    steps = {Dropped.NEVER: [], Dropped.INNOVATION: [A], Dropped.CORRECTION: [withheld], Dropped.EITHER: [A, withheld]}
+    return [replace(system, A=step, B=B) for step in steps[dropped]]

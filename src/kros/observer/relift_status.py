@@ -23,3 +23,22 @@ class ReliftStatus(str, Enum):
     UNSTABLE = "unstable"
     UNBOUNDED = "unbounded"
     NOT_FOUND = "not_found"
+
+
+class Dropped(str, Enum):
+    """What the observer does at a step without a measurement; any pattern of such steps is covered.
+
+    NEVER
+        Every measurement arrives.
+    INNOVATION
+        The innovation is zero; the filter's own correction is applied.
+    CORRECTION
+        The innovation is zero and nothing is applied; the filter runs on.
+    EITHER
+        One or the other, from step to step.
+    """
+
+    NEVER = "never"
+    INNOVATION = "innovation"
+    CORRECTION = "correction"
+    EITHER = "either"

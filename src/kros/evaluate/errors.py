@@ -51,13 +51,16 @@ def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt:
     ErrorSummary
         Not-a-number or infinite where the estimate diverged.
     """
-    spectra = []
-    for i, length in enumerate(lengths):
-        with np.errstate(over="ignore", invalid="ignore"):
-            freqs, density = error_spectrum(estimate[:length, i] - truth[:length, i], dt)
-        spectra.append(density)
-    rms = error_rms(estimate, truth, lengths)
-    return ErrorSummary(rms, _of_range(rms, truth, lengths), np.array(spectra), freqs)
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.ascontiguousarray(np.moveaxis(estimate - truth, 0, -1))  # (batch, n, n_samples): every signal in one piece
+        whole = bool(np.all(lengths == error.shape[-1]))
+        rms = np.sqrt(np.einsum("bns,bns->bn", error, error) / lengths[:, None]) if whole else error_rms(estimate, truth, lengths)
+        spectra = np.empty((len(lengths), _SEGMENT // 2 + 1, error.shape[1]))
+        for length in np.unique(lengths):
+            rows = np.flatnonzero(lengths == length)
+            freqs, density = error_spectrum(error[rows, :, :length], dt, axis=-1)
+            spectra[rows] = np.swapaxes(density, 1, 2)
+    return ErrorSummary(rms, _of_range(rms, truth, lengths), spectra, freqs)
 
 
 def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
@@ -73,20 +76,25 @@ def error_percent(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64])
 
 
 def _of_range(rms: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
-    inside = np.arange(len(truth))[:, None, None] < lengths[:, None]
-    size = np.max(np.abs(truth), axis=0, where=inside, initial=0.0)
+    if np.all(lengths == len(truth)):
+        size = np.maximum(truth.max(axis=0), -truth.min(axis=0))
+    else:
+        inside = np.arange(len(truth))[:, None, None] < lengths[:, None]
+        size = np.max(np.abs(truth), axis=0, where=inside, initial=0.0)
     return np.divide(100 * rms, size, out=np.full_like(rms, np.nan), where=size > 0)
 
 
-def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT) -> tuple[Array, Array]:
+def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int = 0) -> tuple[Array, Array]:
     """Return Welch's estimate of the error's power spectral density.
 
     Parameters
     ----------
     error : ndarray, shape (n_samples, ...)
+        Samples on the first axis, or on that of `axis`.
     dt : float, s
     segment : int
         Samples of a segment; shorter signals are padded with zeros, so that all spectra have the same frequencies.
+    axis : int
 
     Returns
     -------
@@ -95,5 +103,5 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT) -> tuple[Ar
     """
     from scipy.signal import welch
 
-    freqs, density = welch(error, fs=1 / dt, nperseg=min(segment, len(error)), nfft=segment, axis=0)
+    freqs, density = welch(error, fs=1 / dt, nperseg=min(segment, error.shape[axis]), nfft=segment, axis=axis)
     return freqs, density

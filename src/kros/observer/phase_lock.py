@@ -101,18 +101,19 @@ def track_parameter(
     estimates, followed = np.empty((*y.shape[:2], n)), np.empty(y.shape[:2])
     scale = np.ptp(observer.initial(y)[..., C], axis=(0, 1))
     scale = np.where(scale > 0, scale, 1.0)
-    for k in range(len(y)):
-        estimates[k], followed[k] = x, values[name]
-        nu, psi = innovation(observer, x, y[k]), s[:, C]
-        by_state = lifting.slopes(x, values)[..., :n]
-        ahead, behind = ({**values, name: values[name] + h} for h in (_STEP, -_STEP))
-        by_value = (lifting.lift(x, ahead) - lifting.lift(x, behind))[:, n:] / (2 * _STEP)
-        power += forget * (np.sum((psi / scale) ** 2, axis=-1) - power)
-        pull = np.sum(psi * nu / scale**2, axis=-1) * (1 - (1 - forget) ** (k + 1))  # over the mean of psi^2 so far
-        x = next_estimate(observer, x, u[k], x_c @ K.C.T + nu @ K.D.T, values)
-        x_c = x_c @ K.A.T + nu @ K.B.T
-        moved = ((observer.A[:n, :n] + coupling @ by_state) @ s[..., None])[..., 0] + by_value @ coupling.T
-        s, s_c = moved + (s_c @ K.C.T - psi @ K.D.T) @ into.T, s_c @ K.A.T - psi @ K.B.T
-        seen = np.divide(pull, power, out=np.zeros(batch), where=power > 0)
-        values[name] = values[name] + forget * np.clip(seen, -_MOST, _MOST)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for k in range(len(y)):
+            estimates[k], followed[k] = x, values[name]
+            nu, psi = innovation(observer, x, y[k]), s[:, C]
+            by_state = lifting.slopes(x, values)[..., :n]
+            ahead, behind = ({**values, name: values[name] + h} for h in (_STEP, -_STEP))
+            by_value = (lifting.lift(x, ahead) - lifting.lift(x, behind))[:, n:] / (2 * _STEP)
+            power += forget * (np.sum((psi / scale) ** 2, axis=-1) - power)
+            pull = np.sum(psi * nu / scale**2, axis=-1) * (1 - (1 - forget) ** (k + 1))  # over the mean of psi^2 so far
+            x = next_estimate(observer, x, u[k], x_c @ K.C.T + nu @ K.D.T, values)
+            x_c = x_c @ K.A.T + nu @ K.B.T
+            moved = ((observer.A[:n, :n] + coupling @ by_state) @ s[..., None])[..., 0] + by_value @ coupling.T
+            s, s_c = moved + (s_c @ K.C.T - psi @ K.D.T) @ into.T, s_c @ K.A.T - psi @ K.B.T
+            seen = np.divide(pull, power, out=np.zeros(batch), where=(power > 0) & np.isfinite(pull))
+            values[name] = values[name] + forget * np.clip(seen, -_MOST, _MOST)
     return Tracked(estimates, followed)

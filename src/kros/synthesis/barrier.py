@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 Array = npt.NDArray[Any]
 
@@ -63,7 +62,12 @@ class Block:
 
     def at(self, x: Array) -> Array:
         """Value of the matrices, shape (k, d, d)."""
-        return self.constant + np.tensordot(x, self.basis, 1)
+        return self.constant + combine(x, self.basis)
+
+
+def combine(x: Array, matrices: Array) -> Array:
+    """``sum_i x_i M_i``; without BLAS, whose threads cost more than these sums where cores are shared."""
+    return np.einsum("n,nf->f", x, matrices.reshape(len(x), -1)).reshape(matrices.shape[1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +171,7 @@ def _follow(
             gradient, hessian, roots = _derivatives(blocks, x, box)
             gradient, hessian = (c + quadratic @ x) / mu + gradient, quadratic / mu + hessian
             direction = -_solve(hessian, gradient)
-        except LinAlgError:
+        except np.linalg.LinAlgError:
             break
         eigenvalues = _spectrum(blocks, roots, x, direction, box)
         decrement = float(np.sqrt(max(-gradient @ direction, 0.0)))
@@ -210,11 +214,11 @@ def _derivatives(blocks: Sequence[Block], x: Array, box: Array) -> tuple[Array, 
 def _solve(hessian: Array, gradient: Array) -> Array:
     """Newton direction in units in which the Hessian has a unit diagonal, with one step of refinement."""
     scale = 1 / np.sqrt(np.diag(hessian))
-    scaled = hessian * scale[:, None] * scale
-    factor = cho_factor(scaled + 1e-14 * np.eye(len(scaled)))
+    scaled = hessian * scale[:, None] * scale + 1e-14 * np.eye(len(hessian))
     right = gradient * scale
-    found = cho_solve(factor, right)
-    found += cho_solve(factor, right - scaled @ found)
+    # LU: where cores are shared, the threads of a Cholesky factorisation of this size wait for each other.
+    found = np.linalg.solve(scaled, right)
+    found += np.linalg.solve(scaled, right - scaled @ found)
     return found * scale
 
 
@@ -222,7 +226,7 @@ def _spectrum(blocks: Sequence[Block], roots: Sequence[Array], x: Array, directi
     """Eigenvalues of ``F^-1/2 dF F^-1/2`` of all blocks and of the box."""
     parts = [direction / (box + x), -direction / (box - x)]
     for block, root in zip(blocks, roots, strict=True):
-        change = root @ np.tensordot(direction, block.basis, 1) @ root.swapaxes(-1, -2)
+        change = root @ combine(direction, block.basis) @ root.swapaxes(-1, -2)
         parts.append(np.linalg.eigvalsh((change + change.swapaxes(-1, -2)) / 2).ravel())
     return np.concatenate(parts)
 

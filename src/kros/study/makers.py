@@ -32,7 +32,8 @@ class Task:
     """Everything a worker needs for one observer.
 
     `problem` is None where there is no usable uncertain set, and `refusal` says why; `noise` is the standard deviation of every
-    measurement's noise, `covered` names the units whose differences the set covers.
+    measurement's noise, `covered` names the units whose differences the set covers, and
+    `leftover` holds weights of what it leaves out of them.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Task:
     max_order: int
     max_states: int | None
     covered: tuple[str, ...] = ()
+    leftover: tuple[StateSpace, StateSpace] | None = None
 
     def observer(self, synthesis: Synthesis) -> Observer:
         """Return the observer as it runs."""

@@ -14,6 +14,7 @@ s : scaled input;  e : error;  x_p : state of the unit
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DimensionError
+from ..core.errors import DimensionError, SynthesisError
 from ..core.lti import StateSpace
 from ..core.norms import h2_norm, hinf_norm
 from .certificate import certify, density
@@ -32,6 +33,7 @@ from .observer_problem import ObserverProblem
 from .robust_gain import robust_gain
 
 Array = npt.NDArray[Any]
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,7 @@ class UnitCheck:
         Largest ratio, over a grid of frequencies, of the unit's root power density to the bound's, both without noise: the sharpest test, since
         norms may hide a frequency.
     worst_case_h2, worst_case_hinf : float
-        The certified bounds, noise included.
+        The certified bounds, noise included; infinite where none is proven.
     """
 
     units: tuple[str, ...]
@@ -96,7 +98,7 @@ def check_units(problem: ObserverProblem, controller: StateSpace, units: StateSp
     DimensionError
         When models and nominal do not fit together.
     SynthesisError
-        When there is no certificate: see `certify` and `robust_gain`.
+        When there is no H2 certificate: see `certify`.
     """
     n, m = problem.nominal.n_states, problem.nominal.n_inputs
     if units.A.shape[1:] != (n, n) or units.B.shape[1:] != (n, m) or units.dt != problem.nominal.dt:
@@ -116,8 +118,17 @@ def check_units(problem: ObserverProblem, controller: StateSpace, units: StateSp
         np.array([hinf_norm(e, tol=1e-4) for e in errors]),
         np.array([np.max(s / np.maximum(bound, 1e-300)) for s in size]),
         certify(problem, controller)[0],
-        robust_gain(problem, controller).value,
+        _gain_or_infinity(problem, controller),
     )
+
+
+def _gain_or_infinity(problem: ObserverProblem, controller: StateSpace) -> float:
+    """Infinity is a bound too, where no smaller one is proven."""
+    try:
+        return robust_gain(problem, controller).value
+    except SynthesisError as error:
+        log.warning("%s", error)
+        return float("inf")
 
 
 def unit_error(problem: ObserverProblem, controller: StateSpace, A_p: Array, B_p: Array) -> StateSpace:

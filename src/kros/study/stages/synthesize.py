@@ -20,6 +20,7 @@ from ...synthesis import Injection, ObserverProblem, Synthesis, check_units
 from ...synthesis.certificate import certify
 from ...uncertainty import Structure, UncertainModel
 from ..context import Context
+from ..leftover import leftover
 from ..makers import Product, Task, produce
 from ..relift import Running, certify_running, save_running
 from ..residual_maker import OwnModel
@@ -28,6 +29,7 @@ from . import calibrate
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
+WORST_CASE = ("worst_case_h2", "worst_case_hinf")
 PREFERRED = ("worst_case_h2", "worst_case_hinf", "mixed", "residual_h2", "kalman_tuned", "luenberger", "kalman_white", "open_loop")
 
 
@@ -104,6 +106,7 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     ]
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings |= {"max_order": config.uncertainty.max_order, "max_states": config.synthesis.max_states, "covered": uncertain.unit_ids}
+    settings["leftover"] = None if problem is None else leftover(models, unit, uncertain)
     return [
         Task(f"{name}/{method}", method, models, unit, problem, refusal, noise, tuning_set(context, models), **settings)
         for method in ordered
@@ -184,22 +187,26 @@ def certificate(task: Task, synthesis: Synthesis, problem: ObserverProblem | Non
     if problem is None:
         return facts | {"reason": task.refusal}
     problem = replace(problem, injection=synthesis.injection)
+    if task.leftover is not None:
+        problem = replace(problem, remainder_left=task.leftover[0], remainder_right=task.leftover[1])
     loop = float(problem.error_system(synthesis.controller).spectral_radius())
     facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
     try:
         facts["worst_case_h2"] = certify(problem, synthesis.controller)[0]
-        found = check_units(problem, synthesis.controller, task.models.systems(task.covered), task.covered)
+        return facts | (of_units(task, synthesis, problem) if task.method in WORST_CASE else {})
     except SynthesisError as error:
         log.warning("%s: no certificate, %s", task.name, error)
         return facts | {"reason": str(error)}
+
+
+def of_units(task: Task, synthesis: Synthesis, problem: ObserverProblem) -> dict[str, Any]:
+    """Return the bound in the other norm, and whether both hold for the models of all units."""
+    found = check_units(problem, synthesis.controller, task.models.systems(task.covered), task.covered)
     if not found.holds:
         log.warning("%s: the error of a unit's model is %.3g times its certified bound", task.name, found.largest_ratio)
-    facts |= {"worst_case_hinf": found.worst_case_hinf, "causal_h2": synthesis.causal_h2}
-    return facts | {
-        "bound_holds": found.holds,
-        "unit_to_bound_max": found.largest_ratio,
-        "unit_to_density_max": float(found.density_ratio.max(initial=0.0)),
-    }
+    gain = found.worst_case_hinf if np.isfinite(found.worst_case_hinf) else None
+    facts = {"worst_case_hinf": gain, "causal_h2": synthesis.causal_h2, "bound_holds": found.holds}
+    return facts | {"unit_to_bound_max": found.largest_ratio, "unit_to_density_max": float(found.density_ratio.max(initial=0.0))}
 
 
 def save(context: Context, task: Task, synthesis: Synthesis) -> list[Path]:

@@ -46,7 +46,7 @@ def test_a_good_observer_is_handed_over() -> None:
         ({"koopman__worst_case_h2": 0.899, "koopman__open_loop": 0.9}, "no better than its model alone"),
         (
             {"koopman__worst_case_h2": 0.2, "koopman__open_loop": 0.9, "linear__residual_h2": 0.1},
-            "Look at “linear, residual-shaped H2” first",
+            "Look at “linear, residual-shaped H2” before",
         ),
     ],
 )
@@ -72,7 +72,7 @@ def test_flagged_units_come_first_and_count_until_they_are_dropped() -> None:
         {"unit": u, "condition": "load", "score": s, "outlier": s > 5, "freq_hz": 17.4} for u, s in (("a", 6.0), ("z", 9.0), ("b", 1.0))
     ]
     (first, *_) = advice(metrics(outliers=rows, units=[{"unit": u, "group": ""} for u in "abz"]))
-    assert first.startswith("Inspect z (loaded, differs most at 17.4 Hz), a (loaded, differs most at 17.4 Hz) before shipping.")
+    assert first.startswith("Inspect z (loaded, stands out most at 17.4 Hz), a (loaded, stands out most at 17.4 Hz) before shipping.")
     assert "drop_outliers" in first
     filed = metrics(outliers=rows[1:], units=[{"unit": "z", "group": "outliers"}])
     assert "drop_outliers" not in advice(filed)[0]

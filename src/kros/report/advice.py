@@ -43,7 +43,7 @@ def _outliers(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _where(row: Mapping[str, Any]) -> str:
-    at = f", differs most at {number(row['freq_hz'])} Hz" if row.get("freq_hz") is not None else ""
+    at = f", stands out most at {number(row['freq_hz'])} Hz" if row.get("freq_hz") is not None else ""
     return f"{condition_label(row['condition'])}{at}"
 
 
@@ -60,10 +60,12 @@ def _observer(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str
         return [
             f"Do not use “{observer_label(name)}”: its estimates diverge. Look at Models first: free runs there should not diverge either."
         ]
-    better = next((o for o in table.observers if o != name and _smaller(table, o, name, hidden, 0.95)), None)
-    if better is not None:
+    better = [o for o in table.observers if o != name and _smaller(table, o, name, hidden, 0.95)]
+    if better:
+        best = min(better, key=lambda o: sum(table.cells[o][c].mean or 0.0 for c in hidden))
         return [
-            f"Look at “{observer_label(better)}” first: it is better in all that is not measured; observer.deployed names the one that is handed over."
+            f"Look at “{observer_label(best)}” before handing anything over: it is better in all that is not measured. Compare what is certified under "
+            "Synthesis; observer.deployed names the one that is handed over."
         ]
     if name != other and other in table.cells and not _smaller(table, name, other, hidden, 0.99):
         return ["The observer is no better than its model alone: correction from these measurements brings nothing here."]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..content import Cell, Section, Table
-from ..figures.entries import entry_names
+from ..figures.entries import entry_names, short
 from ..names import condition_label, number
 from ..run_folder import NotShownError, RunFolder
 
@@ -38,7 +38,7 @@ def conspicuous_text(row: Mapping[str, Any], names: tuple[Sequence[str], Sequenc
     if row.get("lowest_db") is not None:
         above = "under every choice of the nominal" if row["lowest_db"] > 0 else "under some choices of the nominal only"
         text += f". It exceeds the others {above}, by {number(row['lowest_db'])} to {number(row['highest_db'])} dB"
-        text += f"; under {100 * row['agreement']:.0f} % of them that alone would flag it"
+        text += f"; with {100 * row['agreement']:.0f} % of these nominals alone it would be flagged"
     return f"{text}."
 
 
@@ -47,7 +47,7 @@ def _entry(row: Mapping[str, Any], names: tuple[Sequence[str], Sequence[str]] | 
     if names is None or row.get("entry") is None:
         return ""
     i, j = row["entry"]
-    return pattern.format(names[0][i].replace("_", " "), names[1][j].replace("_", " "))
+    return pattern.format(short(names[0][i]), short(names[1][j]))
 
 
 def _names(run: RunFolder, row: Mapping[str, Any]) -> tuple[Sequence[str], Sequence[str]] | None:

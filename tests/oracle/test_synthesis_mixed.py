@@ -13,8 +13,8 @@ from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status,
 from kros.synthesis.balance import balance
 from kros.synthesis.certificate import certify
 from kros.synthesis.channels import part, scaled, verify
+from kros.synthesis.mixed_candidates import by_inequalities
 from kros.synthesis.mixed_lmi import MixedInequalities
-from kros.synthesis.mixed_optimal import by_inequalities
 from kros.synthesis.paper_plant import paper_plant, reduced_plant
 from kros.synthesis.reduction import truncate
 from kros.synthesis.solvers import Program, solve

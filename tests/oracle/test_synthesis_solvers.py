@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
-from kros.core import SynthesisError
+from kros.core import SynthesisError, hinf_norm
 from kros.synthesis import GeneralizedPlant, h2, hinf, mixed
 from kros.synthesis.barrier import Block, Ending, minimise
 from kros.synthesis.solvers import Program, climb, installed, solve
@@ -128,3 +128,55 @@ def test_states_that_nothing_reaches_or_sees_do_no_harm():
         C2=np.hstack([p.C2, [[0.0]]]),
     )
     assert mixed(wide, gamma=0.13).h2_norm == pytest.approx(mixed(p, gamma=0.13).h2_norm, rel=1e-2)
+
+
+def pathological(name):
+    """Plants at the edge of what can be computed: (A, size of the disturbances)."""
+    rng = np.random.default_rng(1)
+    A = {
+        "chain of delays": np.diag(np.ones(19), 1),
+        "chain of integrators": np.eye(12) + np.diag(np.ones(11), 1),
+        "poles within rounding of the circle": np.diag([1 - 1e-14, 1 + 1e-14, 0.5]),
+        "poles at both ends of the circle": np.diag([-1.0, 1.0, 0.3]),
+        "sixteen decades": np.diag([1e8, 1e-8, 0.5]),
+        "many unstable poles": 0.3 * rng.standard_normal((40, 40)),
+        "huge": np.diag([1e12, 2e12]),
+    }[name]
+    n, r = len(A), rng.standard_normal
+    return GeneralizedPlant(
+        A,
+        np.hstack([r((n, 2)), np.zeros((n, 1))]),
+        r((n, 1)),
+        np.vstack([r((2, n)), np.zeros((1, n))]),
+        r((1, n)),
+        np.zeros((3, 3)),
+        [[0], [0], [1.0]],
+        [[0, 0, 1.0]],
+        [[0.0]],
+        1.0,
+    )
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::scipy.linalg.LinAlgWarning")
+@pytest.mark.parametrize("method", [h2, hinf])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "chain of delays",
+        "chain of integrators",
+        "poles within rounding of the circle",
+        "poles at both ends of the circle",
+        "sixteen decades",
+        "many unstable poles",
+        "huge",
+    ],
+)
+def test_nothing_hangs_and_nothing_is_returned_unverified(method, name):
+    p = pathological(name)
+    try:
+        found = method(p)
+    except SynthesisError:
+        return
+    closed = p.close(found.controller)
+    assert closed.is_stable()
+    assert found.hinf_norm == pytest.approx(hinf_norm(closed), rel=1e-4)

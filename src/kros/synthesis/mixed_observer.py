@@ -24,7 +24,7 @@ from ..core.norms import gramian, hinf_norm
 from .certificate import certify
 from .channels import Verified
 from .generalized_plant import GeneralizedPlant
-from .mixed_optimal import by_inequalities
+from .mixed_candidates import by_inequalities
 from .observer_problem import ObserverProblem
 from .result import Status, Synthesis
 

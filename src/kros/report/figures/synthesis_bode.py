@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 NAME, TITLE = "synthesis", "Plant, weights and correction filters"
 Array = npt.NDArray[Any]
 _POINTS = 260
-_FLOOR_DB = 200.0  # filters for almost noiseless measurements and small weights are far apart
+_FLOOR_DB = 220.0  # filters for almost noiseless measurements and small weights are far apart
 
 
 def draw(run: RunFolder) -> Drawing:

@@ -117,10 +117,10 @@ def usable_problem(
     models: ModelSet, unit: str, uncertain: UncertainModel, noise: Array, context: Context
 ) -> tuple[ObserverProblem | None, str]:
     """Return the synthesis problem of one kind of model, or None and why there is none."""
-    if uncertain.weight.structure in (Structure.FULL, Structure.ENTRYWISE):
+    if uncertain.weight.structure is Structure.ENTRYWISE:
         refusal = (
-            f"synthesis needs weights with one filter per channel, and those of the study are {uncertain.weight.structure.value} "
-            f"(for a {uncertain.weight.perturbation.value} perturbation); set uncertainty.structure to 'auto', 'diagonal' or 'scalar'"
+            "the weights are entrywise, made for a diagonal perturbation, and synthesis is for a full one; "
+            "set uncertainty.structure to 'auto', 'diagonal', 'full' or 'scalar'"
         )
     else:
         problem = observer_problem(models, unit, uncertain, noise, context)

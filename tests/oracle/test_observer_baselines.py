@@ -162,6 +162,10 @@ def test_placed_poles_are_the_models_made_faster():
         reached = np.linalg.eigvals(A - synthesis.controller.D @ C)
         np.testing.assert_allclose(np.sort_complex(reached), np.sort_complex(np.linalg.eigvals(A) ** factor), atol=1e-6)
     assert list(luenberger_candidates(A, np.zeros((1, 2)), DT)) == []
+    alternating = np.array([[-0.5, 0.2], [0.0, 0.8]])  # a pole that alternates keeps its sign
+    factor, synthesis = next(luenberger_candidates(alternating, np.ones((1, 2)), DT))
+    reached = np.sort(np.linalg.eigvals(alternating - synthesis.controller.D @ np.ones((1, 2))).real)
+    np.testing.assert_allclose(reached, [-(0.5**factor), 0.8**factor], atol=1e-6)
 
 
 def test_observers_side_by_side_are_the_same_observers():

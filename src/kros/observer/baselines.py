@@ -62,8 +62,8 @@ def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> 
 def luenberger_candidates(A: Array, C: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:
     """Place the poles of the error dynamics at those of the model, made faster by growing factors.
 
-    A pole ``z`` becomes ``z**factor``: the decay rate and the frequency of its continuous counterpart grow alike. Factors whose poles cannot be
-    placed are left out.
+    A pole ``z`` becomes ``z**factor``: the decay rate and the frequency of its continuous counterpart grow alike; a negative one, which has none,
+    keeps its sign. Factors whose poles cannot be placed are left out.
 
     Parameters
     ----------
@@ -78,9 +78,12 @@ def luenberger_candidates(A: Array, C: Array, dt: float) -> Iterator[tuple[float
         The factor.
     Synthesis
     """
-    poles = np.linalg.eigvals(A)
+    poles = np.linalg.eigvals(A).astype(complex)
+    real = poles.imag == 0
     for factor in _FASTER:
+        wanted = np.abs(poles) ** factor * np.exp(1j * np.angle(poles) * np.where(real, 1.0, factor))
+        wanted[real] = wanted[real].real
         try:
-            yield factor, luenberger(A, C, poles**factor, dt)
+            yield factor, luenberger(A, C, wanted, dt)
         except SynthesisError:
             continue

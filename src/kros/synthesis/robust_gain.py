@@ -40,9 +40,9 @@ from .observer_problem import ObserverProblem
 Array = npt.NDArray[Any]
 
 _SEARCH = 40
-_MARGINS = (1e-3, 2e-2, 2e-1)  # by which the level exceeds what was found, so that every step of the walk gets somewhere
+_MARGINS = (1e-3, 5e-2)  # by which the level exceeds what was found, so that every step of the walk gets somewhere
 _ROUNDS, _FINER = 3, 20
-_WALK = 120
+_WALK = 100
 
 
 @dataclass(frozen=True)

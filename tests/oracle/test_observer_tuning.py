@@ -58,7 +58,9 @@ def test_tuning_finds_the_kalman_filter_of_a_linear_system():
         x[k + 1] = x[k] @ F.T + u[k] @ G.T + rng.normal(size=(6, 2)) * np.sqrt(np.diag(Q))
     # The measurement is the recorded state: what is white in the measurement is in the state too, and the Kalman filter for R -> 0 is best.
     best = kalman(F, np.eye(1, 2), Q, 1e-12 * R, DT)
-    rough = Observer("o", plain, F + np.array([[0, 0.02], [0.05, -0.1]]), 0.9 * G, (0,), ("u",), gain([[0.3], [0.0]], DT), Injection.STATE, DT)
+    rough = Observer(
+        "o", plain, F + np.array([[0, 0.02], [0.05, -0.1]]), 0.9 * G, (0,), ("u",), gain([[0.3], [0.0]], DT), Injection.STATE, DT
+    )
     tuned = tune_observer(rough, x, u)
     assert list(tuned.criterion) == sorted(tuned.criterion, reverse=True)
     fresh = np.random.default_rng(2)

@@ -411,3 +411,23 @@ def test_slycot_h2_agrees_on_random_plants():
         s = plant.open_loop()
         A, B, C, *_ = slycot.sb10hd(n, n_w + n_u, n_z + n_y, n_u, n_y, s.A, s.B, s.C, s.D)
         assert h2(plant).h2_norm == pytest.approx(h2_norm(plant.close(StateSpace(A, B, C, np.zeros((n_u, n_y)), 0.0))), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 11])
+def test_the_optimum_does_not_depend_on_coordinates(seed):
+    """Slow poles that disturbances hardly reach, in units of measure of many sizes: rounding blinded one frame or another here."""
+    rng = np.random.default_rng(seed)
+    n, faint = 10, 1e-6
+    A = np.diag(np.concatenate([[1 - 1e-6, 1 - 1e-6, 1 - 1e-5], rng.uniform(-0.9, 0.99, n - 3)]))
+    B1, B2 = np.hstack([rng.standard_normal((n, 2)), np.zeros((n, 1))]), rng.standard_normal((n, 1))
+    C1, C2 = np.vstack([rng.standard_normal((1, n)), np.zeros((1, n))]), rng.standard_normal((1, n))
+    B1[:3] *= faint
+    found = []
+    for units in (np.ones(n), np.where(np.arange(n) < 3, faint, 1.0), np.geomspace(1, 1e5, n)):
+        plant = GeneralizedPlant(
+            A * units / units[:, None], B1 / units[:, None], B2 / units[:, None], C1 * units, C2 * units,
+            np.zeros((2, 3)), [[0.0], [1.0]], [[0.0, 0.0, 1.0]], [[0.0]], 1.0,
+        )  # fmt: skip
+        found.append(hinf(plant))
+    assert all(f.status is Status.OPTIMAL for f in found)
+    assert max(f.lower_bound for f in found) <= min(f.hinf_norm for f in found)

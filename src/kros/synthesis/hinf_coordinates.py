@@ -12,6 +12,7 @@ X, Y : Riccati solutions of the H2 problem (the level infinity), from which the 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from scipy.linalg import LinAlgError, matrix_balance
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace
 from ..core.norms import to_continuous
+from .balancing import Balancing, gramian_root
 from .generalized_plant import GeneralizedPlant
 from .h2_optimal import absorb_feedthrough
 from .hinf_central import normalise
@@ -60,11 +62,19 @@ class Coordinates:
         return absorb_feedthrough(K, self.original.D22)
 
 
-def coordinates(plant: GeneralizedPlant, balanced: bool = True) -> Coordinates:
-    """Map, balance and normalise a regular plant; without `balanced` the states are only scaled."""
+class Balance(str, Enum):
+    """How the states are balanced; what one way spoils another may save."""
+
+    LOOP = "Riccati solutions of the H2 problem"
+    PLANT = "Gramians of a stable plant, by square roots"
+    SCALES = "powers of two only"
+
+
+def coordinates(plant: GeneralizedPlant, balance: Balance = Balance.LOOP) -> Coordinates:
+    """Map, balance and normalise a regular plant."""
     strict = replace(plant, D22=np.zeros_like(plant.D22))
-    scaled = _scale(strict)
-    if balanced:
+    scaled = _balance_plant(strict) if balance is Balance.PLANT else _scale(strict)
+    if balance is Balance.LOOP:
         scaled = _balance(scaled)
     constant, mirrored, mapped = np.zeros(plant.D22.T.shape), False, scaled
     if plant.dt > 0:
@@ -160,6 +170,20 @@ def _balance(p: GeneralizedPlant) -> GeneralizedPlant:
     U, s, Vh = np.linalg.svd(square[0].T @ square[1])
     T, back = (U / np.sqrt(s)).T @ square[0].T, square[1] @ Vh.T / np.sqrt(s)
     return _level_out(_transform(p, T, back))
+
+
+def _balance_plant(p: GeneralizedPlant) -> GeneralizedPlant:
+    """Balance the Gramians of the plant, where these exist and can be computed; states without effect are dropped."""
+    p = _scale(p)
+    system = p.open_loop()
+    if not p.sizes[0] or not system.is_stable():
+        return p
+    with np.errstate(over="ignore", invalid="ignore"):
+        roots = gramian_root(p.A, system.B, p.dt), gramian_root(p.A.T, system.C.T, p.dt)
+    if not all(np.isfinite(root).all() for root in roots):
+        return p  # so close to the boundary that rounding in A decides
+    balancing = Balancing.of(*roots)
+    return _level_out(_transform(p, balancing.left, balancing.right))
 
 
 def _level_out(p: GeneralizedPlant) -> GeneralizedPlant:

@@ -12,6 +12,7 @@ gamma : level;  K : controller;  P11, P12, P21 : frequency responses of the plan
 
 from __future__ import annotations
 
+import contextlib
 import time
 import warnings
 from dataclasses import dataclass, replace
@@ -27,7 +28,7 @@ from .assumptions import require
 from .generalized_plant import GeneralizedPlant
 from .h2_optimal import h2, stability_margin
 from .hinf_central import Obstacle, central, direct_bound
-from .hinf_coordinates import Coordinates, coordinates
+from .hinf_coordinates import Balance, Coordinates, coordinates
 from .result import Injection, Status, Synthesis
 
 Array = npt.NDArray[Any]
@@ -35,6 +36,8 @@ Array = npt.NDArray[Any]
 _MAX_STEPS = 100
 _MAX_RAISES = 40
 _NEGLIGIBLE = 1e-9
+_SURELY = 1e3  # a level so far above an attained one is attained by any account
+_AGREEMENT = 1e-6
 _RELAXATIONS = (0.0, *np.geomspace(1e-6, 0.1, 16))
 
 
@@ -93,7 +96,7 @@ def hinf(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The best controller so far with its recomputed norm, and the bracket; the second frame is for levels where the first fails."""
+    """The best controller so far with its recomputed norm, and the bracket; later frames are for levels where earlier ones fail."""
 
     plant: GeneralizedPlant
     frames: tuple[Coordinates, ...]
@@ -101,21 +104,27 @@ class _Search:
     norm: float
     lower: float
     scale: float
+    known: float = 0.0  # the part of `lower` that no frame has a say in
 
     @classmethod
     def begin(cls, plant: GeneralizedPlant) -> _Search:
         """Bracket the optimum: Parrott's bound from below, controllers that are at hand from above."""
-        frames = coordinates(plant), coordinates(plant, balanced=False)
-        mapped = frames[1].plant
+        frames = tuple(coordinates(plant, balance) for balance in Balance)
+        mapped = frames[-1].plant
         bound = max(_frequency_bound(mapped), direct_bound(mapped)) * (1 - 1e-9)
-        search = cls(plant, frames, None, float("inf"), bound, 0.0)
+        search = cls(plant, frames, None, float("inf"), bound, 0.0, bound)
         _, _, n_u, _, n_y = plant.sizes
         search = search.consider(gain(np.zeros((n_u, n_y)), plant.dt))
         search = search.consider(_h2_controller(plant))
         for frame in frames:
             if search.K is None and (K := _h2_controller(frame.plant)) is not None:
                 search = search.consider(frame.controller(K))
-        return search._open()
+        return search._open()._seeing()
+
+    def _seeing(self) -> _Search:
+        """Keep the frames that do not deny a level far above one that is attained: with poles next to the boundary, rounding may blind a frame."""
+        seeing = tuple(f for f in self.frames if not _denied(f, _SURELY * self.norm))
+        return replace(self, frames=seeing) if seeing else self
 
     def uncancelled(self) -> float:
         """Size that the closed loop would have if nothing in it cancelled: a norm far below it is rounding."""
@@ -189,7 +198,19 @@ class _Search:
             middle = float(np.sqrt(bottom * high)) if high > 2 * bottom else (bottom + high) / 2
             search, obstacle = search.level(middle, verify=False)
             low, high = (low, middle) if obstacle is None else (middle, high)
-        return search._settle(high, tolerance)
+        return search._contested(tolerance) or search._settle(high, tolerance)
+
+    def _contested(self, tolerance: float) -> _Search | None:
+        """Search again without the frames that deny a level which another one attains; None where all agree."""
+        found = self
+        for frame in self.frames:
+            K = central(frame.plant, self.lower)
+            with contextlib.suppress(SynthesisError):
+                found = found.consider(None if isinstance(K, Obstacle) else frame.controller(K))
+        if found.norm >= self.lower * (1 - _AGREEMENT):
+            return None
+        right = tuple(f for f in self.frames if not _denied(f, self.lower))
+        return replace(found, frames=right, lower=self.known).bisect(tolerance) if len(right) < len(self.frames) else None
 
     def _open(self) -> _Search:
         """Find any controller when none is at hand, by raising the level."""
@@ -245,6 +266,11 @@ def _result(search: _Search, injection: Injection, elapsed: float, tolerance: fl
         solve_s=elapsed,
         solver="riccati",
     )
+
+
+def _denied(frame: Coordinates, gamma: float) -> bool:
+    found = central(frame.plant, gamma)
+    return isinstance(found, Obstacle) and found is not Obstacle.NUMERICAL
 
 
 def _without_control(plant: GeneralizedPlant, injection: Injection, gamma: float | None) -> Synthesis:

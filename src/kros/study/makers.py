@@ -32,8 +32,7 @@ class Task:
     """Everything a worker needs for one observer.
 
     `problem` is None where there is no usable uncertain set, and `refusal` says why; `noise` is the standard deviation of every
-    measurement's noise, `covered` names the units whose differences the set covers, and
-    `leftover` holds weights of what it leaves out of them.
+    measurement's noise, and `covered` names the units whose differences the set covers.
     """
 
     name: str
@@ -49,7 +48,6 @@ class Task:
     max_order: int
     max_states: int | None
     covered: tuple[str, ...] = ()
-    leftover: tuple[StateSpace, StateSpace] | None = None
 
     def observer(self, synthesis: Synthesis) -> Observer:
         """Return the observer as it runs."""
@@ -170,22 +168,17 @@ def best_surroundings(
     How the inputs are spread over frequency and how much white noise there is nobody knows beforehand; the process noise of the tuned
     Kalman filter is chosen on the same episodes and by the same rule.
     """
-    judge = task.tuning.read()
-    limit = judge.percent(task.observer(open_loop(task)[0]))
-    best: tuple[tuple[bool, float], Surroundings, Synthesis] | None = None
-    reason = ""
+    judge, made, reason = task.tuning.read(), [], ""
     for surroundings in candidates(task.models.sample_period_s):
         try:
-            synthesis = design(surroundings.of(problem))
+            made.append((surroundings, design(surroundings.of(problem))))
         except SynthesisError as error:
             reason = str(error)
-            continue
-        verdict = rank(judge.percent(task.observer(synthesis)), limit, task.models.measured)
-        if best is None or verdict < best[0]:
-            best = (verdict, surroundings, synthesis)
-    if best is None:
+    if not made:
         raise SynthesisError(reason)
-    return best[1:]
+    limit, *errors = judge.percent_of_all([task.observer(s) for s in (open_loop(task)[0], *(synthesis for _, synthesis in made))])
+    verdicts = [rank(error, limit, task.models.measured) for error in errors]
+    return made[verdicts.index(min(verdicts))]
 
 
 def remembering(fit: Callable[..., Any]) -> Callable[..., Any]:

@@ -21,7 +21,8 @@ Array = npt.NDArray[Any]
 Responder = Callable[[Array], Array]
 
 _LOG = logging.getLogger(__name__)
-MISFIT = 0.01  # relative misfit beyond which an additive remainder joins the set
+EXACT = 1e-9  # relative misfit up to which a form is said to rebuild every unit: rounding
+WORTH_SAYING = 0.01  # a misfit that makes another form worth a thought
 _REMAINDER_TOLERANCE = 1.5  # the remainder is small: its weight may be looser by this factor
 
 
@@ -120,7 +121,11 @@ class _Residuals:
 
 
 def _leaves_out(form: Form, ratio: Array) -> bool:
-    """Tell whether an additive remainder is needed, and warn."""
+    """Tell whether an additive remainder is needed, and warn.
+
+    A misfit is small or large beside the *error* of an observer, which is a difference of responses: where all units agree, a thousandth of the
+    response may be more than all that the weights allow. So anything beyond rounding joins the set.
+    """
     unknown = int(np.isnan(ratio).sum())
     if unknown:
         _LOG.warning(
@@ -130,9 +135,10 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
             ratio.size,
         )
     largest = np.nanmax(ratio) if unknown < ratio.size else np.inf
-    if largest <= MISFIT and not unknown:
+    if largest <= EXACT and not unknown:
         return False
-    _LOG.warning(
+    _LOG.log(
+        logging.WARNING if largest > WORTH_SAYING else logging.INFO,
         "Uncertainty form %s leaves out up to %.3g of a unit's response; an additive remainder joins the set. The additive form leaves nothing.",
         form.value,
         largest,

@@ -57,7 +57,7 @@ class UncertainModel:
     misfit : ndarray, shape (unit, frequency)
         What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular (condition above 1e12).
     remainder : Weight or None
-        Additive weights for `Gp - rebuilt(G, E)`, when the misfit exceeds 1 % anywhere.
+        Additive weights for `Gp - rebuilt(G, E)`, where the form does not rebuild every unit.
     remainder_cover : Cover or None
     """
 

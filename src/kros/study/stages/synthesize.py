@@ -20,7 +20,6 @@ from ...synthesis import Injection, ObserverProblem, Synthesis, check_units
 from ...synthesis.certificate import certify
 from ...uncertainty import Structure, UncertainModel
 from ..context import Context
-from ..leftover import leftover
 from ..makers import Product, Task, produce
 from ..relift import Running, certify_running, save_running
 from ..residual_maker import OwnModel
@@ -106,7 +105,6 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     ]
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings |= {"max_order": config.uncertainty.max_order, "max_states": config.synthesis.max_states, "covered": uncertain.unit_ids}
-    settings["leftover"] = None if problem is None else leftover(models, unit, uncertain)
     return [
         Task(f"{name}/{method}", method, models, unit, problem, refusal, noise, tuning_set(context, models), **settings)
         for method in ordered
@@ -187,8 +185,6 @@ def certificate(task: Task, synthesis: Synthesis, problem: ObserverProblem | Non
     if problem is None:
         return facts | {"reason": task.refusal}
     problem = replace(problem, injection=synthesis.injection)
-    if task.leftover is not None:
-        problem = replace(problem, remainder_left=task.leftover[0], remainder_right=task.leftover[1])
     loop = float(problem.error_system(synthesis.controller).spectral_radius())
     facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
     try:

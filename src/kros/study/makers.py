@@ -131,9 +131,10 @@ def make_worst_case_h2(task: Task) -> Made:
         assumed = surroundings.of(problem)
         return of_few_states(task, assumed, worst_case_h2(assumed, max_order=task.max_order)), surroundings.facts(), assumed
     rough = partial(worst_case_h2, max_order=2, tolerance_db=3.0, refinements=0, fit=remembering(fit_magnitude), causal=False)
-    surroundings, synthesis = best_surroundings(task, problem, rough)
+    surroundings, _ = best_surroundings(task, problem, partial(rough, bounded=False))
     assumed = surroundings.of(problem)
-    accurate = worst_case_h2(assumed, max_order=task.max_order, causal=False)  # of higher order: for its lower bound
+    synthesis = rough(assumed)
+    accurate = worst_case_h2(assumed, max_order=task.max_order, refinements=0, causal=False)  # of higher order: for its lower bound
     lower = max((b for b in (synthesis.lower_bound, accurate.lower_bound) if b is not None), default=None)
     gap = None if lower is None or synthesis.worst_case_h2 is None else 100 * (synthesis.worst_case_h2 / lower - 1)
     synthesis = replace(synthesis, lower_bound=lower, gap_percent=gap, causal_h2=causal_h2(assumed, synthesis.controller))

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.errors import SynthesisError
 from ..core.lti import StateSpace
 from ..core.norms import h2_norm
 from .causal import causal_h2
@@ -48,6 +49,7 @@ def worst_case_h2(
     rtol: float = 1e-5,
     fit: Fit | None = None,
     causal: bool = True,
+    bounded: bool = True,
 ) -> Synthesis:
     """Return an observer filter with a certified H2 norm for every member of the uncertain set.
 
@@ -68,6 +70,8 @@ def worst_case_h2(
         `kros.uncertainty.fit.fit_magnitude`.
     causal : bool
         Estimate the worst causal perturbation as well.
+    bounded : bool
+        False: only the first design, neither certified nor bounded from below, for those who design many and compare them on recordings.
 
     Returns
     -------
@@ -86,6 +90,8 @@ def worst_case_h2(
     options = {"order": order, "max_order": max_order, "tolerance_db": tolerance_db}
     channels, sharp = Channels(problem, design_grid(problem)), symmetric(problem)
     spectrum = channels.average()
+    if not bounded:
+        return _design_alone(problem, channels.shaping(spectrum, fit, "above", options))
     sound = spectrum if sharp else channels.below_average()  # what lower bounds are made of
     best: tuple[float, float, StateSpace] | None = None
     lower, elapsed = 0.0, 0.0
@@ -105,6 +111,15 @@ def worst_case_h2(
     below = channels.shaping(final, fit, "below", options)
     lower = max(lower, lower_bound(problem, channels.lowered(below, final)))
     return _result(problem, best, lower, elapsed / (refinements + 1), causal)
+
+
+def _design_alone(problem: ObserverProblem, shaping: Shaping) -> Synthesis:
+    controller = design(problem, shaping)
+    radius = float(problem.error_system(controller).spectral_radius())
+    if radius >= 1:
+        raise SynthesisError(f"Worst-case H2 synthesis: the loop has spectral radius {radius:.9g}; add noise, or lower the order of the weights.")
+    notes = ("A design alone, without certificate.",)
+    return Synthesis("worst_case_h2", controller, Status.INACCURATE, problem.injection, spectral_radius=radius, solver="riccati", notes=notes)
 
 
 def _result(problem: ObserverProblem, best: tuple[float, float, StateSpace], lower: float, elapsed: float, causal: bool) -> Synthesis:

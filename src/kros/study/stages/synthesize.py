@@ -29,13 +29,14 @@ from . import calibrate
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 WORST_CASE = ("worst_case_h2", "worst_case_hinf")
+SLOWEST = ("worst_case_hinf", "worst_case_h2", "residual_h2", "kalman_tuned")
 PREFERRED = ("worst_case_h2", "worst_case_hinf", "mixed", "residual_h2", "kalman_tuned", "luenberger", "kalman_white", "open_loop")
 
 
 def run(context: Context) -> list[Path]:
     """Make all observers, certify them, save them."""
     tasks = [task for name in context.model_names for task in tasks_of(context, name)]
-    products = list(context.map("synthesize", produce, tasks))
+    products = produced(context, tasks)
     files, facts = [], {}
     certificates = iter(context.run("certify", certificates_of(tasks, products)))
     for task, product in zip(tasks, products, strict=True):
@@ -56,6 +57,13 @@ def run(context: Context) -> list[Path]:
     save_artifact(folder, "observers", {"names": made, "deployed": deployed, "facts": facts})
     Observer.load(folder / f"{deployed}.json").save(folder / "deployed.json")
     return [*files, folder / "observers.json", folder / "deployed.json"]
+
+
+def produced(context: Context, tasks: list[Task]) -> list[Product]:
+    """Make the observers of all tasks; those that take longest start first, so that no worker waits for them in the end."""
+    order = sorted(range(len(tasks)), key=lambda i: SLOWEST.index(tasks[i].method) if tasks[i].method in SLOWEST else len(SLOWEST))
+    made = dict(zip(order, context.map("synthesize", produce, [tasks[i] for i in order]), strict=True))
+    return [made[i] for i in range(len(tasks))]
 
 
 def certificates_of(tasks: list[Task], products: list[Product]) -> list[Callable[[], dict[str, Any]]]:

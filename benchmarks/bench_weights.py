@@ -25,6 +25,7 @@ import numpy.typing as npt
 import outlier_rates
 import paper_slsqp
 import pytest
+from kros.uncertainty.weights.certificate import ResidualSystems
 
 from kros.core.lti import StateSpace
 from kros.identify import edmd
@@ -42,8 +43,7 @@ from kros.uncertainty import (
     scale_system,
 )
 from kros.uncertainty.bilinear import BilinearAxis
-from kros.uncertainty.certificate import ResidualSystems
-from kros.uncertainty.weights import Weight
+from kros.uncertainty.weights.weight import Weight
 
 Array = npt.NDArray[Any]
 HAS_DKPY = importlib.util.find_spec("dkpy") is not None

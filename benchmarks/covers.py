@@ -28,7 +28,7 @@ from kros.study import run_study, validate_config
 from kros.study.config import Stage
 from kros.study.demo import simulate_to
 from kros.uncertainty import Form, UncertainModel, quantify
-from kros.uncertainty.weights import Weight
+from kros.uncertainty.weights.weight import Weight
 
 Array = npt.NDArray[Any]
 HEADER = "| form | model | population | structure | orders | cover_max, fit | cover_max, independent | overbound, dB | seconds |"

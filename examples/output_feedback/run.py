@@ -15,7 +15,7 @@ from kros.core import StateSpace, hinf_norm
 from kros.interop import KoopmanRegressor
 from kros.plants import PendulumPopulation
 from kros.synthesis import Block, GeneralizedPlant, dk_iteration, h2, mu_bounds, reduce_controller
-from kros.synthesis.interconnect import interconnect
+from kros.synthesis.problem.interconnect import interconnect
 from kros.uncertainty import quantify
 
 DT, REFERENCE_RAD = 0.01, 0.25

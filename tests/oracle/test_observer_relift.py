@@ -6,19 +6,19 @@ from itertools import product
 
 import numpy as np
 import pytest
+from kros.observer.relift.adversary import attack, attack_running
+from kros.observer.relift.error import ErrorSystem, ReliftScales, error_system
+from kros.observer.relift.ladder import growing_sequence
+from kros.observer.relift.proof import margin, proven
+from kros.observer.relift.rows import relift_report
+from kros.observer.relift.sdp import sdp_proposal
+from kros.observer.relift.status import Dropped, ReliftStatus
 
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.lifting import Lifting
 from kros.observer import Observer, one_step_residual, run_observer
-from kros.observer.adversary import attack, attack_running
-from kros.observer.relift import ReliftCertificate, relift_certificate
-from kros.observer.relift_error import ErrorSystem, ReliftScales, error_system
-from kros.observer.relift_ladder import growing_sequence
-from kros.observer.relift_proof import margin, proven
-from kros.observer.relift_report import relift_report
-from kros.observer.relift_sdp import sdp_proposal
-from kros.observer.relift_status import Dropped, ReliftStatus
+from kros.observer.relift.certificate import ReliftCertificate, relift_certificate
 from kros.synthesis import Injection
 
 
@@ -112,7 +112,7 @@ def test_one_slope_is_certified_up_to_the_circle_criterion_and_not_beyond() -> N
     def steeper(factor: float) -> ErrorSystem:
         return ErrorSystem(plain.A, plain.L, plain.B, plain.M * factor / through, plain.D, plain.C, plain.dt)
 
-    from kros.observer.relift_riccati import riccati_proposals
+    from kros.observer.relift.riccati import riccati_proposals
 
     inside = next(riccati_proposals(steeper(0.99)))
     assert proven(inside.roots, steeper(0.99).corners(), plain.C, inside.gain)
@@ -245,7 +245,7 @@ def test_exact_and_floating_margins_agree(seed: int) -> None:
     A = rng.standard_normal((6, 6))
     A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
     system = StateSpace(A, rng.standard_normal((6, 2)), rng.standard_normal((2, 6)), np.zeros((2, 2)), 1.0)
-    from kros.observer.relift_riccati import lyapunov_factor
+    from kros.observer.relift.riccati import lyapunov_factor
 
     error = ErrorSystem(A, np.zeros((6, 0)), system.B, np.zeros((0, 6)), np.zeros((0, 2)), system.C, 1.0)
     norm = hinf_norm(system)

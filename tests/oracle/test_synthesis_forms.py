@@ -6,11 +6,11 @@ from scipy.linalg import expm
 
 from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import Injection, ObserverProblem, check_units, worst_case_h2, worst_case_hinf
-from kros.synthesis.causal import causal_h2, perturbed
-from kros.synthesis.certificate import certify, density
-from kros.synthesis.perturbation import PLACES
-from kros.synthesis.robust_gain import robust_gain
-from kros.synthesis.unit_check import unit_error
+from kros.synthesis.problem.perturbation import PLACES
+from kros.synthesis.robust.causal import causal_h2, perturbed
+from kros.synthesis.robust.certificate import certify, density
+from kros.synthesis.robust.robust_gain import robust_gain
+from kros.synthesis.robust.unit_check import unit_error
 from kros.uncertainty import Form, quantify, rebuild, residual
 
 DT, N, M = 0.05, 3, 2

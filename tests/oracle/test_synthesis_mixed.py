@@ -10,15 +10,15 @@ from scipy.linalg import expm
 
 from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, h2, mixed
-from kros.synthesis.balance import balance
-from kros.synthesis.certificate import certify
-from kros.synthesis.channels import part, scaled, verify
-from kros.synthesis.mixed_candidates import by_inequalities
-from kros.synthesis.mixed_lmi import MixedInequalities
-from kros.synthesis.paper_plant import paper_plant, reduced_plant
-from kros.synthesis.reduction import truncate
-from kros.synthesis.solvers import Program, solve
-from kros.synthesis.youla import hinf_lower_bound, youla_bound
+from kros.synthesis.low_order.reduction import truncate
+from kros.synthesis.mixed_norms.balance import balance
+from kros.synthesis.mixed_norms.candidates import by_inequalities
+from kros.synthesis.mixed_norms.channels import part, scaled, verify
+from kros.synthesis.mixed_norms.inequalities import MixedInequalities
+from kros.synthesis.mixed_norms.solvers import Program, solve
+from kros.synthesis.mixed_norms.youla import hinf_lower_bound, youla_bound
+from kros.synthesis.problem.paper_plant import paper_plant, reduced_plant
+from kros.synthesis.robust.certificate import certify
 
 DT = 1e-3
 

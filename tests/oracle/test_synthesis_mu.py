@@ -6,10 +6,10 @@ from scipy.signal import cont2discrete
 
 from kros.core import ConfigError, DimensionError, StateSpace, SynthesisError, hinf_norm
 from kros.synthesis import Block, GeneralizedPlant, dk_iteration, hinf, mu_bounds, mu_lower, mu_upper
-from kros.synthesis.dk import scale
-from kros.synthesis.dk_scalings import RationalScalings, log_magnitude
-from kros.synthesis.mu_blocks import Structure
-from kros.synthesis.mu_scalings import scalings
+from kros.synthesis.structured.blocks import Structure
+from kros.synthesis.structured.dk import scale
+from kros.synthesis.structured.dk_scalings import RationalScalings, log_magnitude
+from kros.synthesis.structured.scalings import scalings
 
 SCALAR = Block.scalar()
 

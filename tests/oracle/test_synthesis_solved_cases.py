@@ -6,7 +6,7 @@ from scipy.linalg import block_diag
 
 from kros.core import StateSpace, SynthesisError, hinf_norm
 from kros.synthesis import GeneralizedPlant, Status, h2, hinf, mixed, youla_bound
-from kros.synthesis.channels import part
+from kros.synthesis.mixed_norms.channels import part
 
 
 @pytest.mark.parametrize(("q", "sigma"), [(1.0, 1.0), (60.0, 0.1), (1e4, 1e4)])

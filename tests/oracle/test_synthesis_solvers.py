@@ -9,8 +9,8 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from kros.core import SynthesisError, hinf_norm
 from kros.synthesis import GeneralizedPlant, h2, hinf, mixed
-from kros.synthesis.barrier import Block, Ending, minimise
-from kros.synthesis.solvers import Program, climb, installed, solve
+from kros.synthesis.mixed_norms.barrier import Block, Ending, minimise
+from kros.synthesis.mixed_norms.solvers import Program, climb, installed, solve
 
 
 def largest_eigenvalue(matrix):

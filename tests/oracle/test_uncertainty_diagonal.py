@@ -12,7 +12,7 @@ import pytest
 from kros.core import StateSpace
 from kros.core.errors import ConfigError
 from kros.uncertainty import Form, fit_weight, quantify
-from kros.uncertainty.sections import Sections
+from kros.uncertainty.fits.sections import Sections
 
 DT = 1e-3
 FREQS = np.geomspace(5e-2, 500.0, 150)

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from kros.uncertainty import Form, score_outliers
-from kros.uncertainty.groups import excess, separate
-from kros.uncertainty.tail import (
+from kros.uncertainty.outlying.groups import excess, separate
+from kros.uncertainty.outlying.tail import (
     SHAPE,
     exceedance,
     group_factors,

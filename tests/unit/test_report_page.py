@@ -52,7 +52,7 @@ from kros.uncertainty import (
     residual,
     score_outliers,
 )
-from kros.uncertainty.unit_residuals import UnitResiduals
+from kros.uncertainty.population.unit_residuals import UnitResiduals
 
 DT = 0.001
 UNITS = ("000000", "001", "002", "003", "0<b>4")

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from kros.synthesis.riccati.constant_gain import luenberger
 
 import kros.synthesis
 from kros.core import ConfigError, DataError, DimensionError, StateSpace, SynthesisError, block_diagonal, gain
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, Synthesis, h2, kalman, mixed, worst_case_h2
-from kros.synthesis.certificate import certify
-from kros.synthesis.constant_gain import luenberger
-from kros.synthesis.paper_plant import paper_plant
+from kros.synthesis.problem.paper_plant import paper_plant
+from kros.synthesis.robust.certificate import certify
 from kros.synthesis.verify import closed_loop, observer_loop, spectral_radius_max
 
 DT = 1e-3

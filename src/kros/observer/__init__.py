@@ -1,16 +1,16 @@
 """The observer as it runs: one-step predictor with retraction and re-lifting, and the baselines it is compared with."""
 
-from .adversary import Attack, attack, attack_running
-from .baselines import kalman_candidates, luenberger_candidates, noise_covariances
-from .difference import FilteredDifference, cutoffs_hz, rates
-from .extended_kalman import ExtendedKalman, start_covariance
-from .learned import Features, Learned, Moments
+from .baselines.difference import FilteredDifference, cutoffs_hz, rates
+from .baselines.extended_kalman import ExtendedKalman, start_covariance
+from .baselines.kalman import kalman_candidates, luenberger_candidates, noise_covariances
+from .baselines.learned import Features, Learned, Moments
 from .observer import Observer
 from .phase_lock import Tracked, track_parameter
-from .relift import ReliftCertificate, relift_certificate
-from .relift_error import ReliftScales
-from .relift_report import ReliftRow, relift_report
-from .relift_status import Dropped, ReliftStatus
+from .relift.adversary import Attack, attack, attack_running
+from .relift.certificate import ReliftCertificate, relift_certificate
+from .relift.error import ReliftScales
+from .relift.rows import ReliftRow, relift_report
+from .relift.status import Dropped, ReliftStatus
 from .residual import mean_error_dynamics, one_step_residual, residual_spectra
 from .residual_design import ResidualModel, one_step_rows, residual_models
 from .runtime import Estimate, Runtime

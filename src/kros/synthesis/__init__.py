@@ -12,56 +12,56 @@ from typing import TYPE_CHECKING
 from ..core.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from .constant_gain import kalman, luenberger
-    from .dk import dk_iteration
     from .generalized_plant import GeneralizedPlant
-    from .h2_optimal import h2
-    from .hinf_optimal import hinf
-    from .mixed_optimal import mixed
-    from .mu import MuBounds, mu_bounds, mu_lower, mu_upper
-    from .mu_blocks import Block
-    from .observer_problem import ObserverProblem
-    from .polishing import polish
-    from .reduction import reduce_controller
+    from .low_order.polishing import polish
+    from .low_order.reduction import reduce_controller
+    from .mixed_norms.optimal import mixed
+    from .mixed_norms.youla import YoulaBound, youla_bound
+    from .problem.observer_problem import ObserverProblem
+    from .residual.shaped import residual_h2
+    from .residual.shaping import Bank, shaping_filter
     from .result import Injection, Status, Synthesis
-    from .robust_gain import RobustGain, robust_gain
-    from .shaped import residual_h2
-    from .shaping import Bank, shaping_filter
-    from .unit_check import UnitCheck, check_units
-    from .worst_case import worst_case_h2
-    from .worst_case_hinf import worst_case_hinf
-    from .youla import YoulaBound, youla_bound
+    from .riccati.constant_gain import kalman, luenberger
+    from .riccati.h2_optimal import h2
+    from .riccati.hinf_optimal import hinf
+    from .robust.robust_gain import RobustGain, robust_gain
+    from .robust.unit_check import UnitCheck, check_units
+    from .robust.worst_case import worst_case_h2
+    from .robust.worst_case_hinf import worst_case_hinf
+    from .structured.blocks import Block
+    from .structured.bounds import MuBounds, mu_bounds, mu_lower, mu_upper
+    from .structured.dk import dk_iteration
 
 _HOME = {
-    "Bank": "shaping",
-    "Block": "mu_blocks",
+    "Bank": "residual.shaping",
+    "Block": "structured.blocks",
     "GeneralizedPlant": "generalized_plant",
     "Injection": "result",
-    "MuBounds": "mu",
-    "ObserverProblem": "observer_problem",
-    "RobustGain": "robust_gain",
+    "MuBounds": "structured.bounds",
+    "ObserverProblem": "problem.observer_problem",
+    "RobustGain": "robust.robust_gain",
     "Status": "result",
     "Synthesis": "result",
-    "UnitCheck": "unit_check",
-    "YoulaBound": "youla",
-    "check_units": "unit_check",
-    "dk_iteration": "dk",
-    "h2": "h2_optimal",
-    "hinf": "hinf_optimal",
-    "kalman": "constant_gain",
-    "luenberger": "constant_gain",
-    "mixed": "mixed_optimal",
-    "mu_bounds": "mu",
-    "mu_lower": "mu",
-    "mu_upper": "mu",
-    "polish": "polishing",
-    "reduce_controller": "reduction",
-    "residual_h2": "shaped",
-    "robust_gain": "robust_gain",
-    "shaping_filter": "shaping",
-    "worst_case_h2": "worst_case",
-    "worst_case_hinf": "worst_case_hinf",
-    "youla_bound": "youla",
+    "UnitCheck": "robust.unit_check",
+    "YoulaBound": "mixed_norms.youla",
+    "check_units": "robust.unit_check",
+    "dk_iteration": "structured.dk",
+    "h2": "riccati.h2_optimal",
+    "hinf": "riccati.hinf_optimal",
+    "kalman": "riccati.constant_gain",
+    "luenberger": "riccati.constant_gain",
+    "mixed": "mixed_norms.optimal",
+    "mu_bounds": "structured.bounds",
+    "mu_lower": "structured.bounds",
+    "mu_upper": "structured.bounds",
+    "polish": "low_order.polishing",
+    "reduce_controller": "low_order.reduction",
+    "residual_h2": "residual.shaped",
+    "robust_gain": "robust.robust_gain",
+    "shaping_filter": "residual.shaping",
+    "worst_case_h2": "robust.worst_case",
+    "worst_case_hinf": "robust.worst_case_hinf",
+    "youla_bound": "mixed_norms.youla",
 }
 
 __all__ = [

@@ -1,20 +1,20 @@
 """Uncertainty of a population: six forms, residuals, nominal, cover and weights, outliers. The stage's result is an `UncertainModel`."""
 
-from .certificate import Method, ResidualSystems, certify
-from .cover import Cover, Perturbation, Structure, cover_ratio, optimal_cover, optimal_left
-from .entrywise import EntrywiseWeight
-from .fit import FittedMagnitude, Side, fit_magnitude, invert
+from .fits.magnitude import FittedMagnitude, Side, fit_magnitude, invert
+from .fits.tightness import Tightness, magnitude_tightness, weight_tightness
 from .forms import Form, existence, rebuild, residual, residual_shape
-from .full import FullWeight
 from .model import UncertainModel, scale_system
-from .noise import VariationAndNoise, variation_and_noise
-from .nominal import Criterion, NominalChoice, choose_nominal, choose_nominals
-from .outliers import OutlierModel, OutlierScore, score_outliers
+from .outlying.outliers import OutlierModel, OutlierScore, score_outliers
+from .population.noise import VariationAndNoise, variation_and_noise
+from .population.nominal import Criterion, NominalChoice, choose_nominal, choose_nominals
 from .quantify import quantify
 from .residuals import all_bounds, bounds, completion, misfit, sigma_max
 from .responses import ResponseUncertainty, quantify_responses
-from .tightness import Tightness, magnitude_tightness, weight_tightness
-from .weights import Weight, fit_weight
+from .weights.certificate import Method, ResidualSystems, certify
+from .weights.cover import Cover, Perturbation, Structure, cover_ratio, optimal_cover, optimal_left
+from .weights.entrywise import EntrywiseWeight
+from .weights.full import FullWeight
+from .weights.weight import Weight, fit_weight
 
 __all__ = [
     "Cover",

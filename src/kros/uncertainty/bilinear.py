@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from ..core.lti import StateSpace
-from .weights import Weight
+from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 

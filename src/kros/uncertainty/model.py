@@ -16,12 +16,12 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.lti import StateSpace
-from .certificate import Method
-from .cover import Cover, Structure
-from .entrywise import EntrywiseWeight
 from .forms import Form
-from .full import FullWeight
-from .weights import Weight
+from .weights.certificate import Method
+from .weights.cover import Cover, Structure
+from .weights.entrywise import EntrywiseWeight
+from .weights.full import FullWeight
+from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 

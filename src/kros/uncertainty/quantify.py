@@ -13,12 +13,12 @@ from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.frequency import check_grid, log_grid
 from ..core.lti import StateSpace
 from .bilinear import BilinearAxis, beyond, check_continuous_grid, continuous_grid
-from .bounded import Bounded, Responder, bound_residuals
-from .certificate import ResidualSystems
-from .cover import Cover, Structure
 from .forms import Form, as_form
 from .model import UncertainModel, scale_system
-from .nominal import Criterion, NominalChoice, as_criterion, choose_nominal, choose_nominals
+from .population.nominal import Criterion, NominalChoice, as_criterion, choose_nominal, choose_nominals
+from .weights.bounded import Bounded, Responder, bound_residuals
+from .weights.certificate import ResidualSystems
+from .weights.cover import Cover, Structure
 
 Array = npt.NDArray[Any]
 

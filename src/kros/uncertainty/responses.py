@@ -12,13 +12,13 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.frequency import check_grid
 from .bilinear import BilinearAxis, check_continuous_grid
-from .bounded import bound_residuals
-from .cover import Cover, Structure
 from .forms import Form, as_form
-from .nominal import Criterion, as_criterion
+from .population.nominal import Criterion, as_criterion
 from .quantify import POOLED, bound_continuous, check_scale, choose_by
 from .residuals import check_responses
-from .weights import Weight
+from .weights.bounded import bound_residuals
+from .weights.cover import Cover, Structure
+from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 

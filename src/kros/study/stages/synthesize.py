@@ -17,7 +17,7 @@ from ...core.errors import SynthesisError
 from ...identify import ModelSet
 from ...observer import Observer
 from ...synthesis import Injection, ObserverProblem, Synthesis, check_units
-from ...synthesis.certificate import certify
+from ...synthesis.robust.certificate import certify
 from ...uncertainty import Structure, UncertainModel
 from ..context import Context
 from ..makers import Product, Task, produce

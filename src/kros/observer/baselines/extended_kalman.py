@@ -1,0 +1,139 @@
+r"""The extended Kalman filter of the re-lifted model: the gain follows the slopes of the lifted functions at the estimate.
+
+The model of the original states is ``x+ = f(x, u) = A_s theta(x) + B_s u``, the first n rows of the lifted model, with white noise Q on x+
+and R on y. At every sample
+
+    S = C P C' + R,   L = P C' S^-1,   x^ = x_hat + L (y - C x_hat),   P^ = P - L C P
+    x_hat+ = f(x^, u),   F = df/dx (x^),   P+ = F P^ F' + Q
+
+Slopes by earlier values and of input functions count as noise. With a linear model this is the Kalman filter with its start.
+
+References
+----------
+B. D. O. Anderson and J. B. Moore, Optimal Filtering, Prentice-Hall 1979, section 8.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DimensionError
+from ...lifting import Lifting
+from ..simulate import require_recordings
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ExtendedKalman:
+    """Extended Kalman filter.
+
+    Parameters
+    ----------
+    lifting : Lifting
+    A : ndarray, shape (n_lifted, n_lifted)
+    B : ndarray, shape (n_lifted, m)
+        With input functions, m counts them.
+    measured : tuple of int
+    inputs : tuple of str
+    Q : ndarray, shape (n, n)
+        Process noise of the original states; or (k, n, n) for k filters at once, see `run_all`.
+    R : ndarray, shape (q, q)
+        Measurement noise.
+    P0 : ndarray, shape (n, n)
+        Covariance of the first estimate, in which measured states have the measurement's noise.
+    parameters : mapping of str to float
+        Default values of the lifting's parameters, the nominal unit's.
+    """
+
+    lifting: Lifting
+    A: Array
+    B: Array
+    measured: tuple[int, ...]
+    inputs: tuple[str, ...]
+    Q: Array
+    R: Array
+    P0: Array
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n, q = self.lifting.n_states, len(self.measured)
+        if self.Q.shape[-2:] != (n, n) or self.R.shape != (q, q) or self.P0.shape != (n, n):
+            raise DimensionError(
+                f"Extended Kalman filter: {n} states and {q} measurements need Q and P0 ({n}, {n}) and R ({q}, {q}), "
+                f"found {self.Q.shape}, {self.P0.shape} and {self.R.shape}."
+            )
+
+    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+        """Estimate a batch of episodes.
+
+        Parameters
+        ----------
+        y : ndarray, shape (n_samples, batch, q)
+        u : ndarray, shape (n_samples, batch, m)
+        parameters : mapping of str to array_like, shape (batch,)
+
+        Returns
+        -------
+        ndarray, shape (n_samples, batch, n)
+            Row k is the prediction from data up to k - 1; row 0 is the start.
+        """
+        return self.run_all(y, u, parameters)[0]
+
+    def run_all(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+        """Run all filters of a stack Q (k, n, n) side by side, shape (k, n_samples, batch, n)."""
+        require_recordings("the extended Kalman filter", self.inputs, y, u)
+        lifting, n, C = self.lifting, self.lifting.n_states, list(self.measured)
+        Q = self.Q.reshape(-1, 1, n, n)
+        k, (n_samples, batch) = len(Q), y.shape[:2]
+        values = {
+            name: np.broadcast_to(np.asarray(v, dtype=float), (batch,)) for name, v in {**self.parameters, **(parameters or {})}.items()
+        }
+        x = np.zeros((k, batch, n))
+        x[..., C] = y[0]
+        P = np.broadcast_to(self.P0, (k, batch, n, n)).copy()
+        drift, drive = np.ascontiguousarray(self.A[:n].T), np.ascontiguousarray(self.B[:n].T)
+        linear, coupling = self.A[:n, :n], self.A[:n, n:]
+        driven = u @ drive if not lifting.input_functions else None
+        estimates = np.empty((n_samples, k, batch, n))
+        earlier: Array | None = None
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            for sample in range(n_samples):
+                estimates[sample] = x
+                PC = P[..., C]
+                L = _divided(PC, PC[..., C, :] + self.R)
+                x = x + (L @ (y[sample] - x[..., C])[..., None])[..., 0]
+                P = P - L @ PC.swapaxes(-1, -2)
+                held = np.broadcast_to(u[sample], (k, *u[sample].shape))
+                if lifting.history:
+                    earlier = lifting.window.hold(x, held) if earlier is None else earlier
+                    window = np.concatenate([x, earlier], axis=-1)
+                else:
+                    window = x
+                inflow = driven[sample] if driven is not None else lifting.lift_inputs(held, window, values) @ drive
+                x = lifting.lift(window, values) @ drift + inflow
+                F = linear + coupling @ lifting.slopes(window, values)[..., :n] if lifting.functions else linear
+                P = F @ P @ np.swapaxes(F, -1, -2) + Q
+                P = (P + P.swapaxes(-1, -2)) / 2
+                if earlier is not None:
+                    earlier = lifting.window.advance(window, held)
+        return np.moveaxis(estimates, 0, 1)
+
+
+def start_covariance(scale: Array, R: Array, measured: Sequence[int]) -> Array:
+    """Return the covariance of the first estimate: a state may be anywhere in its range, shape (n,); a measured one has the measurement's noise."""
+    P0 = np.diag(scale**2)
+    P0[np.ix_(list(measured), list(measured))] = R
+    return np.asarray(P0)
+
+
+def _divided(PC: Array, S: Array) -> Array:
+    """``PC S^-1``, without a solver where there is one measurement; a filter that diverged stays not a number."""
+    if S.shape[-1] == 1:
+        return np.asarray(PC / S)
+    finite = np.isfinite(S).all(axis=(-2, -1), keepdims=True)
+    return np.asarray(np.where(finite, PC @ np.linalg.inv(np.where(finite, S, np.eye(S.shape[-1]))), np.nan))

@@ -1,0 +1,154 @@
+"""What a certificate says about recorded episodes: the residual that drove the error, the bounds that follow, and the error as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DimensionError
+from ..observer import Observer
+from ..residual import one_step_residual
+from ..simulate import run_observer
+from .certificate import ReliftCertificate
+from .error import ErrorSystem
+
+Array = npt.NDArray[np.float64]
+_CLOSE = 1 + 1e-9  # rounding of a simulation of many thousand steps
+
+
+@dataclass(frozen=True)
+class ReliftRow:
+    """One episode. All values are root mean squares over its samples of the scaled signals, the states' squares added.
+
+    Parameters
+    ----------
+    unit : str
+    residual : float
+        Of the one-step residual, divided by its size in the population.
+    gain_bound : float
+        What ``gamma`` makes of it, the initial error included.
+    frozen : float
+        Error that the residual would cause if every slope stayed in the middle of its interval.
+    bound : float
+        The smaller of `gain_bound` and the frozen response plus what the movement of the slopes can add.
+    error : float
+        Error of the observer as it ran.
+    """
+
+    unit: str
+    residual: float
+    gain_bound: float
+    frozen: float
+    bound: float
+    error: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the error is within the bound; never false where the assumptions hold."""
+        return self.error <= self.bound * _CLOSE
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for a record."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+def relift_report(
+    certificate: ReliftCertificate,
+    observer: Observer,
+    states: Array,
+    inputs: Array,
+    units: Sequence[str],
+    lengths: npt.ArrayLike | None = None,
+    parameters: Mapping[str, npt.ArrayLike] | None = None,
+    estimates: Array | None = None,
+) -> list[ReliftRow]:
+    """Compare bounds and errors, episode by episode; recorded states stand for the true ones, so their noise is part of the residual.
+
+    Parameters
+    ----------
+    certificate : ReliftCertificate
+        Of this observer; certified.
+    observer : Observer
+    states : ndarray, shape (n_samples, batch, n)
+    inputs : ndarray, shape (n_samples, batch, m)
+    units : sequence of str
+        Unit of every episode.
+    lengths : array_like, shape (batch,), optional
+        Samples of every episode; all by default.
+    parameters : mapping of str to array_like, shape (batch,)
+        Lifting parameters of the machine behind each episode.
+    estimates : ndarray, shape (n_samples, batch, n), optional
+        What `run_observer` returned; it is run where they are missing.
+    """
+    if certificate.gain is None:
+        raise DimensionError(f"Re-lift report of observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")
+    n_samples, batch = states.shape[:2]
+    lengths = np.full(batch, n_samples) if lengths is None else np.asarray(lengths, dtype=int)
+    if len(units) != batch or lengths.shape != (batch,):
+        raise DimensionError(
+            f"Re-lift report of observer {observer.name}: {batch} episodes need as many units ({len(units)}) and lengths {lengths.shape}."
+        )
+    values = {**observer.parameters, **(parameters or {})} if observer.lifting.parameters else None
+    if estimates is None:
+        estimates = run_observer(observer, states[..., list(observer.measured)], inputs, values)
+    scales = certificate.scales
+    omega = held_residual(observer, states, inputs, values)
+    system = certificate.system(observer)
+    first = first_error(observer, states[0] - estimates[0], len(system.A) - observer.controller.n_states)
+    n = observer.lifting.n_states
+    with np.errstate(divide="ignore", invalid="ignore"):
+        w = np.where(omega == 0, 0.0, omega / scales.residual)
+    inside = np.arange(n_samples)[:, None] < lengths
+    z, q = frozen_response(system, w, first)
+    energy = {
+        "w": np.sum(np.where(inside[:-1, :, None], w, 0.0) ** 2, axis=(0, 2)),
+        "z": np.sum(np.where(inside[..., None], z, 0.0) ** 2, axis=(0, 2)),
+        "q": np.sum(np.where(inside[..., None], q, 0.0) ** 2, axis=(0, 2)),
+        "e": np.sum(np.where(inside[..., None], (states - estimates[..., :n]) / scales.error, 0.0) ** 2, axis=(0, 2)),
+    }
+    by_gain = np.sqrt(certificate.gain**2 * energy["w"] + certificate.initial_energy(first))
+    by_frozen = np.sqrt(energy["z"]) + (
+        certificate.mismatch_gain * np.sqrt(energy["q"]) if certificate.mismatch_gain is not None else np.inf
+    )
+    root = np.sqrt(lengths)
+    columns = (np.sqrt(energy["w"]), by_gain, np.sqrt(energy["z"]), np.minimum(by_gain, by_frozen), np.sqrt(energy["e"]))
+    return [ReliftRow(unit, *(float(c[i] / root[i]) for c in columns)) for i, unit in enumerate(units)]
+
+
+def held_residual(observer: Observer, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
+    """Return the one-step residual from the first sample on, shape (n_samples - 1, batch, n); earlier values equal the first ones, as in the observer."""
+    h = observer.lifting.history
+    if h:
+        states, inputs = (np.concatenate([np.repeat(v[:1], h, axis=0), v]) for v in (states, inputs))
+    return one_step_residual(observer.lifting, observer.A, observer.B, states, inputs, parameters)
+
+
+def first_error(observer: Observer, error: Array, width: int) -> Array:
+    """Return the first error with the earlier ones that the lifting reads behind it, which equal it; shape (batch, width)."""
+    states = observer.lifting.states
+    earlier = [states.index(name.partition("[")[0]) for name in observer.lifting.window.earlier if name.partition("[")[0] in states]
+    return np.concatenate([error, error[:, earlier]], axis=1)[:, :width]
+
+
+def frozen_response(system: ErrorSystem, w: Array, first: Array) -> tuple[Array, Array]:
+    """Return the scaled error with slopes in the middle, and the movement of the lifted functions it can cause.
+
+    Parameters
+    ----------
+    system : ErrorSystem
+    w : ndarray, shape (n_samples - 1, batch, k)
+        Scaled residual, and noise where ``k`` is as wide as the system's input.
+    first : ndarray, shape (batch, n_window)
+    """
+    xi = np.zeros((len(w) + 1, w.shape[1], len(system.A)))
+    xi[0, :, : first.shape[1]] = first
+    drive = w @ system.B[:, : w.shape[2]].T
+    step = np.ascontiguousarray(system.A.T)
+    for k in range(len(w)):
+        np.matmul(xi[k], step, out=xi[k + 1])
+        xi[k + 1] += drive[k]
+    return xi @ system.C.T, xi @ system.M.T

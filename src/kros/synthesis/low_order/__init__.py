@@ -1,0 +1,1 @@
+"""Controllers of fewer states: reduction, and polish of what is left."""

@@ -1,0 +1,1 @@
+"""Mixed H2/H-infinity synthesis: inequalities, the solvers that they are given to, and the Youla program as a yardstick."""

@@ -1,0 +1,57 @@
+"""The two channels of a mixed problem: T11 from w1 to z1 (performance), T22 from w2 to z2 (uncertainty)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...core.lti import StateSpace
+from ...core.norms import h2_norm, hinf_norm
+from ..generalized_plant import GeneralizedPlant
+from ..riccati.h2_optimal import stability_margin
+
+
+@dataclass(frozen=True, eq=False)
+class Verified:
+    """A controller with its recomputed norms, how it came about, and whether a solver claims the optimum of its inequalities."""
+
+    controller: StateSpace
+    h2: float
+    hinf: float
+    margin: float
+    origin: str
+    solver: str = ""
+    optimal: bool = True
+
+
+def part(plant: GeneralizedPlant, closed: StateSpace, channel: int) -> StateSpace:
+    """Cut T11 (channel 1) or T22 (channel 2) out of the closed loop."""
+    rows, columns = plant.rows(channel), plant.columns(channel)
+    return StateSpace(closed.A, closed.B[:, columns], closed.C[rows], closed.D[rows][:, columns], closed.dt)
+
+
+def verify(
+    plant: GeneralizedPlant, controller: StateSpace, gamma: float, origin: str, solver: str = "", optimal: bool = True
+) -> Verified | str:
+    """Recompute everything on the plant; return what was found, or why the controller is rejected."""
+    if not all(np.isfinite(getattr(controller, name)).all() for name in "ABCD"):
+        return f"{origin}: the controller is not finite"
+    closed = plant.close(controller)
+    margin = stability_margin(closed)
+    if not closed.is_stable():
+        return f"{origin}: closed loop unstable, {'spectral radius' if plant.dt > 0 else 'largest real part'} {margin:.6g}"
+    norm, peak = h2_norm(part(plant, closed, 1)), hinf_norm(part(plant, closed, 2))
+    if peak >= gamma:
+        return f"{origin}: ||T22|| = {peak:.6g} is not below {gamma:g}"
+    if not np.isfinite(norm):
+        return f"{origin}: ||T11||_2 is infinite"
+    return Verified(controller, norm, peak, margin, origin, solver, optimal)
+
+
+def scaled(plant: GeneralizedPlant, a: float) -> GeneralizedPlant:
+    """Scale channel 2: ``w2 -> a w2``, ``z2 -> z2 / a``."""
+    left, right = np.ones(plant.sizes[3]), np.ones(plant.sizes[1])
+    left[plant.rows(2)], right[plant.columns(2)] = 1 / a, a
+    D11 = plant.D11 * left[:, None] * right
+    return replace(plant, B1=plant.B1 * right, D21=plant.D21 * right, C1=plant.C1 * left[:, None], D12=plant.D12 * left[:, None], D11=D11)

@@ -1,0 +1,179 @@
+r"""Generalized plants of the observer problem, in scaled coordinates.
+
+For every form, with the perturbed plant in its place (`perturbation`) and the observer (18)-(21) beside it::
+
+    w1 -> W_u -+-> s                       s, or x = G (s + [W_L w2]) + [W_L w2] -> W_R -> z2 ... Delta ... w2
+               |                                   (what an inverse form sees contains W_L w2)
+               +-> W_rR -> z3 ... Delta_r ... w3
+
+    at the input:  xi+ = A xi + B W_L w2 + v - J u,    e = xi + W_rL w3
+    at the state:  xi+ = A xi + v - J u,               e = xi + W_L w2 + W_rL w3        z1 = W_p e
+                                                                                        y  = C e + n,   u = K y
+
+*Why this is minimal.* With ``x = G s + ...`` the state of the perturbed plant and ``x_hat+ = A x_hat + B s + J u`` the observer, both are driven
+by the same ``s``, so the difference ``xi`` is not: of the two copies of the nominal model one drops out, and the other one remains only
+where the perturbation sees the state, through ``x``. Likewise W_u remains for what Delta sees alone. The interconnection has every block
+once, so with minimal weights the whole is minimal but for poles that cancel between blocks.
+
+Symbols
+-------
+s : scaled input;  xi : what the observer's loop can see of the error;  e : error;  J : injection matrix
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.lti import StateSpace, block_diagonal, gain
+from ..generalized_plant import GeneralizedPlant
+from ..result import Injection
+from .interconnect import interconnect
+
+if TYPE_CHECKING:
+    from .observer_problem import ObserverProblem
+
+Array = npt.NDArray[Any]
+
+
+def injection_matrix(problem: ObserverProblem) -> Array:
+    """J: the correction enters through the inputs or on the state itself."""
+    A, B, _, _ = problem.scaled
+    return B if problem.injection is Injection.INPUT else np.eye(len(A))
+
+
+def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
+    """Whole problem: w = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); the brackets stand for a remainder and process noise, where there are any."""
+    A, B, C, _ = problem.scaled
+    place, J, eye = problem.place, injection_matrix(problem), np.eye
+    n, m, q = len(A), B.shape[1], len(C)
+    whole = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), problem.nominal.dt)
+    blocks = {"error": whole, "W_p": problem.performance, "W_u": problem.input_weight, "W_L": problem.W_L, "W_R": problem.W_R}
+    inputs = {"w1": m, "w2": problem.W_L.n_inputs}
+    error = {"error": eye(n)} | ({} if place.at_input else {"W_L": eye(n)})
+    drive = {"u": -J} | ({"W_L": B} if place.at_input else {})
+    own = {"W_L": eye(problem.W_L.n_outputs)} if place.inverse else {}
+    seen = {"W_u": eye(m)} if place.sees_input else {"plant": eye(n)}
+    wires: dict[str, dict[str, Array]] = {"W_u": {"w1": eye(m)}, "W_L": {"w2": eye(inputs["w2"])}}
+    if not place.sees_input:
+        blocks["plant"] = whole
+        wires["plant"] = {"W_u": B} | ({"W_L": B} if place.inverse and place.at_input else {})
+    wires["W_R"] = seen | (own if place.at_input is place.sees_input else {})
+    outputs = {"z1": {"W_p": eye(problem.performance.n_outputs)}, "z2": {"W_R": eye(problem.W_R.n_outputs)}}
+    if problem.remainder_left is not None and problem.remainder_right is not None:
+        blocks |= {"W_rL": problem.remainder_left, "W_rR": problem.remainder_right}
+        inputs["w3"] = problem.remainder_left.n_inputs
+        wires |= {"W_rL": {"w3": eye(inputs["w3"])}, "W_rR": {"W_u": eye(m)}}
+        outputs["z3"] = {"W_rR": eye(problem.remainder_right.n_outputs)}
+        error["W_rL"] = eye(n)
+    inputs["n"] = q
+    if problem.scaled_process_noise.any():
+        inputs["v"] = n
+        drive["v"] = np.diag(problem.scaled_process_noise)
+    wires |= {"error": drive, "W_p": error}
+    measured = {name: C @ matrix for name, matrix in error.items()} | {"n": eye(q)}
+    system = interconnect(blocks, wires, inputs | {"u": J.shape[1]}, outputs | {"y": measured})
+    parts_z = {name: next(iter(row.values())).shape[0] for name, row in outputs.items()}
+    return partitioned(system, inputs, parts_z)
+
+
+def partitioned(system: StateSpace, w: dict[str, int], z: dict[str, int]) -> GeneralizedPlant:
+    """Cut a system from (w, u) to (z, y) into the nine matrices; channel 1 is all but the perturbation's part."""
+    n_w, n_z = sum(w.values()), sum(z.values())
+    B, C, D = system.B, system.C, system.D
+    matrices = (system.A, B[:, :n_w], B[:, n_w:], C[:n_z], C[n_z:], D[:n_z, :n_w], D[:n_z, n_w:], D[n_z:, :n_w], D[n_z:, n_w:])
+    return GeneralizedPlant(*matrices, system.dt, n_w1=w.get("w1"), n_z1=z.get("z1"), w_parts=w, z_parts=z)
+
+
+def error_plant(problem: ObserverProblem) -> GeneralizedPlant:
+    """Unweighted error system: w = (d, r, n, v), z = W_p e, y = C e + n; d acts at the input, r at the state, v is process noise."""
+    A, B, C, _ = problem.scaled
+    n, m, q, eye = len(A), B.shape[1], len(C), np.eye
+    J = injection_matrix(problem)
+    whole = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), problem.nominal.dt)
+    w = {"d": m, "r": n, "n": q, "v": n}
+    error = {"error": eye(n), "r": eye(n)}
+    wires = {"error": {"d": B, "v": np.diag(problem.scaled_process_noise), "u": -J}, "W_p": error}
+    outputs = {"z": {"W_p": eye(problem.performance.n_outputs)}, "y": {name: C for name in error} | {"n": eye(q)}}
+    system = interconnect({"error": whole, "W_p": problem.performance}, wires, w | {"u": J.shape[1]}, outputs)
+    return partitioned(system, w, {"z": problem.performance.n_outputs})
+
+
+def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
+    """White noise through shaping filters at the input and at the state, penalty on the correction: w = (nu_d, nu_r, n, v)."""
+    q, n = len(problem.C), problem.nominal.n_states
+    filters = block_diagonal([d, r, gain(np.eye(q + n), problem.nominal.dt)])
+    return penalise(shape_inputs(error_plant(problem), filters), problem.correction_penalty)
+
+
+def mixed_plant(problem: ObserverProblem, noise_floor: float, penalty_floor: float) -> GeneralizedPlant:
+    """Reduced, regularised form of (37)-(39) for every form: w = (w1, n, w2), z = (W_p e, penalty, z2).
+
+    The remainder has no place in this problem and is left to the certificate. With the noise of a good encoder the covariances span twelve
+    decades, more than conic solvers can handle; `noise_floor` is the least noise here, as a fraction of the measured channel's range,
+    `penalty_floor` the least correction penalty.
+    """
+    whole = generalized_plant(replace(problem, remainder_left=None, remainder_right=None, process_noise=None))
+    sigma = np.maximum(1.0, noise_floor * (np.abs(problem.C) @ problem.output_scale) / problem.noise)
+    penalty = max(problem.correction_penalty, penalty_floor)
+    w = np.concatenate([whole.part("w", name) for name in ("w1", "n", "w2")])
+    z1, z2 = whole.part("z", "z1"), whole.part("z", "z2")
+    size = np.ones(whole.B1.shape[1])
+    size[whole.part("w", "n")] = sigma
+    B1, D11, D21 = (matrix[:, w] * size[w] for matrix in (whole.B1, whole.D11, whole.D21))
+    n, _, n_u, _, _ = whole.sizes
+
+    def rows(matrix: Array, middle: Array) -> Array:
+        return np.vstack([matrix[z1], middle, matrix[z2]])
+
+    return GeneralizedPlant(
+        whole.A,
+        B1,
+        whole.B2,
+        rows(whole.C1, np.zeros((n_u, n))),
+        whole.C2,
+        rows(D11, np.zeros((n_u, len(w)))),
+        rows(whole.D12, penalty * np.eye(n_u)),
+        D21,
+        whole.D22,
+        whole.dt,
+        n_w1=whole.w_parts["w1"] + whole.w_parts["n"],
+        n_z1=len(z1) + n_u,
+    )
+
+
+def shape_inputs(plant: GeneralizedPlant, weight: StateSpace) -> GeneralizedPlant:
+    """Put a filter in front of the disturbances: w = weight * nu."""
+    n, k = plant.A.shape[0], weight.n_states
+    return GeneralizedPlant(
+        np.block([[plant.A, plant.B1 @ weight.C], [np.zeros((k, n)), weight.A]]),
+        np.vstack([plant.B1 @ weight.D, weight.B]),
+        np.vstack([plant.B2, np.zeros((k, plant.B2.shape[1]))]),
+        np.hstack([plant.C1, plant.D11 @ weight.C]),
+        np.hstack([plant.C2, plant.D21 @ weight.C]),
+        plant.D11 @ weight.D,
+        plant.D12,
+        plant.D21 @ weight.D,
+        plant.D22,
+        plant.dt,
+    )
+
+
+def penalise(plant: GeneralizedPlant, penalty: float) -> GeneralizedPlant:
+    """Append the weighted control to the performance outputs."""
+    n, n_w, n_u, _, _ = plant.sizes
+    return GeneralizedPlant(
+        plant.A,
+        plant.B1,
+        plant.B2,
+        np.vstack([plant.C1, np.zeros((n_u, n))]),
+        plant.C2,
+        np.vstack([plant.D11, np.zeros((n_u, n_w))]),
+        np.vstack([plant.D12, penalty * np.eye(n_u)]),
+        plant.D21,
+        plant.D22,
+        plant.dt,
+    )

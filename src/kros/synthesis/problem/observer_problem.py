@@ -1,0 +1,289 @@
+r"""The observer problem: nominal model, uncertainty weights, noise; and the error system that K shapes.
+
+With uncertainty of any of the six forms, ``E = W_L Delta W_R`` on scaled signals, and an optional additive remainder
+:math:`R = W_{rL} \Delta_r W_{rR}`, the estimation error ``e = x - x_hat`` is
+
+.. math:: e = T_e W_L\,\Delta (I - N \Delta)^{-1} M w_1 + S R\,W_u w_1 \; - \; S\,(zI - A)^{-1} J K\, n
+
+with :math:`S = (I + (zI - A)^{-1} J K C)^{-1}` and ``J = B`` (input injection) or ``J = I`` (state injection). ``T_e`` is ``S`` or ``S G``, and
+M and N, which do not contain K, depend on the form as told in `perturbation`. K is outside the loop of :math:`\Delta`, so no choice of K can
+lose robustness, and none can gain it: the set is well posed when ``||N|| < 1``. The diagram is in `observer_plants`.
+
+Everything numerical happens in scaled coordinates: states over `output_scale`, inputs over `input_scale`, measurements over their noise.
+
+Symbols
+-------
+A, B, C : nominal model, state = full lifted state;  J : injection matrix;  d, r, n : disturbance of the input, of the state, noise
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DimensionError, SynthesisError
+from ...core.lti import StateSpace, gain
+from ...core.norms import hinf_norm
+from ...uncertainty.forms import Form, as_form
+from ..assumptions import unreachable_modes
+from ..generalized_plant import GeneralizedPlant
+from ..result import Injection
+from . import observer_plants
+from .perturbation import PLACES, Place
+
+Array = npt.NDArray[Any]
+_WEIGHTS = ("W_L", "W_R", "W_u", "W_p", "remainder_left", "remainder_right")
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverProblem:
+    """What an observer must be good at: a nominal model, an uncertain set around it, measurement noise.
+
+    Parameters
+    ----------
+    nominal : StateSpace
+        Nominal model; only `A` (n, n), `B` (n, m) and `dt` are used, the state being the full lifted state.
+    C : ndarray, shape (q, n)
+        Selects the measured outputs from the lifted state.
+    W_L : StateSpace
+        Left weight of ``E = W_L Delta W_R`` on scaled signals; stable. As many outputs as E has rows, any number of inputs. Diagonal, scalar
+        and full weights are all sound, since Delta has no structure.
+    W_R : StateSpace
+        Right weight; stable. As many inputs as E has columns, any number of outputs.
+    input_scale : ndarray, shape (m,)
+        Physical size of each input; scaled input = input / scale.
+    output_scale : ndarray, shape (n,)
+        Physical size of each (lifted) state.
+    noise : ndarray, shape (q,)
+        Standard deviation of the white measurement noise per sample, in the units of y; positive.
+    n_original : int, optional
+        The first `n_original` states are the original ones; the rest are lifted functions with no weight. Default all.
+    W_u : StateSpace, (m, m), optional
+        Weight of the scaled inputs; default identity: white scaled inputs of unit variance.
+    W_p : ndarray, shape (p, n), or StateSpace, optional
+        Performance weight on the error in physical units; default ``1 / output_scale`` on the original states.
+    correction_penalty : float
+        Small weight of the scaled correction; used where the problem is singular without it.
+    remainder_left : StateSpace, (n, n), optional
+        Left weight of the additive remainder on scaled states.
+    remainder_right : StateSpace, (m, m), optional
+        Right weight of the additive remainder on scaled inputs.
+    injection : Injection
+        Where the correction enters.
+    process_noise : ndarray, shape (n,), optional
+        Standard deviation of white noise on every (lifted) state per sample, independent of everything else; default none.
+    form : Form or str
+        Form of the uncertainty; default inverse input multiplicative, as in the paper.
+
+    Raises
+    ------
+    DimensionError
+        When sizes or sampling periods do not fit, or a scale or noise level is not positive.
+    """
+
+    nominal: StateSpace
+    C: Array
+    W_L: StateSpace
+    W_R: StateSpace
+    input_scale: Array
+    output_scale: Array
+    noise: Array
+    n_original: int | None = None
+    W_u: StateSpace | None = None
+    W_p: Array | StateSpace | None = None
+    correction_penalty: float = 1e-3
+    remainder_left: StateSpace | None = None
+    remainder_right: StateSpace | None = None
+    injection: Injection = Injection.STATE
+    process_noise: Array | None = None
+    form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "form", as_form(self.form))
+        object.__setattr__(self, "C", np.atleast_2d(np.asarray(self.C, dtype=float)))
+        n, m, q = self.nominal.n_states, self.nominal.n_inputs, self.C.shape[0]
+        if self.C.shape[1] != n:
+            raise DimensionError(
+                f"Observer problem: C should be (q, {n}) for {n} lifted states, found {self.C.shape}; select rows of the identity."
+            )
+        if self.n_original is not None and not 1 <= self.n_original <= n:
+            raise DimensionError(f"Observer problem: n_original = {self.n_original} should lie between 1 and {n}.")
+        for name, size in (("input_scale", m), ("output_scale", n), ("noise", q)):
+            value = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
+            if value.shape != (size,) or not np.all(np.isfinite(value) & (value > 0)):
+                raise DimensionError(
+                    f"Observer problem: {name} should be {size} positive numbers, found {value}; noise of an encoder is its step / sqrt(12)."
+                )
+            object.__setattr__(self, name, value)
+        level = np.zeros(n) if self.process_noise is None else np.asarray(self.process_noise, dtype=float)
+        if level.shape != (n,) or not np.all(np.isfinite(level) & (level >= 0)):
+            raise DimensionError(f"Observer problem: process_noise should be {n} numbers of at least zero, found {level}.")
+        object.__setattr__(self, "process_noise", level)
+        if self.W_p is None:
+            kept = n if self.n_original is None else self.n_original
+            object.__setattr__(self, "W_p", np.diag(1 / self.output_scale)[:kept])
+        if not isinstance(self.W_p, StateSpace):
+            object.__setattr__(self, "W_p", np.atleast_2d(np.asarray(self.W_p, dtype=float)))
+        if self.correction_penalty <= 0:
+            raise DimensionError(
+                f"Observer problem: correction_penalty = {self.correction_penalty} should be positive; 1e-3 is the default."
+            )
+        if self.injection is Injection.NONE:
+            raise DimensionError("Observer problem: injection should be Injection.INPUT or Injection.STATE, found NONE.")
+        if (self.remainder_left is None) != (self.remainder_right is None):
+            raise DimensionError("Observer problem: remainder_left and remainder_right come together, found only one of them.")
+        rows, columns = self.place.sizes(n, m)
+        sizes: dict[str, tuple[int | None, int | None]] = {"W_L": (rows, None), "W_R": (None, columns), "W_u": (m, m), "W_p": (None, n)}
+        for name, size in (sizes | {"remainder_left": (n, None), "remainder_right": (None, m)}).items():
+            self._check_weight(name, *size)
+
+    def _check_weight(self, name: str, rows: int | None, columns: int | None) -> None:
+        weight = getattr(self, name)
+        if weight is None:
+            return
+        found = weight.shape if isinstance(weight, np.ndarray) else (weight.n_outputs, weight.n_inputs)
+        if found != (rows or found[0], columns or found[1]) or getattr(weight, "batch_shape", ()):
+            raise DimensionError(
+                f"Observer problem: {name} should be {rows or 'any'} x {columns or 'any'} for {as_form(self.form).value} uncertainty, "
+                f"found {found[0]} x {found[1]}{getattr(weight, 'batch_shape', None) or ''}."
+            )
+        if isinstance(weight, StateSpace) and weight.dt != self.nominal.dt:
+            raise DimensionError(
+                f"Observer problem: {name} is sampled at {weight.dt} s, the nominal model at {self.nominal.dt} s; fit it at the model's period."
+            )
+
+    @property
+    def place(self) -> Place:
+        """Where the perturbation acts and what it sees."""
+        return PLACES[as_form(self.form)]
+
+    @property
+    def input_weight(self) -> StateSpace:
+        """W_u, the identity unless given."""
+        return self.W_u if self.W_u is not None else gain(np.eye(self.nominal.n_inputs), self.nominal.dt)
+
+    @cached_property
+    def performance(self) -> StateSpace:
+        """W_p on scaled states."""
+        W_p, x = self.W_p, self.output_scale
+        if isinstance(W_p, StateSpace):
+            return StateSpace(W_p.A, W_p.B * x, W_p.C, W_p.D * x, W_p.dt)
+        assert W_p is not None
+        return gain(W_p * x, self.nominal.dt)
+
+    @cached_property
+    def scaled(self) -> tuple[Array, Array, Array, Array]:
+        """A, B, C and the direct part of W_p in scaled coordinates; the measurement noise has unit covariance."""
+        x, u = self.output_scale, self.input_scale
+        return (
+            self.nominal.A * x / x[:, None],
+            self.nominal.B * u / x[:, None],
+            self.C * x / self.noise[:, None],
+            self.performance.D,
+        )
+
+    @cached_property
+    def scaled_model(self) -> StateSpace:
+        """G, from scaled inputs to scaled states."""
+        A, B, _, _ = self.scaled
+        return StateSpace(A, B, np.eye(len(A)), np.zeros_like(B), self.nominal.dt)
+
+    @cached_property
+    def chain(self) -> StateSpace:
+        """M, from the disturbance w1 to what Delta sees."""
+        return self.place.chain(self.W_R, self.scaled_model, self.input_weight)
+
+    @cached_property
+    def loop(self) -> StateSpace | None:
+        """N, from what Delta does to what it sees; None for the forms without a loop."""
+        return self.place.loop(self.W_R, self.scaled_model, self.W_L)
+
+    @property
+    def correction_size(self) -> int:
+        """Number of signals of the correction: outputs of K."""
+        return self.nominal.n_inputs if self.injection is Injection.INPUT else self.nominal.n_states
+
+    @property
+    def port(self) -> slice:
+        """Columns of `error_system` at which ``W_L w2`` acts."""
+        m, n = self.nominal.n_inputs, self.nominal.n_states
+        return slice(0, m) if self.place.at_input else slice(m, m + n)
+
+    def require_sound(self) -> float:
+        """Check that the set is well posed and the observer possible; return ``||N||``, zero for the forms without a loop.
+
+        Raises
+        ------
+        SynthesisError
+            For an unstable nominal model or weight, an undetectable pair, or ``||N|| >= 1``.
+        """
+        return self._soundness
+
+    @cached_property
+    def _soundness(self) -> float:
+        if self.nominal.dt == 0:
+            raise SynthesisError("Observer synthesis works in discrete time, found a continuous nominal model (dt = 0); sample it.")
+        modes = unreachable_modes(self.nominal.A.T, self.C.T, self.nominal.dt)
+        if modes:
+            raise SynthesisError(
+                f"Observer synthesis: (A, C) is not detectable, mode {modes[0]:.6g} is invisible in y; measure another state."
+            )
+        for name in ("nominal", *_WEIGHTS):
+            system = getattr(self, name)
+            if isinstance(system, StateSpace) and not system.is_stable():
+                raise SynthesisError(
+                    f"Observer synthesis: {name} has spectral radius {float(system.spectral_radius()):.9g}; it must be below 1, "
+                    "use a stable model (identification guarantees it) and stable weights."
+                )
+        size = 0.0 if self.loop is None else hinf_norm(self.loop)
+        if size >= 1:
+            raise SynthesisError(
+                f"Observer synthesis: ||{self.place.loop_name}|| = {size:.6g} should be below 1 for {as_form(self.form).value.replace('_', ' ')} "
+                "uncertainty, otherwise the set contains ill-posed plants; choose another form or nominal, or leave outlying units out."
+            )
+        return size
+
+    @property
+    def scaled_process_noise(self) -> Array:
+        """Standard deviation of the process noise over `output_scale`, shape (n,)."""
+        return self.process_noise / self.output_scale
+
+    def error_plant(self) -> GeneralizedPlant:
+        """Unweighted error system in scaled coordinates: w = (d, r, n, v), z = W_p e, u = y^c, y = C e + n; v is process noise."""
+        return observer_plants.error_plant(self)
+
+    def error_system(self, controller: StateSpace) -> StateSpace:
+        """Closed error system from (d, r, n, v), scaled, to W_p e, for a controller in physical units."""
+        return self.error_plant().close(self.to_scaled(controller))
+
+    def generalized_plant(self) -> GeneralizedPlant:
+        """Whole problem in scaled coordinates, minimal, with named parts ``w1 w2 [w3] n [v] | u`` and ``z1 z2 [z3] | y``."""
+        return observer_plants.generalized_plant(self)
+
+    def shaped_plant(self, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
+        """Regularised plant for white noise through the shaping filters d (at the input) and r (at the state), w = (nu_d, nu_r, n, v)."""
+        return observer_plants.shaped_plant(self, d, r)
+
+    def mixed_plant(self, noise_floor: float = 1e-3, penalty_floor: float = 3e-2) -> GeneralizedPlant:
+        """Reduced, regularised, scaled form of (37)-(39): w1 = (inputs, n), w2 = output of Delta, z1 = (W_p e, penalty), z2 = input of Delta."""
+        return observer_plants.mixed_plant(self, noise_floor, penalty_floor)
+
+    def _scales(self) -> tuple[Array, Array]:
+        correction = self.input_scale if self.injection is Injection.INPUT else self.output_scale
+        return correction, self.noise
+
+    def to_scaled(self, controller: StateSpace) -> StateSpace:
+        """Turn a controller in physical units into one in scaled coordinates."""
+        out, noise = self._scales()
+        K = controller
+        return StateSpace(K.A, K.B * noise, K.C / out[:, None], K.D * noise / out[:, None], K.dt)
+
+    def to_physical(self, controller: StateSpace) -> StateSpace:
+        """Turn a controller in scaled coordinates into one in physical units."""
+        out, noise = self._scales()
+        K = controller
+        return StateSpace(K.A, K.B / noise, K.C * out[:, None], K.D / noise * out[:, None], K.dt)

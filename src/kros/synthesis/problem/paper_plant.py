@@ -1,0 +1,133 @@
+r"""The published generalized plant (37)-(39) of Figure 9, and its minimal form in the error.
+
+Three facts shape what kros does with it, each tested: it is not minimal (the copies of the plant and a static input weight drop out in
+``e = x - x_hat``); it is singular (``D12 = 0``, ``D21 = 0``), so Riccati methods refuse it; and problem (7)-(8) is degenerate for it: ``T11 = 0``
+for every stabilising K, since ``w1`` drives plant and observer alike, and ``T22`` does not contain K.
+
+::
+
+    w1 -> W_u -+------------------>(+)--> u_p -> x+ = A x + B u_p          z2 = W_u w1 + W_D w2
+               |        w2 -> W_D --^                   |
+               |                                        v
+               +--------------->(+) -> x_hat+ = A x_hat + B (u + y^c)      z1 = W_p (x - x_hat),   y = C (x - x_hat)
+                           y^c --^
+
+In the paper's sentence after (10) the names of ``z2`` and ``w2`` are swapped; here ``w2 = Delta z2`` as in Figure 9.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DimensionError
+from ...core.lti import StateSpace
+from ..generalized_plant import GeneralizedPlant
+
+Array = npt.NDArray[Any]
+
+
+def paper_plant(nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace) -> GeneralizedPlant:
+    """Build (37)-(39) with all states: plant, observer's copy, performance, input and uncertainty weight.
+
+    Parameters
+    ----------
+    nominal : StateSpace
+        Only A (n, n), B (n, m) and dt are used.
+    C : array_like, shape (q, n)
+        Measured combinations of the state.
+    W_p : StateSpace, (p, n)
+        Performance weight on the error.
+    W_u : StateSpace, (m, m)
+        Input weight.
+    W_D : StateSpace, (m, m)
+        Uncertainty weight, inverse input multiplicative.
+
+    Returns
+    -------
+    GeneralizedPlant
+        States (x, x_hat, x_p, x_u, x_D); ``n_w1 = m``, ``n_z1 = p``; ``u`` is the correction at the input.
+    """
+    A, B, C = nominal.A, nominal.B, _measured(nominal, C)
+    _check(nominal, W_p, W_u, W_D)
+    n, m, p, q = nominal.n_states, nominal.n_inputs, W_p.n_outputs, C.shape[0]
+    k_p, k_u, k_d = W_p.n_states, W_u.n_states, W_D.n_states
+    zero = np.zeros
+    return GeneralizedPlant(
+        np.block(
+            [
+                [A, zero((n, n)), zero((n, k_p)), B @ W_u.C, B @ W_D.C],
+                [zero((n, n)), A, zero((n, k_p)), B @ W_u.C, zero((n, k_d))],
+                [W_p.B, -W_p.B, W_p.A, zero((k_p, k_u + k_d))],
+                [zero((k_u, 2 * n + k_p)), W_u.A, zero((k_u, k_d))],
+                [zero((k_d, 2 * n + k_p + k_u)), W_D.A],
+            ]
+        ),
+        np.block(
+            [[B @ W_u.D, B @ W_D.D], [B @ W_u.D, zero((n, m))], [zero((k_p, 2 * m))], [W_u.B, zero((k_u, m))], [zero((k_d, m)), W_D.B]]
+        ),
+        np.vstack([zero((n, m)), B, zero((k_p + k_u + k_d, m))]),
+        np.block([[W_p.D, -W_p.D, W_p.C, zero((p, k_u + k_d))], [zero((m, 2 * n + k_p)), W_u.C, W_D.C]]),
+        np.hstack([C, -C, zero((q, k_p + k_u + k_d))]),
+        np.block([[zero((p, 2 * m))], [W_u.D, W_D.D]]),
+        zero((p + m, m)),
+        zero((q, 2 * m)),
+        zero((q, m)),
+        nominal.dt,
+        n_w1=m,
+        n_z1=p,
+    )
+
+
+def reduced_plant(nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace) -> GeneralizedPlant:
+    """Build the same transfer matrices in the error: states (e, x_p, x_u, x_D), n fewer than `paper_plant`.
+
+    ``e+ = A e + B (C^D x_D + D^D w2) - B u``. With minimal weights whose responses matter it is minimal: 18 states become 14 for the paper's
+    Koopman model. Arguments as in `paper_plant`.
+    """
+    A, B, C = nominal.A, nominal.B, _measured(nominal, C)
+    _check(nominal, W_p, W_u, W_D)
+    n, m, p, q = nominal.n_states, nominal.n_inputs, W_p.n_outputs, C.shape[0]
+    k_p, k_u, k_d = W_p.n_states, W_u.n_states, W_D.n_states
+    zero = np.zeros
+    return GeneralizedPlant(
+        np.block(
+            [
+                [A, zero((n, k_p + k_u)), B @ W_D.C],
+                [W_p.B, W_p.A, zero((k_p, k_u + k_d))],
+                [zero((k_u, n + k_p)), W_u.A, zero((k_u, k_d))],
+                [zero((k_d, n + k_p + k_u)), W_D.A],
+            ]
+        ),
+        np.block([[zero((n, m)), B @ W_D.D], [zero((k_p, 2 * m))], [W_u.B, zero((k_u, m))], [zero((k_d, m)), W_D.B]]),
+        np.vstack([-B, zero((k_p + k_u + k_d, m))]),
+        np.block([[W_p.D, W_p.C, zero((p, k_u + k_d))], [zero((m, n + k_p)), W_u.C, W_D.C]]),
+        np.hstack([C, zero((q, k_p + k_u + k_d))]),
+        np.block([[zero((p, 2 * m))], [W_u.D, W_D.D]]),
+        zero((p + m, m)),
+        zero((q, 2 * m)),
+        zero((q, m)),
+        nominal.dt,
+        n_w1=m,
+        n_z1=p,
+    )
+
+
+def _measured(nominal: StateSpace, C: npt.ArrayLike) -> Array:
+    matrix = np.atleast_2d(np.asarray(C, dtype=float))
+    if matrix.shape[1] != nominal.n_states:
+        raise DimensionError(f"Published plant: C should be (q, {nominal.n_states}), found {matrix.shape}; select rows of the identity.")
+    return matrix
+
+
+def _check(nominal: StateSpace, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace) -> None:
+    n, m = nominal.n_states, nominal.n_inputs
+    for name, weight, outputs, inputs in (("W_p", W_p, W_p.n_outputs, n), ("W_u", W_u, m, m), ("W_D", W_D, m, m)):
+        if (weight.n_outputs, weight.n_inputs) != (outputs, inputs):
+            raise DimensionError(f"Published plant: {name} should be {outputs} x {inputs}, found {weight.n_outputs} x {weight.n_inputs}.")
+        if weight.dt != nominal.dt:
+            raise DimensionError(
+                f"Published plant: {name} is sampled at {weight.dt} s, the nominal model at {nominal.dt} s; resample one of them."
+            )

@@ -1,0 +1,87 @@
+r"""Where the perturbation sits: what it sees, where it acts, and whether it sees its own effect. Six forms are six answers.
+
+With ``E = W_L Delta W_R`` on scaled signals, ``G`` the nominal model from input to state and ``w2 = Delta z2``,
+
+::
+
+                        +-------------- inverse ---------------+
+                        v                                      |
+     u' ------+------->(+)--> W_R --> z2 --> Delta --> w2 --> W_L --+--> at the input:  x = G (u' + W_L w2)
+              |         ^                                           |
+              +--> G ---+   (sees the state)                        +--> at the state:  x = G u' + W_L w2
+
+=============================  =========  ========  =======  =====  ===============  ===========  =====================
+form                           acts at    sees      inverse  T_e    M                N            robust when
+=============================  =========  ========  =======  =====  ===============  ===========  =====================
+additive                       state      input     no       S      W_R W_u          0            always
+input multiplicative           input      input     no       S G    W_R W_u          0            always
+output multiplicative          state      state     no       S      W_R G W_u        0            always
+inverse additive               input      state     yes      S G    W_R G W_u        W_R G W_L    ``||N|| < 1``
+inverse input multiplicative   input      input     yes      S G    W_R W_u          W_R W_L      ``||N|| < 1``
+inverse output multiplicative  state      state     yes      S      W_R G W_u        W_R W_L      ``||N|| < 1``
+=============================  =========  ========  =======  =====  ===============  ===========  =====================
+
+In all of them the error is ``e = T_e W_L X M w1`` with ``X = Delta (I - N Delta)^-1``, and the observer is in ``T_e`` alone: K is outside the
+loop of Delta.
+
+Symbols
+-------
+S : error sensitivity;  M : from the disturbance to z2;  N : from w2 to z2
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ...core.lti import StateSpace
+from ...uncertainty.forms import Form
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a perturbation acts, and what it sees.
+
+    Parameters
+    ----------
+    at_input : bool
+        It acts on the plant's input, otherwise on its state.
+    sees_input : bool
+        It sees the input, otherwise the state.
+    inverse : bool
+        It sees its own effect too.
+    """
+
+    at_input: bool
+    sees_input: bool
+    inverse: bool
+
+    @property
+    def loop_name(self) -> str:
+        """The loop N in words."""
+        if not self.inverse:
+            return "0"
+        return "W_R W_L" if self.at_input is self.sees_input else "W_R G W_L"
+
+    def sizes(self, n: int, m: int) -> tuple[int, int]:
+        """Rows of W_L and columns of W_R, for n states and m inputs."""
+        return (m if self.at_input else n), (m if self.sees_input else n)
+
+    def chain(self, W_R: StateSpace, G: StateSpace, W_u: StateSpace) -> StateSpace:
+        """From the disturbance to what Delta sees: M."""
+        return W_R @ W_u if self.sees_input else W_R @ (G @ W_u)
+
+    def loop(self, W_R: StateSpace, G: StateSpace, W_L: StateSpace) -> StateSpace | None:
+        """From what Delta does to what it sees: N; None where there is no loop."""
+        if not self.inverse:
+            return None
+        return W_R @ W_L if self.at_input is self.sees_input else W_R @ (G @ W_L)
+
+
+PLACES = {
+    Form.ADDITIVE: Place(at_input=False, sees_input=True, inverse=False),
+    Form.INPUT_MULTIPLICATIVE: Place(at_input=True, sees_input=True, inverse=False),
+    Form.OUTPUT_MULTIPLICATIVE: Place(at_input=False, sees_input=False, inverse=False),
+    Form.INVERSE_ADDITIVE: Place(at_input=True, sees_input=False, inverse=True),
+    Form.INVERSE_INPUT_MULTIPLICATIVE: Place(at_input=True, sees_input=True, inverse=True),
+    Form.INVERSE_OUTPUT_MULTIPLICATIVE: Place(at_input=False, sees_input=False, inverse=True),
+}

@@ -1,0 +1,1 @@
+"""Filters shaped by the one-step residuals that were measured."""

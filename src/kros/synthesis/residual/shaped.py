@@ -1,0 +1,294 @@
+r"""The residual-shaped observer: the Kalman predictor for disturbances with the spectrum that was measured.
+
+The error of an observer on any unit is driven by the one-step residual omega of the nominal model, which does not depend on the observer and
+can be measured on every unit. With a shaping filter ``omega = C_f zeta + D_f w``, ``zeta+ = A_f zeta + B_f w`` of the population's mean spectrum,
+
+    [ e    ]+   [ A   C_f ] [ e    ]   [ D_f ]       [ I ]
+    [ zeta ]  = [ 0   A_f ] [ zeta ] + [ B_f ] w  -  [ 0 ] y^c,      nu = C e + v,
+
+the error of least variance is left by the Kalman predictor's gains ``L = [L_e; L_zeta]``, which is a correction through the state of the
+order of the filter: ``zeta_hat+ = A_f zeta_hat + L_zeta nu``, ``y^c = C_f zeta_hat + L_e nu``. For the mean spectrum it minimises the mean square error over
+the units. The worst unit's error is minimised by a mixture of the units' spectra: for fixed weights the best observer minimises the weighted mean, which is
+concave in the weights, and its gradient is the units' errors.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DimensionError, SynthesisError
+from ...core.lti import StateSpace
+from ...core.norms import gramian, h2_norm
+from ..result import Injection, Status, Synthesis
+from ..riccati.constant_gain import kalman
+from .shaping import Bank, circle_weights, shaping_filter
+
+Array = npt.NDArray[np.float64]
+Spectra = npt.NDArray[Any]
+BANKS = (Bank(8), Bank(4, (0.8, 0.95, 0.98)), Bank(8, (0.95, 0.98)), Bank(8, (0.9, 0.97, 0.99, 0.997)))
+_ROUNDS = 30
+_CLOSE = 1.02
+_NEGLIGIBLE = 1e-12
+
+
+def residual_h2(
+    A: npt.ArrayLike,
+    C: npt.ArrayLike,
+    spectra: Spectra,
+    noise: npt.ArrayLike,
+    scale: npt.ArrayLike,
+    dt: float,
+    banks: Sequence[Bank] = BANKS,
+    tolerance_percent: float = 1.0,
+    worst_unit: bool = False,
+    n_lifted: int | None = None,
+    max_order: int | None = None,
+) -> Synthesis:
+    """Return the correction filter that is optimal for the residuals of a population.
+
+    Parameters
+    ----------
+    A : array_like, shape (n, n)
+        Error dynamics of the original states (`kros.observer.mean_error_dynamics`).
+    C : array_like, shape (q, n)
+        Selects the measured states.
+    spectra : ndarray, shape (unit, f, n, n), complex
+        Cross spectral density of every unit's one-step residual (`kros.observer.residual_spectra`), physical units.
+    noise : array_like, shape (q,)
+        Standard deviation of the measurement noise.
+    scale : array_like, shape (n,)
+        Range of every state; norms are of errors in these units.
+    dt : float, s
+    banks : sequence of Bank
+        Memories of the shaping filter that are tried: the one with the least error under the spectra as they were measured is kept. A lag
+        with a pole near one is a disturbance state, for loads.
+    tolerance_percent : float
+        What the reduction of the order from ``n * bank.size`` may cost in the RMS error of any state that is not measured; 0 keeps every
+        state of the filter.
+    worst_unit : bool
+        Minimise the largest error of a unit in place of the mean.
+    n_lifted : int, optional
+        Rows of the correction; those of lifted functions are zero, since the functions are computed anew from the states.
+    max_order : int, optional
+        Most states of the correction, whatever the tolerance.
+
+    Returns
+    -------
+    Synthesis
+        ``h2_norm`` is the root mean square of the scaled error under the full shaping filter and the noise, recomputed; ``lower_bound`` that of
+        the unreduced optimum, so that `gap_percent` is what the reduction of the order costs.
+
+    Raises
+    ------
+    SynthesisError
+        When the residual has no spectrum to shape, or the Riccati equation no solution.
+    """
+    A, C, noise, scale = (np.asarray(x, dtype=float) for x in (A, C, noise, scale))
+    n, q = len(A), len(C)
+    if (
+        A.shape != (n, n)
+        or C.shape != (q, n)
+        or noise.shape != (q,)
+        or scale.shape != (n,)
+        or spectra.ndim != 4
+        or spectra.shape[2:] != (n, n)
+    ):
+        raise DimensionError(
+            "Residual-shaped observer: needs A (n, n), C (q, n), spectra (unit, f, n, n), noise (q,), scale (n,), "
+            f"found {A.shape}, {C.shape}, {spectra.shape}, {noise.shape}, {scale.shape}."
+        )
+    start = time.perf_counter()
+    scaled = A / scale[:, None] * scale, C * scale, noise, spectra / np.outer(scale, scale)
+    problem = (
+        min((_Problem(*scaled, bank, dt) for bank in banks), key=_Problem.promise) if len(banks) > 1 else _Problem(*scaled, banks[0], dt)
+    )
+    weights, note = problem.worst_unit() if worst_unit else (np.full(len(spectra), 1 / len(spectra)), f"mean of {len(spectra)} units")
+    full = problem.filter(weights)
+    K = problem.correction(full)
+    best = problem.norm(full, K)
+    if not np.isfinite(best):
+        raise SynthesisError(
+            "Residual-shaped observer: the error of the optimal observer is not bounded; check the nominal model and what is measured."
+        )
+    K = problem.reduced(full, K, tolerance_percent, max_order)
+    norm, radius = problem.norm(full, K), float(problem.error_system(K).spectral_radius())
+    note += f", {problem.bank.delays} delays, lags {problem.bank.poles}"
+    note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
+    rows = np.zeros(((n_lifted or n) - n, q))
+    controller = StateSpace(
+        K.A,
+        K.B,
+        np.vstack([scale[:, None] * K.C, np.zeros((len(rows), K.n_states))]),
+        np.vstack([scale[:, None] * K.D, rows]),
+        dt,
+    )
+    return Synthesis(
+        method="residual_h2",
+        controller=controller,
+        status=Status.OPTIMAL if K.n_states == full.n_states else Status.CERTIFIED,
+        injection=Injection.STATE,
+        h2_norm=norm,
+        lower_bound=best,
+        gap_percent=100 * (norm / best - 1),
+        spectral_radius=radius,
+        solve_s=time.perf_counter() - start,
+        solver="riccati",
+        notes=(note,),
+    )
+
+
+def promised_errors(A: Array, C: Array, spectra: Spectra, noise: Array, scale: Array, dt: float, bank: Bank = BANKS[1]) -> Array:
+    """Return the root mean square error of every state, as a share of its range, that a residual-shaped observer would have on the spectra as measured.
+
+    Parameters as in `residual_h2`; the mean over units is taken, the order is not reduced. Infinite where there is no observer.
+    """
+    problem = _Problem(A / scale[:, None] * scale, C * scale, noise, spectra / np.outer(scale, scale), bank, dt)
+    try:
+        K = problem.correction(problem.filter(np.full(len(spectra), 1 / len(spectra))))
+    except SynthesisError:
+        return np.full(len(A), np.inf)
+    return np.asarray(np.sqrt(problem.unit_errors(K).mean(axis=0)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The problem in scaled coordinates."""
+
+    A: Array
+    C: Array
+    noise: Array
+    spectra: Spectra
+    bank: Bank
+    dt: float
+
+    def filter(self, weights: Array) -> StateSpace:
+        """Shaping filter of a mixture of the units' spectra."""
+        return shaping_filter(np.tensordot(weights, self.spectra, 1), self.bank, self.dt)
+
+    def correction(self, shaping: StateSpace) -> StateSpace:
+        """Kalman gains of plant and shaping filter as a correction filter."""
+        n = len(self.A)
+        A = np.block([[self.A, shaping.C], [np.zeros((shaping.n_states, n)), shaping.A]])
+        G = np.vstack([shaping.D, shaping.B])
+        C = np.hstack([self.C, np.zeros((len(self.C), shaping.n_states))])
+        L = kalman(A, C, G @ G.T, np.diag(self.noise**2), self.dt).controller.D
+        return StateSpace(shaping.A, L[n:], shaping.C, L[:n], self.dt)
+
+    def error_system(self, K: StateSpace) -> StateSpace:
+        """From (omega, white noise of unit variance) to the error e."""
+        n, root = len(self.A), np.diag(self.noise)
+        A = np.block([[self.A - K.D @ self.C, -K.C], [K.B @ self.C, K.A]])
+        B = np.block([[np.eye(n), -K.D @ root], [np.zeros((K.n_states, n)), K.B @ root]])
+        return StateSpace(A, B, np.eye(n, len(A)), np.zeros((n, B.shape[1])), self.dt)
+
+    def loop(self, shaping: StateSpace, K: StateSpace) -> StateSpace:
+        """From white noise of unit variance to the error, omega made by a shaping filter."""
+        error, n = self.error_system(K), len(self.A)
+        drive, rest = error.B[:, :n], error.B[:, n:]
+        A = np.block([[error.A, drive @ shaping.C], [np.zeros((shaping.n_states, error.n_states)), shaping.A]])
+        B = np.block([[drive @ shaping.D, rest], [shaping.B, np.zeros((shaping.n_states, rest.shape[1]))]])
+        return StateSpace(A, B, np.hstack([error.C, np.zeros((n, shaping.n_states))]), np.zeros((n, B.shape[1])), self.dt)
+
+    @property
+    def hidden(self) -> npt.NDArray[np.intp]:
+        """States that are not measured; all where none is hidden."""
+        measured = np.any(self.C, axis=0)
+        return np.flatnonzero(~measured) if not measured.all() else np.arange(len(self.A))
+
+    def deviations(self, shaping: StateSpace, K: StateSpace) -> Array:
+        """Root mean square of every state's scaled error, shape (n,); infinite where the error dynamics are unstable."""
+        loop = self.loop(shaping, K)
+        if not loop.is_stable():
+            return np.full(len(self.A), np.inf)
+        return np.asarray(np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, self.dt) @ loop.C.T), np.finfo(float).tiny)))
+
+    def norm(self, shaping: StateSpace, K: StateSpace) -> float:
+        """Root mean square of the scaled error."""
+        return h2_norm(self.loop(shaping, K))
+
+    def unit_errors(self, K: StateSpace) -> Array:
+        """Variance of every state's error on every unit, from the units' own spectra; shape (unit, n)."""
+        f, n = self.spectra.shape[1], len(self.A)
+        response = self.error_system(K).frequency_response(np.linspace(0, 0.5 / self.dt, f))
+        weight = circle_weights(f)
+        drive, rest = response[..., :n], response[..., n:]
+        driven = np.einsum("f,fia,ufab,fib->ui", weight, drive, self.spectra, drive.conj(), optimize=True).real
+        return np.asarray(driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2))
+
+    def promise(self) -> float:
+        """Sum of logarithms of the hidden states' mean square errors under equal weights."""
+        equal = np.full(len(self.spectra), 1 / len(self.spectra))
+        return float(np.log(self.unit_errors(self.correction(self.filter(equal))).mean(axis=0)[self.hidden]).sum())
+
+    def worst_unit(self) -> tuple[Array, str]:
+        """Weights of the units for which the largest error of a unit is smallest.
+
+        An error is the mean over the states that are not measured, each relative to its mean over the units under equal weights. The weights
+        grow by multiplication with the unit's error over the weighted mean, which is ascent on a concave function.
+        """
+
+        def errors(weights: Array) -> Array:
+            return self.unit_errors(self.correction(self.filter(weights)))[:, self.hidden]
+
+        equal = np.full(len(self.spectra), 1 / len(self.spectra))
+        start = errors(equal)
+        reference = start.mean(axis=0)
+        weights, cost = equal, np.mean(start / reference, axis=1)
+        first = best = float(cost.max())
+        chosen = weights
+        for _ in range(_ROUNDS):
+            mean = float(weights @ cost)
+            if cost.max() <= _CLOSE * mean:
+                break
+            weights = weights * (cost / mean)
+            weights = weights / weights.sum()
+            cost = np.mean(errors(weights) / reference, axis=1)
+            if cost.max() < best:
+                best, chosen = float(cost.max()), weights
+        gain = 100 * (1 - np.sqrt(best / first))
+        return chosen, f"worst of {len(self.spectra)} units, whose predicted error is {gain:.1f} % below that under equal weights"
+
+    def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, max_order: int | None = None) -> StateSpace:
+        """The correction filter of lowest order whose errors under the full shaping filter are within the tolerance, or of the highest one allowed.
+
+        Balanced truncation of the shaping filter, its output weighted by the error dynamics of the full observer (weighting one side alone
+        keeps it stable), and new gains at every order that bisection tries.
+        """
+        most = shaping.n_states if max_order is None else max_order
+        if not shaping.n_states or (tolerance_percent <= 0 and most >= shaping.n_states):
+            return K
+        best, loop = self.deviations(shaping, K), self.loop(shaping, K)
+        weighted = loop.C / best[:, None]
+        P = gramian(shaping.A, shaping.B, self.dt)
+        Q = gramian(loop.A.T, weighted.T, self.dt)[-shaping.n_states :, -shaping.n_states :]
+        R, S = _root(P), _root(Q).T
+        U, h, Vh = np.linalg.svd(S @ R)
+        usable = int(np.sum(h > _NEGLIGIBLE * h[0]))
+        left, right = (U[:, :usable] / np.sqrt(h[:usable])).T @ S, R @ Vh[:usable].T / np.sqrt(h[:usable])
+        allowed = (1 + tolerance_percent / 100) * best[self.hidden]
+
+        def of_order(k: int) -> StateSpace:
+            return self.correction(
+                replace(shaping, A=left[:k] @ shaping.A @ right[:, :k], B=left[:k] @ shaping.B, C=shaping.C @ right[:, :k])
+            )
+
+        low, high = -1, min(usable, most) + 1
+        while high - low > 1:
+            k = (low + high) // 2
+            trial = of_order(k)
+            if np.all(self.deviations(shaping, trial)[self.hidden] <= allowed):
+                K, high = trial, k
+            else:
+                low = k
+        return K if K.n_states <= most else of_order(min(usable, most))
+
+
+def _root(matrix: Array) -> Array:
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -1,0 +1,136 @@
+r"""Shaping filters: stable models of low order whose output has a given spectrum.
+
+The signal omega passes a bank of delays and first-order lags, ``z+ = A_z z + B_z omega``, with covariance
+
+.. math:: G = \frac{1}{2\pi} \int Z S Z^H \, d\theta, \qquad Z = (e^{j\theta} I - A_z)^{-1} B_z
+
+and is predicted from it by least squares, ``omega = Theta z + Sigma^(1/2) w``: with delays alone this is the vector autoregression of
+Yule and Walker, and lags lengthen its memory without many states. The model is ``z+ = (A_z + B_z Theta) z + B_z Sigma^(1/2) w``. Because the
+prediction error is orthogonal to z, ``G = (A_z + B_z Theta) G (...)' + B_z Sigma B_z'`` holds exactly, on a grid of frequencies too, so the
+filter is *always stable* and reproduces G. Everything is linear in the spectrum until the least squares: spectra of units may be weighted.
+
+References
+----------
+C. I. Byrnes, T. T. Georgiou and A. Lindquist, "A new approach to spectral estimation: a tunable high-resolution spectral estimator",
+IEEE Transactions on Signal Processing 48 (2000) 3189-3205.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import block_diag
+
+from ...core.errors import DimensionError, SynthesisError
+from ...core.lti import StateSpace
+
+Array = npt.NDArray[Any]
+_FLOOR = 1e-12  # white noise added to every channel, relative to the largest: a channel without residual keeps the Gramian regular
+_PREDICTABLE = 1e-10
+
+
+@dataclass(frozen=True)
+class Bank:
+    """Delays and first-order lags of every channel.
+
+    Parameters
+    ----------
+    delays : int
+    poles : tuple of float
+        Poles of the lags, inside the unit circle, each one once.
+    """
+
+    delays: int = 8
+    poles: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.delays < 0 or len(set(self.poles)) < len(self.poles) or not all(0 < abs(p) < 1 for p in self.poles):
+            raise DimensionError(
+                f"Shaping filter: needs delays of at least 0 and different poles inside the unit circle, found {self.delays} and {self.poles}."
+            )
+
+    @cached_property
+    def scalar(self) -> tuple[Array, Array]:
+        """Dynamics and input of the bank of one channel."""
+        shift = np.eye(self.delays, k=-1)
+        poles = np.array(self.poles)
+        first = np.eye(self.delays, 1)[:, 0]
+        return block_diag(shift, np.diag(poles))[-self.size :, -self.size :], np.concatenate([first, np.sqrt(1 - poles**2)])
+
+    @property
+    def size(self) -> int:
+        """States a channel."""
+        return self.delays + len(self.poles)
+
+    def response(self, z: Array) -> Array:
+        """Return Z of one channel at points of the unit circle, shape (f, size)."""
+        lags = np.sqrt(1 - np.array(self.poles) ** 2) / (z[:, None] - np.array(self.poles))
+        return np.hstack([z[:, None] ** -np.arange(1, self.delays + 1), lags])
+
+    def system(self, n: int) -> tuple[Array, Array]:
+        """Return A_z and B_z for n channels, the channels of one delay or lag side by side."""
+        A, b = self.scalar
+        return np.kron(A, np.eye(n)).reshape(n * self.size, n * self.size), np.kron(b[:, None], np.eye(n)).reshape(n * self.size, n)
+
+
+def circle_weights(f: int) -> Array:
+    """Return weights of the mean over the unit circle, for f equal steps from zero to Nyquist; they sum to one."""
+    weight = np.full(f, 1.0 / (f - 1))
+    weight[[0, -1]] /= 2
+    return weight
+
+
+def shaping_filter(spectrum: Array, bank: Bank, dt: float) -> StateSpace:
+    """Fit a shaping filter to a spectrum.
+
+    Parameters
+    ----------
+    spectrum : ndarray, shape (f, n, n), complex
+        Cross spectral density at equal steps from zero to Nyquist, both included; its mean over the circle is the covariance. Channels
+        should be scaled to similar size.
+    bank : Bank
+    dt : float, s
+
+    Returns
+    -------
+    StateSpace
+        From white noise of unit covariance to the signal.
+
+    Raises
+    ------
+    SynthesisError
+        When there is no signal, or it can be predicted without error: constant, or a sum of few tones.
+    """
+    f, n = spectrum.shape[:2]
+    if spectrum.shape != (f, n, n) or f < 2:
+        raise DimensionError(
+            f"Shaping filter: the spectrum should have shape (f, n, n) with at least two frequencies, found {spectrum.shape}."
+        )
+    weight = circle_weights(f)
+    R = np.tensordot(weight, spectrum, 1).real
+    largest = float(np.max(np.diag(R), initial=0.0))
+    if not (np.isfinite(R).all() and largest > 0):
+        raise SynthesisError("Shaping filter: the residual is zero or not finite, there is nothing to shape; correct nothing (open loop).")
+    R = R + _FLOOR * largest * np.eye(n)
+    response = bank.response(np.exp(1j * np.linspace(0, np.pi, f)))
+    k = bank.size
+    blocks = np.einsum("f,fa,fb,fij->aibj", weight, response, response.conj(), spectrum, optimize=True).real
+    floor = np.einsum("f,fa,fb->ab", weight, response, response.conj()).real
+    G = blocks.reshape(k * n, k * n) + _FLOOR * largest * np.kron(floor, np.eye(n)).reshape(k * n, k * n)
+    cross = np.einsum("f,fb,fij->ibj", weight, response.conj(), spectrum, optimize=True).real.reshape(n, k * n)
+    cross = cross + _FLOOR * largest * np.kron(weight @ response.conj().real, np.eye(n)).reshape(n, k * n)
+    Theta = np.linalg.solve(G, cross.T).T if k else cross
+    innovation = R - Theta @ cross.T
+    values, vectors = np.linalg.eigh((innovation + innovation.T) / 2)
+    if values.max() <= _PREDICTABLE * largest:
+        raise SynthesisError(
+            f"Shaping filter: the residual can be predicted to {np.sqrt(max(values.max(), 0) / largest):.1g} of its size, it is constant or a few tones; "
+            "record longer or richer episodes."
+        )
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    A, B = bank.system(n)
+    return StateSpace(A + B @ Theta, B @ root, Theta, root, dt)

@@ -1,0 +1,1 @@
+"""Synthesis by Riccati equations: H2, H-infinity, and the constant gains of Kalman and Luenberger."""

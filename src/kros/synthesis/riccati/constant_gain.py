@@ -1,0 +1,169 @@
+r"""Steady-state Kalman predictor and Luenberger observer: the baselines with a constant gain.
+
+Both correct the state directly: ``x_hat+ = A x_hat + B u + L (y - C x_hat)``.
+
+Symbols
+-------
+Q, R : process and measurement noise covariance;  P : covariance of the one-step prediction error;  L : gain, shape (n, q)
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DimensionError, SynthesisError
+from ...core.lti import StateSpace, gain
+from ...core.norms import h2_norm
+from ..assumptions import unreachable_modes
+from ..result import Injection, Status, Synthesis
+from .equations import discrete_gain, solve_riccati
+
+Array = npt.NDArray[Any]
+
+
+def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLike, dt: float = 1.0) -> Synthesis:
+    """Return the steady-state Kalman predictor as a constant correction of the state.
+
+    Parameters
+    ----------
+    A : array_like, shape (n, n)
+        Discrete dynamics.
+    C : array_like, shape (q, n)
+        Measured combinations of the state.
+    Q : array_like, shape (n, n)
+        Process noise covariance, positive semidefinite.
+    R : array_like, shape (q, q)
+        Measurement noise covariance, positive definite.
+    dt : float, s
+        Sampling period of the result.
+
+    Returns
+    -------
+    Synthesis
+        ``controller.D`` is the gain L, shape (n, q); ``h2_norm`` is the root of the trace of the prediction error's covariance.
+
+    Raises
+    ------
+    DimensionError
+        When sizes do not fit.
+    SynthesisError
+        When R is not positive definite, Q not positive semidefinite, or the pair (A, C) undetectable (the mode is named).
+
+    Examples
+    --------
+    >>> from kros.synthesis import kalman
+    >>> synthesis = kalman([[1.0]], [[1.0]], [[1.0]], [[2.0]])
+    >>> float(synthesis.controller.D[0, 0])  # P = 2, L = 2 / (2 + 2)
+    0.5
+    """
+    A, C, Q, R = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (A, C, Q, R))
+    n, q = A.shape[0], C.shape[0]
+    if A.shape != (n, n) or C.shape != (q, n) or Q.shape != (n, n) or R.shape != (q, q):
+        raise DimensionError(
+            f"Kalman predictor: needs A (n, n), C (q, n), Q (n, n), R (q, q), found {A.shape}, {C.shape}, {Q.shape}, {R.shape}."
+        )
+    if np.linalg.eigvalsh((R + R.T) / 2).min() <= 0:
+        raise SynthesisError(
+            "Kalman predictor: the measurement noise covariance R is not positive definite; every measurement needs some noise."
+        )
+    lowest = np.linalg.eigvalsh((Q + Q.T) / 2)
+    if lowest.min() < -1e-12 * max(lowest.max(), 1e-300):
+        raise SynthesisError(
+            f"Kalman predictor: the process noise covariance Q has the eigenvalue {lowest.min():.3g}; it must be positive semidefinite."
+        )
+    require_detectable(A, C, "Kalman predictor")
+    start = time.perf_counter()
+    L, P = predictor(A, C, Q, R, np.zeros((n, q)), "Kalman predictor")
+    elapsed = time.perf_counter() - start
+    closed = A - L @ C
+    radius = float(np.abs(np.linalg.eigvals(closed)).max(initial=0.0))
+    if radius >= 1:
+        raise SynthesisError(
+            f"Kalman predictor: the error dynamics have spectral radius {radius:.9g}; add process noise on the modes on the unit circle."
+        )
+    values, vectors = np.linalg.eigh((Q + Q.T) / 2)
+    noise = np.hstack([vectors * np.sqrt(np.maximum(values, 0)), -L @ np.linalg.cholesky(R)])
+    norm = h2_norm(StateSpace(closed, noise, np.eye(n), np.zeros((n, n + q)), dt))
+    promised = float(np.sqrt(max(np.trace(P), 0.0)))
+    return Synthesis(
+        method="kalman",
+        controller=gain(L, dt),
+        status=Status.OPTIMAL,
+        injection=Injection.STATE,
+        h2_norm=norm,
+        lower_bound=promised,
+        gap_percent=100 * (norm / promised - 1) if promised > 0 else 0.0,
+        spectral_radius=radius,
+        solve_s=elapsed,
+        solver="riccati",
+    )
+
+
+def luenberger(A: npt.ArrayLike, C: npt.ArrayLike, poles: npt.ArrayLike, dt: float = 1.0) -> Synthesis:
+    """Return the constant gain that places the poles of the error dynamics (17).
+
+    Parameters
+    ----------
+    A : array_like, shape (n, n)
+    C : array_like, shape (q, n)
+    poles : array_like, shape (n,)
+        Wanted poles, inside the unit circle, complex ones in conjugate pairs; none repeated more than q times.
+    dt : float, s
+
+    Raises
+    ------
+    SynthesisError
+        When a pole is not inside the unit circle, the pair is not observable enough to move it, or the poles cannot be placed.
+    """
+    from scipy.signal import place_poles
+
+    A, C = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (A, C))
+    wanted = np.atleast_1d(np.asarray(poles))
+    if wanted.shape != (A.shape[0],) or C.shape[1:] != A.shape[:1]:
+        raise DimensionError(f"Luenberger observer: needs {A.shape[0]} poles and C (q, {A.shape[0]}), found {wanted.shape} and {C.shape}.")
+    if np.abs(wanted).max() >= 1:
+        raise SynthesisError(
+            f"Luenberger observer: wanted poles should lie inside the unit circle, found magnitude {np.abs(wanted).max():.6g}."
+        )
+    start = time.perf_counter()
+    try:
+        L = place_poles(A.T, C.T, wanted).gain_matrix.T
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise SynthesisError(
+            f"Luenberger observer: the poles cannot be placed ({error}); use distinct poles in conjugate pairs, or measure more."
+        ) from error
+    elapsed = time.perf_counter() - start
+    reached = np.linalg.eigvals(A - L @ C)
+    miss = max(np.abs(reached - pole).min() for pole in wanted)
+    if miss > 1e-3:
+        raise SynthesisError(
+            f"Luenberger observer: a pole was missed by {miss:.3g}; the pair (A, C) is nearly unobservable, keep that pole where A has it."
+        )
+    return Synthesis(
+        "luenberger",
+        gain(L, dt),
+        Status.OPTIMAL,
+        Injection.STATE,
+        spectral_radius=float(np.abs(reached).max()),
+        solve_s=elapsed,
+        solver="pole placement",
+    )
+
+
+def predictor(A: Array, C: Array, Q: Array, R: Array, S: Array, purpose: str) -> tuple[Array, Array]:
+    """Gain and covariance of the one-step predictor for noise covariances Q, R and cross covariance S (n, q)."""
+    P = solve_riccati(A.T, C.T, Q, R, S, 1.0, purpose)
+    return -discrete_gain(A.T, C.T, R, S, P).T, P
+
+
+def require_detectable(A: Array, C: Array, purpose: str) -> None:
+    """Raise a `SynthesisError` naming the first mode on or outside the unit circle that C does not see."""
+    modes = unreachable_modes(A.T, C.T, 1.0)
+    if modes:
+        raise SynthesisError(
+            f"{purpose}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible in y; measure another state."
+        )

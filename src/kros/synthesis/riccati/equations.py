@@ -1,0 +1,100 @@
+"""Riccati equations with a check of the residual; the H2 gains built from them.
+
+Symbols
+-------
+X : stabilising solution of A' X A - X - (A' X B + S)(R + B' X B)^-1 (B' X A + S') + Q = 0 (discrete), or the continuous analogue
+F : state feedback, u = F x;  F0 : feedforward of the disturbance, u = F x + F0 w (discrete full information)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import LinAlgError, solve_continuous_are, solve_discrete_are
+
+from ...core.errors import SynthesisError
+
+Array = npt.NDArray[Any]
+
+
+def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, purpose: str) -> Array:
+    """Return the stabilising solution X of the algebraic Riccati equation.
+
+    Parameters
+    ----------
+    A, B, Q, R, S : ndarray
+        Dynamics (n, n), input (n, m), state cost (n, n), input cost (m, m), cross cost (n, m).
+    dt : float, s
+        0 for the continuous equation.
+    purpose : str
+        For the message when it fails.
+
+    Raises
+    ------
+    SynthesisError
+        When there is no stabilising solution or its residual is large.
+    """
+    if not A.size:
+        return np.zeros((0, 0))
+    if dt > 0:
+        X = _doubling(A, B, Q, R, S)
+        if X is not None and _residual(A, B, Q, R, S, X) < 1e-9:
+            return X
+    try:
+        X = (solve_discrete_are if dt > 0 else solve_continuous_are)(A, B, Q, R, s=S)
+    except (LinAlgError, ValueError) as error:
+        raise SynthesisError(
+            f"{purpose}: the Riccati equation of {A.shape[0]} states has no stabilising solution that can be computed ({error}); "
+            "check stabilisability, detectability and scaling."
+        ) from error
+    X = (X + X.T) / 2
+    if dt > 0 and _residual(A, B, Q, R, S, X) > 1e-5:
+        raise SynthesisError(
+            f"{purpose}: the Riccati solution has residual {_residual(A, B, Q, R, S, X):.2g}; scale states, inputs and outputs to similar size."
+        )
+    return X
+
+
+def discrete_gain(A: Array, B: Array, R: Array, S: Array, X: Array) -> Array:
+    """Optimal discrete feedback ``F = -(R + B' X B)^-1 (B' X A + S')``."""
+    return -np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
+
+
+def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> float:
+    """Relative size of the residual in the closed-loop (Joseph) form, which does not cancel; infinite when the loop is unstable."""
+    F = discrete_gain(A, B, R, S, X)
+    closed = A + B @ F
+    if np.abs(np.linalg.eigvals(closed)).max() >= 1:
+        return float("inf")
+    cost = Q + S @ F + F.T @ S.T + F.T @ R @ F
+    # A plant that can be inverted costs nothing, X = 0: what is left is measured against the terms that cancel.
+    size = max(float(np.linalg.norm(X)), float(np.linalg.norm(Q)), 1e-300)
+    return float(np.linalg.norm(closed.T @ X @ closed + cost - X)) / size
+
+
+def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
+    """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004): quadratic convergence, only additions of semidefinite matrices.
+
+    Returns None when it does not converge; the caller then uses the generic solver.
+    """
+    try:
+        RiS, RiB = np.linalg.solve(R, S.T), np.linalg.solve(R, B.T)
+        Ak, G, H = A - B @ RiS, B @ RiB, Q - S @ RiS
+        eye = np.eye(len(A))
+        for _ in range(60):
+            W = np.linalg.solve(eye + G @ H, np.hstack([Ak, G]))
+            WA, WG = W[:, : len(A)], W[:, len(A) :]
+            step = Ak.T @ H @ WA
+            G = G + Ak @ WG @ Ak.T
+            H = H + (step + step.T) / 2
+            G = (G + G.T) / 2
+            Ak = Ak @ WA
+            if not np.isfinite(H).all():
+                return None
+            if np.linalg.norm(step) <= 1e-16 * np.linalg.norm(H):
+                return H
+    except np.linalg.LinAlgError:
+        return None
+    return None

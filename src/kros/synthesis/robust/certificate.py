@@ -1,0 +1,74 @@
+r"""Certified worst-case H2 norm of an observer, for any correction filter, however it was found.
+
+.. math::
+    \frac{1}{2\pi}\int \Big(b_\Delta(\theta) + b_r(\theta)\Big)^2 + \|T_n\|_F^2 \, d\theta,
+    \qquad b_\Delta = \|T X_c M\|_F + \Big(\sum_i \sigma_i(T R_l)^2 \sigma_i(R_r M)^2\Big)^{1/2}
+
+or the sharper dual bound of `dual_bound`, whichever is smaller. ``b_r`` bounds the additive remainder in the same way (a ball around zero);
+it adds by the triangle inequality since the same input drives both. The noise is independent, so its square adds. Delta is any
+frequency-wise contraction, causal or not: the bound is for that set, and an upper bound for causal perturbations.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import SynthesisError
+from ...core.lti import StateSpace
+from ..problem.observer_problem import ObserverProblem
+from .ball import spread
+from .disturbance import uncertain_ball
+from .quadrature import circle_mean
+
+Array = npt.NDArray[Any]
+
+
+def density(problem: ObserverProblem, loop: StateSpace, freqs_hz: Array) -> Array:
+    """Certified worst-case power density of ``W_p e``, shape (f,), for the closed error system `loop`."""
+    m, n = problem.nominal.n_inputs, problem.nominal.n_states
+    response = loop.frequency_response(freqs_hz)
+    T = response[..., problem.port] @ problem.W_L.frequency_response(freqs_hz)
+    uncertain = uncertain_ball(problem, freqs_hz).bound(T)
+    if problem.remainder_left is not None and problem.remainder_right is not None:
+        left = response[..., m : m + n] @ problem.remainder_left.frequency_response(freqs_hz)
+        uncertain = uncertain + spread(left, (problem.remainder_right @ problem.input_weight).frequency_response(freqs_hz))
+    return uncertain**2 + np.sum(np.abs(response[..., m + n :]) ** 2, axis=(-2, -1))
+
+
+def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5) -> tuple[float, float]:
+    """Return the certified worst-case H2 norm of ``W_p e`` and the quadrature error that it includes.
+
+    Parameters
+    ----------
+    problem : ObserverProblem
+    controller : StateSpace
+        In physical units: m outputs for input injection, n for state injection; q inputs.
+    rtol : float
+        Accuracy asked of the quadrature of the squared norm.
+
+    Raises
+    ------
+    SynthesisError
+        When the set is not well posed or the nominal observer loop is unstable.
+    """
+    problem.require_sound()
+    loop = problem.error_system(controller)
+    if not loop.is_stable():
+        raise SynthesisError(
+            f"Certificate: the nominal observer loop has spectral radius {float(loop.spectral_radius()):.9g}; no bound is finite."
+        )
+    dt = problem.nominal.dt
+    squared, error = circle_mean(lambda theta: density(problem, loop, theta / (2 * np.pi * dt)), _log_poles(problem, loop), rtol)
+    upper = float(np.sqrt(squared + error))
+    return upper, upper - float(np.sqrt(squared))
+
+
+def _log_poles(problem: ObserverProblem, loop: StateSpace) -> Array:
+    """Logarithms of all poles, in the upper half plane."""
+    systems = [loop, problem.W_L, problem.chain, problem.loop, problem.remainder_left, problem.remainder_right]
+    poles = np.concatenate([s.poles() for s in systems if s is not None]).astype(complex)
+    poles = poles[(poles.imag >= 0) & (np.abs(poles) > 1e-3)]
+    return np.log(poles)

@@ -1,0 +1,193 @@
+r"""The worst case as a disturbance: its spectrum, and rational filters that shape white noise like it.
+
+The disturbance is ``W_L w2`` and acts at the input or at the state. Where W_L is diagonal one filter a channel stands for W_L and the spectrum
+of w2 together, which takes fewer states; a full W_L stays as it is behind one filter for every component of w2.
+
+Symbols
+-------
+phi : power of every shaped channel, shape (f, channels);  psi : the same for the remainder, shape (f, n)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import SynthesisError
+from ...core.lti import StateSpace, block_diagonal, gain
+from ..problem.observer_problem import ObserverProblem
+from .ball import Ball, below
+
+Array = npt.NDArray[Any]
+Fit = Callable[..., Any]
+
+_GRID = 400
+_FLOOR, _NOTHING = 1e-14, 1e-30
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Power of the shaped channels on the design grid: disturbance phi (f, channels) and remainder psi (f, n) or None."""
+
+    phi: Array
+    psi: Array | None
+
+    def mixed_with(self, phi: Array, weight: float) -> Spectrum:
+        """Return the average of two spectra of the disturbance."""
+        return replace(self, phi=(1 - weight) * self.phi + weight * phi)
+
+
+@dataclass(frozen=True, eq=False)
+class Shaping:
+    """Rational factors of a spectrum, one a channel, and the system that they drive (W_L, or None where it is contained)."""
+
+    filters: StateSpace
+    behind: StateSpace | None
+    remainder: StateSpace | None
+
+    def ports(self, problem: ObserverProblem) -> tuple[StateSpace, StateSpace]:
+        """Return the shaped disturbances at the input, m outputs, and at the state, n outputs."""
+        m, n, dt = problem.nominal.n_inputs, problem.nominal.n_states, problem.nominal.dt
+        shaped = self.filters if self.behind is None else self.behind @ self.filters
+        at_input = shaped if problem.place.at_input else gain(np.zeros((m, 0)), dt)
+        at_state = [s for s in (None if problem.place.at_input else shaped, self.remainder) if s is not None]
+        return at_input, _sum(at_state) if at_state else gain(np.zeros((n, 0)), dt)
+
+
+def default_fit() -> Fit:
+    """Return `kros.uncertainty.fits.magnitude.fit_magnitude`."""
+    from ...uncertainty.fits.magnitude import fit_magnitude
+
+    return fit_magnitude
+
+
+def _sum(systems: list[StateSpace]) -> StateSpace:
+    """Add the outputs of systems with inputs of their own."""
+    stacked = block_diagonal(systems)
+    add = np.hstack([np.eye(systems[0].n_outputs)] * len(systems))
+    return StateSpace(stacked.A, stacked.B, add @ stacked.C, add @ stacked.D, stacked.dt)
+
+
+def uncertain_ball(problem: ObserverProblem, freqs_hz: Array) -> Ball:
+    """Return the ball of ``Delta (I - N Delta)^-1 M``."""
+    M = problem.chain.frequency_response(freqs_hz)
+    if problem.loop is None:
+        return Ball.without_loop(M, problem.W_L.n_inputs)
+    return Ball.of(problem.loop.frequency_response(freqs_hz), M)
+
+
+def is_diagonal(system: StateSpace) -> bool:
+    """Tell whether the system is square and its off-diagonal transfer functions vanish (Markov parameters up to twice the order)."""
+    if system.n_outputs != system.n_inputs:
+        return False
+    off = ~np.eye(system.n_outputs, dtype=bool)
+    block, size = system.B, float(np.abs(system.C).max(initial=0) * np.abs(system.B).max(initial=0))
+    if np.any(system.D[off]):
+        return False
+    for _ in range(2 * system.n_states):
+        if np.any(np.abs((system.C @ block)[off]) > 1e-12 * size):
+            return False
+        block = system.A @ block
+    return True
+
+
+def symmetric(problem: ObserverProblem) -> bool:
+    """Tell whether the set keeps every change of signs, so that the diagonal of any element's spectrum is an average over the set."""
+    if problem.loop is None:
+        return True
+    place = problem.place
+    return place.sees_input and place.at_input and all(is_diagonal(s) for s in (problem.W_L, problem.W_R, problem.input_weight))
+
+
+def design_grid(problem: ObserverProblem) -> Array:
+    """Frequencies for the design, Hz: logarithmic from well below the slowest pole to Nyquist."""
+    dt = problem.nominal.dt
+    systems = [problem.nominal, problem.W_L, problem.W_R, problem.input_weight]
+    poles = np.concatenate([s.poles() for s in systems])
+    slowest = np.abs(poles - 1).min(initial=1.0)
+    return np.geomspace(min(max(slowest / 30, 1e-7), 1e-2), np.pi, _GRID) / (2 * np.pi * dt)
+
+
+class Channels:
+    """The channels that are shaped, on a grid of frequencies.
+
+    Parameters
+    ----------
+    problem : ObserverProblem
+    freqs_hz : ndarray, shape (f,), Hz
+    """
+
+    def __init__(self, problem: ObserverProblem, freqs_hz: Array) -> None:
+        self.problem, self.freqs_hz = problem, freqs_hz
+        self.ball = uncertain_ball(problem, freqs_hz)
+        self.left = problem.W_L.frequency_response(freqs_hz)
+        self.contained = is_diagonal(problem.W_L)
+        self.behind = None if self.contained else problem.W_L
+
+    def shaped(self, power: Array) -> Array:
+        """Power of the channels for the power of w2."""
+        return np.sum(np.abs(self.left) ** 2, axis=-1) * power if self.contained else power
+
+    def average(self) -> Spectrum:
+        """Average over the set; every causal observer costs at least its share of it."""
+        return Spectrum(self.shaped(np.real(np.einsum("fii->fi", self.ball.average()))), self._remainder())
+
+    def below_average(self) -> Spectrum:
+        """Largest diagonal spectrum below the average, where its channels are correlated."""
+        return Spectrum(self.shaped(below(self.ball.average())), self._remainder())
+
+    def symmetric_part(self) -> Array:
+        """``q^2 R_l R_l^H`` with ``q = ||R_r M||``: what the ball holds on both sides of its centre, shape (f, b, b)."""
+        q = np.linalg.norm(self.ball.right, 2, axis=(-2, -1))
+        return q[:, None, None] ** 2 * (self.ball.left @ np.conj(np.swapaxes(self.ball.left, -1, -2)))
+
+    def worst(self, controller: StateSpace) -> Array:
+        """Spectrum of the element of the set that is (locally) worst for a given observer."""
+        T = self.problem.error_system(controller).frequency_response(self.freqs_hz)[..., self.problem.port] @ self.left
+        return self.shaped(self.ball.worst_spectrum(T))
+
+    def _remainder(self) -> Array | None:
+        """Average spectrum of the remainder, shape (f, n)."""
+        problem = self.problem
+        if problem.remainder_left is None or problem.remainder_right is None:
+            return None
+        left = problem.remainder_left.frequency_response(self.freqs_hz)
+        right = (problem.remainder_right @ problem.input_weight).frequency_response(self.freqs_hz)
+        energy = np.sum(np.abs(right) ** 2, axis=(-2, -1)) / max(left.shape[-1], right.shape[-2])
+        return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
+
+    def shaping(self, spectrum: Spectrum, fit: Fit, side: str, options: dict[str, Any]) -> Shaping:
+        """Fit one rational factor a channel."""
+
+        def factor(power: Array) -> StateSpace:
+            systems = []
+            for column in power.T:
+                if column.max() <= _NOTHING:
+                    systems.append(gain([[0.0]], self.problem.nominal.dt))
+                    continue
+                magnitude = np.sqrt(np.maximum(column, _FLOOR * column.max()))
+                systems.append(fit(self.freqs_hz, magnitude, self.problem.nominal.dt, side=side, **options).system)
+            return block_diagonal(systems)
+
+        return Shaping(factor(spectrum.phi), self.behind, None if spectrum.psi is None else factor(spectrum.psi))
+
+    def lowered(self, shaping: Shaping, spectrum: Spectrum) -> Shaping:
+        """Scale every filter so that its power nowhere on the grid exceeds the spectrum."""
+        remainder = shaping.remainder
+        if remainder is not None and spectrum.psi is not None:
+            remainder = _lowered(remainder, self.freqs_hz, spectrum.psi)
+        return Shaping(_lowered(shaping.filters, self.freqs_hz, spectrum.phi), shaping.behind, remainder)
+
+
+def _lowered(system: StateSpace, freqs_hz: Array, power: Array) -> StateSpace:
+    """Scale each channel of a diagonal filter so that its power nowhere exceeds `power`, shape (f, channels)."""
+    found = np.abs(np.diagonal(system.frequency_response(freqs_hz), axis1=-2, axis2=-1)) ** 2
+    if not np.isfinite(found).all():
+        raise SynthesisError("Worst-case synthesis: a shaping filter has an infinite response; ask for a lower order.")
+    ratio = np.min(power / np.maximum(found, 1e-300), axis=0)
+    scale = np.sqrt(np.minimum(ratio, 1.0))
+    return StateSpace(system.A, system.B, system.C * scale[:, None], system.D * scale[:, None], system.dt)

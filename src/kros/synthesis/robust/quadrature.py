@@ -1,0 +1,130 @@
+r"""Mean of a spectral density over the unit circle, when it spans many decades of frequency.
+
+.. math:: \frac{1}{2\pi}\int_{-\pi}^{\pi} f(\theta)\,d\theta = \frac{1}{\pi}\int_0^{\pi} f(\theta)\,d\theta
+
+for an even density. The interval is cut into panels, logarithmic in frequency and refined around given frequencies (the poles), with a linear
+panel at DC. Each panel carries the Gauss-Kronrod pair of 7 and 15 points; panels whose pair disagrees most are halved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import SynthesisError
+
+Array = npt.NDArray[Any]
+
+# Positive abscissae of the 15-point Kronrod rule; every second one belongs to the 7-point Gauss rule.
+_X = np.array(
+    [
+        0.991455371120812639206854697526329,
+        0.949107912342758524526189684047851,
+        0.864864423359769072789712788640926,
+        0.741531185599394439863864773280788,
+        0.586087235467691130294144691693327,
+        0.405845151377397166906606412076961,
+        0.207784955007898467600689403773245,
+        0.0,
+    ]
+)
+_WK = np.array(
+    [
+        0.022935322010529224963732008058970,
+        0.063092092629978553290700663189204,
+        0.104790010322250183839876322541518,
+        0.140653259715525918745189590510238,
+        0.169004726639267902826583426598550,
+        0.190350578064785409913256402421014,
+        0.204432940075298892414161999234649,
+        0.209482141084727828012999174891714,
+    ]
+)
+_WG = np.array(
+    [
+        0.129484966168869693270611432679082,
+        0.279705391489276667901467771423780,
+        0.381830050505118944950369775488975,
+        0.417959183673469387755102040816327,
+    ]
+)
+_NODES = np.concatenate([-_X, _X[-2::-1]])
+_KRONROD = np.concatenate([_WK, _WK[-2::-1]])
+_GAUSS = np.zeros(15)
+_GAUSS[1::2] = np.concatenate([_WG, _WG[-2::-1]])
+
+
+def circle_mean(density: Callable[[Array], Array], centers: Array, rtol: float = 1e-6, max_panels: int = 4000) -> tuple[float, float]:
+    """Integrate an even, non-negative density over the unit circle.
+
+    Parameters
+    ----------
+    density : callable
+        Takes angles in (0, pi], shape (k,), returns values of the same shape.
+    centers : ndarray, rad
+        Poles of the density, in the upper half plane, as complex numbers ``log z``: panels are laid around their angles at the scale of
+        their distance from the unit circle, so that no resonance falls between the nodes.
+    rtol : float
+        Relative accuracy asked for.
+    max_panels : int
+        Work limit.
+
+    Returns
+    -------
+    tuple of float
+        Mean, and the sum of the panels' differences between the two rules: an estimate of the error that is conservative for smooth
+        densities, since it is the error of the poorer rule.
+
+    Raises
+    ------
+    SynthesisError
+        When the accuracy is not reached within the work limit, or the density is not finite.
+    """
+    edges = _edges(centers)
+    left, right = edges[:-1], edges[1:]
+    values, errors = _panels(density, left, right)
+    while errors.sum() > rtol * values.sum():
+        if len(values) > max_panels:
+            raise SynthesisError(
+                f"Integrating the spectral density: relative error {errors.sum() / values.sum():.2g} after {len(values)} panels, asked for {rtol:.2g}; "
+                "a weight or the loop has poles extremely close to the unit circle."
+            )
+        split = errors > min(0.5 * errors.max(), rtol * values.sum() / len(values))
+        middle = np.where(left[split] > 0, np.sqrt(left[split] * right[split]), right[split] / 4)
+        new_left = np.concatenate([left[split], middle])
+        new_right = np.concatenate([middle, right[split]])
+        new_values, new_errors = _panels(density, new_left, new_right)
+        left, right = np.concatenate([left[~split], new_left]), np.concatenate([right[~split], new_right])
+        values, errors = np.concatenate([values[~split], new_values]), np.concatenate([errors[~split], new_errors])
+    return float(values.sum() / np.pi), float(errors.sum() / np.pi)
+
+
+def _edges(centers: Array) -> Array:
+    """Panel edges: three a decade, and a ladder of widths around each pole's angle."""
+    angle, width = np.abs(centers.imag), np.abs(centers.real)
+    size = np.hypot(angle, width)
+    low = min(max(1e-2 * size.min(initial=np.pi), 1e-12), 1e-3)
+    ladder = np.concatenate([-(4.0 ** np.arange(8)), [0.0], 4.0 ** np.arange(8)])
+    around = (angle[:, None] + width[:, None] * ladder).ravel()
+    around = around[(around > low) & (around < np.pi)]
+    edges = np.unique(np.concatenate([np.geomspace(low, np.pi, 2 + int(3 * np.log10(np.pi / low))), around]))
+    kept = np.concatenate([[True], np.diff(np.log(edges)) > 1e-9])
+    return np.concatenate([[0.0], edges[kept]])
+
+
+def _panels(density: Callable[[Array], Array], left: Array, right: Array) -> tuple[Array, Array]:
+    """Both rules on every panel; logarithmic inside, linear in the panel that touches DC."""
+    linear = left <= 0
+    log_left = np.log(np.where(linear, 1.0, left))
+    log_right = np.where(linear, 0.0, np.log(right))
+    middle, half = (log_left + log_right) / 2, (log_right - log_left) / 2
+    angles = np.exp(middle[:, None] + half[:, None] * _NODES)
+    angles[linear] = right[linear, None] * (1 + _NODES) / 2
+    values = density(angles.ravel()).reshape(angles.shape)
+    if not np.isfinite(values).all():
+        raise SynthesisError("Integrating the spectral density: it is not finite; is the uncertain set well posed and the loop stable?")
+    weighted = np.where(linear[:, None], values * right[:, None] / 2, values * angles * half[:, None])
+    return weighted @ _KRONROD, np.abs(weighted @ (_KRONROD - _GAUSS))

@@ -1,0 +1,1 @@
+"""Structured perturbations: bounds of the structured singular value, and D-K iteration."""

@@ -1,0 +1,1 @@
+"""Rational magnitudes: the tightest bound of data, alone or several at once."""

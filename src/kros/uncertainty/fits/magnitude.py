@@ -1,0 +1,386 @@
+r"""Log-Chebyshev fit of a magnitude by a stable, minimum-phase system, from above or from below.
+
+Of all squared magnitudes `n / d` of one order with `m^2 <= n / d <= gamma m^2` on the grid, the one with the smallest `gamma` is found:
+a quasi-convex problem, solved by a handful of linear programs (`minimax`). After every program the true ratios are recomputed, `n` is lifted
+by the deficit, and both are proven positive on the whole axis by the location of their roots.
+
+Basis and spectral factor: see `spectral`. In `tau = tan^2(theta / 2)` the fit holds its precision over six decades and more.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from enum import Enum
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import ConfigError, DataError, DimensionError, KrosError
+from ...core.frequency import bilinear_squared, check_grid
+from ...core.lti import StateSpace, gain
+from .given import best_numerator, pole_roots
+from .minimax import Grid
+from .spectral import RationalMagnitude, basis, on_half_line, roots, spectral_factor
+
+Array = npt.NDArray[Any]
+
+_LOG = logging.getLogger(__name__)
+_FLOOR = 1e-8  # magnitudes below this fraction of the largest count as this fraction (-160 dB)
+_POINTS = 150  # of the grid in the first programs
+_ROUNDS = 6
+_TOP = 10.0  # tau beyond which (80 % of Nyquist) no knots are placed
+_EXCHANGE = 10**0.002 - 1  # 0.02 dB of squared magnitude
+_HOPELESS = 2.0  # an order whose overbound is beyond this many tolerances is not polished while a higher one is allowed
+_UNPROVEN_DB = 0.5  # a fit farther than this from what is proven to be the best is compared with those that start from lower orders
+_HALVINGS, _BOTTOMS = 30, 25  # of the search for an alternation
+_GAIN = 0.9  # a further order that brings the overbound in dB to this share needs no other start
+
+
+class Side(str, Enum):
+    """Which side of the data the fit stays on."""
+
+    ABOVE = "above"
+    BELOW = "below"
+
+
+@dataclass(frozen=True, eq=False)
+class FittedMagnitude:
+    """A system whose magnitude bounds data.
+
+    Parameters
+    ----------
+    system : StateSpace
+        One input, one output, stable and minimum phase.
+    order : int
+    overbound_db : float, dB
+        Largest distance between the system's magnitude and the data; the smallest is zero.
+    side : Side
+    within_tolerance : bool
+        Whether `overbound_db` is within the tolerance asked for.
+    proven_db : float, dB
+        No system of this order stays closer to the data on the same grid than this: proven by the alternation of the fit around them,
+        whatever the programs did. With given poles, NaN.
+    """
+
+    system: StateSpace
+    order: int
+    overbound_db: float
+    side: Side
+    within_tolerance: bool
+    proven_db: float = float("nan")
+
+    def inverse(self) -> StateSpace:
+        """Return the inverse system, stable because the system is minimum phase."""
+        return invert(self.system)
+
+
+def fit_magnitude(
+    freqs_hz: npt.ArrayLike,
+    magnitude: npt.ArrayLike,
+    sample_period_s: float,
+    order: int | None = None,
+    *,
+    max_order: int = 4,
+    tolerance_db: float = 1.0,
+    side: Side | str = Side.ABOVE,
+    nyquist_zeros: int = 0,
+    dc_zeros: int = 0,
+    poles: npt.ArrayLike | None = None,
+) -> FittedMagnitude:
+    r"""Return a discrete system whose magnitude is the tightest uniform bound of the data.
+
+    Parameters
+    ----------
+    freqs_hz : array_like, shape (n_freqs,), Hz
+        Increasing, from zero at least to Nyquist at most; both ends allowed.
+    magnitude : array_like, shape (n_freqs,)
+        Non-negative. Values below 1e-8 of the largest count as that; all zero gives the zero system (only from above).
+    sample_period_s : float, s
+    order : int, optional
+        Best fit of at most this order; by default the smallest order within the tolerance, or the best up to `max_order`.
+    max_order : int
+    tolerance_db : float, dB
+        Largest distance accepted when the order is chosen.
+    side : {"above", "below"}
+        Smallest majorant or largest minorant of the data.
+    nyquist_zeros, dc_zeros : int
+        Zeros at z = -1 and z = 1 that the system must have beyond `order` (roll-off); it then has no stable inverse, and grid points where
+        it vanishes do not count.
+    poles : array_like of complex, optional
+        Poles in z that the system must have, complex ones in pairs; only its zeros are fitted then, and the order is their number. From below
+        the zeros are given in the same way.
+
+    Returns
+    -------
+    FittedMagnitude
+
+    Raises
+    ------
+    DataError
+        Magnitudes negative, NaN or infinite; from below, all zero.
+    KrosError
+        When no program of any order could be solved.
+
+    Notes
+    -----
+    The bound holds at the given frequencies, for the system as returned and evaluated. Between them the fit is smooth, and positive.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import fit_magnitude
+    >>> freqs = np.geomspace(1e-3, 500.0, 200)
+    >>> fit = fit_magnitude(freqs, 1 / np.hypot(1.0, freqs / 3.0) + 0.01, 1e-3)
+    >>> gain_at_freqs = abs(fit.system.frequency_response(freqs)[:, 0, 0])
+    >>> bool(np.all(gain_at_freqs >= 1 / np.hypot(1.0, freqs / 3.0) + 0.01))
+    True
+    """
+    side = _as_side(side)
+    freqs = check_grid(freqs_hz, sample_period_s)
+    values = _check_magnitude(magnitude, freqs, side)
+    highest = max_order if order is None else order
+    if highest < 0 or min(nyquist_zeros, dc_zeros) < 0:
+        raise ConfigError(f"Magnitude fit: orders and numbers of zeros should not be negative, found order {order}, max_order {max_order}.")
+    if not values.any():
+        return FittedMagnitude(gain([[0.0]], sample_period_s), 0, 0.0, side, True)
+    problem = _Problem(freqs, values, sample_period_s, side, nyquist_zeros, dc_zeros)
+    if poles is not None:
+        return problem.with_poles(pole_roots(poles), tolerance_db)
+    best: FittedMagnitude | None = None
+    lower: _Bound | None = None
+    if order is not None:
+        best, _ = problem.fit(order, tolerance_db, None, last=True)
+        if best is not None and best.overbound_db < best.proven_db + _UNPROVEN_DB:
+            return best
+    for candidate in range((order or 0) // 2, highest + 1):
+        found, lower = problem.fit(candidate, tolerance_db, lower, last=candidate == highest)
+        if found is not None and (best is None or found.overbound_db < best.overbound_db):
+            best = found
+        if best is not None and best.within_tolerance:
+            break
+    if best is None:
+        raise KrosError(
+            f"Magnitude fit: no system of order up to {highest} found for {len(freqs)} points; raise max_order or smooth the data."
+        )
+    return best
+
+
+def alternation_db(ratio: npt.ArrayLike, count: int) -> float:
+    r"""Return a lower bound on the overbound of any magnitude of one order, from the ratio of one such fit to the data.
+
+    Let the squared fit `n / d` have degree N in tau, and its ratio to the data swing `count = 2 N + 2` times in turn above H and below L.
+    Another `n' / d'` whose ratio stays within less than H / L would, scaled, be below the fit at every high and above it at every low point:
+    `n' d - n d'` of degree 2 N would change sign 2 N + 1 times. This is de la Vallee Poussin's bound for a ratio instead of a difference.
+
+    Parameters
+    ----------
+    ratio : array_like, shape (n_points,)
+        Fit over data, in the order of the frequencies.
+    count : int
+        Alternations needed, at least two.
+
+    Returns
+    -------
+    float, dB
+        Of magnitudes, when the ratio is one; the largest H / L for which the alternation exists, between zero and `max / min`.
+    """
+    level = 20 * np.log10(np.asarray(ratio, float))
+    low, high = 0.0, float(np.ptp(level))
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        if any(_swings(level, bottom, bottom + middle) >= count for bottom in _bottoms(level, middle)):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _bottoms(level: Array, width: float) -> Array:
+    """Lower levels that are tried for an alternation of some width."""
+    return np.linspace(level.min(), level.max() - width, _BOTTOMS)
+
+
+def _swings(level: Array, bottom: float, top: float) -> int:
+    """How often the level reaches below the bottom and above the top in turn."""
+    side = np.where(level >= top, 1, np.where(level <= bottom, -1, 0))
+    side = side[side != 0]
+    return int((side[1:] != side[:-1]).sum()) + 1 if side.size else 0
+
+
+def invert(system: StateSpace) -> StateSpace:
+    """Return the inverse of a square system with a regular feedthrough."""
+    D = np.linalg.inv(system.D)
+    B = system.B @ D
+    return StateSpace(system.A - B @ system.C, B, -D @ system.C, D, system.dt)
+
+
+def majorant(tau: Array, magnitude: Array, order: int) -> RationalMagnitude | None:
+    """Return the best squared magnitude of an order above data at points in tau, none where the programs fail; both shape (n_points,)."""
+    targets = np.maximum(magnitude, _FLOOR * magnitude.max()) ** 2
+    unit = np.exp(np.mean(np.log(targets)))
+    found = _minimax(tau, targets / unit, order, None, np.inf)
+    return None if found is None else replace(found.rational, numerator=found.rational.numerator * unit)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Data of one fit, in physical values; the programs work on `targets`."""
+
+    freqs: Array
+    values: Array
+    dt: float
+    side: Side
+    nyquist_zeros: int
+    dc_zeros: int
+
+    def fit(self, order: int, tolerance_db: float, lower: _Bound | None, *, last: bool) -> tuple[FittedMagnitude | None, _Bound | None]:
+        """Fit one order, starting from the bound of a lower order; None where the programs fail."""
+        tau, targets, unit, keep = self._targets()
+        hopeless = np.inf if last else 10 ** (_HOPELESS * tolerance_db / 10)
+        found = _minimax(tau, targets, order, lower, hopeless)
+        if found is None:
+            return None, lower
+        try:
+            return self._finish(found.rational, unit, keep, tolerance_db), found
+        except KrosError as error:  # positive on the grid and zero at Nyquist: no system with an inverse, another order is
+            _LOG.debug("Magnitude fit: order %d has no spectral factor (%s)", order, error)
+            return None, lower
+
+    def with_poles(self, found: Array, tolerance_db: float) -> FittedMagnitude:
+        """Fit the numerator for given roots of the denominator in tau: one linear program, and further points where it is not positive."""
+        tau, targets, unit, keep = self._targets()
+        return replace(self._finish(best_numerator(tau, targets, found), unit, keep, tolerance_db), proven_db=float("nan"))
+
+    def _targets(self) -> tuple[Array, Array, float, Array]:
+        """Points in tau, squared magnitudes to stay above there, their unit, and which points of the grid these are."""
+        tau = bilinear_squared(self.freqs, self.dt)
+        shape = self._zero_factor(tau)
+        keep = shape > 1e-30
+        targets = self.values[keep] ** (2 if self.side is Side.ABOVE else -2) / shape[keep]
+        unit = float(np.exp(np.mean(np.log(targets))))
+        return tau[keep], targets / unit, unit, keep
+
+    def _zero_factor(self, tau: Array) -> Array:
+        """Squared magnitude of the prescribed zeros; from below they would be poles of the inverse fit."""
+        down = 1.0 / (1.0 + tau)
+        power = down**self.nyquist_zeros * (1.0 - down) ** self.dc_zeros if self.dc_zeros else down**self.nyquist_zeros
+        return power if self.side is Side.ABOVE else 1.0 / np.maximum(power, 1e-300)
+
+    def _finish(self, rational: RationalMagnitude, unit: float, keep: Array, tolerance_db: float) -> FittedMagnitude:
+        """Factorise, and lift (or lower) by the deficit of the system as evaluated."""
+        bound = RationalMagnitude(rational.numerator * unit, rational.denominator, rational.knots)
+        if self.side is Side.BELOW:
+            bound = RationalMagnitude(bound.denominator, bound.numerator, bound.knots)
+        system = spectral_factor(bound, self.dt, nyquist_zeros=self.nyquist_zeros, dc_zeros=self.dc_zeros)
+        ratio = np.abs(system.frequency_response(self.freqs[keep])[:, 0, 0]) / self.values[keep]
+        margin = 1 + 1e-12
+        touch = margin / ratio.min() if self.side is Side.ABOVE else 1 / (margin * ratio.max())
+        system = StateSpace(system.A, system.B, system.C * touch, system.D * touch, system.dt)
+        overbound = float(20 * np.log10(ratio.max() / ratio.min()))
+        degree = system.n_states - self.nyquist_zeros - self.dc_zeros
+        proven = alternation_db(ratio, 2 * degree + 2)
+        return FittedMagnitude(system, system.n_states, overbound, self.side, overbound <= tolerance_db, proven)
+
+
+@dataclass(frozen=True, eq=False)
+class _Bound:
+    """A bound of the squared targets, with its largest ratio to them."""
+
+    rational: RationalMagnitude
+    ratio: float
+
+
+def _minimax(tau: Array, targets: Array, order: int, lower: _Bound | None, hopeless: float) -> _Bound | None:
+    """Best n / d of one order above the targets, positive on the whole axis; `lower` is the best of an order less.
+
+    The problem has no local optima, but programs are solved in finite precision: knots where the data bend come first, evenly spaced ones
+    and those at the roots just found follow where a further order has not helped.
+    """
+    if order == 0:
+        return _Bound(RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0)), float(targets.max() / targets.min()))
+    best = _exchange(tau, targets, _knots(tau, targets, order, 0.05), lower, hopeless)
+    for even in (1.0, 0.3):
+        if best is not None and (lower is None or best.ratio < lower.ratio * (1 - 1e-3) or lower.ratio < 1 + _EXCHANGE):
+            break
+        other = _exchange(tau, targets, _knots(tau, targets, order, even), lower, hopeless)
+        best = other if best is None or (other is not None and other.ratio < best.ratio) else best
+    return best
+
+
+def _knots(tau: Array, targets: Array, order: int, even: float) -> Array:
+    """Knots of the basis, as dense as the data bend in log-log coordinates, plus a share that is evenly spaced."""
+    inside = (tau > 0) & (tau < _TOP)
+    if inside.sum() < 3:
+        return np.geomspace(1e-6, 1.0, order + 2)[1:-1]
+    x = np.log(tau[inside])
+    slope = np.diff(np.log(targets[inside])) / np.diff(x)
+    middle = (x[1:] + x[:-1]) / 2
+    bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(slope)))])
+    bend = bend / bend[-1] if bend[-1] > 0 else bend
+    share = (1 - even) * bend + even * (middle - middle[0]) / (middle[-1] - middle[0])
+    return np.exp(np.interp((np.arange(order) + 0.5) / order * share[-1], share, middle))
+
+
+def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None, hopeless: float) -> _Bound | None:
+    """Solve on part of the grid, and add the points at which the bound found there is worse; a ratio beyond `hopeless` is left as it is."""
+    chosen = np.unique(np.linspace(0, len(tau) - 1, _POINTS).round().astype(int))
+    cuts = np.zeros(0)
+    phi, best = basis(tau, knots), None
+    start = None if lower is None else basis(tau, lower.rational.knots) @ lower.rational.denominator
+    enough = 1 + _EXCHANGE if lower is None else max(lower.ratio**_GAIN, 1 + _EXCHANGE)
+    for _ in range(_ROUNDS):
+        starts = [targets[chosen] ** -0.5] if best is None else []  # n and d share the slope
+        if start is not None:
+            starts.append(start[chosen])
+        if best is None:
+            starts.append(np.ones(len(chosen)))
+        rational = Grid.build(tau[chosen], targets[chosen], knots, cuts).best(starts, enough)
+        if rational is None:
+            return best
+        n, d = phi @ rational.numerator, phi @ rational.denominator
+        ratio = np.where((n > 0) & (d > 0), n / (targets * np.where(d > 0, d, 1.0)), 0.0)
+        bad = sorted(on_half_line(roots(rational.numerator, knots)[0]) + on_half_line(roots(rational.denominator, knots)[0]))
+        if not bad and ratio.min() > 0 and (best is None or ratio.max() / ratio.min() < best.ratio):
+            best, start = (
+                _Bound(RationalMagnitude(rational.numerator / ratio.min(), rational.denominator, knots), float(ratio.max() / ratio.min())),
+                d,
+            )
+        worse = np.setdiff1d(_extremes(ratio, 1.0, float(ratio[chosen].max())), chosen)
+        if not bad and (not worse.size or (best is not None and best.ratio > hopeless)):
+            break
+        chosen = np.union1d(chosen, worse)
+        cuts = np.unique(np.concatenate([cuts, bad, [np.sqrt(x * y) for x, y in pairwise(bad)]]))
+    return best
+
+
+def _extremes(ratio: Array, low: float, high: float) -> Array:
+    """Indices of local extremes of the ratio that leave [low, high] by more than 0.01 dB."""
+    inner = np.concatenate([[ratio[0]], ratio, [ratio[-1]]])
+    dips = (ratio <= inner[:-2]) & (ratio <= inner[2:]) & (ratio < low * (1 - _EXCHANGE))
+    peaks = (ratio >= inner[:-2]) & (ratio >= inner[2:]) & (ratio > high * (1 + _EXCHANGE))
+    return np.flatnonzero(dips | peaks)
+
+
+def _as_side(side: Side | str) -> Side:
+    try:
+        return Side(side)
+    except ValueError as error:
+        raise ConfigError(f"Magnitude fit: side {side!r} is unknown; choose 'above' or 'below'.") from error
+
+
+def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array, side: Side) -> Array:
+    """Return magnitudes with a relative floor."""
+    values = np.asarray(magnitude, float)
+    if values.shape != freqs.shape:
+        raise DimensionError(f"Magnitude fit: needs one magnitude for each of {len(freqs)} frequencies, found shape {values.shape}.")
+    if not (np.isfinite(values) & (values >= 0)).all():
+        where = int(np.argmin(np.isfinite(values) & (values >= 0)))
+        raise DataError(
+            f"Magnitude fit: magnitudes should be finite and not negative, found {values[where]} at {freqs[where]} Hz; look at the responses."
+        )
+    if side is Side.BELOW and not values.any():
+        raise DataError("Magnitude fit: nothing but zero fits below a magnitude of zero; ask for a bound from above.")
+    return np.maximum(values, _FLOOR * values.max())

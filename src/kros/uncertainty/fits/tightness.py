@@ -1,0 +1,103 @@
+"""Order against tightness: what a further state of a weight buys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.artifacts import load_artifact, save_artifact
+from ..weights.cover import Structure
+from ..weights.weight import Residuals, fit_weight
+from .magnitude import _FLOOR, FittedMagnitude, Side, _Problem, fit_magnitude
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Tightness:
+    """Overbounds over orders.
+
+    Parameters
+    ----------
+    orders : ndarray of int, shape (n_orders,)
+        Of a magnitude, or the largest of one entry of a weight.
+    overbound_db : ndarray, shape (n_orders,), dB
+    proven_db : ndarray, shape (n_orders,), dB
+        What no fit of that order goes below (magnitudes); zero where nothing is proven.
+    states : ndarray of int, shape (n_orders,)
+        Of all entries together.
+    """
+
+    orders: Array
+    overbound_db: Array
+    proven_db: Array
+    states: Array
+
+    def save(self, folder: Path) -> None:
+        """Write ``tightness.json``."""
+        save_artifact(Path(folder), "tightness", vars(self))
+
+    @classmethod
+    def load(cls, folder: Path) -> Tightness:
+        """Read what `save` wrote."""
+        content, _ = load_artifact(Path(folder), "tightness")
+        return cls(**{f.name: np.array(content[f.name]) for f in fields(cls)})
+
+
+def magnitude_tightness(
+    freqs_hz: npt.ArrayLike, magnitude: npt.ArrayLike, sample_period_s: float, orders: Iterable[int] = range(1, 9)
+) -> Tightness:
+    """Return the overbound of the best fit of each order to one magnitude, each fit started from the one an order lower.
+
+    Orders, or a magnitude, that cannot be fitted are refused as by `fit_magnitude`. A system of lower order counts as one of every higher order.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty.fits.tightness import magnitude_tightness
+    >>> freqs = np.geomspace(1e-3, 500.0, 200)
+    >>> curve = magnitude_tightness(freqs, 1 / np.hypot(1.0, freqs / 3.0) + 0.01, 1e-3, range(1, 4))
+    >>> bool(curve.overbound_db[-1] < curve.overbound_db[0])
+    True
+    """
+    chosen = np.array(list(orders), int)
+    fits = _fit_orders(freqs_hz, magnitude, sample_period_s, int(chosen.max(initial=0)))
+    best = [min((f for f in fits if f.order <= n), key=lambda f: f.overbound_db) for n in chosen]
+    proven = [max((f.proven_db for f in fits if f.order >= n), default=0.0) for n in chosen]  # of an order, hence of every lower one
+    return Tightness(chosen, np.array([f.overbound_db for f in best]), np.array(proven), np.array([f.order for f in best]))
+
+
+def _fit_orders(freqs_hz: npt.ArrayLike, magnitude: npt.ArrayLike, sample_period_s: float, highest: int) -> list[FittedMagnitude]:
+    """Fits of order 0, 1, ..., each started from the one before; fewer where programs fail."""
+    constant = fit_magnitude(freqs_hz, magnitude, sample_period_s, order=0)
+    if constant.overbound_db == 0:
+        return [constant]
+    freqs, values = np.asarray(freqs_hz, float), np.asarray(magnitude, float)
+    problem = _Problem(freqs, np.maximum(values, _FLOOR * values.max()), sample_period_s, Side.ABOVE, 0, 0)
+    found, lower = [constant], None
+    for order in range(highest + 1):
+        fit, lower = problem.fit(order, 0.0, lower, last=True)
+        found += [fit] if fit is not None and order > 0 else []
+    return found
+
+
+def weight_tightness(
+    residuals: Residuals,
+    freqs_hz: Array,
+    sample_period_s: float,
+    orders: Iterable[int] = range(1, 9),
+    *,
+    structure: Structure | str = Structure.DIAGONAL,
+    density: int = 10,
+) -> Tightness:
+    """Return the overbound of weights whose entries have at most each order; nothing is proven about the best ones."""
+    chosen = np.array(list(orders), int)
+    options: dict[str, Any] = {"structure": structure, "tolerance_db": 0.0, "density": density}
+    found = [fit_weight(residuals, freqs_hz, sample_period_s, max_order=int(n), **options)[0] for n in chosen]
+    states = np.array([sum(w.left_orders) + sum(w.right_orders) for w in found])
+    return Tightness(chosen, np.array([w.overbound_db_max for w in found]), np.zeros(len(chosen)), states)

@@ -1,0 +1,1 @@
+"""Units that stick out, and how far a good one may."""

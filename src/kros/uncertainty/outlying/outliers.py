@@ -1,0 +1,362 @@
+r"""Outliers (Appendix A): units whose residual exceeds the cover of the others.
+
+For every pair of units the residual of the form is taken with the one as nominal and the other as perturbed plant (`distances`). A unit's
+distance at a frequency is the median over all nominals of the largest singular value, averaged (in dB) over a third of a decade:
+
+    distance_i(f) = smooth median_(k != i) sigma_max(D_l^-1 E(G_k, G_i) D_r^-1)
+    excess_i      = max_f ( distance_i(f) - max_(k != i) distance_k(f) ),    dB
+
+No single nominal decides, and the nominal of the study has a score like any other unit. Beside it the excess is computed with every unit as
+the only nominal, as the paper states its criterion: the range over the nominals, and the share of them under which the unit is conspicuous.
+
+Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold is the bound of a
+generalised extreme value model of the others' scores at the stated rate (`tail`): an extrapolation, and labelled as such. Units are taken
+out one at a time while they are beyond; where none is, groups that hide one another are looked for (`groups`), up to a third of the units
+and eight at once. With three units nothing can be flagged: two scores make no model. Two units are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.artifacts import load_artifact, save_artifact
+from ...core.errors import ConfigError, DataError, DimensionError
+from ..forms import Form, as_form
+from ..residuals import check_responses
+from .distances import Distances, balance, distances, largest_entries
+from .groups import excess, separate
+from .tail import leave_one_out_bounds
+
+Array = npt.NDArray[Any]
+
+FALSE_ALARM_RATE = 3e-3
+_FREQUENCIES = 120
+
+
+@dataclass(frozen=True)
+class OutlierScore:
+    """How far one unit exceeds the cover of the others.
+
+    Parameters
+    ----------
+    unit : str
+    score_db : float, dB
+        The excess, referred to the threshold: a unit that is out covers the others and lowers their scores, and with them its own
+        threshold; the difference is added to its excess, so that one threshold serves all units.
+    threshold_db : float, dB
+    outlier : bool
+    freq_hz : float, Hz
+        Where the excess is largest.
+    entry : tuple of int
+        Row and column of the residual's largest entry there, relative to its typical size.
+    excess_db : float, dB
+        Largest excess over frequency over the cover of the inliers; negative for a unit that the others cover everywhere.
+    lowest_db, highest_db : float, dB
+        Range of the excess over all choices of one nominal unit.
+    agreement : float
+        Share of those nominals under which the unit is beyond the threshold that the others' scores then make.
+    """
+
+    unit: str
+    score_db: float
+    threshold_db: float
+    outlier: bool
+    freq_hz: float
+    entry: tuple[int, int]
+    excess_db: float
+    lowest_db: float
+    highest_db: float
+    agreement: float
+
+
+@dataclass(frozen=True, eq=False)
+class OutlierModel:
+    """Responses of the inliers of a population, against which units are scored.
+
+    Parameters
+    ----------
+    form : Form
+    unit_ids : tuple of str
+        Inliers.
+    freqs_hz : ndarray, shape (frequency,), Hz
+    responses : ndarray, shape (unit, frequency, p, m), complex
+        In scaled coordinates.
+    output_scale, input_scale : ndarray, shape (p,) and (m,)
+    scores : tuple of OutlierScore
+        Of all units that were scored when the model was made, outliers among them.
+    threshold_db : float, dB
+        Infinity where there are too few units.
+    false_alarm_rate : float
+        Nominal rate per unit.
+    extrapolated : bool
+        Whether the rate is below 1 / (N + 1), so that it rests on the tail model alone.
+    nominal_ids : tuple of str
+        Units that were the nominal in turn: all, or 64 of them.
+    by_nominal_db : ndarray, shape (nominal, scored unit), dB
+        The excess with one unit as the only nominal, NaN of a unit against itself.
+    """
+
+    form: Form
+    unit_ids: tuple[str, ...]
+    freqs_hz: Array
+    responses: Array
+    output_scale: Array
+    input_scale: Array
+    scores: tuple[OutlierScore, ...]
+    threshold_db: float
+    false_alarm_rate: float
+    extrapolated: bool
+    nominal_ids: tuple[str, ...]
+    by_nominal_db: Array
+
+    def score(self, unit: str, response: npt.ArrayLike) -> OutlierScore:
+        """Score a new unit.
+
+        Parameters
+        ----------
+        unit : str
+        response : array_like, shape (frequency, p, m), complex
+            At `freqs_hz`, in physical units.
+
+        Returns
+        -------
+        OutlierScore
+
+        Raises
+        ------
+        DimensionError
+            When the response does not have the shape of the population's.
+        DataError
+            When the response is not finite.
+        """
+        G = np.asarray(response)
+        if G.shape != self.responses.shape[1:]:
+            raise DimensionError(
+                f"Scoring unit {unit}: needs a response of shape {self.responses.shape[1:]} at the stored frequencies, found {G.shape}."
+            )
+        _require_finite(G[None], (unit,), self.freqs_hz)
+        everyone = np.concatenate([self.responses, (G / self.output_scale[:, None] * self.input_scale)[None]])
+        found = distances(self.form, everyone, self.freqs_hz)
+        last = np.arange(len(everyone)) == len(everyone) - 1
+        margin = _margins(found.levels, self.false_alarm_rate)[1][-1]
+        summary = _Nominals.of(found, ~last, self.false_alarm_rate)
+        return _scores(self.form, everyone, self.freqs_hz, found, ~last, (margin,), (unit,), self.threshold_db, summary, [len(last) - 1])[0]
+
+    def save(self, folder: Path) -> None:
+        """Write ``arrays.npz`` and ``outlier_model.json``."""
+        content = {
+            "form": self.form,
+            "unit_ids": self.unit_ids,
+            "threshold_db": self.threshold_db,
+            "false_alarm_rate": self.false_alarm_rate,
+            "extrapolated": self.extrapolated,
+            "nominal_ids": self.nominal_ids,
+            "scores": [{**vars(s), "threshold_db": None} for s in self.scores],
+        }
+        save_artifact(Path(folder), "outlier_model", content, {name: getattr(self, name) for name in _ARRAYS})
+
+    @classmethod
+    def load(cls, folder: Path) -> OutlierModel:
+        """Read what `save` wrote."""
+        content, arrays = load_artifact(Path(folder), "outlier_model")
+        threshold = float("inf") if content["threshold_db"] is None else content["threshold_db"]
+        scores = tuple(OutlierScore(**{**s, "threshold_db": threshold, "entry": tuple(s["entry"])}) for s in content["scores"])
+        return cls(
+            form=Form(content["form"]),
+            unit_ids=tuple(content["unit_ids"]),
+            scores=scores,
+            threshold_db=threshold,
+            false_alarm_rate=content["false_alarm_rate"],
+            extrapolated=content["extrapolated"],
+            nominal_ids=tuple(content["nominal_ids"]),
+            **{name: arrays[name] for name in _ARRAYS},
+        )
+
+
+_ARRAYS = ("freqs_hz", "responses", "output_scale", "input_scale", "by_nominal_db")
+
+
+def score_outliers(
+    responses: npt.ArrayLike | Sequence[npt.ArrayLike],
+    freqs_hz: npt.ArrayLike,
+    form: Form | str = Form.ADDITIVE,
+    *,
+    unit_ids: tuple[str, ...] | None = None,
+    output_scale: npt.ArrayLike | None = None,
+    input_scale: npt.ArrayLike | None = None,
+    false_alarm_rate: float = FALSE_ALARM_RATE,
+) -> OutlierModel:
+    """Score every unit of a population against the others.
+
+    Parameters
+    ----------
+    responses : array_like, shape (unit, frequency, p, m), complex
+        In physical units, of all units; nothing but the responses is looked at.
+    freqs_hz : array_like, shape (frequency,), Hz
+        Increasing, above zero.
+    form : Form or str
+    unit_ids : tuple of str, optional
+    output_scale, input_scale : array_like, optional
+        Ranges; without both, those at which the responses' typical entries are equal, so that units of measure never matter.
+    false_alarm_rate : float
+        Nominal rate per unit of the tail model.
+
+    Returns
+    -------
+    OutlierModel
+        With the scores of all units, and the inliers to score new units against.
+
+    Raises
+    ------
+    DataError
+        With fewer than three units there are no others to be covered; when a response is not finite.
+    DimensionError
+        When units have responses of different shapes.
+    ConfigError
+        When the rate is not between 0 and 1.
+    """
+    G, ids, freqs = _population(responses, unit_ids, freqs_hz)
+    form, rate = as_form(form), float(false_alarm_rate)
+    if not 0 < rate < 1:
+        raise ConfigError(f"Outlier scores: need a false alarm rate between 0 and 1, found {rate}; 0.003 is usual.")
+    rows = np.unique(np.linspace(0, len(freqs) - 1, _FREQUENCIES).round().astype(int))
+    freqs, G = freqs[rows], G[:, rows]
+    given = output_scale is not None or input_scale is not None
+    scales = tuple(np.ones(n) if s is None else np.asarray(s, float) for s, n in ((output_scale, G.shape[2]), (input_scale, G.shape[3])))
+    scales = scales if given else balance(G)
+    if any(s.shape != (n,) or not (np.isfinite(s).all() and (s > 0).all()) for s, n in zip(scales, G.shape[2:], strict=True)):
+        raise DimensionError(
+            f"Outlier scores: ranges should be {G.shape[2]} positive numbers for the outputs and {G.shape[3]} for the inputs, "
+            f"found {scales[0].tolist()} and {scales[1].tolist()}."
+        )
+    G = G / scales[0][:, None] * scales[1]
+    found = distances(form, G, freqs)
+    parts = separate(found.levels, rate)
+    summary = _Nominals.of(found, parts.inliers, rate)
+    margins = tuple(float(m) for m in parts.margin_db)
+    scores = _scores(form, G, freqs, found, parts.inliers, margins, ids, parts.threshold_db, summary, range(len(G)))
+    inliers = np.flatnonzero(parts.inliers)
+    return OutlierModel(
+        form=form,
+        unit_ids=tuple(ids[k] for k in inliers),
+        freqs_hz=freqs,
+        responses=G[inliers],
+        output_scale=scales[0],
+        input_scale=scales[1],
+        scores=scores,
+        threshold_db=parts.threshold_db,
+        false_alarm_rate=rate,
+        extrapolated=rate < 1 / (len(inliers) + 1),
+        nominal_ids=tuple(ids[k] for k in found.nominals),
+        by_nominal_db=summary.excess_db,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Nominals:
+    """Excess of every unit with one nominal at a time, shape (nominal, unit), and whether it is beyond its threshold."""
+
+    excess_db: Array
+    beyond: Array
+
+    @classmethod
+    def of(cls, found: Distances, inliers: npt.NDArray[np.bool_], rate: float) -> _Nominals:
+        shape = found.by_nominal.shape[:2]
+        values, beyond = np.full(shape, np.nan), np.zeros(shape, bool)
+        for row, nominal in enumerate(found.nominals):
+            others = np.arange(shape[1]) != nominal
+            for units, members in _juries(inliers & others, others):
+                score, margin = _margins(found.by_nominal[row, members], rate)
+                place = np.searchsorted(members, units)
+                values[row, units], beyond[row, units] = score[place], margin[place] > 0
+        return cls(values, beyond)
+
+    def summary(self, unit: int) -> tuple[float, float, float]:
+        """Return lowest and highest excess and agreement."""
+        known = np.isfinite(self.excess_db[:, unit])
+        values = self.excess_db[known, unit]
+        return float(values.min()), float(values.max()), float(self.beyond[known, unit].mean())
+
+
+def _juries(inliers: npt.NDArray[np.bool_], wanted: npt.NDArray[np.bool_]) -> list[tuple[Array, Array]]:
+    """Units, and the units that they are scored among: inliers together, every other unit alone with them."""
+    together = np.flatnonzero(inliers)
+    alone = [(np.array([k]), np.sort(np.append(together, k))) for k in np.flatnonzero(wanted & ~inliers)]
+    return [(together, together), *alone] if len(together) > 1 else alone
+
+
+def _margins(levels: Array, rate: float) -> tuple[Array, Array]:
+    """Excess of all units, and what it has beyond the bound of the others' scores."""
+    if len(levels) < 2:
+        return np.zeros(len(levels)), np.full(len(levels), -np.inf)
+    scores = excess(levels)[0]
+    return scores, scores - leave_one_out_bounds(scores, rate)
+
+
+def _scores(
+    form: Form,
+    G: Array,
+    freqs: Array,
+    found: Distances,
+    inliers: npt.NDArray[np.bool_],
+    margins: tuple[float, ...],
+    ids: tuple[str, ...],
+    threshold: float,
+    summary: _Nominals,
+    units: Sequence[int],
+) -> tuple[OutlierScore, ...]:
+    """Scores of some units; `margins` and `ids` are theirs."""
+    wanted = np.isin(np.arange(len(G)), np.asarray(units))
+    value, where = np.zeros(len(G)), np.zeros(len(G), int)
+    for some, members in _juries(inliers, wanted | inliers):
+        score, place = excess(found.levels[members])
+        value[some], where[some] = score[np.searchsorted(members, some)], place[np.searchsorted(members, some)]
+    rows = where[list(units)]
+    entries = largest_entries(form, G, found, np.asarray(units), rows)
+    scores = []
+    for k, unit, margin, row, entry in zip(units, ids, margins, rows, entries, strict=True):
+        referred = float(value[k]) if not np.isfinite(margin) else threshold + margin
+        beyond = bool(np.isfinite(threshold) and margin > 0)
+        scores.append(OutlierScore(unit, referred, threshold, beyond, float(freqs[row]), entry, float(value[k]), *summary.summary(k)))
+    return tuple(scores)
+
+
+def _population(
+    responses: npt.ArrayLike | Sequence[npt.ArrayLike], unit_ids: tuple[str, ...] | None, freqs_hz: npt.ArrayLike
+) -> tuple[Array, tuple[str, ...], Array]:
+    """Checked responses, names and frequencies."""
+    listed = responses if isinstance(responses, np.ndarray) else [np.asarray(r) for r in responses]  # type: ignore[union-attr]
+    ids = tuple(str(k) for k in range(len(listed))) if unit_ids is None else tuple(unit_ids)
+    freqs = np.asarray(freqs_hz, float)
+    for name, one in zip(ids, listed, strict=False):
+        if one.shape != listed[0].shape:
+            raise DimensionError(
+                f"Outlier scores: unit {name} has a response of shape {one.shape}, unit {ids[0]} one of shape {listed[0].shape}; "
+                "bring all units to the same frequencies and channels."
+            )
+    G = check_responses(np.asarray(listed))
+    if len(G) < 3 or len(ids) != len(G) or freqs.shape != G.shape[1:2]:
+        raise DataError(
+            f"Outlier scores: need at least three units, one id each, and one frequency for each response; found {len(G)} units, {len(ids)} ids, "
+            f"{freqs.size} frequencies for {G.shape[1]}."
+        )
+    if not np.isfinite(freqs).all() or np.any(np.diff(freqs) <= 0) or freqs[0] <= 0:
+        raise ConfigError(f"Outlier scores: need increasing positive frequencies, found {freqs[:3]}.")
+    _require_finite(G, ids, freqs)
+    return G, ids, freqs
+
+
+def _require_finite(G: Array, ids: tuple[str, ...], freqs: Array) -> None:
+    bad = np.argwhere(~np.isfinite(G))
+    if len(bad):
+        unit, row, i, j = bad[0]
+        raise DataError(
+            f"Outlier scores: the response of unit {ids[unit]} is {G[unit, row, i, j]} at {freqs[row]:.4g} Hz, entry ({i}, {j}), and not finite at "
+            f"{len(bad)} places in all; leave the unit out, or look at its model."
+        )

@@ -1,0 +1,229 @@
+r"""What is variation and what is noise: the residuals of a population beside those that finite recordings alone would make.
+
+    bootstrapped models of every unit --responses--> draws (unit, draw, frequency)
+    total(f) = mean over pairs of units   |E(G_k, G_i)|_F^2          what is seen: variation and noise of both estimates
+    noise(f) = mean over pairs of draws   |E(G_i*, G_i**)|_F^2       of the same unit: what would be seen of identical units
+    ratio(f) = noise / total
+
+For the additive form the noise of both estimates adds to the squared difference, so the ratio is an unbiased comparison of mean squares (the
+within over the total mean square of a one-way random-effects analysis of variance); for the other forms it is one to first order in the
+residual. It scatters: with identical units around one, by about ``sqrt(2 / (units - 1))`` and less. The share is the ratio cut at one.
+
+What the bootstrap does not see is not in it: a bias that all episodes share counts as variation where it differs between units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.artifacts import load_artifact, save_artifact
+from ...core.errors import ConfigError, DataError, DimensionError
+from ...core.frequency import check_grid
+from ...core.lti import StateSpace
+from ...identify import KoopmanMatrices, ModelSamples
+from ..forms import Form, as_form, residual
+from ..residuals import sigma_max
+from ..small import squared
+
+Array = npt.NDArray[Any]
+
+_AT_ONCE = 4_000_000  # complex numbers in memory
+_MOST_NOMINALS = 64
+_ARRAYS = ("freqs_hz", "residual", "band", "total", "noise")
+
+
+@dataclass(frozen=True, eq=False)
+class VariationAndNoise:
+    """Residuals of a population and the part of them that the recordings' finite length explains.
+
+    Parameters
+    ----------
+    form : Form
+    unit_ids : tuple of str
+    nominal : int
+        Row of the nominal unit.
+    level : float
+        Of the band.
+    freqs_hz : ndarray, shape (frequency,), Hz
+    residual : ndarray, shape (unit, frequency)
+        Largest singular value of the residual against the nominal unit, in scaled coordinates.
+    band : ndarray, shape (unit, frequency)
+        What the largest singular value of the residual between a unit and a resampled model of its own stays below with probability `level`.
+    total, noise : ndarray, shape (frequency,)
+        Mean squared Frobenius norms of residuals between units, and between resampled models of the same unit.
+    """
+
+    form: Form
+    unit_ids: tuple[str, ...]
+    nominal: int
+    level: float
+    freqs_hz: Array
+    residual: Array
+    band: Array
+    total: Array
+    noise: Array
+
+    @property
+    def ratio(self) -> Array:
+        """Noise over total, shape (frequency,); above one where chance has it, zero where there is neither."""
+        return np.divide(self.noise, self.total, out=np.where(self.noise > 0, np.inf, 0.0), where=self.total > 0)
+
+    @property
+    def noise_share(self) -> Array:
+        """Share of the squared residual that estimation explains, shape (frequency,), within [0, 1]."""
+        return np.minimum(self.ratio, 1.0)
+
+    @property
+    def variation_share(self) -> Array:
+        """Share of the squared residual that the units' differences explain, shape (frequency,)."""
+        return 1.0 - self.noise_share
+
+    def save(self, folder: Path) -> None:
+        """Write ``arrays.npz`` and ``variation_and_noise.json``."""
+        content = {"form": self.form, "unit_ids": self.unit_ids, "nominal": self.nominal, "level": self.level}
+        save_artifact(Path(folder), "variation_and_noise", content, {name: getattr(self, name) for name in _ARRAYS})
+
+    @classmethod
+    def load(cls, folder: Path) -> VariationAndNoise:
+        """Read what `save` wrote."""
+        content, arrays = load_artifact(Path(folder), "variation_and_noise")
+        return cls(
+            form=Form(content["form"]),
+            unit_ids=tuple(content["unit_ids"]),
+            nominal=content["nominal"],
+            level=content["level"],
+            **{name: arrays[name] for name in _ARRAYS},
+        )
+
+
+def variation_and_noise(
+    models: ModelSamples,
+    freqs_hz: npt.ArrayLike,
+    sample_period_s: float,
+    form: Form | str = Form.ADDITIVE,
+    *,
+    nominal: int = 0,
+    output_scale: npt.ArrayLike | None = None,
+    input_scale: npt.ArrayLike | None = None,
+    level: float = 0.95,
+) -> VariationAndNoise:
+    """Compare the residuals between units with those between resampled models of the same unit.
+
+    Parameters
+    ----------
+    models : ModelSamples
+        Of at least two units, with at least two draws, as `kros.identify.bootstrap_edmd` or `bootstrap_refined` gives them.
+    freqs_hz : array_like, shape (frequency,), Hz
+    sample_period_s : float, s
+    form : Form or str
+    nominal : int
+        Row of the unit against which residuals are shown; the shares do not depend on it.
+    output_scale, input_scale : array_like, shape (n,) and (m,), optional
+        Ranges of lifted states and inputs, as in `ModelSet`; ones by default.
+    level : float
+        Quantile of the band over the draws.
+
+    Returns
+    -------
+    VariationAndNoise
+
+    Raises
+    ------
+    DataError
+        With fewer than two units or draws, or when a model is not finite.
+    DimensionError
+        When scales do not fit, or are not positive.
+    ConfigError
+        When `level` is no probability, the nominal no unit, or the frequencies no grid.
+    """
+    form, freqs = as_form(form), check_grid(freqs_hz, sample_period_s)
+    units, draws, n, m = _require(models, nominal, level)
+    scale = _scale(output_scale, n)[:, None] / _scale(input_scale, m)
+    # Responses of the estimates, scaled: (unit, frequency, n, m).
+    G = _response(models.estimate, freqs, sample_period_s) / scale
+    noise, band = np.zeros(len(freqs)), np.empty((units, len(freqs)))
+    for row in range(units):
+        for part in _parts(len(freqs), draws * n * max(n, m)):
+            other = _draws(models, row, freqs[part], sample_period_s, G[row, part] * scale) / scale  # (draw, frequency, n, m)
+            noise[part] += _mean_square(residual(form, other, np.roll(other, 1, axis=0))) / units
+            band[row, part] = np.quantile(sigma_max(residual(form, G[row, part], other)), level, axis=0)
+    return VariationAndNoise(
+        form=form,
+        unit_ids=models.unit_ids,
+        nominal=nominal,
+        level=level,
+        freqs_hz=freqs,
+        residual=sigma_max(residual(form, G[nominal], G)),
+        band=band,
+        total=_between(form, G),
+        noise=noise,
+    )
+
+
+def _between(form: Form, G: Array) -> Array:
+    """Mean squared residual over ordered pairs of units, with at most 64 of them as nominals."""
+    units = len(G)
+    chosen = np.unique(np.linspace(0, units - 1, min(units, _MOST_NOMINALS)).round().astype(int))
+    total = np.zeros(G.shape[1])
+    for k in chosen:
+        total += _mean_square(residual(form, G[k], G)) * units / (units - 1)  # a unit against itself adds nothing
+    return total / len(chosen)
+
+
+def _mean_square(E: Array) -> Array:
+    """Mean over the first axis of squared Frobenius norms, shape (frequency,)."""
+    return np.asarray(squared(E).sum(axis=(-2, -1)).mean(axis=0))
+
+
+def _draws(models: ModelSamples, row: int, freqs: Array, sample_period_s: float, G: Array) -> Array:
+    """Responses of one unit's resampled models; first-order samples have first-order deviations, ``(zI - A)^-1 dW [G; I]``."""
+    A, B = models.samples.A[row], models.samples.B[row]
+    if not models.linear:
+        return _response(KoopmanMatrices(A, B), freqs, sample_period_s)
+    own_A, own_B = models.estimate.A[row], models.estimate.B[row]
+    Phi = _response(KoopmanMatrices(own_A, np.eye(len(own_A))), freqs, sample_period_s)
+    return np.asarray(G + Phi @ ((A - own_A)[:, None] @ G + (B - own_B)[:, None]))
+
+
+def _response(models: KoopmanMatrices, freqs: Array, sample_period_s: float) -> Array:
+    n, m = models.B.shape[-2:]
+    C, D = (np.broadcast_to(M, (*models.A.shape[:-2], *M.shape)) for M in (np.eye(n), np.zeros((n, m))))
+    return StateSpace(models.A, models.B, C, D, sample_period_s).frequency_response(freqs)
+
+
+def _require(models: ModelSamples, nominal: int, level: float) -> tuple[int, int, int, int]:
+    units, draws, n, m = *models.samples.A.shape[:2], models.samples.A.shape[-1], models.samples.B.shape[-1]
+    if units < 2 or draws < 2:
+        raise DataError(f"Variation and noise: needs at least two units and two draws of each, found {units} and {draws}.")
+    for unit, parts in zip(models.unit_ids, zip(*_matrices(models), strict=True), strict=True):
+        if not all(np.isfinite(p).all() for p in parts):
+            raise DataError(
+                f"Variation and noise: unit {unit} has a model or a draw that is not finite; leave the unit out, or raise alpha."
+            )
+    if not 0 < level < 1 or not 0 <= nominal < units:
+        raise ConfigError(
+            f"Variation and noise: the level should be between 0 and 1 and the nominal a row of {units} units, found {level} and {nominal}."
+        )
+    return units, draws, n, m
+
+
+def _matrices(models: ModelSamples) -> tuple[Array, ...]:
+    return models.estimate.A, models.estimate.B, models.samples.A, models.samples.B
+
+
+def _scale(scale: npt.ArrayLike | None, size: int) -> Array:
+    values = np.ones(size) if scale is None else np.asarray(scale, dtype=float)
+    if values.shape != (size,) or not (np.isfinite(values).all() and (values > 0).all()):
+        raise DimensionError(f"Variation and noise: a scale should hold {size} positive numbers, found {values.tolist()}.")
+    return values
+
+
+def _parts(count: int, size: int) -> Iterator[slice]:
+    step = max(1, _AT_ONCE // size)
+    return (slice(start, start + step) for start in range(0, count, step))

@@ -1,0 +1,231 @@
+r"""Exact search for the best nominal among many candidates, without visiting all pairs.
+
+A candidate's bound is the largest residual over the units, `b_c(f) = max_k sigma(E(c, k, f))`; any units and frequencies that were looked at give a bound of
+`b_c` from below. The search evaluates the candidate with the lowest such bound over *all* units, asks which unit was the worst at every frequency, and
+raises the lower bounds of all other candidates by these witnesses. A candidate whose lower bound exceeds the best score so far is never evaluated;
+when none is left below, the best is the best of all: nothing is assumed about the population. A population has few extreme units, so that
+few rounds are needed; each visits as many pairs as there are units, not their square.
+
+A peak is looked for on part of the frequencies first, because a maximum over part of them is a lower bound as well. A mean needs all.
+
+Plants are tall here: wide ones are transposed, with the dual form, and the inverse additive form then has its plants exchanged (see `residuals`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..forms import Form
+from ..small import entries_first, multiply, pseudo_inverse_first, sigma_max_first, triangle
+
+Array = npt.NDArray[Any]
+Score = Callable[[Array], Array]
+
+_VECTOR = 16000  # complex numbers in a vector
+_COARSE = 16  # every so many frequencies a peak is looked for first
+_TIE = 1e-9  # relative; scores closer than rounding are one
+
+
+@dataclass(frozen=True, eq=False)
+class Plants:
+    """Responses with what residuals need of them, entries first: (p, m, unit, frequency).
+
+    Parameters
+    ----------
+    G : ndarray, shape (p, m, unit, frequency), p >= m
+    P : ndarray, shape (m, p, unit, frequency), or None
+        Pseudo-inverses, for the forms that need them.
+    L : ndarray, shape (m, m, unit, frequency), or None
+        Triangles with `P P^H = L L^H`.
+    """
+
+    G: Array
+    P: Array | None
+    L: Array | None
+
+    def part(self, *index: Any) -> Plants:
+        """Return some units and frequencies; two integer arrays are matched, as in NumPy."""
+        key = (slice(None), slice(None), *index)
+        return Plants(self.G[key], None if self.P is None else self.P[key], None if self.L is None else self.L[key])
+
+    def one(self, unit: int) -> Plants:
+        """Return one unit, with its axis."""
+        return self.part(slice(unit, unit + 1))
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A form for tall plants, and whether they were transposed for it."""
+
+    form: Form
+    wide: bool
+
+    @classmethod
+    def of(cls, form: Form, shape: tuple[int, int]) -> Geometry:
+        """Return the geometry for plants of a shape (outputs, inputs)."""
+        wide = shape[0] < shape[1]
+        return cls(form.dual if wide else form, wide)
+
+    def plants(self, responses: Array) -> Plants:
+        """Prepare responses of shape (unit, frequency, p, m), some units at a time."""
+        G = entries_first(np.swapaxes(responses, -1, -2) if self.wide else responses)
+        if self.form is Form.ADDITIVE:
+            return Plants(G, None, None)
+        p, m, n_units, n_freqs = G.shape
+        inverse = self.form in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE, Form.INVERSE_ADDITIVE)
+        factor = self.form in (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE, Form.INVERSE_ADDITIVE)
+        P = np.empty((m, p, n_units, n_freqs), complex) if inverse else None
+        L = np.empty((m, m, n_units, n_freqs), complex) if factor else None
+        for rows in blocks(n_units, n_freqs):
+            pseudo_inverses = pseudo_inverse_first(np.moveaxis(G[:, :, rows], (0, 1), (-2, -1)))
+            if P is not None:
+                P[:, :, rows] = pseudo_inverses
+            if L is not None:
+                L[:, :, rows] = triangle(pseudo_inverses)
+        return Plants(G, P, L)
+
+    def sigma(self, nominal: Plants, units: Plants) -> Array:
+        """Return the largest singular value of the residuals; the axes of units and frequencies broadcast."""
+        D = units.G - nominal.G
+        if self.form is Form.ADDITIVE:
+            return sigma_max_first(D)
+        if self.form is Form.INVERSE_ADDITIVE:
+            first, second = (nominal, units) if self.wide else (units, nominal)
+            return sigma_max_first(multiply(multiply(_known(first.P), D), _known(second.L)))
+        base = units if self.form in (Form.INVERSE_INPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE) else nominal
+        if self.form in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE):
+            return sigma_max_first(multiply(_known(base.P), D))
+        return sigma_max_first(multiply(D, _known(base.L)))
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Result of a search.
+
+    Parameters
+    ----------
+    index : int
+        Best candidate; of several equal ones the first.
+    bound : ndarray, shape (frequency,)
+        Its largest residual over the units.
+    scores : ndarray, shape (candidate,)
+        Where a candidate was evaluated its score, elsewhere a lower bound; infinity where it was not allowed.
+    evaluated : ndarray of bool, shape (candidate,)
+        Which scores are exact.
+    """
+
+    index: int
+    bound: Array
+    scores: Array
+    evaluated: Array
+
+
+def search(geometry: Geometry, candidates: Plants, units: Plants, allowed: Array, score: Score, *, partial: bool) -> Found:
+    """Return the allowed candidate whose bound has the lowest score.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    candidates : Plants
+        Among them the units themselves: a residual of zero with itself changes no maximum.
+    units : Plants
+    allowed : ndarray of bool, shape (candidate,)
+    score : callable
+        From bounds (..., frequency) to scores (...), non-negative and never falling when a bound rises.
+    partial : bool
+        Whether the score of some of the frequencies bounds that of all from below.
+
+    Returns
+    -------
+    Found
+    """
+    n_freqs = units.G.shape[3]
+    coarse = np.unique(np.linspace(0, n_freqs - 1, max(2, n_freqs // _COARSE)).round().astype(int)) if partial else np.arange(n_freqs)
+    few_candidates, few_units = (candidates.part(slice(None), coarse), units.part(slice(None), coarse)) if partial else (candidates, units)
+    lower = np.zeros((len(allowed), len(coarse)))
+    scores = np.where(allowed, 0.0, np.inf)
+    evaluated = np.zeros(len(allowed), bool)
+    best, bound, holder, waiting = np.inf, np.zeros(n_freqs), -1, allowed.copy()
+    while waiting.any():
+        rows = np.flatnonzero(waiting)
+        row = int(rows[np.argmin(scores[rows])]) if evaluated.any() else _central(candidates, rows)
+        if scores[row] > best * (1 + _TIE):
+            break
+        lower[row], witness = bound_of(geometry, few_candidates.one(row), few_units)
+        scores[row], waiting[row] = max(scores[row], float(score(lower[row]))), False
+        raised = few_units.part(witness, np.arange(len(coarse)))
+        if scores[row] <= best * (1 + _TIE):
+            full, who = bound_of(geometry, candidates.one(row), units) if partial else (lower[row], witness)
+            scores[row], evaluated[row] = float(score(full)), True
+            if scores[row] < best:
+                best, bound, holder = scores[row], full, row
+            if partial and waiting.any():
+                peak = int(np.argmax(full))
+                _raise_at(
+                    geometry, candidates, units.part(slice(who[peak], who[peak] + 1), slice(peak, peak + 1)), peak, waiting, scores, score
+                )
+        rows = np.flatnonzero(waiting & (scores <= best * (1 + _TIE)))
+        _raise_by(geometry, few_candidates, raised, rows, lower)
+        scores[rows] = np.maximum(scores[rows], score(lower[rows]))
+    index = first_best(np.where(evaluated, scores, np.inf))
+    if index != holder:
+        bound = bound_of(geometry, candidates.one(index), units)[0]
+    return Found(index, bound, scores, evaluated)
+
+
+def bound_of(geometry: Geometry, nominal: Plants, units: Plants) -> tuple[Array, Array]:
+    """Return the largest residual over the units and which unit it is, both of shape (frequency,)."""
+    n_units, n_freqs = units.G.shape[2:]
+    largest, who = np.full(n_freqs, -1.0), np.zeros(n_freqs, int)
+    for rows in blocks(n_units, n_freqs):
+        sigma = geometry.sigma(nominal, units.part(rows))
+        worst = np.argmax(sigma, axis=0)
+        value = np.take_along_axis(sigma, worst[None], axis=0)[0]
+        more = value > largest
+        largest[more], who[more] = value[more], worst[more] + rows.start
+    return largest, who
+
+
+def first_best(scores: Array) -> int:
+    """Return the first of the lowest scores, which rounding may have told apart."""
+    least = scores.min()
+    return int(np.argmax(scores <= least + _TIE * np.abs(least))) if np.isfinite(least) else int(np.argmin(scores))
+
+
+def blocks(n_rows: int, n_freqs: int) -> list[slice]:
+    """Return slices of rows that make vectors of a good length."""
+    step = max(1, _VECTOR // n_freqs)
+    return [slice(start, min(start + step, n_rows)) for start in range(0, n_rows, step)]
+
+
+def _raise_by(geometry: Geometry, candidates: Plants, witnesses: Plants, rows: Array, lower: Array) -> None:
+    """Raise lower bounds by one unit at every frequency."""
+    one_each = witnesses.part(None)
+    for part in blocks(len(rows), lower.shape[1]):
+        chosen = rows[part]
+        lower[chosen] = np.maximum(lower[chosen], geometry.sigma(candidates.part(chosen), one_each))
+
+
+def _raise_at(geometry: Geometry, candidates: Plants, witness: Plants, freq: int, waiting: Array, scores: Array, score: Score) -> None:
+    """Raise scores by one unit at one frequency."""
+    rows = np.flatnonzero(waiting)
+    sigma = geometry.sigma(candidates.part(rows, slice(freq, freq + 1)), witness)
+    scores[rows] = np.maximum(scores[rows], score(sigma))
+
+
+def _central(candidates: Plants, rows: Array) -> int:
+    """Return the candidate closest to the mean at a few frequencies, to begin with."""
+    some = np.linspace(0, candidates.G.shape[3] - 1, 8).astype(int)
+    G = candidates.G[..., some][:, :, rows]
+    distance = np.abs(G - G.mean(axis=2, keepdims=True)).max(axis=(0, 1))
+    return int(rows[np.argmin((distance / np.maximum(distance.max(axis=0), 1e-300)).max(axis=1))])
+
+
+def _known(factor: Array | None) -> Array:
+    assert factor is not None
+    return factor

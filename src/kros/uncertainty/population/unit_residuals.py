@@ -1,0 +1,206 @@
+r"""Residuals of every unit beside weights, in both readings: entry by entry as in the paper's figures, and as a cover.
+
+    |E_ij|                               against  |W_ij|, the best fit to the largest of the covered units     entrywise: bounds numbers
+    sigma_max(W_L^-1 E W_R^-1)           against  one                                                          sound: bounds the perturbation
+
+Nothing here decides anything: it is what pictures of an uncertain model and of an outlier show. A unit that the weights were not made for
+exceeds one where it sticks out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.artifacts import load_artifact, save_artifact
+from ...core.errors import DimensionError
+from ..fits.magnitude import fit_magnitude
+from ..forms import Form, residual
+from ..residuals import sigma_max
+from ..weights.cover import Cover, Structure, cover_ratio
+from ..weights.weight import Weight
+
+Array = npt.NDArray[Any]
+
+MOST_UNITS = 200  # that are kept for a picture
+_SINGULAR = 1e10
+_ARRAYS = ("freqs_hz", "entries", "ratio", "largest", "entry_weights", "entry_orders")
+
+
+@dataclass(frozen=True, eq=False)
+class UnitResiduals:
+    """Sizes of the residuals of many units against one nominal.
+
+    Parameters
+    ----------
+    form : Form
+    nominal_id : str
+    unit_ids : tuple of str
+        Units that are kept, at most 200 of those covered, and all others.
+    outside : tuple of str
+        Units that the weights do not have to cover.
+    freqs_hz : ndarray, shape (frequency,), Hz
+    entries : ndarray, shape (unit, frequency, p', m')
+        Magnitudes of the residual's entries, in scaled coordinates.
+    ratio : ndarray, shape (unit, frequency)
+        ``sigma_max(W_L^-1 E W_R^-1)``.
+    largest : ndarray, shape (frequency, p', m')
+        Largest entries of all covered units.
+    entry_weights : ndarray, shape (frequency, p', m')
+        Magnitudes of the systems that bound `largest`, entry by entry. They are no cover: a perturbation within them may exceed every
+        contraction between them.
+    entry_orders : ndarray of int, shape (p', m')
+    entry_excess : float
+        Largest ``sigma_max(W^-1 E)`` of a covered unit, W the entrywise systems as one matrix, where it can be inverted; NaN where it is not square.
+    """
+
+    form: Form
+    nominal_id: str
+    unit_ids: tuple[str, ...]
+    outside: tuple[str, ...]
+    freqs_hz: Array
+    entries: Array
+    ratio: Array
+    largest: Array
+    entry_weights: Array
+    entry_orders: Array
+    entry_excess: float = float("nan")
+
+    def rows(self, *, inside: bool) -> list[int]:
+        """Return rows of the units that are covered, or of those that need not be."""
+        return [k for k, unit in enumerate(self.unit_ids) if (unit not in self.outside) is inside]
+
+    def save(self, folder: Path) -> None:
+        """Write ``arrays.npz`` and ``unit_residuals.json``."""
+        content = {name: getattr(self, name) for name in ("form", "nominal_id", "unit_ids", "outside", "entry_excess")}
+        save_artifact(Path(folder), "unit_residuals", content, {name: getattr(self, name) for name in _ARRAYS})
+
+    @classmethod
+    def load(cls, folder: Path) -> UnitResiduals:
+        """Read what `save` wrote."""
+        content, arrays = load_artifact(Path(folder), "unit_residuals")
+        return cls(
+            form=Form(content["form"]),
+            nominal_id=content["nominal_id"],
+            unit_ids=tuple(content["unit_ids"]),
+            outside=tuple(content["outside"]),
+            entry_excess=float("nan") if content["entry_excess"] is None else content["entry_excess"],
+            **{name: arrays[name] for name in _ARRAYS},
+        )
+
+
+def unit_residuals(
+    form: Form,
+    nominal: Array,
+    responses: Array,
+    weights: Weight | Cover,
+    freqs_hz: Array,
+    sample_period_s: float,
+    *,
+    unit_ids: Sequence[str],
+    nominal_id: str,
+    outside: Collection[str] = (),
+    max_order: int = 4,
+    tolerance_db: float = 1.0,
+) -> UnitResiduals:
+    """Return the residuals of units against a nominal, beside weights.
+
+    Parameters
+    ----------
+    form : Form
+    nominal : ndarray, shape (frequency, p, m), complex
+        In scaled coordinates, as `responses`.
+    responses : ndarray, shape (unit, frequency, p, m), complex
+    weights : Weight or Cover
+        Systems, or magnitudes at the frequencies.
+    freqs_hz : ndarray, shape (frequency,), Hz
+    sample_period_s : float, s
+    unit_ids : sequence of str
+    nominal_id : str
+    outside : collection of str
+        Units that the weights need not cover; they take no part in the entrywise bounds.
+    max_order : int
+        Of the bound of one entry.
+    tolerance_db : float, dB
+        Overbound at which a lower order is good enough.
+
+    Returns
+    -------
+    UnitResiduals
+
+    Raises
+    ------
+    DimensionError
+        When there is not one name for each response, or nobody is covered.
+    """
+    inside = np.array([u not in outside for u in unit_ids], dtype=bool)
+    if len(unit_ids) != len(responses) or not inside.any():
+        raise DimensionError(
+            f"Residuals of units: need a name for each of {len(responses)} responses and at least one unit that is covered, "
+            f"found {len(unit_ids)} names, {int(inside.sum())} of them covered."
+        )
+    E = residual(form, nominal, responses)
+    sizes, ratio = np.abs(E), weight_ratio(weights, E, freqs_hz)
+    largest = sizes[inside].max(axis=0)
+    fitted, orders = np.empty_like(largest, dtype=complex), np.zeros(largest.shape[1:], dtype=int)
+    for i, j in np.ndindex(*largest.shape[1:]):
+        found = fit_magnitude(freqs_hz, largest[:, i, j], sample_period_s, max_order=max_order, tolerance_db=tolerance_db)
+        fitted[:, i, j] = found.system.frequency_response(freqs_hz)[:, 0, 0]
+        orders[i, j] = found.order
+    kept = shown_rows(inside)
+    return UnitResiduals(
+        form=form,
+        nominal_id=nominal_id,
+        unit_ids=tuple(unit_ids[k] for k in kept),
+        outside=tuple(u for u in unit_ids if u in outside),
+        freqs_hz=freqs_hz,
+        entries=sizes[kept],
+        ratio=ratio[kept],
+        largest=largest,
+        entry_weights=np.abs(fitted),
+        entry_orders=orders,
+        entry_excess=unstructured_excess(fitted, E[inside]),
+    )
+
+
+def weight_ratio(weights: Weight | Cover, E: Array, freqs_hz: Array) -> Array:
+    """Return ``sigma_max(W_L^-1 E W_R^-1)``, shape (unit, frequency); the largest ratio of an entry where the weights are entrywise.
+
+    Parameters
+    ----------
+    weights : Weight or Cover
+    E : ndarray, shape (unit, frequency, p', m'), complex
+    freqs_hz : ndarray, shape (frequency,), Hz
+    """
+    if isinstance(weights, Weight) and weights.structure in (Structure.SCALAR, Structure.DIAGONAL):
+        weights = weights.magnitudes(freqs_hz)
+    if isinstance(weights, Cover):
+        return cover_ratio(E, weights.left, weights.right)
+    left, right = weights.left.frequency_response(freqs_hz), weights.right.frequency_response(freqs_hz)
+    if left.shape[-1] != left.shape[-2]:
+        size = np.abs(left @ right)
+        return np.asarray(np.divide(np.abs(E), size, out=np.zeros(E.shape), where=size > 0).max(axis=(-2, -1)))
+    return sigma_max(np.linalg.solve(left, E) @ np.linalg.inv(right))
+
+
+def unstructured_excess(W: Array, E: Array) -> float:
+    """Return the largest ``sigma_max(W^-1 E)`` where W, shape (frequency, p', p'), can be inverted well; NaN where that is nowhere.
+
+    Above one, residuals leave the set ``W Delta`` with a full perturbation, although every entry is bounded.
+    """
+    if W.shape[-1] != W.shape[-2] or not np.abs(W).max():
+        return float("nan")
+    usable = np.linalg.cond(W) < _SINGULAR
+    return float(sigma_max(np.linalg.inv(W[usable]) @ E[:, usable]).max()) if usable.any() else float("nan")
+
+
+def shown_rows(inside: npt.NDArray[np.bool_]) -> Array:
+    """Return at most 200 rows of covered units, evenly spread, and all others."""
+    rows = np.flatnonzero(inside)
+    some = rows[np.unique(np.linspace(0, len(rows) - 1, min(MOST_UNITS, len(rows))).round().astype(int))]
+    return np.sort(np.concatenate([some, np.flatnonzero(~inside)]))

@@ -1,0 +1,1 @@
+"""Covers of residuals, the weights that bound them at all frequencies, and the proof that they do."""

@@ -1,0 +1,242 @@
+r"""Optimal cover of a set of residuals, frequency by frequency: diagonal (or scalar) magnitudes left and right.
+
+A cover `W_L, W_R` is sound when `sigma_max(W_L^-1 E_k W_R^-1) <= 1` for every unit k. With `W_L = s exp(x_l)`, `W_R = exp(x_r)` and
+`s = max_k sigma_max(exp(-x_l) E_k exp(-x_r))` every choice of x is sound, and
+
+    mean(log W_L) + mean(log W_R) = mean(x_l) + mean(x_r) + log s(x_l, x_r)
+
+is convex in x (three-lines theorem) and the same for all ways to share a common factor between left and right. The maximum over units and
+singular values is smoothed by a Schatten norm of order 2 q,
+
+    log s  ~  1 / (2 q) log sum_k tr (M_k M_k^H)^q,     M_k = exp(-x_l) E_k exp(-x_r)
+
+whose gradient is the marginals of `Y * conj(M)`, `Y = (M M^H)^(q-1) M`; Newton's method runs over all frequencies at once with q rising to
+65, and s is then recomputed without smoothing. A weak pull towards equal entries keeps the optimum finite where residuals are triangular,
+and picks the smooth one where it is not unique; a stronger pull gives covers that are easier to fit (`weights`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import ConfigError
+from ..small import adjoint, entries_first, multiply, sigma_max_first, squared
+
+Array = npt.NDArray[Any]
+
+_SQUARINGS = (1, 3, 6)  # q = 2^s + 1 = 3, 9, 65
+_NEWTON = 8
+_ENTRIES = 1200  # entries of E times frequencies in the search: 300 frequencies for 2 x 2, 75 for 4 x 4
+_UNITS = 6  # per frequency
+_PULL = 1e-3
+_REACH = 2.0  # largest Newton step, nepers
+_DIFFERENCE = 1e-5
+_TINY = 1e-300
+
+
+class Perturbation(str, Enum):
+    """Which perturbations Delta a weight is sound for."""
+
+    FULL = "full"
+    DIAGONAL = "diagonal"
+
+
+class Structure(str, Enum):
+    """Which entries of the weights are free."""
+
+    SCALAR = "scalar"
+    DIAGONAL = "diagonal"
+    ENTRYWISE = "entrywise"
+    FULL = "full"
+
+    @property
+    def perturbation(self) -> Perturbation:
+        """Perturbations with which weights of this structure reach every residual they were made for."""
+        return Perturbation.DIAGONAL if self is Structure.ENTRYWISE else Perturbation.FULL
+
+
+@dataclass(frozen=True, eq=False)
+class Cover:
+    """Magnitudes of a cover.
+
+    Parameters
+    ----------
+    left : ndarray, shape (frequency, p')
+    right : ndarray, shape (frequency, m')
+        One entry is one at every frequency: the scale between left and right is free.
+    """
+
+    left: Array
+    right: Array
+
+    def entries(self) -> Array:
+        """Return `left_i right_j`, what the cover allows entry by entry, shape (frequency, p', m'); independent of the gauge."""
+        return self.left[:, :, None] * self.right[:, None, :]
+
+    def regauged(self, reference: int) -> Cover:
+        """Return the same cover with right entry `reference` equal to one."""
+        scale = self.right[:, [reference]]
+        return Cover(self.left * scale, self.right / scale)
+
+    def cost_db(self) -> Array:
+        """Return mean log left plus mean log right, in dB, shape (frequency,)."""
+        return 20 * (np.log10(self.left).mean(axis=1) + np.log10(self.right).mean(axis=1))
+
+
+def as_structure(structure: Structure | str) -> Structure:
+    """Return the structure of a name.
+
+    Raises
+    ------
+    ConfigError
+        When there is no structure of that name.
+    """
+    try:
+        return Structure(structure)
+    except ValueError as error:
+        raise ConfigError(f"Weight structure {structure!r} is unknown; choose {', '.join(repr(s.value) for s in Structure)}.") from error
+
+
+def optimal_cover(
+    E: Array, structure: Structure | str = Structure.DIAGONAL, pull: float = _PULL, squarings: tuple[int, ...] = _SQUARINGS
+) -> Cover:
+    """Return the cover with the smallest mean log magnitudes.
+
+    Parameters
+    ----------
+    E : ndarray, shape (unit, frequency, p', m'), complex
+    structure : Structure or str
+        Scalar; every other one has the diagonal cover.
+    pull : float
+        Pull towards equal entries, relative to the cost: a larger one gives covers that cost more and vary less over frequency.
+    squarings : tuple of int
+        s of the smoothed maxima, `q = 2^s + 1`, one after the other; fewer are quicker, and the cover is the less optimal.
+
+    Returns
+    -------
+    Cover
+        Sound at every frequency; all zero where all residuals are. The right entry with the largest median is one at every frequency.
+    """
+    first = entries_first(E)
+    p, m = first.shape[:2]
+    size = sigma_max_first(first).max(axis=0)
+    if as_structure(structure) is Structure.SCALAR:
+        return Cover(np.repeat(size[:, None], p, axis=1), np.ones((len(size), m)))
+    x = _descend(first, size, p, pull, free_right=True, squarings=squarings)
+    right = np.exp(x[p:] - x[p:].mean(axis=0)).T
+    right = right / right[:, [int(np.argmax(np.median(right, axis=0)))]]
+    return Cover(_scaled_left(first, np.exp(x[:p]).T, right), right)
+
+
+def optimal_left(E: Array, right: Array, pull: float = _PULL) -> Array:
+    """Return the best left magnitudes, shape (frequency, p'), for given right ones, shape (frequency, m')."""
+    first = entries_first(E) / right.T[None, :, None, :]
+    x = _descend(first, sigma_max_first(first).max(axis=0), first.shape[0], pull, free_right=False)
+    return _scaled_left(first, np.exp(x[: first.shape[0]]).T, np.ones_like(right))
+
+
+def cover_ratio(E: Array, left: Array, right: Array) -> Array:
+    """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), for magnitudes (frequency, p') and (frequency, m').
+
+    Zero residuals are covered by anything, also by a weight of zero.
+    """
+    first = entries_first(E)
+    l_inv, r_inv = (1 / np.maximum(v, _TINY) for v in (left.T, right.T))
+    return sigma_max_first(first * l_inv[:, None, None, :] * r_inv[None, :, None, :])
+
+
+def _scaled_left(first: Array, left: Array, right: Array) -> Array:
+    """Scale left magnitudes so that the cover touches."""
+    return left * sigma_max_first(first / left.T[:, None, None, :] / right.T[None, :, None, :]).max(axis=0)[:, None]
+
+
+def _descend(first: Array, size: Array, p: int, pull: float, *, free_right: bool, squarings: tuple[int, ...] = _SQUARINGS) -> Array:
+    """Minimise the smoothed cost over x of shape (p' + m', frequency); the right part only where it is free.
+
+    Newton's method runs on part of the frequencies and of the units, and x is interpolated: the scale s, which is recomputed for all
+    frequencies and units, keeps every x sound.
+    """
+    alive = np.flatnonzero(size > 0)
+    n = first.shape[0] + first.shape[1]
+    if not alive.size:
+        return np.zeros((n, len(size)))
+    chosen = alive[np.unique(np.linspace(0, len(alive) - 1, max(60, _ENTRIES // (first.shape[0] * first.shape[1]))).round().astype(int))]
+    E = first[..., chosen] / size[chosen]
+    E = E[:, :, _largest(sigma_max_first(E))]
+    x = np.zeros((n, len(chosen)))
+    for power in squarings:
+        for _ in range(_NEWTON):
+            x, moved = _newton(_Smooth(E, p, n if free_right else p, power, pull), x)
+            if moved < 1e-3:
+                break
+    return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
+
+
+def _largest(sizes: Array) -> Array:
+    """Indices of the units that are among the largest residuals anywhere; the others are covered by the scale."""
+    order = np.argsort(-sizes, axis=0)[:_UNITS]
+    return np.unique(order)
+
+
+@dataclass(frozen=True, eq=False)
+class _Smooth:
+    """The smoothed cost of residuals (p', m', unit, frequency) in the first `free` of the x."""
+
+    E: Array
+    p: int
+    free: int
+    squarings: int
+    pull: float
+
+    def cost(self, x: Array) -> tuple[Array, Array]:
+        """Return the cost, shape (frequency,), and its gradient, shape (free, frequency)."""
+        p, m = self.p, len(x) - self.p
+        M = self.E * np.exp(-x[:p])[:, None, None, :] * np.exp(-x[p:])[None, :, None, :]
+        top = np.sqrt(squared(M).sum(axis=(0, 1)).max(axis=0))  # no smaller than the largest singular value, and at most four times
+        M = M / top
+        wide = p <= m
+        power = multiply(M, adjoint(M)) if wide else multiply(adjoint(M), M)
+        for _ in range(self.squarings):
+            power = multiply(power, power)
+        Y = multiply(power, M) if wide else multiply(M, power)
+        marginal = (Y * np.conj(M)).real.sum(axis=2)  # over units: (p', m', frequency)
+        total = marginal.sum(axis=(0, 1))
+        q = 2**self.squarings + 1
+        cost = x[:p].mean(axis=0) + np.log(top) + np.log(total) / (2 * q) + self.pull / 2 * (x**2).sum(axis=0)
+        gradient = 1 / p - marginal.sum(axis=1) / total
+        if self.free > p:
+            cost = cost + x[p:].mean(axis=0)
+            gradient = np.concatenate([gradient, 1 / m - marginal.sum(axis=0) / total])
+        return cost, gradient + self.pull * x[: self.free]
+
+
+def _newton(smooth: _Smooth, x: Array) -> tuple[Array, float]:
+    """One damped Newton step; the Hessian from differences of the gradient."""
+    free = smooth.free
+    cost, gradient = smooth.cost(x)
+    hessian = np.empty((x.shape[1], free, free))
+    for i in range(free):
+        ahead = x.copy()
+        ahead[i] += _DIFFERENCE
+        hessian[:, :, i] = ((smooth.cost(ahead)[1] - gradient) / _DIFFERENCE).T
+    hessian = (hessian + hessian.swapaxes(1, 2)) / 2 + 1e-6 * np.eye(free)
+    step = -np.linalg.solve(hessian, gradient.T[..., None])[..., 0].T
+    step *= np.minimum(1.0, _REACH / np.maximum(np.abs(step).max(axis=0), _TINY))
+    slope = (gradient * step).sum(axis=0)
+    best, length = x, np.ones(x.shape[1])
+    pending = np.ones(x.shape[1], bool)
+    for _ in range(8):
+        trial = x.copy()
+        trial[:free] += length * step
+        better = pending & (smooth.cost(trial)[0] <= cost + 0.1 * length * slope)
+        best = np.where(better, trial, best)
+        pending &= ~better
+        if not pending.any():
+            break
+        length = np.where(pending, length / 3, length)
+    return best, float(np.abs(best - x).max(initial=0.0))

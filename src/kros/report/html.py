@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +13,33 @@ from ..core.artifacts import write_bytes
 from ..data.population import DEFAULT_CONDITION
 from .advice import advice
 from .encode import to_svg
-from .figures import draw_all
+from .figures import FIGURES, draw
 from .names import condition_label
 from .run_folder import RunFolder
 from .sections import SECTIONS
 from .theme import Tone
 from .verdict import findings, trust
 
+log = logging.getLogger(__name__)
+
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
-def render(run: Path, metrics: Mapping[str, Any]) -> Path:
+@dataclass(frozen=True)
+class Encoded:
+    """A figure as the page shows it, or the reason why it does not."""
+
+    name: str
+    title: str
+    svg: str
+    caption: str
+    reason: str
+
+
+Mapped = Callable[[Callable[[str], Encoded], Iterable[str]], Iterator[Encoded]]
+
+
+def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map) -> Path:
     """Write `report.html` into a run folder.
 
     Parameters
@@ -29,6 +48,8 @@ def render(run: Path, metrics: Mapping[str, Any]) -> Path:
         Run folder; what it does not have is left out, with the reason.
     metrics : mapping
         As in ``metrics.json``; any part but ``study`` may be absent.
+    mapped : callable
+        Maps the drawing of a figure over their names, in order, for example in several processes.
 
     Returns
     -------
@@ -41,11 +62,11 @@ def render(run: Path, metrics: Mapping[str, Any]) -> Path:
         When an artifact is broken or of another version.
     """
     path = Path(run) / "report.html"
-    write_bytes(path, page(RunFolder(Path(run)), metrics).encode())
+    write_bytes(path, page(RunFolder(Path(run)), metrics, mapped).encode())
     return path
 
 
-def page(run: RunFolder, metrics: Mapping[str, Any]) -> str:
+def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> str:
     """Return the report as HTML."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
@@ -54,14 +75,10 @@ def page(run: RunFolder, metrics: Mapping[str, Any]) -> str:
         loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     figures = {}
-    for result in draw_all(run):
-        svg = Markup(to_svg(result.drawing.figure, result.name)) if result.drawing else None
-        figures[result.name] = {
-            "title": result.title,
-            "svg": svg,
-            "caption": result.drawing.caption if result.drawing else "",
-            "reason": result.reason,
-        }
+    for figure in mapped(partial(encoded, run), FIGURES):
+        if figure.reason:
+            log.info("figure %s: left out, %s", figure.name, figure.reason)
+        figures[figure.name] = {"title": figure.title, "svg": Markup(figure.svg), "caption": figure.caption, "reason": figure.reason}
     return environment.get_template("report.html.jinja").render(
         name=run.study.get("name", run.folder.name),
         subtitle=_subtitle(metrics),
@@ -74,6 +91,14 @@ def page(run: RunFolder, metrics: Mapping[str, Any]) -> str:
         figures=figures,
         style=Markup(stylesheet()),
     )
+
+
+def encoded(run: RunFolder, module_name: str) -> Encoded:
+    """Draw a figure and return it as the page shows it."""
+    result = draw(module_name, run)
+    if result.drawing is None:
+        return Encoded(result.name, result.title, "", "", result.reason)
+    return Encoded(result.name, result.title, to_svg(result.drawing.figure, result.name), result.drawing.caption, "")
 
 
 def stylesheet() -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
@@ -10,8 +9,6 @@ from importlib import import_module
 from ..run_folder import NotShownError, RunFolder
 from ..theme import style
 from .drawing import Drawing
-
-log = logging.getLogger(__name__)
 
 FIGURES = (
     "signals",
@@ -38,7 +35,7 @@ FIGURES = (
     "outlier_residuals",
 )
 
-__all__ = ["FIGURES", "Drawing", "Result", "draw_all"]
+__all__ = ["FIGURES", "Drawing", "Result", "draw", "draw_all"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +58,16 @@ class Result:
     reason: str = ""
 
 
+def draw(module_name: str, run: RunFolder) -> Result:
+    """Draw one figure of a run; one that lacks an artifact comes with the reason instead."""
+    module = import_module(f".{module_name}", __name__)
+    with style():
+        try:
+            return Result(module.NAME, module.TITLE, module.draw(run))
+        except NotShownError as absent:
+            return Result(module.NAME, module.TITLE, None, str(absent))
+
+
 def draw_all(run: RunFolder) -> Iterator[Result]:
-    """Draw all figures of a run, one at a time; one that lacks an artifact comes with the reason instead."""
-    for module_name in FIGURES:
-        module = import_module(f".{module_name}", __name__)
-        with style():
-            try:
-                yield Result(module.NAME, module.TITLE, module.draw(run))
-            except NotShownError as absent:
-                log.info("figure %s: left out, %s", module.NAME, absent)
-                yield Result(module.NAME, module.TITLE, None, str(absent))
+    """Draw all figures of a run, one at a time."""
+    return (draw(name, run) for name in FIGURES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ def run(context: Context) -> list[Path]:
     from ...report import render
     from ..metrics import collect_metrics
 
-    return [render(context.store.folder, collect_metrics(context, Stage.EVALUATE, None))]
+    return [render(context.store.folder, collect_metrics(context, Stage.EVALUATE, None), partial(context.map, "report"))]
 
 
 def render_run(folder: Path) -> Path:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from ...core.errors import KrosError
 from ...data.population import EpisodeKey, Population
 from ...evaluate import EpisodeBatch, ErrorSummary, summarise
 from ...identify import ModelSet, free_run
-from ...observer import Observer, run_observer
+from ...observer import Observer, run_observers
 from ..context import Context
 from ..estimators import Baseline, make_difference, make_extended, make_learned
 from ..presets import gearbox_band_hz
@@ -27,6 +28,8 @@ from .synthesize import measurement_noise, tuning_set
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 UnitParameters = dict[str, dict[str, float]]
+_SIDE_BY_SIDE = 8  # observers of one piece of work: few enough to keep all processes busy
+_SAMPLES_AT_ONCE = 20_000_000  # of all estimates that are in memory, 160 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,15 +45,35 @@ class Outcome:
     estimated: tuple[int, ...] | None = None
 
 
-def evaluate_observer(
-    observer: Observer, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
-) -> Outcome:
-    """Run an observer on test episodes."""
-    batch = EpisodeBatch.read(population, keys)
-    estimate = run_observer(
-        observer, batch.states[..., list(observer.measured)], batch.inputs, batch.parameters(units) if observer.lifting.parameters else None
-    )
-    return _outcome(estimate, batch, population.sample_period_s, shown)
+def evaluate_observers(
+    observers: Sequence[Observer], population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
+) -> list[Outcome]:
+    """Run observers that `alike` puts together on test episodes, as many at a time as fit into memory."""
+    batch, first = EpisodeBatch.read(population, keys), observers[0]
+    y, parameters = batch.states[..., list(first.measured)], batch.parameters(units) if first.lifting.parameters else None
+    together = max(1, _SAMPLES_AT_ONCE // batch.states.size)
+    found = []
+    for start in range(0, len(observers), together):
+        estimates = run_observers(observers[start : start + together], y, batch.inputs, parameters)
+        found += [_outcome(estimate, batch, population.sample_period_s, shown) for estimate in estimates]
+    return found
+
+
+def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
+    """Return observers in groups that can run side by side: of one lifting, with the same parameters, measured states and inputs."""
+    groups: list[list[Observer]] = []
+    for observer in observers:
+        key = _model_of(observer)
+        group = next((g for g in groups if len(g) < _SIDE_BY_SIDE and _model_of(g[0]) == key), None)
+        if group is None:
+            groups.append([observer])
+        else:
+            group.append(observer)
+    return groups
+
+
+def _model_of(observer: Observer) -> tuple[Any, ...]:
+    return observer.lifting, dict(observer.parameters), observer.measured, observer.inputs
 
 
 def evaluate_baseline(
@@ -98,10 +121,16 @@ def run(context: Context) -> list[Path]:
 
     observers, models = load_observers(context), {name: context.models(name) for name in context.model_names}
     makers = baseline_makers(context, models)
-    work: list[Callable[[], Outcome | str]] = [partial(evaluate_observer, o, population, keys, units, shown) for o in observers.values()]
-    work += [partial(evaluate_baseline, make, population, keys, units, shown) for make in makers.values()]
+    groups = alike(observers.values())
+    work: list[Callable[[], Any]] = [partial(evaluate_baseline, make, population, keys, units, shown) for make in makers.values()]
+    work += [partial(evaluate_observers, group, population, keys, units, shown) for group in groups]
     work += [partial(evaluate_model, m, population, on, units, shown_on) for m in models.values()]
-    results = dict(zip([*observers, *makers, *(f"free run/{m}" for m in models)], context.run("evaluate", work), strict=True))
+    done = context.run("evaluate", work)
+    of_groups = dict(zip((o.name for g in groups for o in g), chain(*done[len(makers) : len(makers) + len(groups)]), strict=True))
+    results: dict[str, Outcome | str] = {name: of_groups[o.name] for name, o in observers.items()}
+    results |= dict(
+        zip([*makers, *(f"free run/{m}" for m in models)], done[: len(makers)] + done[len(makers) + len(groups) :], strict=True)
+    )
     free_runs = {m: outcome for m in models if isinstance(outcome := results[f"free run/{m}"], Outcome)}
     estimates = {name: outcome for name in (*observers, *makers) if isinstance(outcome := results[name], Outcome)}
 

@@ -106,7 +106,7 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int =
     signals = np.moveaxis(np.asarray(error, float), axis, -1)
     size = min(segment, signals.shape[-1])
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size) if size > 1 else np.ones(1)
-    freqs = np.fft.rfftfreq(segment, dt)
+    freqs = np.asarray(np.fft.rfftfreq(segment, dt), float)
     rows, density = signals.reshape(-1, signals.shape[-1]), np.empty((signals[..., 0].size, len(freqs)))
     step = max(1, _TOGETHER // signals.shape[-1])
     for start in range(0, len(rows), step):

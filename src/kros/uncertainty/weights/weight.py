@@ -21,6 +21,7 @@ import numpy.typing as npt
 from ...core.errors import ConfigError
 from ...core.frequency import bilinear_squared, dense_grid
 from ...core.lti import StateSpace, block_diagonal, gain
+from ..fits.chain import diagonal_response
 from ..fits.diagonal import Problem, fit_sections, refit
 from ..fits.magnitude import fit_magnitude
 from ..fits.sections import Sections
@@ -337,5 +338,5 @@ def _peaks(ratio: Array) -> Array:
 
 
 def _diagonal(system: StateSpace, freqs_hz: npt.ArrayLike) -> Array:
-    """Magnitudes of the diagonal, shape (frequency, size), block by block."""
-    return np.abs(np.einsum("fii->fi", system.frequency_response(freqs_hz)))
+    """Magnitudes of the diagonal, shape (frequency, size)."""
+    return np.abs(diagonal_response(system, freqs_hz))

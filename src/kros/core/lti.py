@@ -21,6 +21,29 @@ from .errors import DimensionError
 Array = npt.NDArray[Any]
 
 
+def real_array(name: str, values: Any) -> Array:
+    """Return a matrix of doubles, or say by name what else was found."""
+    if np.iscomplexobj(values):
+        raise DimensionError(f"{name} should be a matrix of real numbers, found complex ones; take the real part if that is meant.")
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise DimensionError(f"{name} should be a matrix of real numbers, found {type(values).__name__}: {error}.") from error
+
+
+def sampling_period(name: str, dt: Any) -> float:
+    """Return the sampling period in seconds, or say by name what else was found."""
+    try:
+        period = float(dt)
+    except (TypeError, ValueError):
+        period = -1.0
+    if not 0 <= period < np.inf:
+        raise DimensionError(
+            f"{name}: the sampling period should be a number of seconds, not negative, 0 for continuous time; found {dt!r}."
+        )
+    return period
+
+
 @dataclass(frozen=True, eq=False)
 class StateSpace:
     """State-space system, or a batch of them.
@@ -48,7 +71,8 @@ class StateSpace:
 
     def __post_init__(self) -> None:
         for name in "ABCD":
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+            object.__setattr__(self, name, real_array(f"State space: {name}", getattr(self, name)))
+        object.__setattr__(self, "dt", sampling_period("State space", self.dt))
         n, m, p = self.A.shape[-1], self.B.shape[-1], self.C.shape[-2]
         expected = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}
         for name, shape in expected.items():
@@ -57,8 +81,24 @@ class StateSpace:
                 raise DimensionError(
                     f"State space: {name} should end in shape {shape}, found {found}; transpose or pad the offending matrix."
                 )
-        if self.dt < 0:
-            raise DimensionError(f"State space: sampling period {self.dt} s is negative; use 0 for continuous time.")
+
+    @classmethod
+    def of(cls, system: Any) -> StateSpace:
+        """Return any object with `A, B, C, D, dt` as a `StateSpace`; a period of None is that of a continuous system.
+
+        Raises
+        ------
+        DimensionError
+            When an attribute is missing.
+        """
+        if isinstance(system, cls):
+            return system
+        try:
+            return cls(system.A, system.B, system.C, system.D, 0.0 if system.dt is None else system.dt)
+        except AttributeError as error:
+            raise DimensionError(
+                f"State space: needs a system with A, B, C, D and dt, found {type(system).__name__} ({error}); convert it first."
+            ) from error
 
     @property
     def n_states(self) -> int:

@@ -38,14 +38,7 @@ def as_state_space(system: Any) -> StateSpace:
     DimensionError
         When it is a batch, or an attribute is missing.
     """
-    if not isinstance(system, StateSpace):
-        try:
-            dt = 1.0 if system.dt is True else float(system.dt or 0.0)
-            system = StateSpace(system.A, system.B, system.C, system.D, dt)
-        except AttributeError as error:
-            raise DimensionError(
-                f"System norm: needs a system with A, B, C, D and dt, found {type(system).__name__} ({error}); convert it first."
-            ) from error
+    system = StateSpace.of(system)
     if system.batch_shape:
         raise DimensionError(
             f"System norm: needs one system, found a batch of shape {system.batch_shape}; index it, for example system[0]."

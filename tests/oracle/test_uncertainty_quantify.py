@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -214,5 +215,30 @@ def test_the_nominal_may_be_sought_by_other_criteria_and_among_models_that_are_n
     assert quantify(units, "additive", freqs, extra={"mean": mean}, nominal="mean", **options).nominal_id == "mean"
     with pytest.raises(ConfigError, match="name of a unit"):
         quantify(units, "additive", freqs, extra={"0": mean}, **options)
-    with pytest.raises(DataError, match="candidate 'bad' is unstable"):
+    with pytest.raises(DataError, match="the model of candidate bad is unstable"):
         quantify(units, "additive", freqs, extra={"bad": StateSpace(2 * np.eye(3), mean.B, mean.C, mean.D, DT)}, **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"structure": "diamond"}, "structure 'diamond' is unknown"),
+        ({"max_order": -1}, "max_order = -1"),
+        ({"tolerance_db": -1.0}, "tolerance_db = -1.0"),
+        ({"density": 0}, "density = 0"),
+        ({"nominal": 0.5}, "nominal 0.5 is out of range"),
+    ],
+)
+def test_options_out_of_range_are_refused(options, message):
+    units = [StateSpace([[p]], [[1.0]], [[1.0]], [[0.0]], 0.01) for p in (0.9, 0.91)]
+    with pytest.raises(ConfigError, match=message):
+        quantify(units, **options)
+
+
+def test_an_unstable_nominal_is_refused_and_foreign_systems_are_read():
+    units = [SimpleNamespace(A=[[p]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt=0.01) for p in (0.9, 0.91)]
+    assert quantify(units, "additive").cover_max <= 1
+    with pytest.raises(DataError, match="the nominal is unstable"):
+        quantify(units, nominal=StateSpace([[1.1]], [[1.0]], [[1.0]], [[0.0]], 0.01))
+    with pytest.raises(DimensionError, match="found int"):
+        quantify(3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from .model import UncertainModel, scale_system
 from .population.nominal import Criterion, NominalChoice, as_criterion, choose_nominal, choose_nominals
 from .weights.bounded import Bounded, Responder, bound_residuals
 from .weights.certificate import ResidualSystems
-from .weights.cover import Cover, Structure
+from .weights.cover import Cover, Structure, as_structure
 
 Array = npt.NDArray[Any]
 
@@ -47,9 +47,10 @@ def quantify(
     Parameters
     ----------
     models : StateSpace, sequence of StateSpace, or ModelSet
-        Stable models, the unit axis first; at least two units. Models of fewer states than others get states that do nothing. A model set
-        brings its unit ids and scales. Continuous models (``dt = 0``) are quantified on the unit circle that the bilinear map makes of the
-        imaginary axis, and the weights mapped back to continuous time: what bounds there bounds here, exactly.
+        Stable models, the unit axis first; at least two units. In a sequence any objects with `A, B, C, D, dt` will do. Models of fewer states
+        than others get states that do nothing. A model set brings its unit ids and scales. Continuous models (``dt = 0``) are quantified on the
+        unit circle that the bilinear map makes of the imaginary axis, and the weights mapped back to continuous time: what bounds there bounds
+        here, exactly.
     form : Form or str
         Uncertainty form of the weights; the bounds of all six are reported.
     freqs_hz : array_like, shape (frequency,), Hz, optional
@@ -88,7 +89,7 @@ def quantify(
     DataError
         Fewer than two units, unstable models, NaN.
     ConfigError
-        Unknown form, criterion or nominal, frequencies above Nyquist.
+        Unknown form, criterion, structure or nominal, frequencies above Nyquist, an order or tolerance out of range.
 
     Examples
     --------
@@ -101,7 +102,8 @@ def quantify(
     >>> model.nominal, model.cover_max <= 1
     (1, True)
     """
-    form, criterion = as_form(form), as_criterion(criterion)
+    form, criterion, structure = as_form(form), as_criterion(criterion), as_structure(structure)
+    check_fit(max_order, tolerance_db, density)
     system, ids, scales = _read_models(models, unit_ids, output_scale, input_scale)
     others = _read_extra(extra, system, ids)
     axis, freqs = _axis(system, freqs_hz)
@@ -209,11 +211,17 @@ def _read_extra(extra: Mapping[str, StateSpace] | None, system: StateSpace, ids:
         if name in ids:
             raise ConfigError(f"Quantify: candidate {name!r} has the name of a unit; give it another.")
         _check_candidate(candidate, system)
-        if not bool(np.all(candidate.is_stable())):
-            raise DataError(
-                f"Quantify: candidate {name!r} is unstable (spectral radius {float(candidate.spectral_radius()):.6f}); leave it out."
-            )
+        _check(candidate[None], (f"candidate {name}",))
     return others
+
+
+def check_fit(max_order: int, tolerance_db: float, density: int = 1) -> None:
+    """Raise a `ConfigError` when an option of the fit is out of range."""
+    if not (isinstance(max_order, (int, np.integer)) and max_order >= 0 and tolerance_db >= 0 and density >= 1):
+        raise ConfigError(
+            f"Quantify: max_order = {max_order!r} should be a whole number from 0, tolerance_db = {tolerance_db} not negative, "
+            f"density = {density} at least 1."
+        )
 
 
 def _check_candidate(nominal: StateSpace, system: StateSpace) -> None:
@@ -240,7 +248,11 @@ def _read_models(
         raise DimensionError(
             f"Quantify: needs one id for each of {count} units, all different, found {len(ids)} ({', '.join(ids[:5])} ...)."
         )
-    _check(system, ids)
+    if count < 2:
+        raise DataError(
+            f"Quantify: uncertainty of a population needs at least two units, found {count} ({', '.join(ids)}); record more units."
+        )
+    _check(system, tuple(f"unit {name}" for name in ids))
     return system, ids, (check_scale("output", output_scale, system.n_outputs), check_scale("input", input_scale, system.n_inputs))
 
 
@@ -255,7 +267,11 @@ def stack_systems(models: Any) -> StateSpace:
         When they differ, or a single system without the unit axis is given.
     """
     if not isinstance(models, StateSpace):
-        systems = list(models)
+        if isinstance(models, str) or not isinstance(models, Iterable):
+            raise DimensionError(
+                f"Quantify: needs the models of at least two units, found {type(models).__name__}; give a list of systems."
+            )
+        systems = [StateSpace.of(system) for system in models]
         found = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
         if len(found) != 1:
             raise DimensionError(
@@ -288,25 +304,21 @@ def _padded(system: StateSpace, n_states: int) -> StateSpace:
     return StateSpace(A, B, C, system.D, system.dt)
 
 
-def _check(system: StateSpace, ids: tuple[str, ...]) -> None:
-    if len(ids) < 2:
-        raise DataError(
-            f"Quantify: uncertainty of a population needs at least two units, found {len(ids)} ({', '.join(ids)}); record more units."
-        )
-    finite = np.ones(len(ids), bool)
+def _check(system: StateSpace, names: tuple[str, ...]) -> None:
+    """Raise a `DataError` that names the first model of a batch that is not finite or not stable."""
+    count = (len(names),)
+    finite = np.ones(count, bool)
     for name in "ABCD":
-        finite &= np.broadcast_to(np.isfinite(getattr(system, name)).all(axis=(-2, -1)), (len(ids),))
+        finite &= np.broadcast_to(np.isfinite(getattr(system, name)).all(axis=(-2, -1)), count)
     if not finite.all():
-        raise DataError(
-            f"Quantify: unit {ids[int(np.argmin(finite))]} has NaN or infinity in its model; leave it out or identify it again."
-        )
-    stable = np.broadcast_to(system.is_stable(), (len(ids),))
+        raise DataError(f"Quantify: the model of {names[int(np.argmin(finite))]} has NaN or infinity; leave it out or identify it again.")
+    stable = np.broadcast_to(system.is_stable(), count)
     if not stable.all():
-        unit = int(np.argmin(stable))
-        poles = np.broadcast_to(system.poles(), (len(ids), system.n_states))[unit]
+        first = int(np.argmin(stable))
+        poles = np.broadcast_to(system.poles(), (*count, system.n_states))[first]
         worst = f"spectral radius {np.abs(poles).max():.6f}" if system.dt > 0 else f"largest real part of a pole {poles.real.max():.6g}"
         raise DataError(
-            f"Quantify: the model of unit {ids[unit]} is unstable ({worst}, {int((~stable).sum())} units in all); "
+            f"Quantify: the model of {names[first]} is unstable ({worst}, {int((~stable).sum())} in all); "
             "identify with more regularisation or leave it out."
         )
 
@@ -325,13 +337,14 @@ def _find_nominal(
     """Row of the nominal among units and candidates (-1 for a model of its own) and its system."""
     if isinstance(nominal, StateSpace):
         _check_candidate(nominal, system)
+        _check(nominal[None], ("the nominal",))
         return -1, nominal
     names = (*ids, *others)
     if isinstance(nominal, str):
         if nominal not in names:
             raise ConfigError(f"Quantify: nominal {nominal!r} is not among the units {', '.join(names[:10])}.")
         nominal = names.index(nominal)
-    index = best if nominal is None else int(nominal)
-    if not 0 <= index < len(names):
-        raise ConfigError(f"Quantify: nominal {index} is out of range for {len(names)} units.")
-    return index, system[index] if index < len(ids) else others[names[index]]
+    index = best if nominal is None else nominal
+    if not isinstance(index, (int, np.integer)) or not 0 <= index < len(names):
+        raise ConfigError(f"Quantify: nominal {index!r} is out of range; give a name, a system, or a whole number below {len(names)}.")
+    return int(index), system[index] if index < len(ids) else others[names[index]]

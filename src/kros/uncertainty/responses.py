@@ -14,10 +14,10 @@ from ..core.frequency import check_grid
 from .bilinear import BilinearAxis, check_continuous_grid
 from .forms import Form, as_form
 from .population.nominal import Criterion, as_criterion
-from .quantify import POOLED, bound_continuous, check_scale, choose_by
+from .quantify import POOLED, bound_continuous, check_fit, check_scale, choose_by
 from .residuals import check_responses
 from .weights.bounded import bound_residuals
-from .weights.cover import Cover, Structure
+from .weights.cover import Cover, Structure, as_structure
 from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
@@ -143,7 +143,8 @@ def quantify_responses(
     >>> round(float(abs(found.weight.left.frequency_response([1.0])[0, 0, 0])), 6)
     0.2
     """
-    form, criterion = as_form(form), as_criterion(criterion)
+    form, criterion, structure = as_form(form), as_criterion(criterion), as_structure(structure)
+    check_fit(max_order, tolerance_db)
     G = check_responses(responses)
     freqs = check_grid(freqs_hz, sample_period_s) if sample_period_s > 0 else check_continuous_grid(freqs_hz)
     ids = tuple(str(k) for k in range(len(G))) if unit_ids is None else tuple(unit_ids)

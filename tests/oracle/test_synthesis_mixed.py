@@ -280,3 +280,27 @@ def test_truncation_error_is_within_its_bound():
     )
     assert small.sizes[0] <= 8
     assert hinf_norm(difference) <= 2 * tail * hinf_norm(full) * 1.01 + 1e-9 * hinf_norm(full)
+
+
+@pytest.mark.parametrize(("seed", "speed"), [(0, 1e-2), (1, 1e2)])
+def test_continuous_plants_are_mapped_exactly(seed, speed):
+    """Without a constraint the value is that of the continuous Riccati equations; with one, everything holds for the continuous loop."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((3, 3))
+    A = speed * (A - (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(3))
+    B1 = np.hstack([speed * rng.standard_normal((3, 1)), np.zeros((3, 1)), 0.3 * speed * np.ones((3, 1))])
+    C1 = np.vstack([rng.standard_normal((1, 3)), np.zeros((1, 3)), 0.3 * np.ones((1, 3))])
+    zero, B2, C2 = np.zeros((3, 3)), speed * rng.standard_normal((3, 1)), rng.standard_normal((1, 3))
+    plant = GeneralizedPlant(A, B1, B2, C1, C2, zero, [[0.0], [1.0], [0.1]], [[0.0, 1.0, 0.1]], [[0.2]], 0.0, 2, 2)
+    free = h2(plant.channel(plant.rows(1), plant.columns(1)))
+    found = mixed(plant, gamma=1e3)
+    assert found.status is Status.OPTIMAL
+    assert found.h2_norm == pytest.approx(free.h2_norm, rel=1e-9)
+    gamma = 0.8 * hinf_norm(part(plant, plant.close(free.controller), 2))
+    found = mixed(plant, gamma=gamma)
+    closed = plant.close(found.controller)
+    assert hinf_norm(part(plant, closed, 2)) == pytest.approx(found.hinf_norm, rel=1e-5)
+    assert found.hinf_norm < gamma
+    assert h2_norm(part(plant, closed, 1)) == pytest.approx(found.h2_norm, rel=1e-9)
+    assert free.h2_norm * (1 - 1e-9) <= found.lower_bound <= found.h2_norm
+    assert found.gap_percent < 2

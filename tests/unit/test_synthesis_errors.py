@@ -1,15 +1,16 @@
 """Bad input to the synthesis layer: every refusal names what is wrong."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from kros.synthesis.riccati.constant_gain import luenberger
 
 import kros.synthesis
-from kros.core import ConfigError, DataError, DimensionError, StateSpace, SynthesisError, block_diagonal, gain
-from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, Synthesis, h2, kalman, mixed, worst_case_h2
+from kros.core import ConfigError, DataError, DimensionError, StateSpace, SynthesisError, block_diagonal, gain, h2_norm, hinf_norm
+from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, Synthesis, h2, hinf, kalman, mixed, worst_case_h2
 from kros.synthesis.problem.paper_plant import paper_plant
+from kros.synthesis.riccati.constant_gain import luenberger
 from kros.synthesis.robust.certificate import certify
 from kros.synthesis.verify import closed_loop, observer_loop, spectral_radius_max
 
@@ -52,7 +53,11 @@ def problem(**changes):
         ({"B1": [[1.0], [0.0]]}, r"B1 should have shape \(1, 1\)"),
         ({"D12": [[1.0]]}, r"D12 should have shape \(2, 1\)"),
         ({"C2": [[np.nan]]}, "NaN"),
-        ({"dt": -1.0}, "negative"),
+        ({"dt": -1.0}, "not negative"),
+        ({"dt": np.nan}, "found nan"),
+        ({"dt": None}, "found None"),
+        ({"A": [[1j]]}, "A should be a matrix of real numbers, found complex"),
+        ({"A": "fast"}, "A should be a matrix of real numbers, found str"),
         ({"n_w1": 3}, "n_w1 = 3 should lie between 0 and 2"),
         ({"n_z1": -1}, "n_z1 = -1"),
     ],
@@ -72,6 +77,50 @@ def test_generalized_plant_checks_its_shapes(changes, message):
 def test_closing_the_loop_checks_sizes_and_periods(controller, message):
     with pytest.raises(DimensionError, match=message):
         plant().close(controller)
+
+
+@pytest.mark.parametrize("method", [h2, hinf, mixed])
+def test_methods_want_a_generalized_plant(method):
+    with pytest.raises(DimensionError, match=r"GeneralizedPlant .* found StateSpace"):
+        method(gain([[1.0]], 1.0))
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+@pytest.mark.parametrize("method", [h2, hinf])
+def test_without_measurement_or_control_the_open_loop_is_optimal(method, dt):
+    A = [[0.9 if dt else -0.9]]
+    blind = plant(A=A, dt=dt, C2=np.zeros((0, 1)), D21=np.zeros((0, 2)), D22=np.zeros((0, 1)))
+    tied = plant(A=A, dt=dt, B2=np.zeros((1, 0)), D12=np.zeros((2, 0)), D22=np.zeros((1, 0)))
+    alone = StateSpace(A, [[1.0]], [[1.0]], [[0.0]], dt)
+    for case in (blind, tied):
+        found = method(case)
+        assert found.h2_norm == pytest.approx(h2_norm(alone))
+        assert found.hinf_norm == pytest.approx(hinf_norm(alone))
+
+
+@pytest.mark.parametrize("method", [h2, hinf, mixed])
+def test_an_optimum_of_zero_is_an_optimum(method):
+    # every disturbance is measured as it enters, and the control can undo it: T = 0, up to rounding
+    rng = np.random.default_rng(3)
+    B2, D12, D21, Q = rng.standard_normal((3, 2)), *rng.standard_normal((3, 2, 2))
+    C1, zero = rng.standard_normal((2, 3)), np.zeros((2, 2))
+    case = GeneralizedPlant(np.diag([0.9, 0.5, -0.3]), B2 @ Q @ D21, B2, C1, np.zeros((2, 3)), D12 @ Q @ D21, D12, D21, zero, 0.1)
+    found = method(case)
+    assert found.status is Status.OPTIMAL
+    assert found.lower_bound <= found.h2_norm < 1e-9
+
+
+@pytest.mark.parametrize("missing", [{"D12": [[0.0], [0.0]]}, {"D21": [[0.0, 0.0]]}])
+def test_singular_mixed_plant_without_a_second_channel(missing):
+    found = mixed(plant(**missing))
+    assert np.isfinite(found.h2_norm)
+    assert any("small ones were added" in note for note in found.notes)
+
+
+def test_controllers_of_other_libraries_close_the_loop():
+    theirs = SimpleNamespace(A=[[0.5]], B=[[1.0]], C=[[0.1]], D=[[0.0]], dt=1.0)
+    ours = StateSpace(theirs.A, theirs.B, theirs.C, theirs.D, 1.0)
+    assert h2_norm(plant().close(theirs)) == h2_norm(plant().close(ours))
 
 
 def test_singular_algebraic_loop_is_refused():
@@ -159,8 +208,10 @@ def test_certificate_refuses_an_unstable_observer():
 
 
 def test_mixed_refuses_what_it_cannot_do():
-    with pytest.raises(SynthesisError, match="continuous"):
-        mixed(plant(A=[[-1.0]], dt=0.0))
+    with pytest.raises(SynthesisError, match=r"in continuous time .* A2a"):
+        mixed(plant(A=[[-1.0]], dt=0.0, D12=[[0.0], [0.0]]))
+    with pytest.raises(SynthesisError, match="D11 = 0 in continuous time"):
+        mixed(plant(A=[[-1.0]], dt=0.0, D11=np.eye(2)))
     with pytest.raises(ConfigError, match="gamma = 0"):
         mixed(plant(), gamma=0)
     with pytest.raises(ConfigError, match="scalings"):

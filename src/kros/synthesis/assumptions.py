@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import matrix_balance
 
-from ..core.errors import SynthesisError
+from ..core.errors import DimensionError, SynthesisError
 from .generalized_plant import GeneralizedPlant
 
 Array = npt.NDArray[Any]
@@ -116,8 +116,17 @@ def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> list[Violatio
     return found
 
 
+def require_plant(plant: object, method: str) -> None:
+    """Raise a `DimensionError` when it is no generalized plant."""
+    if not isinstance(plant, GeneralizedPlant):
+        raise DimensionError(
+            f"{method} needs a GeneralizedPlant (A, B1, B2, C1, C2, D11, D12, D21, D22, dt), found {type(plant).__name__}; build one first."
+        )
+
+
 def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
-    """Raise a `SynthesisError` that names every violated assumption."""
+    """Raise a `SynthesisError` that names every violated assumption, or a `DimensionError` when it is no generalized plant."""
+    require_plant(plant, method)
     found = h2_violations(plant, proper)
     if found:
         raise SynthesisError(f"{method} needs a regular generalized plant; violated: " + "; ".join(map(str, found)) + ".")

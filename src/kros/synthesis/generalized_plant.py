@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DimensionError
-from ..core.lti import StateSpace
+from ..core.lti import StateSpace, real_array, sampling_period
 
 Array = npt.NDArray[Any]
 
@@ -80,7 +80,8 @@ class GeneralizedPlant:
 
     def __post_init__(self) -> None:
         for name in _MATRICES:
-            object.__setattr__(self, name, np.atleast_2d(np.asarray(getattr(self, name), dtype=float)))
+            object.__setattr__(self, name, np.atleast_2d(real_array(f"Generalized plant: {name}", getattr(self, name))))
+        object.__setattr__(self, "dt", sampling_period("Generalized plant", self.dt))
         n, n_w, n_u, n_z, n_y = self.A.shape[-1], self.B1.shape[-1], self.B2.shape[-1], self.C1.shape[0], self.C2.shape[0]
         expected = {"A": (n, n), "B1": (n, n_w), "B2": (n, n_u), "C1": (n_z, n), "C2": (n_y, n)}
         expected |= {"D11": (n_z, n_w), "D12": (n_z, n_u), "D21": (n_y, n_w), "D22": (n_y, n_u)}
@@ -92,8 +93,6 @@ class GeneralizedPlant:
                 )
         if not all(np.isfinite(getattr(self, name)).all() for name in _MATRICES):
             raise DimensionError("Generalized plant: a matrix contains NaN or infinity; look at the weights that went into it.")
-        if self.dt < 0:
-            raise DimensionError(f"Generalized plant: sampling period {self.dt} s is negative; use 0 for continuous time.")
         for name, part, whole in (("n_w1", self.n_w1, n_w), ("n_z1", self.n_z1, n_z)):
             if part is not None and not 0 <= part <= whole:
                 raise DimensionError(f"Generalized plant: {name} = {part} should lie between 0 and {whole}.")
@@ -151,14 +150,14 @@ class GeneralizedPlant:
         Parameters
         ----------
         controller : StateSpace
-            ``n_u`` outputs, ``n_y`` inputs, the plant's sampling period.
+            Or any object with `A, B, C, D, dt`: ``n_u`` outputs, ``n_y`` inputs, the plant's sampling period.
 
         Raises
         ------
         DimensionError
             When sizes or sampling periods differ, or the loop is not well posed (``I - D22 D^c`` singular).
         """
-        K = controller
+        K = StateSpace.of(controller)
         _, _, n_u, _, n_y = self.sizes
         if (K.n_outputs, K.n_inputs) != (n_u, n_y) or K.dt != self.dt or K.batch_shape:
             raise DimensionError(
@@ -166,7 +165,7 @@ class GeneralizedPlant:
                 "match the sizes and resample one of them."
             )
         loop = np.eye(n_y) - self.D22 @ K.D
-        if np.linalg.cond(loop) > 1e14:
+        if n_y and np.linalg.cond(loop) > 1e14:
             raise DimensionError(
                 "Closing the loop: I - D22 D^c is singular, so the algebraic loop has no solution; use a strictly proper controller."
             )

@@ -28,6 +28,8 @@ from ..riccati.h2_optimal import h2
 
 Array = npt.NDArray[Any]
 
+_KNOWN = 1e-28  # share of a state's variance below which rounding alone keeps it from being known exactly
+
 
 @dataclass(frozen=True, eq=False)
 class Balanced:
@@ -89,6 +91,39 @@ def balance(plant: GeneralizedPlant) -> Balanced:
         D21=plant.D21 / measurements[:, None],
     )
     return Balanced(balanced, size, s, controls, measurements)
+
+
+def reached(plant: GeneralizedPlant, share: float = 1e-3) -> GeneralizedPlant:
+    """Return a plant in which no state is known exactly, such as that of an actuator: every state gets a little disturbance in w1 where one is.
+
+    Parameters
+    ----------
+    plant : GeneralizedPlant
+    share : float
+        Of a state's standard deviation.
+    """
+    bare = replace(plant, D22=np.zeros_like(plant.D22))
+    try:
+        E, F, W = covariances(bare, h2(bare.channel(bare.rows(1), slice(None))).controller)
+        sizes = np.sqrt(np.diag(E + F + F.T + W))
+        np.linalg.cholesky(E)
+        if (np.diag(E) > _KNOWN * sizes**2).all():
+            return plant
+    except LinAlgError:
+        pass
+    except SynthesisError:
+        return plant  # not regular: `balance` says so
+    n, _, _, n_z, n_y = plant.sizes
+    w1 = plant.columns(1).stop if plant.n_w1 is not None else plant.sizes[1]
+    noise = np.diag(share * np.where(sizes > 0, sizes, sizes.max(initial=0.0)))
+    return replace(
+        plant,
+        B1=np.insert(plant.B1, [w1] * n, noise, axis=1),
+        D11=np.insert(plant.D11, [w1] * n, np.zeros((n_z, n)), axis=1),
+        D21=np.insert(plant.D21, [w1] * n, np.zeros((n_y, n)), axis=1),
+        n_w1=w1 + n,
+        w_parts={},
+    )
 
 
 def covariances(plant: GeneralizedPlant, K: StateSpace) -> tuple[Array, Array, Array]:

@@ -130,7 +130,9 @@ def _programme(problem: _Problem, x: Array, freqs_hz: Array, level: float, itera
 
     room: dict[str, Any] = {"type": "ineq", "fun": lambda v: np.log(level) - gains(v)[0], "jac": lambda v: -gains(v)[1]}
     cost: Callable[[Array], tuple[float, Array]] = problem.cost
-    found = minimize(cost, x, jac=True, method="SLSQP", constraints=[room], options={"maxiter": iterations, "ftol": 1e-7})
+    p = problem.loop.plant
+    rooms = [room] if p.D11[p.rows(2), p.columns(2)].size else []
+    found = minimize(cost, x, jac=True, method="SLSQP", constraints=rooms, options={"maxiter": iterations, "ftol": 1e-7})
     return np.asarray(found.x)
 
 

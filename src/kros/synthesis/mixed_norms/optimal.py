@@ -18,14 +18,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 from ...core.errors import ConfigError, SynthesisError
+from ..assumptions import require, require_plant
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
 from ..riccati.h2_optimal import h2
+from .balance import reached
 from .candidates import by_hinf, by_inequalities
 from .channels import Verified, verify
+from .continuous import continuous_controller, discrete_twin, speed
 from .improvement import polish
 from .singular import is_degenerate, is_singular, on_the_plant, regularised
 from .youla import hinf_lower_bound, mixed_lower_bound
@@ -52,14 +57,14 @@ def mixed(
     Parameters
     ----------
     plant : GeneralizedPlant or ObserverProblem
-        A discrete plant with its channel partition (`n_w1`, `n_z1`), with penalty and noise in channel 1 (otherwise see
-        `mixed_singular`); or an observer problem, whose reduced and
-        regularised plant is then used, and whose result is a filter in physical units with a certified ``worst_case_h2``.
+        A plant with its channel partition (`n_w1`, `n_z1`), with penalty and noise in channel 1 (a discrete one may lack them, see
+        `kros.synthesis.mixed_norms.singular`); or an observer problem, whose reduced and regularised plant is then used, and whose result is a
+        filter in physical units with a certified ``worst_case_h2``. Continuous plants are mapped to discrete time, exactly.
     gamma : float
         Level of the H-infinity constraint.
     scalings : sequence of float
         Scalings of the second channel to try; the best verified result is kept. Default 1, 4, 16, and larger ones where these fail. For
-        observer problems see `mixed_observer`.
+        observer problems see `kros.synthesis.mixed_norms.observer`.
     max_states : int
         Stable plants are reduced to this number by balanced truncation for the inequalities only (their cost grows with the sixth power of
         the states, and states of no consequence make them ill-conditioned). The controller is verified on the full plant.
@@ -114,12 +119,14 @@ def mixed(
             time_limit_s=time_limit_s,
             solvers=solvers,
         )
-    if plant.dt == 0:
-        raise SynthesisError("Mixed synthesis works in discrete time, found a continuous plant (dt = 0); sample it.")
+    require_plant(plant, "Mixed synthesis")
     if not plant.sizes[0]:
         raise SynthesisError(
             "Mixed synthesis needs a plant with states, found none; without dynamics the best gain is a small convex problem."
         )
+    if plant.dt == 0:
+        options: dict[str, Any] = {"scalings": scalings, "max_states": max_states, "time_limit_s": time_limit_s, "polished": polished}
+        return _continuous(plant, gamma, **options, solvers=solvers)
     start = time.perf_counter()
     end = start + time_limit_s
     if is_singular(plant):
@@ -136,7 +143,13 @@ def mixed(
     found += by_hinf(plant, gamma, end, reasons)
     if not found:
         require_attainable(plant, gamma)
-        found = by_inequalities(plant, gamma, _LAST_SCALINGS if scalings is None else tried, max_states, end, reasons, notes, solvers)
+        easier = reached(plant)
+        if easier is not plant:  # the inequalities have not been tried yet
+            found = on_the_plant(
+                plant, by_inequalities(easier, gamma, (*tried, *_LAST_SCALINGS), max_states, end, reasons, notes, quick), gamma
+            )
+        else:
+            found = by_inequalities(plant, gamma, _LAST_SCALINGS if scalings is None else tried, max_states, end, reasons, notes, solvers)
     if not found:
         told = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
         raise SynthesisError(
@@ -192,6 +205,28 @@ def _singular(
     notes.append(f"Found by: {best.origin}.")
     lower = best.h2 if degenerate else None
     return _synthesis(best, lower, Status.CERTIFIED if best.optimal else Status.INACCURATE, list(dict.fromkeys(notes)), start)
+
+
+def _continuous(plant: GeneralizedPlant, gamma: float, **options: Any) -> Synthesis:
+    """Solve the discrete twin of a continuous plant, and verify on the plant itself."""
+    require(performance(plant), "Mixed synthesis in continuous time")
+    a = speed(plant)
+    found = mixed(discrete_twin(plant, a), gamma=gamma, **options)
+    verdict = verify(plant, continuous_controller(found.controller, a), gamma, "the controller of the discrete twin", found.solver)
+    if not isinstance(verdict, Verified):
+        raise SynthesisError(f"Mixed synthesis in continuous time: {verdict}; scale states to similar size, or raise gamma.")
+    return replace(
+        found,
+        controller=verdict.controller,
+        h2_norm=verdict.h2,
+        hinf_norm=verdict.hinf,
+        lower_bound=None if found.lower_bound is None else min(found.lower_bound, verdict.h2),
+        spectral_radius=verdict.margin,
+        notes=(
+            *found.notes,
+            f"Solved in discrete time by the bilinear map at {a:.6g} rad/s, which is exact; the norms are of the continuous loop.",
+        ),
+    )
 
 
 def performance(plant: GeneralizedPlant) -> GeneralizedPlant:

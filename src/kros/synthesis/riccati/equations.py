@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import LinAlgError, solve_continuous_are, solve_discrete_are
+from scipy.linalg import LinAlgError, solve_continuous_are, solve_continuous_lyapunov, solve_discrete_are
 
 from ...core.errors import SynthesisError
 
@@ -38,6 +38,8 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, p
     """
     if not A.size:
         return np.zeros((0, 0))
+    if dt == 0 and not B.shape[1]:
+        return solve_continuous_lyapunov(A.T, -Q)
     if dt > 0:
         X = _doubling(A, B, Q, R, S)
         if X is not None and _residual(A, B, Q, R, S, X) < 1e-9:

@@ -36,7 +36,7 @@ from .equations import discrete_gain, solve_riccati
 
 Array = npt.NDArray[Any]
 
-_AGREEMENT = 1e-4
+_AGREEMENT, _ROUNDING = 1e-4, 1e-12
 
 
 def h2(plant: GeneralizedPlant, injection: Injection = Injection.NONE) -> Synthesis:
@@ -69,16 +69,17 @@ def h2(plant: GeneralizedPlant, injection: Injection = Injection.NONE) -> Synthe
     """
     require(plant, "H2 synthesis")
     start = time.perf_counter()
-    K, promised = (_discrete if plant.dt > 0 else _continuous)(plant)
+    K, promised, rounding = (_discrete if plant.dt > 0 else _continuous)(plant)
     K = absorb_feedthrough(K, plant.D22)
     elapsed = time.perf_counter() - start
     closed = plant.close(K)
     norm = h2_norm(closed)
-    if not np.isfinite(norm) or abs(norm - promised) > _AGREEMENT * max(promised, 1e-12):
+    if not np.isfinite(norm) or abs(norm - promised) > _AGREEMENT * promised + rounding:
         raise SynthesisError(
             f"H2 synthesis: the closed loop has norm {norm:.9g} where the Riccati solutions promise {promised:.9g}; "
             "scale states, inputs and outputs to similar size."
         )
+    lower = min(promised, norm)
     return Synthesis(
         method="h2",
         controller=K,
@@ -86,8 +87,8 @@ def h2(plant: GeneralizedPlant, injection: Injection = Injection.NONE) -> Synthe
         injection=injection,
         h2_norm=norm,
         hinf_norm=hinf_norm(closed),
-        lower_bound=promised,
-        gap_percent=100 * (norm / promised - 1) if promised > 0 else 0.0,
+        lower_bound=lower,
+        gap_percent=100 * (norm / lower - 1) if lower > rounding else 0.0,
         spectral_radius=stability_margin(closed),
         solve_s=elapsed,
         solver="riccati",
@@ -112,13 +113,13 @@ def absorb_feedthrough(K: StateSpace, D22: Array) -> StateSpace:
         return K
     loop = np.eye(K.n_outputs) + K.D @ D22
     if np.linalg.cond(loop) > 1e12:
-        raise SynthesisError("H2 synthesis: the optimal controller makes the algebraic loop with D22 singular; add a delay or change D22.")
+        raise SynthesisError("Algebraic loop: the controller makes I + D^c D22 singular; add a delay to the plant, or change D22.")
     C, D = np.linalg.solve(loop, K.C), np.linalg.solve(loop, K.D)
     return StateSpace(K.A - K.B @ D22 @ C, K.B - K.B @ D22 @ D, C, D, K.dt)
 
 
-def _discrete(p: GeneralizedPlant) -> tuple[StateSpace, float]:
-    """Controller for D22 = 0 and the norm it promises."""
+def _discrete(p: GeneralizedPlant) -> tuple[StateSpace, float, float]:
+    """Controller for D22 = 0, the norm it promises, and how far rounding may be from it."""
     R1, S1 = p.D12.T @ p.D12, p.C1.T @ p.D12
     R2, S2 = p.D21 @ p.D21.T, p.B1 @ p.D21.T
     X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, R1, S1, p.dt, "H2 synthesis, control")
@@ -130,13 +131,13 @@ def _discrete(p: GeneralizedPlant) -> tuple[StateSpace, float]:
     L0 = np.linalg.solve(Sy, (F @ Y @ p.C2.T + F0 @ p.D21.T).T).T
     C = F - L0 @ p.C2
     K = StateSpace(p.A - L @ p.C2 + p.B2 @ C, L + p.B2 @ L0, C, L0, p.dt)
-    full_information = np.trace(p.D11.T @ p.D11 + p.B1.T @ X @ p.B1 - F0.T @ Rb @ F0)
-    estimation = np.trace(Rb @ (F @ Y @ F.T + F0 @ F0.T - L0 @ Sy @ L0.T))
-    return K, float(np.sqrt(max(full_information + estimation, 0.0)))
+    terms = [np.trace(p.D11.T @ p.D11 + p.B1.T @ X @ p.B1), -np.trace(F0.T @ Rb @ F0)]  # of full information
+    terms += [np.trace(Rb @ (F @ Y @ F.T + F0 @ F0.T)), -np.trace(Rb @ L0 @ Sy @ L0.T)]  # of estimation
+    return K, *_norm(terms)
 
 
-def _continuous(p: GeneralizedPlant) -> tuple[StateSpace, float]:
-    """Strictly proper controller for D22 = 0, D11 = 0, and the norm it promises."""
+def _continuous(p: GeneralizedPlant) -> tuple[StateSpace, float, float]:
+    """Strictly proper controller for D22 = 0, D11 = 0, the norm it promises, and how far rounding may be from it."""
     R1, S1 = p.D12.T @ p.D12, p.C1.T @ p.D12
     R2, S2 = p.D21 @ p.D21.T, p.B1 @ p.D21.T
     X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, R1, S1, 0.0, "H2 synthesis, control")
@@ -144,4 +145,10 @@ def _continuous(p: GeneralizedPlant) -> tuple[StateSpace, float]:
     F = -np.linalg.solve(R1, p.B2.T @ X + S1.T)
     L = np.linalg.solve(R2, p.C2 @ Y + S2.T).T
     K = StateSpace(p.A + p.B2 @ F - L @ p.C2, L, F, np.zeros((F.shape[0], L.shape[1])), 0.0)
-    return K, float(np.sqrt(max(np.trace(p.B1.T @ X @ p.B1) + np.trace(R1 @ F @ Y @ F.T), 0.0)))
+    return K, *_norm([np.trace(p.B1.T @ X @ p.B1), np.trace(R1 @ F @ Y @ F.T)])
+
+
+def _norm(terms: list[float]) -> tuple[float, float]:
+    """Root of a sum of terms that may cancel, and its rounding error; an optimum of zero is as large as rounding makes it."""
+    squared, rounding = sum(terms), _ROUNDING * sum(abs(term) for term in terms)
+    return float(np.sqrt(max(squared, 0.0))), float(np.sqrt(rounding))

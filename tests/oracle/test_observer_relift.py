@@ -6,19 +6,19 @@ from itertools import product
 
 import numpy as np
 import pytest
+
+from kros.core.lti import StateSpace, gain
+from kros.core.norms import hinf_norm
+from kros.lifting import Lifting
+from kros.observer import Observer, one_step_residual, run_observer
 from kros.observer.relift.adversary import attack, attack_running
+from kros.observer.relift.certificate import ReliftCertificate, relift_certificate
 from kros.observer.relift.error import ErrorSystem, ReliftScales, error_system
 from kros.observer.relift.ladder import growing_sequence
 from kros.observer.relift.proof import margin, proven
 from kros.observer.relift.rows import relift_report
 from kros.observer.relift.sdp import sdp_proposal
 from kros.observer.relift.status import Dropped, ReliftStatus
-
-from kros.core.lti import StateSpace, gain
-from kros.core.norms import hinf_norm
-from kros.lifting import Lifting
-from kros.observer import Observer, one_step_residual, run_observer
-from kros.observer.relift.certificate import ReliftCertificate, relift_certificate
 from kros.synthesis import Injection
 
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from kros.synthesis.riccati.constant_gain import luenberger
 from scipy.optimize import minimize
 
 from kros.core import StateSpace, SynthesisError, gain, h2_norm
 from kros.synthesis import GeneralizedPlant, h2, kalman
+from kros.synthesis.riccati.constant_gain import luenberger
 
 
 def random_plant(rng, n, dt, d22=True):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from kros.uncertainty.weights.certificate import Method, ResidualSystems, _pencils, certify
 
 from kros.core.errors import ConfigError
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.uncertainty import cover_ratio, fit_magnitude, residual
 from kros.uncertainty.fits.magnitude import alternation_db
+from kros.uncertainty.weights.certificate import Method, ResidualSystems, _pencils, certify
 from kros.uncertainty.weights.weight import fit_weight
 
 DT = 1e-3

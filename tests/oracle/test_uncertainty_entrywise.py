@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from kros.uncertainty.weights.certificate import _pencils
 
 from kros.core.lti import StateSpace, gain
 from kros.study.stages.synthesize import usable_problem
@@ -22,6 +21,7 @@ from kros.uncertainty import (
     quantify,
     residual,
 )
+from kros.uncertainty.weights.certificate import _pencils
 
 DT = 1e-3
 GRID = np.geomspace(0.01, 500.0, 60)

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kros.uncertainty.weights.certificate import _pencils
-from kros.uncertainty.weights.full_frames import _Search, best_frames, unit_triangular, with_floor
 from scipy.optimize import check_grad
 
 from kros.core.lti import StateSpace, block_diagonal, gain
 from kros.uncertainty import FullWeight, Method, Perturbation, ResidualSystems, Structure, UncertainModel, fit_weight, quantify, residual
 from kros.uncertainty.small import entries_first
+from kros.uncertainty.weights.certificate import _pencils
 from kros.uncertainty.weights.full import volume_db
+from kros.uncertainty.weights.full_frames import _Search, best_frames, unit_triangular, with_floor
 
 DT = 1e-3
 GRID = np.geomspace(0.05, 500.0, 60)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from kros.uncertainty.weights.cover_search import cost_from_below_db, couplings
 
 from kros.core import StateSpace
 from kros.core.errors import ConfigError, DimensionError
 from kros.uncertainty import Form, all_bounds, choose_nominal, choose_nominals, optimal_cover, residual
 from kros.uncertainty.population.nominal import frequency_weights
 from kros.uncertainty.small import lower_factor, triangle
+from kros.uncertainty.weights.cover_search import cost_from_below_db, couplings
 
 FORMS = list(Form)
 SHAPES = [(4, 2), (2, 4), (2, 2), (1, 1), (3, 3), (1, 3)]

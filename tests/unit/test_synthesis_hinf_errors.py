@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kros.synthesis.riccati.hinf_central import Obstacle, central
-from kros.synthesis.riccati.hinf_coordinates import coordinates
 
 from kros.core import ConfigError, SynthesisError, gain, hinf_norm
 from kros.synthesis import GeneralizedPlant, Status, hinf
+from kros.synthesis.riccati.hinf_central import Obstacle, central
+from kros.synthesis.riccati.hinf_coordinates import coordinates
 
 
 def plant(**changes):

@@ -321,7 +321,7 @@ def _scores(
     entries = largest_entries(form, G, found, np.asarray(units), rows)
     scores = []
     for k, unit, margin, row, entry in zip(units, ids, margins, rows, entries, strict=True):
-        referred = float(value[k]) if not np.isfinite(margin) else threshold + margin
+        referred = threshold + margin if np.isfinite(threshold) and np.isfinite(margin) else float(value[k])
         beyond = bool(np.isfinite(threshold) and margin > 0)
         scores.append(OutlierScore(unit, referred, threshold, beyond, float(freqs[row]), entry, float(value[k]), *summary.summary(k)))
     return tuple(scores)

@@ -21,6 +21,7 @@ from ...synthesis.robust.certificate import certify
 from ...uncertainty import Structure, UncertainModel
 from ..context import Context
 from ..makers import Product, Task, produce
+from ..methods import preferred, slowest_first, suitable
 from ..relift import Running, certify_running, save_running
 from ..residual_maker import OwnModel
 from ..tuning import TUNING_EPISODES, TUNING_UNITS, TuningSet
@@ -29,8 +30,6 @@ from . import calibrate
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 WORST_CASE = ("worst_case_h2", "worst_case_hinf")
-SLOWEST = ("worst_case_hinf", "worst_case_h2", "residual_h2", "kalman_tuned")
-PREFERRED = ("worst_case_h2", "worst_case_hinf", "mixed", "residual_h2", "kalman_tuned", "luenberger", "kalman_white", "open_loop")
 
 
 def run(context: Context) -> list[Path]:
@@ -61,7 +60,7 @@ def run(context: Context) -> list[Path]:
 
 def produced(context: Context, tasks: list[Task]) -> list[Product]:
     """Make the observers of all tasks; those that take longest start first, so that no worker waits for them in the end."""
-    order = sorted(range(len(tasks)), key=lambda i: SLOWEST.index(tasks[i].method) if tasks[i].method in SLOWEST else len(SLOWEST))
+    order = slowest_first([task.method for task in tasks])
     made = dict(zip(order, context.map("synthesize", produce, [tasks[i] for i in order]), strict=True))
     return [made[i] for i in range(len(tasks))]
 
@@ -88,11 +87,10 @@ def choose_deployed(wanted: str | None, made: list[str]) -> str:
         if wanted not in made:
             raise SynthesisError(f"observer.deployed = {wanted!r}: there is no such observer, only {', '.join(made)}; name one of them.")
         return wanted
-    for method in PREFERRED:
-        for name in made:
-            if name.endswith(f"/{method}"):
-                return name
-    raise SynthesisError("No observer could be made; see the reasons above.")
+    best = preferred(made)
+    if best is None:
+        raise SynthesisError("No observer could be made; see the reasons above.")
+    return best
 
 
 def tasks_of(context: Context, name: str) -> list[Task]:
@@ -103,19 +101,12 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     noise = measurement_noise(context, models)
     uncertain = UncertainModel.load(folder)
     problem, refusal = usable_problem(models, unit, uncertain, noise, context)
-    methods = set(config.observer.baselines + config.synthesis.methods)
-    if name not in context.edmd_names:
-        methods.discard("mixed")  # the paper's synthesis is made for the paper's models: see the page on limits
-    ordered = [
-        m
-        for m in ("open_loop", "kalman_white", "kalman_tuned", "luenberger", "mixed", "worst_case_h2", "worst_case_hinf", "residual_h2")
-        if m in methods
-    ]
+    methods = suitable(config.observer.baselines + config.synthesis.methods, name, refined=name not in context.edmd_names)
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings |= {"max_order": config.uncertainty.max_order, "max_states": config.synthesis.max_states, "covered": uncertain.unit_ids}
     return [
-        Task(f"{name}/{method}", method, models, unit, problem, refusal, noise, tuning_set(context, models), **settings)
-        for method in ordered
+        Task(f"{name}/{method.name}", method.name, models, unit, problem, refusal, noise, tuning_set(context, models), **settings)
+        for method in methods
     ]
 
 

@@ -1,0 +1,27 @@
+"""Which methods a study makes for which models, what starts first, and what is handed over."""
+
+import logging
+
+from kros.study.makers import MAKERS
+from kros.study.methods import METHODS, preferred, slowest_first, suitable
+
+
+def test_every_method_of_the_table_has_a_maker():
+    assert {method.name for method in METHODS} == set(MAKERS)
+    assert len({method.rank for method in METHODS}) == len(METHODS)
+
+
+def test_what_does_not_suit_refined_models_is_left_out_with_the_reason(caplog):
+    caplog.set_level(logging.INFO, logger="kros.study.methods")
+    wanted = ("mixed", "worst_case_h2", "open_loop", "filtered_difference")
+    assert [m.name for m in suitable(wanted, "koopman_edmd", refined=False)] == ["open_loop", "mixed", "worst_case_h2"]
+    assert not caplog.records
+    assert [m.name for m in suitable(wanted, "koopman", refined=True)] == ["open_loop", "worst_case_h2"]
+    assert "koopman/mixed is not made for refined models" in caplog.text
+
+
+def test_the_slowest_start_first_and_the_best_guarantee_is_handed_over():
+    assert slowest_first(["open_loop", "worst_case_hinf", "residual_h2", "kalman_white"]) == [1, 2, 0, 3]
+    made = ["koopman/open_loop", "koopman/residual_h2", "koopman_edmd/worst_case_h2", "linear/worst_case_h2"]
+    assert preferred(made) == "koopman_edmd/worst_case_h2"
+    assert preferred(["koopman/ekf"]) is None

@@ -12,7 +12,6 @@ from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status,
 from kros.synthesis.problem.paper_plant import paper_plant
 from kros.synthesis.riccati.constant_gain import luenberger
 from kros.synthesis.robust.certificate import certify
-from kros.synthesis.verify import closed_loop, observer_loop, spectral_radius_max
 
 DT = 1e-3
 
@@ -288,38 +287,17 @@ def test_result_survives_saving(tmp_path):
         Synthesis.load(tmp_path / "elsewhere")
 
 
-def test_block_triangular_closed_loop():
-    rng = np.random.default_rng(0)
-    case = problem()
-    units = StateSpace(
-        case.nominal.A * np.array([0.5, 0.9, 1.0])[:, None, None], np.ones((3, 2, 1)), np.ones((3, 1, 2)), np.zeros((3, 1, 1)), DT
-    )
-    for injection, rows in ((Injection.INPUT, 1), (Injection.STATE, 2)):
-        K = StateSpace([[0.5]], [[0.1]], 0.1 * rng.standard_normal((rows, 1)), 0.1 * rng.standard_normal((rows, 1)), DT)
-        loop = np.linalg.eigvals(observer_loop(case.nominal, case.C, K, injection))
-        for k in range(3):
-            whole = np.linalg.eigvals(closed_loop(units[k], case.nominal, case.C, K, injection))
-            expected = np.concatenate([loop, np.linalg.eigvals(units.A[k])])
-            assert np.sort(np.abs(whole)) == pytest.approx(np.sort(np.abs(expected)), abs=1e-6)
-        highest = max(np.abs(loop).max(), np.abs(np.linalg.eigvals(case.nominal.A)).max())
-        assert spectral_radius_max(units, case.nominal, case.C, K, injection) == pytest.approx(highest)
-    with pytest.raises(DimensionError, match=r"2 x 1 at 0\.001 s"):
-        observer_loop(case.nominal, case.C, gain([[1.0]], DT), Injection.STATE)
-    with pytest.raises(DimensionError, match="NONE"):
-        observer_loop(case.nominal, case.C, gain([[1.0]], DT), Injection.NONE)
-
-
-def test_closed_loop_matrix_is_the_simulation():
-    case = problem()
-    rng = np.random.default_rng(1)
-    K = StateSpace([[0.5]], [[0.1]], [[0.2]], [[0.3]], DT)
-    unit_A = case.nominal.A * 0.9
-    x, x_hat, x_c = rng.standard_normal(2), rng.standard_normal(2), rng.standard_normal(1)
-    matrix = closed_loop(StateSpace(unit_A, np.zeros((2, 1)), np.eye(2), np.zeros((2, 1)), DT), case.nominal, case.C, K, Injection.INPUT)
-    nu = case.C @ (x - x_hat)
-    correction = K.C @ x_c + K.D @ nu
-    expected = np.concatenate([unit_A @ x, case.nominal.A @ x_hat + case.nominal.B @ correction, K.A @ x_c + K.B @ nu])
-    assert matrix @ np.concatenate([x, x_hat, x_c]) == pytest.approx(expected)
+@pytest.mark.parametrize("injection", [Injection.INPUT, Injection.STATE])
+def test_no_unit_makes_the_loop_unstable(injection):
+    """Machine and observer together have the machine's poles and those of the nominal error: the spectral radius says nothing about robustness."""
+    rng, case = np.random.default_rng(0), problem(injection=injection)
+    J = case.nominal.B if injection is Injection.INPUT else np.eye(2)
+    K = StateSpace([[0.5]], [[0.1]], 0.1 * rng.standard_normal((J.shape[1], 1)), 0.1 * rng.standard_normal((J.shape[1], 1)), DT)
+    machine, correction = 0.9 * rng.standard_normal((2, 2)), J @ K.D @ case.C
+    observer = np.block([[case.nominal.A - correction, J @ K.C], [-K.B @ case.C, K.A]])
+    whole = np.block([[machine, np.zeros((2, 3))], [np.vstack([correction, K.B @ case.C]), observer]])
+    expected = np.concatenate([np.linalg.eigvals(machine), case.error_system(K).poles()])
+    assert np.sort(np.abs(np.linalg.eigvals(whole))) == pytest.approx(np.sort(np.abs(expected)), abs=1e-6)
 
 
 def test_units_of_measure_do_not_matter():

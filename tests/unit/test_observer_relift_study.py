@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kros.core.errors import DimensionError
+from kros.core.errors import DimensionError, SynthesisError
 from kros.core.lti import gain
 from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
@@ -17,6 +17,7 @@ from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certifica
 from kros.report.run_folder import RunFolder
 from kros.report.sections.relift import section
 from kros.study.relift import Running, certify, first_episodes, save_running
+from kros.study.stages.synthesize import choose_deployed
 from kros.study.tuning import TuningSet
 from kros.synthesis import Injection
 
@@ -93,7 +94,7 @@ def test_the_report_tells_gains_bounds_and_failures(tmp_path: Path) -> None:
     states = np.cumsum(np.random.default_rng(0).standard_normal((50, 2, 1)), axis=0)
     certificate = relift_certificate(good)
     rows = relift_report(certificate, good, states, np.zeros((50, 2, 1)), ["a", "b"])
-    running = [Running(good.name, certificate, rows), Running(bad.name, relift_certificate(bad), [])]
+    running = [Running(good.name, certificate, rows, 1.0), Running(bad.name, relift_certificate(bad), [], 2.0)]
     assert [r.facts()["relift_certified"] for r in running] == [True, False]
     assert running[0].facts()["relift_bound_worst"] == max(r.bound for r in rows)
     save_running(tmp_path / "observers", running)
@@ -104,3 +105,22 @@ def test_the_report_tells_gains_bounds_and_failures(tmp_path: Path) -> None:
     assert [row[1].text for row in found.tables[0].rows] == ["10.0", "none"]
     assert [row[0].text for row in found.tables[1].rows] == ["a", "b"]
     assert section(RunFolder(tmp_path), {"study": {}, "observers": {}}) is None
+
+
+def test_handed_over_is_the_most_accurate_observer_that_is_certified_as_it_runs() -> None:
+    good, bad = observer("koopman/open_loop", "sin(x)", 0.1), observer("koopman/worst_case_h2", "sin(x)", 0.5)
+    certificate, refused = relift_certificate(good), relift_certificate(bad)
+    assert certificate.certified
+    assert not refused.certified
+    running = [
+        Running("koopman/open_loop", certificate, [], 3.0),
+        Running("koopman/residual_h2", certificate, [], 1.0),
+        Running("linear/residual_h2", certificate, [], float("inf")),
+        Running("koopman/worst_case_h2", refused, [], 0.5),
+    ]
+    made = [r.name for r in running]
+    assert choose_deployed(None, made, running) == "koopman/residual_h2"
+    assert choose_deployed("koopman/open_loop", made, running) == "koopman/open_loop"
+    assert choose_deployed(None, made, running[3:]) == "koopman/worst_case_h2"
+    with pytest.raises(SynthesisError, match="there is no such observer"):
+        choose_deployed("ours", made, running)

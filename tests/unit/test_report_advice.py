@@ -34,7 +34,7 @@ def test_a_run_that_stopped_early_asks_for_nothing() -> None:
 
 
 def test_a_good_observer_is_handed_over() -> None:
-    assert "kros export c" in " ".join(advice(metrics(), ("position",)))
+    assert "deployed.json" in " ".join(advice(metrics(), ("position",)))
     without = metrics(observers={NAME: {"relift_certified": False}})
     assert "No certificate covers it as it runs" in " ".join(advice(without))
 

@@ -70,7 +70,9 @@ def _observer(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str
     if name != other and other in table.cells and not _smaller(table, name, other, hidden, 0.99):
         return ["The observer is no better than its model alone: correction from these measurements brings nothing here."]
     entry = metrics.get("observers", {}).get(name, {})
-    text = "Hand the observer over as C code with “kros export c”, and score new units with “kros check”."
+    text = (
+        "The observer is one JSON file, observers/deployed.json; “kros estimate” runs it on recordings, and “kros check” scores new units."
+    )
     if entry.get("relift_certified") is False:
         text += " No certificate covers it as it runs, so let it run beside the machine before anything depends on it."
     return [text]

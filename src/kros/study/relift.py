@@ -24,7 +24,7 @@ from ..observer import (
     run_observers,
 )
 from .makers import Product, Task
-from .tuning import TuningSet
+from .tuning import TuningSet, hidden_mean
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -34,16 +34,24 @@ _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has
 
 @dataclass(frozen=True, eq=False)
 class Running:
-    """What is known about one observer as it runs: its certificate and a row for every unit."""
+    """What is known about one observer as it runs: its certificate, a row for every unit, and the size of its errors.
+
+    `hidden_percent` is the geometric mean over the states that are not measured of the mean error on training episodes, percent of the range.
+    """
 
     name: str
     certificate: ReliftCertificate
     rows: list[ReliftRow]
+    hidden_percent: float
 
     def facts(self) -> dict[str, Any]:
         """Return what goes into the metrics."""
         found = self.certificate
-        facts: dict[str, Any] = {"relift_certified": found.certified, "relift_gain": found.gain}
+        facts: dict[str, Any] = {
+            "relift_certified": found.certified,
+            "relift_gain": found.gain,
+            "hidden_error_percent": self.hidden_percent,
+        }
         if not found.certified:
             return facts | {"relift_reason": found.reason}
         return facts | {"relift_mismatch_gain": found.mismatch_gain, "relift_bound_worst": max((r.bound for r in self.rows), default=None)}
@@ -69,12 +77,12 @@ def certify_running(tasks: Sequence[Task], products: Sequence[Product]) -> list[
     scales = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
     certificates = [certify(observer, scales, task) for observer in observers]
     estimates = run_observers(observers, judge.measurements(first.measured), batch.inputs, values)
-    return [
-        Running(
-            o.name, c, relift_report(c, o, batch.states, batch.inputs, units, batch.lengths, values, estimates=x) if c.certified else []
-        )
+    rows = [
+        relift_report(c, o, batch.states, batch.inputs, units, batch.lengths, values, estimates=x) if c.certified else []
         for o, c, x in zip(observers, certificates, estimates, strict=True)
     ]
+    hidden = hidden_mean(judge.compare(estimates), first.measured)
+    return [Running(o.name, c, r, float(h)) for o, c, r, h in zip(observers, certificates, rows, hidden, strict=True)]
 
 
 def first_episodes(tuning: TuningSet) -> TuningSet:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,9 +64,19 @@ class Judge:
         y = self.batch.states[..., list(observers[0].measured)]
         found = []
         for start in range(0, len(observers), SIDE_BY_SIDE):
-            estimates = run_observers(observers[start : start + SIDE_BY_SIDE], y, self.batch.inputs, values)
-            found += [error_percent(estimate, self.batch.states, self.batch.lengths).mean(axis=0) for estimate in estimates]
+            found += [*self.compare(run_observers(observers[start : start + SIDE_BY_SIDE], y, self.batch.inputs, values))]
+        return np.array(found)
+
+    def compare(self, estimates: Iterable[Array]) -> Array:
+        """Return the same for estimates that are there already, shape (observer, n)."""
+        found = [error_percent(estimate, self.batch.states, self.batch.lengths).mean(axis=0) for estimate in estimates]
         return np.where(np.isfinite(found), found, np.inf)
+
+
+def hidden_mean(values: Array, measured: Sequence[int]) -> Array:
+    """Return the geometric mean over the states that are not measured (all, where none is hidden); `values` has shape (..., n)."""
+    hidden = [i for i in range(values.shape[-1]) if i not in measured] or list(measured)
+    return np.asarray(np.exp(np.mean(np.log(np.maximum(values[..., hidden], np.finfo(float).tiny)), axis=-1)))
 
 
 def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, float]:
@@ -89,5 +99,4 @@ def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, f
     worst = float(ratio.max())
     if not worst <= 1:
         return True, worst
-    hidden = [i for i in range(len(ratio)) if i not in measured] or list(measured)
-    return False, float(np.exp(np.mean(np.log(np.maximum(ratio[hidden], np.finfo(float).tiny)))))
+    return False, float(hidden_mean(ratio, measured))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -47,10 +47,10 @@ def run(context: Context) -> list[Path]:
             facts[task.name] |= next(certificates)
             files += save(context, task, product.synthesis)
     made = [p.name for p in products if p.synthesis is not None]
-    deployed = choose_deployed(context.config.observer.deployed, made)
     folder = context.store.path("observers")
     running = [r for found in context.run("certify as it runs", as_it_runs(tasks, products)) for r in found]
     files += save_running(folder, running)
+    deployed = choose_deployed(context.config.observer.deployed, made, running)
     for found in running:
         facts[found.name] |= found.facts()
     save_artifact(folder, "observers", {"names": made, "deployed": deployed, "facts": facts})
@@ -81,13 +81,18 @@ def as_it_runs(tasks: list[Task], products: list[Product]) -> list[Callable[[], 
     return [partial(certify_running, [t for t, _ in kind], [p for _, p in kind]) for kind in kinds]
 
 
-def choose_deployed(wanted: str | None, made: list[str]) -> str:
-    """Return the observer that is handed over: the one asked for, else the best guarantee of the best model."""
+def choose_deployed(wanted: str | None, made: list[str], running: Sequence[Running]) -> str:
+    """Return the observer that is handed over: the one asked for, else the most accurate one that is certified as it runs.
+
+    Accuracy is that on training episodes, of the states that are not measured. Where no observer is certified as it runs, the best guarantee of
+    the best model decides.
+    """
     if wanted is not None:
         if wanted not in made:
             raise SynthesisError(f"observer.deployed = {wanted!r}: there is no such observer, only {', '.join(made)}; name one of them.")
         return wanted
-    best = preferred(made)
+    certified = {r.name: r.hidden_percent for r in running if r.certificate.certified and np.isfinite(r.hidden_percent)}
+    best = min(certified, key=lambda name: certified[name], default=preferred(made))
     if best is None:
         raise SynthesisError("No observer could be made; see the reasons above.")
     return best

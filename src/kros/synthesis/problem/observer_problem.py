@@ -204,7 +204,7 @@ class ObserverProblem:
 
     @property
     def correction_size(self) -> int:
-        """Number of signals of the correction: outputs of K."""
+        """Number of outputs of K, the signals of the correction."""
         return self.nominal.n_inputs if self.injection is Injection.INPUT else self.nominal.n_states
 
     @property

@@ -4,6 +4,7 @@ from .baselines.difference import FilteredDifference, cutoffs_hz, rates
 from .baselines.extended_kalman import ExtendedKalman, start_covariance
 from .baselines.kalman import kalman_candidates, luenberger_candidates, noise_covariances
 from .baselines.learned import Features, Learned, Moments
+from .memory import Past, remembering_observer
 from .observer import Observer
 from .phase_lock import Tracked, track_parameter
 from .relift.adversary import Attack, attack, attack_running
@@ -27,6 +28,7 @@ __all__ = [
     "Learned",
     "Moments",
     "Observer",
+    "Past",
     "ReliftCertificate",
     "ReliftRow",
     "ReliftScales",
@@ -47,6 +49,7 @@ __all__ = [
     "rates",
     "relift_certificate",
     "relift_report",
+    "remembering_observer",
     "residual_models",
     "residual_spectra",
     "run_observer",

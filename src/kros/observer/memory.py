@@ -1,0 +1,291 @@
+r"""Observers with a memory of what they saw: low-order models for hidden states, identified from recordings in which these are known.
+
+A correction filter sees innovations only, and a model of the recorded states cannot hold what a machine remembers besides: the integrator of its
+controller, the load. Here the hidden states are regressed on the past of what the observer sees,
+
+.. math:: z = [\,y - M u;\; u_f;\; \sigma(y)\,],
+
+(u_f the inputs that no measurement follows: where a drive stands says nothing) through a bank of delays of all and slow lags of the first
+(as for `shaping_filter`), ``s+ = S s + E z``, ``x_h = W s``. Only few directions of s matter: with P the second moment of s *as recorded* and
+Q the observability Gramian of (W, S), the leading eigenvectors of ``Q^(1/2) P Q^(1/2)`` span the states that are kept. In the
+coordinates where Q is the identity S is a contraction, and so is any orthogonal projection of it: the reduced model is *always stable*.
+
+The hidden states become coordinates of it, the other directions states ``memory_1, ...`` of the observer's model. The measured state enters as
+``y = y_hat + nu``, equal columns of A and of the gain. So the result is an `Observer` like any other, which runs, is tuned (`tune_observer`) and certified
+(`relift_certificate`) as all are: extra states start at zero and nothing has to be recorded for them.
+
+References
+----------
+D. F. Enns, "Model reduction with balanced realizations: an error bound and a frequency weighted generalization", CDC 1984, 127-132.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import null_space
+from scipy.signal import lfilter
+
+from ..core.errors import DataError, DimensionError
+from ..core.lti import gain
+from ..core.norms import gramian
+from ..lifting import Lifting
+from ..synthesis.residual.shaping import Bank
+from ..synthesis.result import Injection
+from .observer import Observer
+
+Array = npt.NDArray[np.float64]
+BANK = Bank(40)
+_THIN, _SKIP, _RIDGE, _FOLLOWS, _NEGLIGIBLE = 4, 300, 1e-5, 0.5, 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Past:
+    """What the units' recordings say about their hidden states: moments of the bank's states, common to any order.
+
+    Parameters
+    ----------
+    lifting : Lifting
+    measured : tuple of int
+    bank : Bank
+    static : ndarray, shape (q, m)
+        M, what the inputs alone say of the measurement.
+    free : tuple of int
+        Inputs that no measurement follows.
+    units : tuple of str
+    gram : ndarray, shape (unit, N, N)
+        Second moments of s.
+    cross : ndarray, shape (unit, N, h)
+        Of s and the hidden states.
+    power : ndarray, shape (unit, h)
+        Mean squares of the hidden states.
+    """
+
+    lifting: Lifting
+    measured: tuple[int, ...]
+    bank: Bank
+    static: Array
+    free: tuple[int, ...]
+    units: tuple[str, ...]
+    gram: Array
+    cross: Array
+    power: Array
+
+    @classmethod
+    def of(
+        cls,
+        lifting: Lifting,
+        measured: Sequence[int],
+        states: Array,
+        inputs: Array,
+        lengths: npt.ArrayLike,
+        units: Sequence[str],
+        parameters: Mapping[str, npt.ArrayLike] | None = None,
+        bank: Bank = BANK,
+    ) -> Past:
+        """Collect moments of recordings.
+
+        Parameters
+        ----------
+        lifting : Lifting
+            Its functions read measured states alone; no delays, no functions of inputs.
+        measured : sequence of int
+        states : ndarray, shape (n_samples, batch, n)
+        inputs : ndarray, shape (n_samples, batch, m)
+        lengths : array_like of int, shape (batch,)
+        units : sequence of str, length batch
+        parameters : mapping of str to array_like, shape (batch,)
+        bank : Bank
+
+        Raises
+        ------
+        DimensionError
+            When the lifting reads hidden or earlier values, or has functions of inputs.
+        DataError
+            When every state is measured, or an episode is too short.
+        """
+        seen = {lifting.states[i] for i in measured} | set(lifting.parameters)
+        if lifting.history or lifting.input_functions or any(set(f.used) - seen for f in lifting.formulas):
+            raise DimensionError(
+                f"Observer with memory: functions of the lifting should read {', '.join(sorted(seen))} alone, found {', '.join(lifting.functions)}."
+            )
+        hidden, lengths = _hidden(lifting, measured), np.asarray(lengths, dtype=int)
+        if not hidden or lengths.min() <= 2 * _SKIP:
+            raise DataError(
+                f"Observer with memory: needs a state that is not measured and episodes of more than {2 * _SKIP} samples, "
+                f"found {len(hidden)} and {lengths.min()}."
+            )
+        y = states[..., list(measured)]
+        static: Array = np.asarray(np.linalg.lstsq(_centred(inputs), _centred(y), rcond=None)[0].T, dtype=float)
+        share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
+        free = tuple(int(j) for j in np.flatnonzero(share.max(axis=0) < _FOLLOWS))
+        z = _seen(lifting, tuple(measured), static, free, y, inputs, parameters)
+        names = tuple(dict.fromkeys(units))
+        size = bank.delays * z.shape[-1] + len(bank.poles) * len(measured)
+        gram, cross, power = (
+            np.zeros((len(names), size, size)),
+            np.zeros((len(names), size, len(hidden))),
+            np.zeros((len(names), len(hidden))),
+        )
+        counts = np.zeros(len(names))
+        for i, unit in enumerate(units):
+            rows, k = np.arange(_SKIP, lengths[i], _THIN), names.index(unit)
+            s, truth = _bank_states(bank, z[:, i], rows, len(measured)), states[rows, i][:, hidden]
+            gram[k] += s.T @ s
+            cross[k] += s.T @ truth
+            power[k] += np.sum(truth**2, axis=0)
+            counts[k] += len(rows)
+        each = counts[:, None]
+        return cls(lifting, tuple(measured), bank, static, free, names, gram / each[:, None], cross / each[:, None], power / each)
+
+    def model(self, order: int, without: Sequence[str] = (), importance: npt.ArrayLike = 1.0) -> tuple[Array, Array, Array]:
+        """Return a stable model ``h+ = F h + G z``, ``x_h = H h`` of an order, of all units but some; F (order, order).
+
+        Raises
+        ------
+        DataError
+            When no unit is left.
+        DimensionError
+            When the order is below the number of hidden states.
+
+        Notes
+        -----
+        `importance`, shape (h,) or a number, weights the hidden states' mean square errors, each relative to what the whole bank leaves of it.
+        """
+        rows = [i for i, unit in enumerate(self.units) if unit not in without]
+        if not rows:
+            raise DataError(f"Observer with memory: no unit is left without {', '.join(sorted(without))}; record more units.")
+        P, cross, power = self.gram[rows].mean(axis=0), self.cross[rows].mean(axis=0), self.power[rows].mean(axis=0)
+        if not cross.shape[1] <= order:
+            raise DimensionError(f"Observer with memory: {cross.shape[1]} hidden states need an order of at least as many, found {order}.")
+        q, delays = len(self.measured), self.bank.delays
+        channels = (len(P) - len(self.bank.poles) * q) // delays
+        S, E = self.bank.system(channels)
+        present = [i for i in range(len(S)) if i < delays * channels or i % channels < q]
+        S, E = S[np.ix_(present, present)], E[present]
+        W = _ridge(P, cross, self.bank, channels)
+        left = np.sqrt(np.maximum(power - 2 * np.sum(W * cross.T, axis=1) + np.sum((W @ P) * W, axis=1), _NEGLIGIBLE * power))
+        values, vectors = np.linalg.eigh(gramian(S.T, (W * (np.sqrt(importance) / left)[:, None]).T, 1.0))
+        kept = values > _NEGLIGIBLE * values[-1]
+        root, inverse = np.sqrt(values[kept])[:, None] * vectors[:, kept].T, vectors[:, kept] / np.sqrt(values[kept])
+        leading = np.linalg.eigh(root @ P @ root.T)[1][:, ::-1][:, :order]
+        down, up = leading.T @ root, inverse @ leading
+        size = np.sqrt(np.diag(down @ P @ down.T))
+        down, up = down / size[:, None], up * size
+        return down @ S @ up, down @ E, W @ up
+
+
+def remembering_observer(
+    name: str,
+    past: Past,
+    memories: int,
+    inputs: Sequence[str],
+    states: Array,
+    recorded: Array,
+    sample_period_s: float,
+    parameters: Mapping[str, npt.ArrayLike] | None = None,
+    without: Sequence[str] = (),
+    importance: npt.ArrayLike = 1.0,
+) -> Observer:
+    """Return an observer with states of its own, for all units but some.
+
+    Parameters
+    ----------
+    name : str
+    past : Past
+    memories : int
+        States besides the original ones: they take the place of a correction filter's.
+    inputs : sequence of str
+    states : ndarray, shape (n_samples, batch, n)
+        Recordings to fit the measured states' rows on, of the units that take part.
+    recorded : ndarray, shape (n_samples, batch, m)
+        Their inputs.
+    sample_period_s : float
+    parameters : mapping of str to array_like, shape (batch,)
+    without : sequence of str
+    importance : array_like, shape (h,)
+        Weights of the hidden states' mean square errors, each relative to what the whole bank leaves of it.
+
+    Returns
+    -------
+    Observer
+        Its lifting has ``memory_1, ...`` after the original states; its correction is a gain.
+    """
+    lifting, measured = past.lifting, past.measured
+    n, q, m, hidden = lifting.n_states, len(measured), recorded.shape[-1], _hidden(lifting, measured)
+    F, G, H = past.model(len(hidden) + memories, without, importance)
+    turn = np.vstack([H, null_space(H / np.linalg.norm(H, axis=1)[:, None]).T])
+    back = np.linalg.inv(turn)
+    F, G = turn @ F @ back, turn @ G
+    z = _seen(lifting, measured, past.static, past.free, states[..., list(measured)], recorded, parameters)
+    following = _measured_rows(F, G, z, states[..., list(measured)])
+    place = [*hidden, *range(n, n + memories)]
+    raw = np.zeros((n + memories, q + m + len(lifting.functions)))  # of y, u and sigma, in place of z
+    own = np.zeros((n + memories, n + memories))
+    channels = [*range(q), *(q + j for j in past.free), *range(q + m, raw.shape[1])]
+    raw[np.ix_(place, channels)], own[np.ix_(place, place)] = G, F
+    raw[np.ix_(list(measured), channels)], own[np.ix_(list(measured), place)] = following[:, len(F) :], following[:, : len(F)]
+    raw[:, q : q + m] -= raw[:, :q] @ past.static
+    raw[list(measured), range(q)] += 1.0
+    own[:, list(measured)] = raw[:, :q]
+    widened = Lifting((*lifting.states, *(f"memory_{i + 1}" for i in range(memories))), lifting.functions, lifting.parameters)
+    silent = np.zeros((len(lifting.functions), widened.n_lifted))
+    A = np.vstack([np.hstack([own, raw[:, q + m :]]), silent])
+    B, D = (np.vstack([M, silent[:, : M.shape[1]]]) for M in (raw[:, q : q + m], raw[:, :q]))
+    return Observer(name, widened, A, B, measured, tuple(inputs), gain(D, sample_period_s), Injection.STATE, sample_period_s)
+
+
+def _hidden(lifting: Lifting, measured: Sequence[int]) -> list[int]:
+    return [i for i in range(lifting.n_states) if i not in measured]
+
+
+def _centred(values: Array) -> Array:
+    rows = values.reshape(-1, values.shape[-1])
+    return np.asarray(rows - rows.mean(axis=0))
+
+
+def _seen(
+    lifting: Lifting,
+    measured: tuple[int, ...],
+    static: Array,
+    free: tuple[int, ...],
+    y: Array,
+    u: Array,
+    parameters: Mapping[str, npt.ArrayLike] | None,
+) -> Array:
+    """The channels z, shape (n_samples, batch, channels)."""
+    x = np.zeros((*y.shape[:-1], lifting.n_states))
+    x[..., list(measured)] = y
+    return np.concatenate([y - u @ static.T, u[..., list(free)], lifting.lift(x, parameters)[..., lifting.n_states :]], axis=-1)
+
+
+def _bank_states(bank: Bank, z: Array, rows: npt.NDArray[np.intp], slow: int) -> Array:
+    """States s of one episode at some samples: delays of all channels, then lags of the first few, shape (rows, N)."""
+    delayed = [z[np.maximum(rows - j, 0)] for j in range(1, bank.delays + 1)]
+    lags = [lfilter([0.0, np.sqrt(1 - p**2)], [1.0, -p], z[:, :slow], axis=0)[rows] for p in bank.poles]
+    return np.concatenate([*delayed, *lags], axis=1)
+
+
+def _ridge(P: Array, cross: Array, bank: Bank, channels: int) -> Array:
+    """Weights W of the hidden states, shape (h, N); the penalty is on differences of neighbouring samples, as the samples are nearly alike."""
+    n = bank.delays * channels
+    change = np.eye(len(P)) - np.diag((np.arange(len(P) - channels) < n - channels).astype(float), -channels)
+    P, cross = change @ P @ change.T, change @ cross
+    size = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))
+    weights = np.linalg.solve(P / np.outer(size, size) + _RIDGE * np.eye(len(P)), cross / size[:, None]) / size[:, None]
+    return np.asarray((change.T @ weights).T)
+
+
+def _measured_rows(F: Array, G: Array, z: Array, y: Array) -> Array:
+    """Fit the change of the measured states on h and z, shape (q, order + channels)."""
+    h = np.zeros((*z.shape[:2], len(F)))
+    driven = z @ G.T
+    for k in range(len(z) - 1):
+        h[k + 1] = h[k] @ F.T + driven[k]
+    regressors = np.concatenate([h, z], axis=-1)[_SKIP:-1:_THIN].reshape(-1, len(F) + z.shape[-1])
+    change = np.diff(y, axis=0)[_SKIP::_THIN].reshape(-1, y.shape[-1])
+    size = np.maximum(np.sqrt(np.mean(regressors**2, axis=0)), np.finfo(float).tiny)
+    return np.asarray((np.linalg.lstsq(regressors / size, change, rcond=None)[0] / size[:, None]).T)

@@ -1,0 +1,118 @@
+"""Observers with memory against systems whose memory is known, and against the Kalman predictor."""
+
+import numpy as np
+import pytest
+
+from kros.core.errors import DataError, DimensionError
+from kros.lifting import Lifting
+from kros.observer import Observer, Past, relift_certificate, remembering_observer, run_observer, tune_observer
+from kros.synthesis import Injection, kalman
+from kros.synthesis.residual.shaping import Bank
+
+DT = 0.01
+LIFTING = Lifting(("p", "c"), ("sin(5*p + phase)",), ("phase",))
+NAMES = ("target", "push")
+
+
+def controlled(n_samples=2500, batch=6, seed=0):
+    """The hidden state is the command of a controller with an integrator: it is known from the past of tracking errors, not from p."""
+    rng = np.random.default_rng(seed)
+    target = np.cumsum(0.01 * rng.normal(size=(n_samples, batch)), axis=0)
+    push, phase = rng.normal(size=(n_samples, batch)), rng.uniform(-3, 3, batch)
+    x, integral = np.zeros((n_samples, batch, 2)), np.zeros(batch)
+    for k in range(n_samples - 1):
+        p, c = x[k].T
+        error = target[k] - p
+        integral = 0.99 * integral + error
+        wave = np.sin(5 * p + phase)
+        x[k + 1, :, 0] = p + 0.1 * c + 0.01 * wave + 0.003 * rng.normal(size=batch)
+        x[k + 1, :, 1] = 0.5 * c + 0.8 * error + 0.02 * integral + 0.1 * push[k] + 0.05 * wave
+    return x, np.stack([target, push], axis=-1), {"phase": phase}
+
+
+def size(values):
+    return np.sqrt(np.mean(values[400:] ** 2))
+
+
+@pytest.fixture(scope="module")
+def made():
+    x, u, phase = controlled()
+    past = Past.of(LIFTING, (0,), x, u, [2500] * 6, list("aabbcc"), phase, Bank(20))
+    return past, x, u, phase
+
+
+def test_the_integrator_of_a_controller_is_found(made):
+    past, x, u, phase = made
+    rough = remembering_observer("o", past, 1, NAMES, x, u, DT, phase)
+    tuned = tune_observer(rough, x, u, phase, least_gain=1e-4)
+    fresh, v, other = controlled(seed=1)
+    errors = [size((o.run(fresh[..., :1], v, other)[..., :2] - fresh)[..., 1]) for o in (rough, tuned.observer)]
+    assert errors[1] < 0.05 * 5 * 0.003  # c and one memory make the next c, but for the wave, which is lifted from the predicted p
+    assert errors[1] < 0.1 * errors[0]
+    poles = np.sort(np.linalg.eigvals((tuned.observer.A[:3, :3] - tuned.observer.controller.D[:3] @ np.eye(1, 3))[1:, 1:]).real)
+    np.testing.assert_allclose(poles, [0.5, 0.99], atol=2e-3)
+
+
+def test_what_runs_is_an_observer_like_any_other(made, tmp_path):
+    past, x, u, phase = made
+    observer = remembering_observer("o", past, 3, NAMES, x, u, DT, phase)
+    assert observer.lifting.states == ("p", "c", "memory_1", "memory_2", "memory_3")
+    assert relift_certificate(observer, mismatch=False).certified
+    observer.save(tmp_path / "o.json")
+    again = Observer.load(tmp_path / "o.json")
+    running, expected = (
+        again.start(x[0, 0, :1], {"phase": phase["phase"][0]}),
+        observer.run(x[:50, :1, :1], u[:50, :1], {"phase": phase["phase"][:1]}),
+    )
+    for k in range(49):
+        np.testing.assert_allclose(running.step(x[k, 0, :1], u[k, 0]), expected[k + 1, 0], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("order", [1, 2, 5, 12])
+def test_reduced_models_are_stable(made, order):
+    F = made[0].model(order)[0]
+    assert np.abs(np.linalg.eigvals(F)).max() < 1
+
+
+def test_leaving_a_unit_out_is_as_if_it_had_not_been_recorded(made):
+    past, x, u, phase = made
+    others = Past.of(LIFTING, (0,), x[:, :4], u[:, :4], [2500] * 4, list("aabb"), {"phase": phase["phase"][:4]}, Bank(20))
+    same = Past(past.lifting, past.measured, past.bank, past.static, past.free, others.units, past.gram[:2], past.cross[:2], past.power[:2])
+    F, G, H = past.model(4, without=["c"])
+    for found, expected in zip((F, G, H), same.model(4), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
+
+
+def test_a_linear_system_gets_the_kalman_predictor():
+    rng = np.random.default_rng(3)
+    F, G, Q = np.array([[1.0, 0.1], [-0.3, 0.8]]), np.array([[0.0], [1.0]]), np.diag([1e-3, 4e-2])
+    x, u = np.zeros((4000, 6, 2)), rng.normal(size=(4000, 6, 1))
+    for k in range(3999):
+        x[k + 1] = x[k] @ F.T + u[k] @ G.T + rng.normal(size=(6, 2)) * np.sqrt(np.diag(Q))
+    plain = Lifting(("x", "v"))
+    past = Past.of(plain, (0,), x, u, [4000] * 6, list("abcdef"), bank=Bank(30))
+    found = remembering_observer("o", past, 3, ("u",), x, u, DT)
+    best = kalman(F, np.eye(1, 2), Q, np.array([[1e-15]]), DT)
+    ideal = Observer("k", plain, F, G, (0,), ("u",), best.controller, Injection.STATE, DT)
+    errors = [size((run_observer(o, x[..., :1], u)[..., :2] - x)[..., 1]) for o in (found, ideal)]
+    assert errors[0] == pytest.approx(errors[1], rel=0.02)
+
+
+def test_tuning_leaves_measured_rows_of_such_observers_alone(made):
+    past, x, u, phase = made
+    rough = remembering_observer("o", past, 1, NAMES, x, u, DT, phase)
+    tuned = tune_observer(rough, x, u, phase, iterations=2, importance=(1.0,)).observer
+    np.testing.assert_array_equal(tuned.A[0], rough.A[0])
+    np.testing.assert_array_equal(tuned.A[:, 0], tuned.controller.D[:, 0])
+
+
+def test_what_cannot_be_done_is_refused(made):
+    past, x, u, phase = made
+    with pytest.raises(DimensionError, match="alone"):
+        Past.of(Lifting(("p", "c"), ("sin(c)",)), (0,), x, u, [2500] * 6, list("aabbcc"))
+    with pytest.raises(DataError, match="not measured"):
+        Past.of(LIFTING, (0, 1), x, u, [2500] * 6, list("aabbcc"), phase)
+    with pytest.raises(DataError, match="no unit is left"):
+        past.model(3, without=["a", "b", "c"])
+    with pytest.raises(DimensionError, match="at least as many"):
+        past.model(0)

@@ -33,7 +33,8 @@ def test_published_values():
     assert mu_upper(M, [Block.full(2)]) == pytest.approx(np.sqrt(10), rel=1e-9)
     assert mu_lower(M, [SCALAR, SCALAR])[0] == pytest.approx(3.0, rel=1e-9)
     assert mu_upper(four_scalars(), [SCALAR] * 4) == pytest.approx(1.0, rel=1e-7)
-    assert mu_lower(four_scalars(), [SCALAR] * 4)[0] == pytest.approx(0.8723, abs=1e-4)  # at most 0.8724 by sums of squares
+    # mu is at most 0.8724 by sums of squares: demo 5 of SOSTOOLS
+    assert mu_lower(four_scalars(), [SCALAR] * 4)[0] == pytest.approx(0.8723, abs=1e-4)
 
 
 def test_slicot_agrees():
@@ -154,7 +155,7 @@ def test_published_design_of_a_distillation_column():
     plant, blocks = distillation(), [SCALAR, SCALAR, Block.full(2)]
     grid = np.geomspace(1e-5, 4.9, 35)
     first = hinf(plant, tolerance=1e-4)
-    # the book: norm 1.1823 and mu 1.1818 at first, 1.0238 after a second round with scalings of order four; 0.974 is the best known
+    # scripts of the book (Sec8_124): norm 1.1823 and mu 1.1818 at first, 1.0238 after a second round with scalings of order four; 0.974 with those of Lundström
     assert first.hinf_norm == pytest.approx(1.1823, rel=5e-3)
     found = dk_iteration(plant, blocks, iterations=1, freqs_hz=grid, start=first)
     before, peak = (float(p) for p in found.notes[0].split(":")[1].split(";")[0].split(","))

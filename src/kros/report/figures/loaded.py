@@ -51,7 +51,8 @@ def draw(run: RunFolder) -> Drawing:
 
 def _compared(observers: list[str], deployed: str | None) -> list[str]:
     """The observer that is handed over and its twin; beside a lonely one the tuned Kalman filters."""
-    main = [n for n in main_observers(observers, deployed) if split_observer(n)[1] != "open_loop"]
+    known = main_observers(observers, deployed)
+    main = [n for n in known if split_observer(n)[1] != "open_loop"] or known
     robust = [n for n in main if split_observer(n)[1] not in BASELINES]
     return robust if len(robust) > 1 else main
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ...uncertainty import Cover, Form, Structure, UncertainModel
+from ...uncertainty import Cover, Form, Structure, UncertainModel, sigma_max
 from ...uncertainty.population.unit_residuals import UnitResiduals
 from ..canvas import decibel, frequency_axis, grid, thin_log
 from ..names import best_models, model_label, number
@@ -94,7 +94,9 @@ def _draw_row(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] |
     for panel, magnitudes, below in ((row[0], fitted.left, cover.left), (row[1], fitted.right, cover.right)):
         _draw_entries(panel, model.freqs_hz, magnitudes, below, names)
     if square:
-        _draw_product(row[2], model.freqs_hz, fitted.left * fitted.right, cover.left * cover.right)
+        loop = model.weight.right.frequency_response(model.freqs_hz) @ model.weight.left.frequency_response(model.freqs_hz)
+        best = None if model.weight.structure is Structure.FULL else (cover.left * cover.right).max(axis=1)  # the frames are the fit's own
+        _draw_product(row[2], model.freqs_hz, sigma_max(loop), best)
 
 
 def in_gauge(cover: Cover, other: Cover) -> Cover:
@@ -132,11 +134,12 @@ def _start_labels(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
         )
 
 
-def _draw_product(axes: Axes, freqs_hz: Array, product: Array, cover: Array) -> None:
+def _draw_product(axes: Axes, freqs_hz: Array, product: Array, cover: Array | None) -> None:
     frequency_axis(axes, freqs_hz, "", 4)
-    freqs, line = thin_log(freqs_hz, product.max(axis=1))
-    _, below = thin_log(freqs_hz, cover.max(axis=1))
-    axes.plot(freqs, decibel(below), color=Tone.INK.light, lw=3.2, alpha=0.25, solid_capstyle="butt")
+    freqs, line = thin_log(freqs_hz, product)
+    if cover is not None:
+        _, below = thin_log(freqs_hz, cover)
+        axes.plot(freqs, decibel(below), color=Tone.INK.light, lw=3.2, alpha=0.25, solid_capstyle="butt")
     axes.plot(freqs, decibel(line), color=Tone.INK.light, lw=1.2)
     axes.axhline(0, color=Tone.ALARM.light, lw=0.9, ls="--")
     axes.annotate(

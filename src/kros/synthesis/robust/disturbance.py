@@ -27,6 +27,7 @@ Fit = Callable[..., Any]
 
 _GRID = 400
 _FLOOR, _NOTHING = 1e-14, 1e-30
+_ALIKE = 9  # decimals, in nepers, to which spectra of one shape agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +128,7 @@ class Channels:
         self.left = problem.W_L.frequency_response(freqs_hz)
         self.contained = is_diagonal(problem.W_L)
         self.behind = None if self.contained else problem.W_L
+        self._fits: dict[Any, StateSpace] = {}
 
     def shaped(self, power: Array) -> Array:
         """Power of the channels for the power of w2."""
@@ -161,7 +163,10 @@ class Channels:
         return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
 
     def shaping(self, spectrum: Spectrum, fit: Fit, side: str, options: dict[str, Any]) -> Shaping:
-        """Fit one rational factor a channel."""
+        """Fit one rational factor a channel.
+
+        The best from below is the best from above but for its size, and channels whose spectra differ in size alone share a fit.
+        """
 
         def factor(power: Array) -> StateSpace:
             systems = []
@@ -170,10 +175,18 @@ class Channels:
                     systems.append(gain([[0.0]], self.problem.nominal.dt))
                     continue
                 magnitude = np.sqrt(np.maximum(column, _FLOOR * column.max()))
-                systems.append(fit(self.freqs_hz, magnitude, self.problem.nominal.dt, side=side, **options).system)
+                systems.append(_touching(self._fitted(magnitude, fit, options), self.freqs_hz, magnitude, side))
             return block_diagonal(systems)
 
         return Shaping(factor(spectrum.phi), self.behind, None if spectrum.psi is None else factor(spectrum.psi))
+
+    def _fitted(self, magnitude: Array, fit: Fit, options: dict[str, Any]) -> StateSpace:
+        """Fit of a magnitude, whatever its size, once."""
+        shape = np.round(np.log(magnitude / magnitude.max()), _ALIKE)
+        key = shape.tobytes(), fit, tuple(sorted(options.items()))
+        if key not in self._fits:
+            self._fits[key] = fit(self.freqs_hz, np.exp(shape), self.problem.nominal.dt, side="above", **options).system
+        return self._fits[key]
 
     def lowered(self, shaping: Shaping, spectrum: Spectrum) -> Shaping:
         """Scale every filter so that its power nowhere on the grid exceeds the spectrum."""
@@ -181,6 +194,13 @@ class Channels:
         if remainder is not None and spectrum.psi is not None:
             remainder = _lowered(remainder, self.freqs_hz, spectrum.psi)
         return Shaping(_lowered(shaping.filters, self.freqs_hz, spectrum.phi), shaping.behind, remainder)
+
+
+def _touching(system: StateSpace, freqs_hz: Array, magnitude: Array, side: str) -> StateSpace:
+    """Scale a fit until it touches the magnitude from above or from below."""
+    ratio = magnitude / np.abs(system.frequency_response(freqs_hz)[:, 0, 0])
+    scale = float(ratio.max() if side == "above" else ratio.min())
+    return StateSpace(system.A, system.B, system.C * scale, system.D * scale, system.dt)
 
 
 def _lowered(system: StateSpace, freqs_hz: Array, power: Array) -> StateSpace:

@@ -8,7 +8,19 @@ import pytest
 
 import kros.synthesis
 from kros.core import ConfigError, DataError, DimensionError, StateSpace, SynthesisError, block_diagonal, gain, h2_norm, hinf_norm
-from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, Synthesis, h2, hinf, kalman, mixed, worst_case_h2
+from kros.synthesis import (
+    GeneralizedPlant,
+    Injection,
+    ObserverProblem,
+    Status,
+    Synthesis,
+    h2,
+    hinf,
+    kalman,
+    mixed,
+    worst_case_h2,
+    worst_case_hinf,
+)
 from kros.synthesis.problem.paper_plant import paper_plant
 from kros.synthesis.riccati.constant_gain import luenberger
 from kros.synthesis.robust.certificate import certify
@@ -321,3 +333,16 @@ def test_public_names():
     assert callable(kros.synthesis.h2)
     with pytest.raises(AttributeError, match="nothing"):
         _ = kros.synthesis.nothing
+
+
+@pytest.mark.parametrize("method", [worst_case_h2, worst_case_hinf, mixed])
+def test_where_all_units_are_alike_nothing_is_corrected(method):
+    found = method(problem(W_L=gain([[0.0]], DT)))
+    assert found.worst_case_h2 == 0
+    assert found.lower_bound == 0
+    assert not np.any(found.controller.D)
+
+
+def test_weights_should_be_systems():
+    with pytest.raises(DimensionError, match="found ndarray"):
+        problem(W_L=np.eye(1))

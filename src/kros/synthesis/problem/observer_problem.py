@@ -104,6 +104,9 @@ class ObserverProblem:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "form", as_form(self.form))
+        for name in ("nominal", "W_L", "W_R", "W_u", "remainder_left", "remainder_right"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, StateSpace.of(getattr(self, name)))
         object.__setattr__(self, "C", np.atleast_2d(np.asarray(self.C, dtype=float)))
         n, m, q = self.nominal.n_states, self.nominal.n_inputs, self.C.shape[0]
         if self.C.shape[1] != n:

@@ -102,6 +102,12 @@ class _Constraint:
         half = inverse[..., None] * (_hermitian(vectors) @ self.A)
         return np.where(feasible, np.linalg.eigvalsh(_hermitian(half) @ half + extra)[:, -1], np.inf)
 
+    def vanishes(self) -> bool:
+        """Tell whether nothing reaches the error; a rational response that is zero at a whole grid is zero everywhere."""
+        return not self.A.any() and not any(
+            (P.any(axis=(-2, -1)) & Q.any(axis=(-2, -1))).any() for P, Q in zip(self.P, self.Q, strict=True)
+        )
+
     def best(self) -> tuple[Array, Array]:
         """Smallest bound, shape (f,), and its multipliers, shape (f, constraints): a compass search on a convex function."""
         size = np.linalg.norm(self.A, 2, axis=(-2, -1)) + 1e-300
@@ -111,7 +117,7 @@ class _Constraint:
         total = size + sum(reach)
         through = [np.linalg.norm(Q, 2, axis=(-2, -1)) + 1e-300 for Q in self.Q]
         # for scalars: tau q^2 = |p q| (|a| + |p q| + |p_r q_r|) is optimal
-        point = np.stack([np.log(r * total / q**2) for r, q in zip(reach, through, strict=True)], axis=-1)
+        point = np.stack([np.log(np.maximum(r * total / q**2, 1e-200)) for r, q in zip(reach, through, strict=True)], axis=-1)
         value, step = self.squared(point), np.full(len(size), 1.0)
         directions = np.vstack([np.eye(len(reach)), -np.eye(len(reach))])
         for _ in range(_SEARCH):
@@ -149,7 +155,10 @@ def robust_gain(problem: ObserverProblem, controller: StateSpace) -> RobustGain:
             f"Certificate: the nominal observer loop has spectral radius {float(loop.spectral_radius()):.9g}; no bound is finite."
         )
     freqs = _first_grid(problem, loop)
-    gains, _ = _Constraint.of(problem, loop, freqs).best()
+    constraint = _Constraint.of(problem, loop, freqs)
+    if constraint.vanishes():
+        return RobustGain(0.0, 0.0, 0.0)
+    gains, _ = constraint.best()
     for _ in range(_ROUNDS):
         k = int(np.argmax(gains))
         finer = np.linspace(freqs[max(k - 1, 0)], freqs[min(k + 1, len(freqs) - 1)], _FINER + 2)[1:-1]

@@ -89,6 +89,8 @@ def worst_case_hinf(
     channels = Channels(problem, design_grid(problem))
     nothing = gain(np.zeros((problem.correction_size, len(problem.C))), problem.nominal.dt)
     loop, best = problem.error_system(nothing), (robust_gain(problem, nothing), nothing)
+    if best[0].value == 0:
+        return _result(problem, *best, 0.0, 0.0)
     reasons, elapsed = [], 0.0
     for _ in range(refinements + 1):
         spectrum = dominating(channels, loop)

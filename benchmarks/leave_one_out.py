@@ -7,7 +7,7 @@ training episodes observers are made, tuned and trained, and the fold's own unit
 from its own training episodes, as it would on a new machine. Prints a line for every observer and condition: mean over the units with the
 95 % interval of a bootstrap over units, and the worst unit, of velocity and current in percent of the range; with the states of its filter,
 or its memory, and in how many folds its deployed form is certified.
-Refined models, moments of the past and those of the learned estimator are made once for each unit: what a fold leaves out is algebra.
+Nothing is shared between folds: refinement centres every unit on a pooled model, so that even a unit's own model knows the others.
 """
 
 from __future__ import annotations
@@ -124,40 +124,15 @@ def quantum(folder: Path) -> float:
     return float(steps[steps > 0].min())
 
 
-@dataclass(frozen=True)
-class Shared:
-    """What is made once for all units."""
-
-    A: np.ndarray
-    B: np.ndarray
-    pasts: dict[int, tuple[Past, ...]]
-    moments: Moments
-
-    @classmethod
-    def of(cls, data: Recordings) -> Shared:
-        """Refine every unit's model, and collect every unit's moments of training episodes."""
-        ids = list(data.population.unit_ids)
-        keys = {u: data.train[u, HOME] for u in ids}
-        phases = {"phase": np.array([data.parameters[u]["phase"] for u in ids])}
-        models = refine_population(data.population, keys, LIFTING, phases, stacked(data.population, keys, phases)).units
-        judge = data.judge(data.train, ids, HOME, TRAIN_SAMPLES)
-        b, owners = judge.batch, [k.unit for k in judge.batch.keys]
-        recordings = (b.states, b.inputs, b.lengths, owners, judge.parameters)
-        pasts = {bank: Past.of(CIRCLE, MEASURED, *recordings, bank=bank) for bank in {bank for banks in BANKS.values() for bank in banks}}
-        features = Features.of(LIFTING, MEASURED, b.states[..., :1], b.inputs)
-        own = {order: tuple(pasts[bank] for bank in banks) for order, banks in BANKS.items()}
-        return cls(models.A, models.B, own, Moments.of(features, *recordings))
-
-
 def leave_out(data: Recordings, folds: int) -> tuple[dict[tuple[str, str], np.ndarray], dict[str, tuple[str, str]]]:
     """Return errors (unit, hidden state) by observer and condition, and by observer its orders and the folds in which it is certified."""
-    ids, shared = list(data.population.unit_ids), Shared.of(data)
+    ids = list(data.population.unit_ids)
     errors: dict[tuple[str, str], list[np.ndarray]] = {}
     orders: dict[str, set[int | str]] = {}
     certified: dict[str, list[bool]] = {}
     for fold in range(folds):
         held = ids[fold::folds]
-        estimators = estimators_without(data, shared, [u for u in ids if u not in held])
+        estimators = estimators_without(data, [u for u in ids if u not in held])
         for name, estimator in estimators.items():
             orders.setdefault(name, set()).add(memory_of(estimator))
             if isinstance(estimator, Observer):
@@ -181,11 +156,13 @@ def memory_of(estimator: object) -> int | str:
     return estimator.controller.n_states + estimator.lifting.n_states - len(STATES)
 
 
-def estimators_without(data: Recordings, shared: Shared, units: list[str]) -> dict[str, object]:
+def estimators_without(data: Recordings, units: list[str]) -> dict[str, object]:
     """Make all observers and estimators from the training episodes of some units."""
     population = data.population.select(units)
-    rows = [data.population.unit_ids.index(u) for u in units]
-    A, B = shared.A[rows].mean(axis=0), shared.B[rows].mean(axis=0)
+    keys = {u: data.train[u, HOME] for u in units}
+    phases = {"phase": np.array([data.parameters[u]["phase"] for u in units])}
+    models = refine_population(population, keys, LIFTING, phases, stacked(population, keys, phases)).units
+    A, B = models.A.mean(axis=0), models.B.mean(axis=0)
     judge = data.judge(data.train, units, HOME, TRAIN_SAMPLES)
     batch, dt = judge.batch, population.sample_period_s
     scale, noise = np.abs(batch.states).max(axis=(0, 1)), np.array([data.resolution / np.sqrt(12)])
@@ -209,22 +186,25 @@ def estimators_without(data: Recordings, shared: Shared, units: list[str]) -> di
         found[f"residual_h2, {order} states"] = observer(designs[0], order)
     start = observer(designs[0], 2)
     short = judge.first(TUNE_SAMPLES)
-    tuned = tune_observer(start, short.batch.states, short.batch.inputs, short.parameters, delays=6 - start.controller.n_states)
-    found["residual_h2, tuned, 6 states"] = tuned.observer
+    delays = 6 - start.controller.n_states
+    found["residual_h2, tuned, 6 states"] = tune_observer(
+        start, short.batch.states, short.batch.inputs, short.parameters, delays=delays
+    ).observer
     found["filtered_difference"] = difference(judge, dt)
-    without = [u for u in data.population.unit_ids if u not in units]
-    for order, pasts in shared.pasts.items():
-        starts, tuned = remembering(pasts, order, judge.first(MEMORY_SAMPLES), dt, without)
-        found[f"with memory, {order} states"], found[f"with memory, tuned, {order} states"] = starts, tuned
-    found["learned"] = shared.moments.estimator(without)
+    recordings = (batch.states, batch.inputs, batch.lengths, owners, judge.parameters)
+    for order, banks in BANKS.items():
+        pasts = [Past.of(CIRCLE, MEASURED, *recordings, bank=bank) for bank in banks]
+        start, tuned = remembering(pasts, order, judge.first(MEMORY_SAMPLES), dt)
+        found[f"with memory, {order} states"], found[f"with memory, tuned, {order} states"] = start, tuned
+    found["learned"] = Moments.of(Features.of(LIFTING, MEASURED, batch.states[..., :1], batch.inputs), *recordings).estimator()
     return found
 
 
-def remembering(pasts: tuple[Past, ...], memories: int, judge: Judge, dt: float, without: list[str]) -> tuple[Observer, Observer]:
+def remembering(pasts: list[Past], memories: int, judge: Judge, dt: float) -> tuple[Observer, Observer]:
     """The observer with memory of the first bank, and the best tuned one."""
     b = judge.batch
     starts = [
-        remembering_observer("memory", past, memories, INPUTS, b.states, b.inputs, dt, judge.parameters, without, IMPORTANCE)
+        remembering_observer("memory", past, memories, INPUTS, b.states, b.inputs, dt, judge.parameters, importance=IMPORTANCE)
         for past in pasts
     ]
     tuned = [tune_observer(o, b.states, b.inputs, judge.parameters, iterations=STEPS, importance=IMPORTANCE) for o in starts]

@@ -13,8 +13,9 @@ from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.frequency import check_grid
 from .bilinear import BilinearAxis, check_continuous_grid
 from .forms import Form, as_form
+from .given_models import check_fit, check_scale
 from .population.nominal import Criterion, as_criterion
-from .quantify import POOLED, bound_continuous, check_fit, check_scale, choose_by
+from .quantify import POOLED, bound_continuous, choose_by
 from .residuals import check_responses
 from .weights.bounded import bound_residuals
 from .weights.cover import Cover, Structure, as_structure

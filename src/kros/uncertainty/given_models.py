@@ -1,0 +1,160 @@
+"""What a quantification is given: models of units, candidates for the nominal, scales and options, read and checked, every refusal by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError, DataError, DimensionError
+from ..core.lti import StateSpace
+
+Array = npt.NDArray[Any]
+
+
+def read_models(
+    models: Any, unit_ids: Sequence[str] | None, output_scale: npt.ArrayLike | None, input_scale: npt.ArrayLike | None
+) -> tuple[StateSpace, tuple[str, ...], tuple[Array, Array]]:
+    """Models as a checked batch, ids and scales."""
+    if hasattr(models, "systems") and hasattr(models, "unit_ids"):
+        output_scale = models.output_scale if output_scale is None else output_scale
+        input_scale = models.input_scale if input_scale is None else input_scale
+        unit_ids = tuple(models.unit_ids) if unit_ids is None else tuple(unit_ids)
+        models = models.systems(unit_ids)
+    system = stack_systems(models)
+    count = system.batch_shape[0]
+    ids = tuple(str(k) for k in range(count)) if unit_ids is None else tuple(unit_ids)
+    if len(ids) != count or len(set(ids)) != count:
+        raise DimensionError(
+            f"Quantify: needs one id for each of {count} units, all different, found {len(ids)} ({', '.join(ids[:5])} ...)."
+        )
+    if count < 2:
+        raise DataError(
+            f"Quantify: uncertainty of a population needs at least two units, found {count} ({', '.join(ids)}); record more units."
+        )
+    _check(system, tuple(f"unit {name}" for name in ids))
+    return system, ids, (check_scale("output", output_scale, system.n_outputs), check_scale("input", input_scale, system.n_inputs))
+
+
+def stack_systems(models: Any) -> StateSpace:
+    """Return a batch from a batch, or from a sequence of systems with the same outputs, inputs and sampling period.
+
+    Systems with fewer states than others get further ones that are stable and do nothing.
+
+    Raises
+    ------
+    DimensionError
+        When they differ, or a single system without the unit axis is given.
+    """
+    if not isinstance(models, StateSpace):
+        if isinstance(models, str) or not isinstance(models, Iterable):
+            raise DimensionError(
+                f"Quantify: needs the models of at least two units, found {type(models).__name__}; give a list of systems."
+            )
+        systems = [StateSpace.of(system) for system in models]
+        found = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
+        if len(found) != 1:
+            raise DimensionError(
+                f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(found)}; identify them alike."
+                if systems
+                else "Quantify: found no models; give at least two."
+            )
+        n_states = max(s.n_states for s in systems)
+        systems = [_padded(s, n_states) for s in systems]
+        A, B, C, D = (np.stack([getattr(s, x) for s in systems]) for x in "ABCD")
+        models = StateSpace(A, B, C, D, systems[0].dt)
+    if len(models.batch_shape) != 1:
+        raise DimensionError(
+            f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}; stack the units."
+        )
+    return models
+
+
+def read_candidates(extra: Mapping[str, StateSpace] | None, system: StateSpace, ids: tuple[str, ...]) -> dict[str, StateSpace]:
+    """Further candidates, checked like units."""
+    others = dict(extra or {})
+    for name, candidate in others.items():
+        if name in ids:
+            raise ConfigError(f"Quantify: candidate {name!r} has the name of a unit; give it another.")
+        _check_candidate(candidate, system)
+        _check(candidate[None], (f"candidate {name}",))
+    return others
+
+
+def find_nominal(
+    nominal: int | str | StateSpace | None, system: StateSpace, ids: tuple[str, ...], others: Mapping[str, StateSpace], best: int
+) -> tuple[int, StateSpace]:
+    """Row of the nominal among units and candidates (-1 for a model of its own) and its system."""
+    if isinstance(nominal, StateSpace):
+        _check_candidate(nominal, system)
+        _check(nominal[None], ("the nominal",))
+        return -1, nominal
+    names = (*ids, *others)
+    if isinstance(nominal, str):
+        if nominal not in names:
+            raise ConfigError(f"Quantify: nominal {nominal!r} is not among the units {', '.join(names[:10])}.")
+        nominal = names.index(nominal)
+    index = best if nominal is None else nominal
+    if not isinstance(index, (int, np.integer)) or not 0 <= index < len(names):
+        raise ConfigError(f"Quantify: nominal {index!r} is out of range; give a name, a system, or a whole number below {len(names)}.")
+    return int(index), system[index] if index < len(ids) else others[names[index]]
+
+
+def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
+    """Return ranges as an array, ones by default, or say what is wrong with them."""
+    scale = np.ones(size) if values is None else np.asarray(values, float)
+    if scale.shape != (size,) or not (np.isfinite(scale) & (scale > 0)).all():
+        raise DimensionError(f"Quantify: {side}_scale needs {size} positive ranges, found {np.array2string(scale, threshold=10)}.")
+    return scale
+
+
+def check_fit(max_order: int, tolerance_db: float, density: int = 1) -> None:
+    """Raise a `ConfigError` when an option of the fit is out of range."""
+    if not (isinstance(max_order, (int, np.integer)) and max_order >= 0 and tolerance_db >= 0 and density >= 1):
+        raise ConfigError(
+            f"Quantify: max_order = {max_order!r} should be a whole number from 0, tolerance_db = {tolerance_db} not negative, "
+            f"density = {density} at least 1."
+        )
+
+
+def _check_candidate(nominal: StateSpace, system: StateSpace) -> None:
+    if nominal.batch_shape or (nominal.n_outputs, nominal.n_inputs, nominal.dt) != (system.n_outputs, system.n_inputs, system.dt):
+        raise DimensionError(
+            f"Quantify: the nominal should be one system with {system.n_outputs} outputs, {system.n_inputs} inputs at {system.dt} s, found "
+            f"{nominal.n_outputs}, {nominal.n_inputs} at {nominal.dt} s in a batch of {nominal.batch_shape}."
+        )
+
+
+def _check(system: StateSpace, names: tuple[str, ...]) -> None:
+    """Raise a `DataError` that names the first model of a batch that is not finite or not stable."""
+    count = (len(names),)
+    finite = np.ones(count, bool)
+    for name in "ABCD":
+        finite &= np.broadcast_to(np.isfinite(getattr(system, name)).all(axis=(-2, -1)), count)
+    if not finite.all():
+        raise DataError(f"Quantify: the model of {names[int(np.argmin(finite))]} has NaN or infinity; leave it out or identify it again.")
+    stable = np.broadcast_to(system.is_stable(), count)
+    if not stable.all():
+        first = int(np.argmin(stable))
+        poles = np.broadcast_to(system.poles(), (*count, system.n_states))[first]
+        worst = f"spectral radius {np.abs(poles).max():.6f}" if system.dt > 0 else f"largest real part of a pole {poles.real.max():.6g}"
+        raise DataError(
+            f"Quantify: the model of {names[first]} is unstable ({worst}, {int((~stable).sum())} in all); "
+            "identify with more regularisation or leave it out."
+        )
+
+
+def _padded(system: StateSpace, n_states: int) -> StateSpace:
+    """Add states without input and output: at rest after one sample, or decaying as fast as the system's slowest mode."""
+    more = n_states - system.n_states
+    if not more:
+        return system
+    slowest = np.abs(system.poles().real).min() if system.n_states else 1.0
+    A = np.zeros((n_states, n_states))
+    A[: system.n_states, : system.n_states] = system.A
+    if system.dt == 0:
+        A[system.n_states :, system.n_states :] = -max(slowest, 1e-300) * np.eye(more)
+    B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
+    return StateSpace(A, B, C, system.D, system.dt)

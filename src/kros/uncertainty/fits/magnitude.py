@@ -155,7 +155,7 @@ def fit_magnitude(
         best, _ = problem.fit(order, tolerance_db, None, last=True)
         if best is not None and best.overbound_db < best.proven_db + _UNPROVEN_DB:
             return best
-    for candidate in range((order or 0) // 2, highest + 1):
+    for candidate in range(highest + 1):
         found, lower = problem.fit(candidate, tolerance_db, lower, last=candidate == highest)
         if found is not None and (best is None or found.overbound_db < best.overbound_db):
             best = found

@@ -4,8 +4,8 @@ With Lyapunov matrices ``P_v = R_v' R_v``, one for every word v of the last corn
 
     F = [[P_v, 0], [0, gamma^2 I]] - [A_c, B_c]' P_v' [A_c, B_c] - [C, D]' [C, D] > 0
 
-for every mode, every corner c and every step v -> v' that begins with c. All of F is quadratic and convex in the slopes and linear in every P,
-so corners are enough. (D is zero but where multipliers stand in for corners: then p is an input and q an output.)
+for every mode, every corner c and every step v -> v' that begins with c. What is subtracted is convex in the slopes, and F is linear in every
+P, so corners are enough. (D is zero but where multipliers stand in for corners: then p is an input and q an output.)
 
 In the coordinates in which ``P_v = I`` it says that a matrix has a spectral norm below one: that is the margin, in floating point. The decision
 is exact: matrices of doubles are rational, so F is formed without rounding and its positivity decided by elimination of integers.

@@ -20,7 +20,7 @@ OPTIONS: dict[str, Any] = {"order": None, "max_order": 3, "tolerance_db": 0.5}
 
 
 def _channels() -> Channels:
-    lag = StateSpace(*(np.array([[x]]) for x in (0.97, 1.0, 0.03, 0.001)), DT)
+    lag = StateSpace(np.array([[0.97]]), np.array([[1.0]]), np.array([[0.03]]), np.array([[0.001]]), DT)
     nominal = StateSpace(np.diag([0.95, 0.9]), np.eye(2), np.eye(2), np.zeros((2, 2)), DT)
     W_L, W_R = block_diagonal([lag, lag]), gain(0.1 * np.eye(2), DT)
     scales: dict[str, Any] = {"input_scale": np.ones(2), "output_scale": np.ones(2), "noise": np.array([1e-3])}

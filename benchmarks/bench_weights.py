@@ -25,7 +25,6 @@ import numpy.typing as npt
 import outlier_rates
 import paper_slsqp
 import pytest
-from kros.uncertainty.weights.certificate import ResidualSystems
 
 from kros.core.lti import StateSpace
 from kros.identify import edmd
@@ -43,6 +42,7 @@ from kros.uncertainty import (
     scale_system,
 )
 from kros.uncertainty.bilinear import BilinearAxis
+from kros.uncertainty.weights.certificate import ResidualSystems
 from kros.uncertainty.weights.weight import Weight
 
 Array = npt.NDArray[Any]

@@ -116,3 +116,13 @@ def test_what_cannot_be_done_is_refused(made):
         past.model(3, without=["a", "b", "c"])
     with pytest.raises(DimensionError, match="at least as many"):
         past.model(0)
+
+
+def test_it_starts_at_rest(made):
+    past, x, u, phase = made
+    observer = remembering_observer("o", past, 3, NAMES, x, u, DT, phase)
+    y = np.full((5, 6, 1), 0.7)
+    u = np.concatenate([y / past.static[0, 0], np.zeros_like(y)], axis=-1)  # target and measurement in balance, no push
+    estimates = run_observer(observer, y, u, phase)
+    np.testing.assert_allclose(estimates[1, :, 1:], estimates[0, :, 1:], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(observer.start([0.7], {"phase": phase["phase"][2]}).step([0.7], u[0, 2]), estimates[1, 2], rtol=1e-12)

@@ -41,7 +41,7 @@ def run_carefully(observer: Observer, y: Array, u: Array, parameters: Parameters
     """
     d = min(observer.runtime.delay, len(y))
     values = {**observer.parameters, **(parameters or {})}
-    x = observer.initial(y[0])
+    x = observer.initial(y[0], parameters)
     held = observer.lifting.window.hold(x, u[0])
     corrected, earlier = _corrected(observer, x, held, y[d:], u, values, wanted)
     corrected, earlier = (

@@ -39,7 +39,7 @@ from .observer import Observer
 
 Array = npt.NDArray[np.float64]
 BANK = Bank(40)
-_THIN, _SKIP, _RIDGE, _FOLLOWS, _NEGLIGIBLE = 4, 300, 1e-5, 0.5, 1e-13
+_THIN, _SKIP, _RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 4, 300, 1e-5, 0.5, 0.1, 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ class Past:
                 f"found {len(hidden)} and {lengths.min()}."
             )
         y = states[..., list(measured)]
-        static: Array = np.asarray(np.linalg.lstsq(_centred(inputs), _centred(y), rcond=None)[0].T, dtype=float)
+        static = _static(inputs, y)
         share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
         free = tuple(int(j) for j in np.flatnonzero(share.max(axis=0) < _FOLLOWS))
         z = _seen(lifting, tuple(measured), static, free, y, inputs, parameters)
@@ -245,6 +245,16 @@ def _hidden(lifting: Lifting, measured: Sequence[int]) -> list[int]:
 def _centred(values: Array) -> Array:
     rows = values.reshape(-1, values.shape[-1])
     return np.asarray(rows - rows.mean(axis=0))
+
+
+def _static(inputs: Array, y: Array) -> Array:
+    """M, shape (q, m): on the first samples, where machines rest, if they start in different places; else on all.
+
+    A lag that depends on the speed would bias M by little, but start every run with an error that the differences of the past magnify.
+    """
+    starts = np.all(y[0].std(axis=0) > _APART * _centred(y).std(axis=0))
+    rows, values = (inputs[:1], y[:1]) if starts else (inputs, y)
+    return np.asarray(np.linalg.lstsq(_centred(rows), _centred(values), rcond=1e-9)[0].T, dtype=float)
 
 
 def _seen(

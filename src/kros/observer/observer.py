@@ -123,12 +123,28 @@ class Observer:
         controller = np.hstack([-K.B @ C, K.A, np.zeros((K.n_states, self.B.shape[1])), K.B])
         return np.vstack([plant, controller])
 
-    def initial(self, y: npt.ArrayLike) -> Array:
-        """Return the first estimate: the first measurement where there is one, other states zero; shape (..., n)."""
+    @property
+    def replaces(self) -> bool:
+        """Whether measurements take the place of the estimates of measured states: a gain alone, equal to these states' columns of A."""
+        return self.controller.n_states == 0 and np.array_equal(self.A[:, list(self.measured)], self.into @ self.controller.D)
+
+    def initial(self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+        """Return the first estimate: the first measurement where there is one, other states zero; shape (..., n).
+
+        Where measurements take the place of estimates, other states start at rest: where the lifted functions alone hold them, inputs
+        and measurements in balance.
+        """
         y = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(y), y, 0.0)
-        x = np.zeros((*y.shape[:-1], self.lifting.n_states))
+        n = self.lifting.n_states
+        x = np.zeros((*y.shape[:-1], n))
         x[..., list(self.measured)] = y
+        if self.replaces and self.lifting.functions and not self.lifting.history:
+            others = [i for i in range(n) if i not in self.measured]
+            held = self.lifting.lift(x, {**self.parameters, **(parameters or {})})[..., n:] @ self.A[others, n:].T
+            x[..., others] = np.linalg.lstsq(np.eye(len(others)) - self.A[np.ix_(others, others)], held.reshape(-1, len(others)).T)[
+                0
+            ].T.reshape(held.shape)
         return x
 
     def start(self, y: npt.ArrayLike, parameters: Mapping[str, float] | None = None) -> RunningObserver:

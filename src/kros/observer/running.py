@@ -33,7 +33,7 @@ class RunningObserver:
 
     def reset(self, y: npt.ArrayLike) -> None:
         """Start again at a measurement, shape (q,)."""
-        self._x = self.observer.initial(np.atleast_1d(np.asarray(y, dtype=float)))
+        self._x = self.observer.initial(np.atleast_1d(np.asarray(y, dtype=float)), self.parameters)
         self._x_c = np.zeros(self.observer.controller.n_states)
         self._earlier: Array | None = None
         self._inputs: deque[Array] = deque()

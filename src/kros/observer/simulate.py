@@ -81,7 +81,8 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
     # One row a machine: [theta, x^c, u, y]. The product gives [x_hat+, x^c+].
     row = np.zeros((k, batch, step.shape[1]))
     lifted, inflow, measurement = row[..., :n_lifted], row[..., n_lifted + order : n_lifted + order + m], row[..., n_lifted + order + m :]
-    row[..., :n] = observer.initial(y[0])
+    for own, first in zip(row, observers, strict=True):
+        own[..., :n] = first.initial(y[0], parameters)
     estimates = np.empty((n_samples, k, batch, n))
     following = np.empty((k, batch, n + order))
     plain = not (lifting.history or lifting.input_functions)

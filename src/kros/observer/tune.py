@@ -149,14 +149,9 @@ def _whitening(rows: Array) -> Array:
     return np.asarray(vectors[:, kept] / np.sqrt(values[kept]) / size[:, None])
 
 
-def replaces(observer: Observer) -> bool:
-    """Whether measurements take the place of the estimates of measured states (columns of A equal the gain): they stay so when tuned."""
-    return observer.controller.n_states == 0 and np.array_equal(observer.A[:, list(observer.measured)], observer.controller.D)
-
-
 def rows_tuned(observer: Observer) -> list[int]:
     """Rows of W that are tuned: all, but for those of measured states where these are not used."""
-    kept = set(observer.measured) if replaces(observer) else set()
+    kept = set(observer.measured) if observer.replaces else set()
     return [i for i in range(observer.lifting.n_states) if i not in kept]
 
 
@@ -224,7 +219,7 @@ class _Tuning:
         nl, m, rows, measured = observer.lifting.n_lifted, observer.B.shape[1], rows_tuned(observer), list(observer.measured)
         K = observer.controller
         A, B, D, C = observer.A.copy(), observer.B.copy(), K.D.copy(), K.C.copy()
-        q = 0 if replaces(observer) else len(measured)
+        q = 0 if observer.replaces else len(measured)
         dA, dB, dD, dC = np.split(dW, np.cumsum([nl, m, q]), axis=1)
         A[rows] += dA
         B[rows] += dB
@@ -238,7 +233,7 @@ class _Tuning:
         values = {**observer.parameters, **(self.parameters or {})}
         measured = list(observer.measured)
         innovation = self.states[..., measured] - estimate[..., measured]
-        if replaces(observer):
+        if observer.replaces:
             innovation = innovation[..., :0]
         x_c = np.zeros((*estimate.shape[:2], K.n_states))
         for k in range(len(estimate) - 1 if K.n_states else 0):

@@ -144,7 +144,7 @@ class Grid:
             b_eq=[1.0],
             bounds=[(None, None)] * (2 * size + 1),
             method="highs",
-            options={"primal_feasibility_tolerance": 1e-9, "dual_feasibility_tolerance": 1e-9, "time_limit": 5.0, "presolve": False},
+            options={"primal_feasibility_tolerance": 1e-9, "dual_feasibility_tolerance": 1e-9, "time_limit": 5.0},
         )
         if result.x is None:
             _LOG.debug("Magnitude fit: linear program ended with status %s (%s)", result.status, result.message)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from ..core.artifacts import save_artifact
 from ..observer import (
+    Dropped,
     Observer,
     ReliftCertificate,
     ReliftRow,
@@ -36,6 +37,7 @@ _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has
 class Running:
     """What is known about one observer as it runs: its certificate, a row for every unit, and the size of its errors.
 
+    `survives_gaps` tells whether the certificate can be had for any pattern of missing measurements too.
     `hidden_percent` is the geometric mean over the states that are not measured of the mean error on training episodes, percent of the range.
     """
 
@@ -43,6 +45,7 @@ class Running:
     certificate: ReliftCertificate
     rows: list[ReliftRow]
     hidden_percent: float
+    survives_gaps: bool
 
     def facts(self) -> dict[str, Any]:
         """Return what goes into the metrics."""
@@ -82,7 +85,8 @@ def certify_running(tasks: Sequence[Task], products: Sequence[Product]) -> list[
         for o, c, x in zip(observers, certificates, estimates, strict=True)
     ]
     hidden = hidden_mean(judge.compare(estimates), first.measured)
-    return [Running(o.name, c, r, float(h)) for o, c, r, h in zip(observers, certificates, rows, hidden, strict=True)]
+    gaps = [survives_gaps(o, c, scales, task) for o, c in zip(observers, certificates, strict=True)]
+    return [Running(o.name, c, r, float(h), g) for o, c, r, h, g in zip(observers, certificates, rows, hidden, gaps, strict=True)]
 
 
 def first_episodes(tuning: TuningSet) -> TuningSet:
@@ -91,9 +95,21 @@ def first_episodes(tuning: TuningSet) -> TuningSet:
     return replace(tuning, keys=tuple(key for key in tuning.keys if firsts[key.unit] == key))
 
 
+def survives_gaps(observer: Observer, certificate: ReliftCertificate, scales: ReliftScales, task: Task) -> bool:
+    """Whether a certified observer is certified for any pattern of missing measurements as well, its innovation being zero then."""
+    return certificate.certified and _certificate(observer, scales, task, Dropped.INNOVATION).certified
+
+
 def certify(observer: Observer, scales: ReliftScales, task: Task) -> ReliftCertificate:
     """Certify one observer everywhere, or in an operating box where slopes have no bound of their own."""
-    found = relift_certificate(observer, scales=scales)
+    found = _certificate(observer, scales, task)
+    if not found.certified:
+        log.warning("%s: no certificate covers it as it runs. %s", observer.name, found.reason)
+    return found
+
+
+def _certificate(observer: Observer, scales: ReliftScales, task: Task, dropped: Dropped = Dropped.NEVER) -> ReliftCertificate:
+    found = relift_certificate(observer, scales=scales, dropped=dropped)
     if found.status is ReliftStatus.UNBOUNDED:
         models = task.models
         sizes = [
@@ -102,9 +118,7 @@ def certify(observer: Observer, scales: ReliftScales, task: Task) -> ReliftCerti
         ]
         box = {name: (-_BOX * size, _BOX * size) for name, size in sizes}
         own = {name: (float(np.min(v)), float(np.max(v))) for name, v in models.parameters.items()}
-        found = relift_certificate(observer, box, scales, own)
-    if not found.certified:
-        log.warning("%s: no certificate covers it as it runs. %s", observer.name, found.reason)
+        found = relift_certificate(observer, box, scales, own, dropped=dropped)
     return found
 
 

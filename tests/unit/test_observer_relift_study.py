@@ -94,7 +94,7 @@ def test_the_report_tells_gains_bounds_and_failures(tmp_path: Path) -> None:
     states = np.cumsum(np.random.default_rng(0).standard_normal((50, 2, 1)), axis=0)
     certificate = relift_certificate(good)
     rows = relift_report(certificate, good, states, np.zeros((50, 2, 1)), ["a", "b"])
-    running = [Running(good.name, certificate, rows, 1.0, True), Running(bad.name, relift_certificate(bad), [], 2.0, False)]
+    running = [Running(good.name, certificate, rows, 1.0, 5.0), Running(bad.name, relift_certificate(bad), [], 2.0, 5.0)]
     assert [r.facts()["relift_certified"] for r in running] == [True, False]
     assert running[0].facts()["relift_bound_worst"] == max(r.bound for r in rows)
     save_running(tmp_path / "observers", running)
@@ -113,11 +113,11 @@ def test_handed_over_is_the_most_accurate_observer_that_is_certified_as_it_runs(
     assert certificate.certified
     assert not refused.certified
     running = [
-        Running("koopman/open_loop", certificate, [], 3.0, True),
-        Running("koopman/kalman_tuned", certificate, [], 2.0, True),
-        Running("koopman/residual_h2", certificate, [], 1.0, False),
-        Running("linear/residual_h2", certificate, [], float("inf"), True),
-        Running("koopman/worst_case_h2", refused, [], 0.5, False),
+        Running("koopman/open_loop", certificate, [], 3.0, 5.0),
+        Running("koopman/kalman_tuned", certificate, [], 2.0, 5.0),
+        Running("koopman/residual_h2", certificate, [], 1.0, float("inf")),
+        Running("linear/residual_h2", certificate, [], float("inf"), 5.0),
+        Running("koopman/worst_case_h2", refused, [], 0.5, 5.0),
     ]
     made = [r.name for r in running]
     assert choose_deployed(None, made, running) == "koopman/kalman_tuned"

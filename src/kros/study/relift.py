@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from ..core.artifacts import save_artifact
 from ..observer import (
-    Dropped,
     Observer,
     ReliftCertificate,
     ReliftRow,
@@ -25,11 +24,12 @@ from ..observer import (
     run_observers,
 )
 from .makers import Product, Task
-from .tuning import TuningSet, hidden_mean
+from .tuning import Judge, TuningSet, hidden_mean
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 _EPISODE_S = 5.0
+_SEEN_S, _BLIND_S, _BLIND_EPISODES = 0.5, 1.5, 3
 _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has no global slope bounds
 
 
@@ -37,15 +37,15 @@ _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has
 class Running:
     """What is known about one observer as it runs: its certificate, a row for every unit, and the size of its errors.
 
-    `survives_gaps` tells whether the certificate can be had for any pattern of missing measurements too.
-    `hidden_percent` is the geometric mean over the states that are not measured of the mean error on training episodes, percent of the range.
+    `hidden_percent` is the geometric mean over the states that are not measured of the mean error on training episodes, percent of the range;
+    `blind_percent` the largest error of a state in a short run in which measurements stop arriving.
     """
 
     name: str
     certificate: ReliftCertificate
     rows: list[ReliftRow]
     hidden_percent: float
-    survives_gaps: bool
+    blind_percent: float
 
     def facts(self) -> dict[str, Any]:
         """Return what goes into the metrics."""
@@ -54,6 +54,7 @@ class Running:
             "relift_certified": found.certified,
             "relift_gain": found.gain,
             "hidden_error_percent": self.hidden_percent,
+            "blind_error_percent": self.blind_percent,
         }
         if not found.certified:
             return facts | {"relift_reason": found.reason}
@@ -85,8 +86,8 @@ def certify_running(tasks: Sequence[Task], products: Sequence[Product]) -> list[
         for o, c, x in zip(observers, certificates, estimates, strict=True)
     ]
     hidden = hidden_mean(judge.compare(estimates), first.measured)
-    gaps = [survives_gaps(o, c, scales, task) for o, c in zip(observers, certificates, strict=True)]
-    return [Running(o.name, c, r, float(h), g) for o, c, r, h, g in zip(observers, certificates, rows, hidden, gaps, strict=True)]
+    blind = blind_percent(observers, judge, task.models.sample_period_s)
+    return [Running(o.name, c, r, float(h), float(b)) for o, c, r, h, b in zip(observers, certificates, rows, hidden, blind, strict=True)]
 
 
 def first_episodes(tuning: TuningSet) -> TuningSet:
@@ -95,21 +96,18 @@ def first_episodes(tuning: TuningSet) -> TuningSet:
     return replace(tuning, keys=tuple(key for key in tuning.keys if firsts[key.unit] == key))
 
 
-def survives_gaps(observer: Observer, certificate: ReliftCertificate, scales: ReliftScales, task: Task) -> bool:
-    """Whether a certified observer is certified for any pattern of missing measurements as well, its innovation being zero then."""
-    return certificate.certified and _certificate(observer, scales, task, Dropped.INNOVATION).certified
+def blind_percent(observers: Sequence[Observer], judge: Judge, dt: float) -> Array:
+    """Return the largest error of a state in percent of its range where measurements stop arriving, shape (observer,); infinite where it grows on."""
+    short, first = judge.few(_BLIND_EPISODES).first((_SEEN_S + _BLIND_S) / dt), observers[0]
+    y = short.measurements(first.measured)
+    y[round(_SEEN_S / dt) :] = np.nan
+    values = short.parameters if first.lifting.parameters else None
+    return np.asarray(short.compare(run_observers(observers, y, short.batch.inputs, values)).max(axis=-1))
 
 
 def certify(observer: Observer, scales: ReliftScales, task: Task) -> ReliftCertificate:
     """Certify one observer everywhere, or in an operating box where slopes have no bound of their own."""
-    found = _certificate(observer, scales, task)
-    if not found.certified:
-        log.warning("%s: no certificate covers it as it runs. %s", observer.name, found.reason)
-    return found
-
-
-def _certificate(observer: Observer, scales: ReliftScales, task: Task, dropped: Dropped = Dropped.NEVER) -> ReliftCertificate:
-    found = relift_certificate(observer, scales=scales, dropped=dropped)
+    found = relift_certificate(observer, scales=scales)
     if found.status is ReliftStatus.UNBOUNDED:
         models = task.models
         sizes = [
@@ -118,7 +116,9 @@ def _certificate(observer: Observer, scales: ReliftScales, task: Task, dropped: 
         ]
         box = {name: (-_BOX * size, _BOX * size) for name, size in sizes}
         own = {name: (float(np.min(v)), float(np.max(v))) for name, v in models.parameters.items()}
-        found = relift_certificate(observer, box, scales, own, dropped=dropped)
+        found = relift_certificate(observer, box, scales, own)
+    if not found.certified:
+        log.warning("%s: no certificate covers it as it runs. %s", observer.name, found.reason)
     return found
 
 

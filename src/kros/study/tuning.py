@@ -47,6 +47,12 @@ class Judge:
         short = EpisodeBatch(b.keys, np.minimum(b.lengths, cut), b.states[:cut], np.ascontiguousarray(b.inputs[:cut]))
         return Judge(short, self.parameters)
 
+    def few(self, count: int) -> Judge:
+        """Return the first episodes alone."""
+        b = self.batch
+        batch = EpisodeBatch(b.keys[:count], b.lengths[:count], b.states[:, :count], np.ascontiguousarray(b.inputs[:, :count]))
+        return Judge(batch, {name: values[:count] for name, values in self.parameters.items()})
+
     def measurements(self, measured: Sequence[int]) -> Array:
         """Return the measured states, shape (n_samples, batch, q)."""
         return np.ascontiguousarray(self.batch.states[..., list(measured)])

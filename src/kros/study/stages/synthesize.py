@@ -30,6 +30,7 @@ from . import calibrate
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 _AS_GOOD = 1.01  # ratio of errors that is no reason to prefer one observer to another
+_LOST = 100.0  # percent of the range: an estimate that says nothing
 WORST_CASE = ("worst_case_h2", "worst_case_hinf")
 
 
@@ -83,17 +84,17 @@ def as_it_runs(tasks: list[Task], products: list[Product]) -> list[Callable[[], 
 
 
 def choose_deployed(wanted: str | None, made: list[str], running: Sequence[Running]) -> str:
-    """Return the observer that is handed over: the one asked for, else the most accurate one that is certified as it runs, gaps included.
+    """Return the observer that is handed over: the one asked for, else the most accurate one that is certified as it runs and bears gaps.
 
-    Accuracy is that on training episodes, of the states that are not measured. Where no observer is certified for missing measurements, those that
-    are certified without gaps compete; where there is none either, the best guarantee of the best model decides.
+    Accuracy is that on training episodes, of the states that are not measured. Where no observer bears missing measurements, those that are certified
+    compete; where there is none either, the best guarantee of the best model decides.
     """
     if wanted is not None:
         if wanted not in made:
             raise SynthesisError(f"observer.deployed = {wanted!r}: there is no such observer, only {', '.join(made)}; name one of them.")
         return wanted
     certified = [r for r in running if r.certificate.certified and np.isfinite(r.hidden_percent)]
-    candidates = [r for r in certified if r.survives_gaps] or certified
+    candidates = [r for r in certified if r.blind_percent < _LOST] or certified
     least = min((r.hidden_percent for r in candidates), default=np.inf)
     best = preferred([r.name for r in candidates if r.hidden_percent <= _AS_GOOD * least] or made)
     if best is None:

@@ -60,7 +60,7 @@ class Shaping:
 
 
 def default_fit() -> Fit:
-    """Return `kros.uncertainty.fits.magnitude.fit_magnitude`."""
+    """Return `kros.uncertainty.fit_magnitude`."""
     from ...uncertainty.fits.magnitude import fit_magnitude
 
     return fit_magnitude

@@ -67,7 +67,7 @@ def worst_case_h2(
         Accuracy of the certificate's quadrature.
     fit : callable, optional
         ``fit(freqs_hz, magnitude, dt, order=, max_order=, tolerance_db=, side=)`` with a result whose ``.system`` is a filter; default
-        `kros.uncertainty.fits.magnitude.fit_magnitude`.
+        `kros.uncertainty.fit_magnitude`.
     causal : bool
         Estimate the worst causal perturbation as well.
     bounded : bool

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
+
+from kros.synthesis import GeneralizedPlant
 
 # Properties are drawn from a fixed seed and without a time limit, so that a test's outcome depends on the code alone.
 settings.register_profile("kros", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -23,3 +28,21 @@ def recordings() -> Path:
     if not path.is_dir():
         pytest.fail(f"KROS_DATA = {folder} is no folder; unset it or name the folder of the recordings")
     return path
+
+
+@pytest.fixture(scope="session")
+def one_state() -> Callable[..., GeneralizedPlant]:
+    """Build a regular generalized plant of one state, with some of its matrices changed."""
+    parts: dict[str, Any] = {
+        "A": [[0.9]],
+        "B1": [[1.0, 0.0]],
+        "B2": [[1.0]],
+        "C1": [[1.0], [0.0]],
+        "C2": [[1.0]],
+        "D11": np.zeros((2, 2)),
+        "D12": [[0.0], [1.0]],
+        "D21": [[0.0, 1.0]],
+        "D22": [[0.0]],
+        "dt": 1.0,
+    }
+    return lambda **changes: GeneralizedPlant(**{**parts, **changes})

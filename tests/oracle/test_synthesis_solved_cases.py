@@ -65,22 +65,6 @@ def test_mixed_sensitivity_of_the_disturbance_process():
     assert hinf_norm(plant.close(found.controller)) == pytest.approx(found.hinf_norm)
 
 
-def one_state(**changes):
-    parts = {
-        "A": [[0.8]],
-        "B1": [[1.0, 0.0]],
-        "B2": [[1.0]],
-        "C1": [[1.0], [0.0]],
-        "C2": [[1.0]],
-        "D11": np.zeros((2, 2)),
-        "D12": [[0.0], [1.0]],
-        "D21": [[0.0, 1.0]],
-        "D22": [[0.0]],
-        "dt": 1.0,
-    }
-    return GeneralizedPlant(**{**parts, **changes})
-
-
 @pytest.mark.parametrize("method", [h2, hinf])
 @pytest.mark.parametrize(
     ("changes", "label"),
@@ -90,19 +74,19 @@ def one_state(**changes):
         ({"B2": [[1.0, 1.0]], "D12": [[0.0, 0.0], [1.0, 1.0]], "D22": [[0.0, 0.0]]}, "A2a.*rank 1, 2 controls"),
     ],
 )
-def test_singular_plants_are_refused_by_name(method, changes, label):
+def test_singular_plants_are_refused_by_name(one_state, method, changes, label):
     with pytest.raises(SynthesisError, match=label):
         method(one_state(**changes))
 
 
-def test_singular_but_stable_plants_have_a_youla_bound():
+def test_singular_but_stable_plants_have_a_youla_bound(one_state):
     # Nothing is measured with noise and nothing is paid for control: u = -0.8 y cancels the pole, and only w itself is left.
     singular = one_state(D12=[[0.0], [0.0]], D21=[[0.0, 0.0]])
     assert youla_bound(singular, 4, "h2", centre="open_loop").value == pytest.approx(1.0, rel=1e-6)
     assert youla_bound(singular, 4, "hinf", centre="open_loop").value == pytest.approx(1.0, rel=1e-3)
 
 
-def test_mixed_adds_what_a_singular_plant_lacks():
+def test_mixed_adds_what_a_singular_plant_lacks(one_state):
     """Norms are those of the plant as given, between what a filter of eight taps reaches and a few percent more."""
     for changes in ({"D21": [[0.0, 0.0, 0.0]]}, {"D12": [[0.0], [0.0], [0.3]]}):
         plant = one_state(

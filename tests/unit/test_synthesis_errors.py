@@ -28,22 +28,6 @@ from kros.synthesis.robust.certificate import certify
 DT = 1e-3
 
 
-def plant(**changes):
-    parts = {
-        "A": [[0.9]],
-        "B1": [[1.0, 0.0]],
-        "B2": [[1.0]],
-        "C1": [[1.0], [0.0]],
-        "C2": [[1.0]],
-        "D11": np.zeros((2, 2)),
-        "D12": [[0.0], [1.0]],
-        "D21": [[0.0, 1.0]],
-        "D22": [[0.0]],
-        "dt": 1.0,
-    }
-    return GeneralizedPlant(**{**parts, **changes})
-
-
 def problem(**changes):
     nominal = StateSpace([[0.99, 0.01], [0.0, 0.9]], [[0.0], [0.1]], np.eye(2), np.zeros((2, 1)), DT)
     parts = {
@@ -73,9 +57,9 @@ def problem(**changes):
         ({"n_z1": -1}, "n_z1 = -1"),
     ],
 )
-def test_generalized_plant_checks_its_shapes(changes, message):
+def test_generalized_plant_checks_its_shapes(one_state, changes, message):
     with pytest.raises(DimensionError, match=message):
-        plant(**changes)
+        one_state(**changes)
 
 
 @pytest.mark.parametrize(
@@ -85,9 +69,9 @@ def test_generalized_plant_checks_its_shapes(changes, message):
         (gain([[1.0]], 0.5), "found 1 x 1 at 0.5 s"),
     ],
 )
-def test_closing_the_loop_checks_sizes_and_periods(controller, message):
+def test_closing_the_loop_checks_sizes_and_periods(one_state, controller, message):
     with pytest.raises(DimensionError, match=message):
-        plant().close(controller)
+        one_state().close(controller)
 
 
 @pytest.mark.parametrize("method", [h2, hinf, mixed])
@@ -98,10 +82,10 @@ def test_methods_want_a_generalized_plant(method):
 
 @pytest.mark.parametrize("dt", [0.0, 1.0])
 @pytest.mark.parametrize("method", [h2, hinf])
-def test_without_measurement_or_control_the_open_loop_is_optimal(method, dt):
+def test_without_measurement_or_control_the_open_loop_is_optimal(one_state, method, dt):
     A = [[0.9 if dt else -0.9]]
-    blind = plant(A=A, dt=dt, C2=np.zeros((0, 1)), D21=np.zeros((0, 2)), D22=np.zeros((0, 1)))
-    tied = plant(A=A, dt=dt, B2=np.zeros((1, 0)), D12=np.zeros((2, 0)), D22=np.zeros((1, 0)))
+    blind = one_state(A=A, dt=dt, C2=np.zeros((0, 1)), D21=np.zeros((0, 2)), D22=np.zeros((0, 1)))
+    tied = one_state(A=A, dt=dt, B2=np.zeros((1, 0)), D12=np.zeros((2, 0)), D22=np.zeros((1, 0)))
     alone = StateSpace(A, [[1.0]], [[1.0]], [[0.0]], dt)
     for case in (blind, tied):
         found = method(case)
@@ -122,21 +106,21 @@ def test_an_optimum_of_zero_is_an_optimum(method):
 
 
 @pytest.mark.parametrize("missing", [{"D12": [[0.0], [0.0]]}, {"D21": [[0.0, 0.0]]}])
-def test_singular_mixed_plant_without_a_second_channel(missing):
-    found = mixed(plant(**missing))
+def test_singular_mixed_plant_without_a_second_channel(one_state, missing):
+    found = mixed(one_state(**missing))
     assert np.isfinite(found.h2_norm)
     assert any("small ones were added" in note for note in found.notes)
 
 
-def test_controllers_of_other_libraries_close_the_loop():
+def test_controllers_of_other_libraries_close_the_loop(one_state):
     theirs = SimpleNamespace(A=[[0.5]], B=[[1.0]], C=[[0.1]], D=[[0.0]], dt=1.0)
     ours = StateSpace(theirs.A, theirs.B, theirs.C, theirs.D, 1.0)
-    assert h2_norm(plant().close(theirs)) == h2_norm(plant().close(ours))
+    assert h2_norm(one_state().close(theirs)) == h2_norm(one_state().close(ours))
 
 
-def test_singular_algebraic_loop_is_refused():
+def test_singular_algebraic_loop_is_refused(one_state):
     with pytest.raises(DimensionError, match="I - D22"):
-        plant(D22=[[1.0]]).close(gain([[1.0]], 1.0))
+        one_state(D22=[[1.0]]).close(gain([[1.0]], 1.0))
 
 
 @pytest.mark.parametrize(
@@ -151,9 +135,9 @@ def test_singular_algebraic_loop_is_refused():
         ({"A": [[-1.0]], "dt": 0.0, "D11": np.ones((2, 2))}, "D11 = 0 in continuous time"),
     ],
 )
-def test_h2_names_the_violated_assumption(changes, label):
+def test_h2_names_the_violated_assumption(one_state, changes, label):
     with pytest.raises(SynthesisError, match=label):
-        h2(plant(**changes))
+        h2(one_state(**changes))
 
 
 @pytest.mark.parametrize(
@@ -218,22 +202,22 @@ def test_certificate_refuses_an_unstable_observer():
         certify(problem(), gain([[-1.0], [0.0]], DT))
 
 
-def test_mixed_refuses_what_it_cannot_do():
+def test_mixed_refuses_what_it_cannot_do(one_state):
     with pytest.raises(SynthesisError, match=r"in continuous time .* A2a"):
-        mixed(plant(A=[[-1.0]], dt=0.0, D12=[[0.0], [0.0]]))
+        mixed(one_state(A=[[-1.0]], dt=0.0, D12=[[0.0], [0.0]]))
     with pytest.raises(SynthesisError, match="D11 = 0 in continuous time"):
-        mixed(plant(A=[[-1.0]], dt=0.0, D11=np.eye(2)))
+        mixed(one_state(A=[[-1.0]], dt=0.0, D11=np.eye(2)))
     with pytest.raises(ConfigError, match="gamma = 0"):
-        mixed(plant(), gamma=0)
+        mixed(one_state(), gamma=0)
     with pytest.raises(ConfigError, match="scalings"):
-        mixed(plant(), scalings=())
+        mixed(one_state(), scalings=())
     with pytest.raises(SynthesisError, match="A1a"):
-        mixed(plant(A=[[1.1]], B2=[[0.0]], D12=[[0.0], [0.0]]))
+        mixed(one_state(A=[[1.1]], B2=[[0.0]], D12=[[0.0], [0.0]]))
 
 
-def test_mixed_says_why_nothing_survives():
+def test_mixed_says_why_nothing_survives(one_state):
     # z2 = w2 + (something): the gain from w2 to z2 is at least one whatever K does.
-    base = plant()
+    base = one_state()
     impossible = GeneralizedPlant(
         base.A,
         np.hstack([base.B1, [[0.0]]]),

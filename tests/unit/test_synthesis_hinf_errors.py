@@ -6,25 +6,9 @@ import numpy as np
 import pytest
 
 from kros.core import ConfigError, SynthesisError, gain, hinf_norm
-from kros.synthesis import GeneralizedPlant, Status, hinf
+from kros.synthesis import Status, hinf
 from kros.synthesis.riccati.hinf_central import Obstacle, central
 from kros.synthesis.riccati.hinf_coordinates import coordinates
-
-
-def plant(**changes):
-    parts = {
-        "A": [[0.9]],
-        "B1": [[1.0, 0.0]],
-        "B2": [[1.0]],
-        "C1": [[1.0], [0.0]],
-        "C2": [[1.0]],
-        "D11": np.zeros((2, 2)),
-        "D12": [[0.0], [1.0]],
-        "D21": [[0.0, 1.0]],
-        "D22": [[0.0]],
-        "dt": 1.0,
-    }
-    return GeneralizedPlant(**{**parts, **changes})
 
 
 @pytest.mark.parametrize(
@@ -40,9 +24,9 @@ def plant(**changes):
         ({"A": [[0.0]], "B1": [[0.0, 0.0]], "dt": 0.0}, "A4: no zero"),
     ],
 )
-def test_the_violated_assumption_is_named(changes, label):
+def test_the_violated_assumption_is_named(one_state, changes, label):
     with pytest.raises(SynthesisError, match=f"H-infinity synthesis needs a regular generalized plant.*{label}"):
-        hinf(plant(**changes))
+        hinf(one_state(**changes))
 
 
 @pytest.mark.parametrize(
@@ -54,21 +38,21 @@ def test_the_violated_assumption_is_named(changes, label):
         ({"tolerance": 1.0}, "tolerance should lie"),
     ],
 )
-def test_options_are_checked(options, message):
+def test_options_are_checked(one_state, options, message):
     with pytest.raises(ConfigError, match=message):
-        hinf(plant(), **options)
+        hinf(one_state(), **options)
 
 
-def test_direct_gain_is_no_obstacle_in_continuous_time():
-    direct = plant(A=[[-1.0]], dt=0.0, D11=np.ones((2, 2)))
+def test_direct_gain_is_no_obstacle_in_continuous_time(one_state):
+    direct = one_state(A=[[-1.0]], dt=0.0, D11=np.ones((2, 2)))
     found = hinf(direct)
     assert found.status is Status.OPTIMAL
     assert found.hinf_norm == pytest.approx(hinf_norm(direct.close(found.controller)))
 
 
-def test_every_obstacle_is_told_apart():
-    frame = coordinates(plant(A=[[1.5]]))
-    best = hinf(plant(A=[[1.5]])).hinf_norm
+def test_every_obstacle_is_told_apart(one_state):
+    frame = coordinates(one_state(A=[[1.5]]))
+    best = hinf(one_state(A=[[1.5]])).hinf_norm
     assert central(frame.plant, 1.01 * best).n_states == 1
     assert central(frame.plant, 0.99 * best) is Obstacle.COUPLING
     assert central(frame.plant, 1e-6) is Obstacle.DIRECT
@@ -76,18 +60,18 @@ def test_every_obstacle_is_told_apart():
     assert far_below & {Obstacle.CONTROL_SIGN, Obstacle.FILTER_SIGN, Obstacle.CONTROL_AXIS, Obstacle.FILTER_AXIS}
 
 
-def test_a_level_below_the_optimum_is_refused_with_both_ends():
+def test_a_level_below_the_optimum_is_refused_with_both_ends(one_state):
     with pytest.raises(SynthesisError, match=r"gamma = 0\.5 is out of reach \(.*\); the best that was reached is .* below .*Raise gamma"):
-        hinf(plant(), gamma=0.5)
+        hinf(one_state(), gamma=0.5)
 
 
-def test_an_uncontrolled_stable_mode_in_the_weights_is_fine():
+def test_an_uncontrolled_stable_mode_in_the_weights_is_fine(one_state):
     # A state that the control does not reach and y does not see, but z does: stable, so allowed.
-    wide = plant(A=np.diag([0.9, 0.3]), B1=[[1.0, 0.0], [1.0, 0.0]], B2=[[1.0], [0.0]], C1=[[1.0, 1.0], [0.0, 0.0]], C2=[[1.0, 0.0]])
+    wide = one_state(A=np.diag([0.9, 0.3]), B1=[[1.0, 0.0], [1.0, 0.0]], B2=[[1.0], [0.0]], C1=[[1.0, 1.0], [0.0, 0.0]], C2=[[1.0, 0.0]])
     assert hinf(wide).status is Status.OPTIMAL
 
 
-def test_better_than_the_zero_gain_and_never_below_the_bound():
+def test_better_than_the_zero_gain_and_never_below_the_bound(one_state):
     rng = np.random.default_rng(0)
     for _ in range(10):
         n = int(rng.integers(1, 6))
@@ -95,7 +79,7 @@ def test_better_than_the_zero_gain_and_never_below_the_bound():
         A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
         B1, C1 = np.hstack([rng.standard_normal((n, 2)), np.zeros((n, 1))]), np.vstack([rng.standard_normal((2, n)), np.zeros((1, n))])
         p = replace(
-            plant(),
+            one_state(),
             A=A,
             B1=B1,
             B2=rng.standard_normal((n, 1)),

@@ -7,6 +7,7 @@ from .model import UncertainModel, scale_system
 from .outlying.outliers import OutlierModel, OutlierScore, score_outliers
 from .population.noise import VariationAndNoise, variation_and_noise
 from .population.nominal import Criterion, NominalChoice, choose_nominal, choose_nominals
+from .quantified import Quantified
 from .quantify import quantify
 from .residuals import all_bounds, bounds, completion, misfit, sigma_max
 from .responses import ResponseUncertainty, quantify_responses
@@ -28,6 +29,7 @@ __all__ = [
     "OutlierModel",
     "OutlierScore",
     "Perturbation",
+    "Quantified",
     "ResidualSystems",
     "ResponseUncertainty",
     "Side",

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.lti import StateSpace
 from .forms import Form
+from .quantified import Quantified
 from .weights.certificate import Method
 from .weights.cover import Cover, Structure
 from .weights.entrywise import EntrywiseWeight
@@ -30,79 +31,22 @@ _OWN_FACTS = {Structure.ENTRYWISE: ("unstructured_excess",), Structure.FULL: ("s
 _FRAMES = ("left_frame", "right_frame")
 
 
-@dataclass(frozen=True, eq=False)
-class UncertainModel:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class UncertainModel(Quantified):
     """A nominal model and a bound on how the units of the population differ from it.
 
     Parameters
     ----------
-    form : Form
-    unit_ids : tuple of str
-        Units that the weights cover.
-    nominal : int
-        Row of the nominal unit; -1 when the nominal is a model of its own (for example a pooled one).
-    nominal_id : str
     nominal_system : StateSpace
-        In physical units.
-    freqs_hz : ndarray, shape (frequency,), Hz
-    output_scale : ndarray, shape (p,)
-    input_scale : ndarray, shape (m,)
-    bounds : dict of Form to ndarray, shape (frequency,)
-        Largest residual over the other units, for the best nominal of each form (for the chosen form: the nominal used).
-    nominals : dict of Form to str
-        Unit behind each of these bounds.
-    cover : Cover
-        Optimal cover of the residuals, frequency by frequency.
-    weight : Weight
-    misfit : ndarray, shape (unit, frequency)
-        What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular (condition above 1e12).
-    remainder : Weight or None
-        Additive weights for `Gp - rebuilt(G, E)`, where the form does not rebuild every unit.
-    remainder_cover : Cover or None
+        In physical units; all others are those of `Quantified`.
     """
 
-    form: Form
-    unit_ids: tuple[str, ...]
-    nominal: int
-    nominal_id: str
     nominal_system: StateSpace
-    freqs_hz: Array
-    output_scale: Array
-    input_scale: Array
-    bounds: dict[Form, Array]
-    nominals: dict[Form, str]
-    cover: Cover
-    weight: Weight
-    misfit: Array
-    remainder: Weight | None = None
-    remainder_cover: Cover | None = None
 
     @property
     def sample_period_s(self) -> float:
         """Sampling period, s."""
         return self.nominal_system.dt
-
-    @property
-    def peak_db(self) -> dict[Form, float]:
-        """Peak of the bound of each form, dB; minus infinity where all units are alike."""
-        with np.errstate(divide="ignore"):
-            return {form: float(20 * np.log10(bound.max())) for form, bound in self.bounds.items()}
-
-    @property
-    def misfit_max(self) -> float:
-        """Largest misfit where it is known; NaN where it is known nowhere."""
-        known = self.misfit[np.isfinite(self.misfit)]
-        return float(known.max()) if known.size else float("nan")
-
-    @property
-    def cover_max(self) -> float:
-        """Largest `sigma_max(W_L^-1 E_k W_R^-1)` on the dense grid; at most one."""
-        return self.weight.cover_max
-
-    @property
-    def overbound_db_max(self) -> float:
-        """Largest distance of the weight from the optimal cover, dB."""
-        return self.weight.overbound_db_max
 
     def scaled_nominal(self) -> StateSpace:
         """Return the nominal between scaled inputs and outputs, on which the weights act."""

@@ -16,13 +16,12 @@ from .forms import Form, as_form
 from .given_models import check_fit, find_nominal, read_candidates, read_models
 from .model import UncertainModel, scale_system
 from .population.nominal import Criterion, NominalChoice, as_criterion, choose_nominal, choose_nominals
+from .quantified import findings
 from .weights.bounded import Bounded, Responder, bound_residuals
 from .weights.certificate import ResidualSystems
 from .weights.cover import Cover, Structure, as_structure
 
 Array = npt.NDArray[Any]
-
-POOLED = "pooled"
 
 
 def quantify(
@@ -110,29 +109,11 @@ def quantify(
     responses = scale_system(system, *scales).frequency_response(freqs)
     of_others = np.array([scale_system(s, *scales).frequency_response(freqs) for s in others.values()]).reshape(-1, *responses.shape[1:])
     choices = choose_by(responses, form, criterion, of_others, candidates, freqs, structure)
-    names = (*ids, *others)
     index, nominal_system = find_nominal(nominal, system, ids, others, choices[form].index)
     found = axis.bound(
         form, scale_system(nominal_system, *scales), scale_system(system, *scales), structure, max_order, tolerance_db, density
     )
-    name = names[index] if index >= 0 else POOLED
-    return UncertainModel(
-        form=form,
-        unit_ids=ids,
-        nominal=index if index < len(ids) else -1,
-        nominal_id=name,
-        nominal_system=nominal_system,
-        freqs_hz=freqs,
-        output_scale=scales[0],
-        input_scale=scales[1],
-        bounds={f: choice.bound for f, choice in choices.items()} | {form: found.bound},
-        nominals={f: names[choice.index] for f, choice in choices.items()} | {form: name},
-        cover=found.cover,
-        weight=found.weight,
-        misfit=found.misfit,
-        remainder=found.remainder,
-        remainder_cover=found.remainder_cover,
-    )
+    return UncertainModel(nominal_system=nominal_system, **findings(form, ids, tuple(others), index, freqs, scales, choices, found))
 
 
 def choose_by(

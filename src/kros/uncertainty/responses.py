@@ -15,61 +15,31 @@ from .bilinear import BilinearAxis, check_continuous_grid
 from .forms import Form, as_form
 from .given_models import check_fit, check_scale
 from .population.nominal import Criterion, as_criterion
-from .quantify import POOLED, bound_continuous, choose_by
+from .quantified import Quantified, findings
+from .quantify import bound_continuous, choose_by
 from .residuals import check_responses
 from .weights.bounded import bound_residuals
-from .weights.cover import Cover, Structure, as_structure
-from .weights.weight import Weight
+from .weights.cover import Structure, as_structure
 
 Array = npt.NDArray[Any]
 
 
-@dataclass(frozen=True, eq=False)
-class ResponseUncertainty:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ResponseUncertainty(Quantified):
     """Weights that bound how measured frequency responses differ from a nominal one, at the frequencies given and nowhere else.
 
     Parameters
     ----------
-    form : Form
-    unit_ids : tuple of str
-    nominal : int
-        Row of the nominal unit; -1 when the nominal is none of the units.
-    nominal_id : str
     nominal_response : ndarray, shape (frequency, p, m), complex
         In physical units.
-    freqs_hz : ndarray, shape (frequency,), Hz
     sample_period_s : float, s
         Zero for continuous time.
-    output_scale : ndarray, shape (p,)
-    input_scale : ndarray, shape (m,)
-    bounds : dict of Form to ndarray, shape (frequency,)
-    nominals : dict of Form to str
-    cover : Cover
-    weight : Weight
-        Its `cover_max` is over `freqs_hz`.
-    misfit : ndarray, shape (unit, frequency)
-    remainder : Weight or None
-    remainder_cover : Cover or None
     certificate : str
-        Where the bound holds.
+        Where the bound holds; all others are those of `Quantified`.
     """
 
-    form: Form
-    unit_ids: tuple[str, ...]
-    nominal: int
-    nominal_id: str
     nominal_response: Array
-    freqs_hz: Array
     sample_period_s: float
-    output_scale: Array
-    input_scale: Array
-    bounds: dict[Form, Array]
-    nominals: dict[Form, str]
-    cover: Cover
-    weight: Weight
-    misfit: Array
-    remainder: Weight | None
-    remainder_cover: Cover | None
     certificate: str
 
 
@@ -170,25 +140,11 @@ def quantify_responses(
         found = bound_residuals(form, of_nominal, of_units, freqs, sample_period_s, **options)
     else:
         found = bound_continuous(form, of_nominal, of_units, freqs, BilinearAxis.over(freqs), **options)
-    name = names[index] if index >= 0 else POOLED
     return ResponseUncertainty(
-        form=form,
-        unit_ids=ids,
-        nominal=index if index < len(ids) else -1,
-        nominal_id=name,
         nominal_response=chosen,
-        freqs_hz=freqs,
         sample_period_s=float(sample_period_s),
-        output_scale=scales[0],
-        input_scale=scales[1],
-        bounds={f: choice.bound for f, choice in choices.items()} | {form: found.bound},
-        nominals={f: names[choice.index] for f, choice in choices.items()} | {form: name},
-        cover=found.cover,
-        weight=found.weight,
-        misfit=found.misfit,
-        remainder=found.remainder,
-        remainder_cover=found.remainder_cover,
         certificate=f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them",
+        **findings(form, ids, tuple(others), index, freqs, scales, choices, found),
     )
 
 

@@ -125,7 +125,9 @@ def convert(
 def run(
     study: Annotated[Path, typer.Argument(metavar="STUDY.toml")],
     out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/<study> beside the study file.")] = None,
-    until: Annotated[str, typer.Option(help="Last stage: read, calibrate, identify, quantify, synthesize, evaluate or report.")] = "report",
+    until: Annotated[
+        str, typer.Option(help="Last stage: read, calibrate, identify, quantify, synthesize, evaluate, left_out or report.")
+    ] = "report",
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the study.")] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,

@@ -33,6 +33,7 @@ class Stage(str, Enum):
     QUANTIFY = "quantify"
     SYNTHESIZE = "synthesize"
     EVALUATE = "evaluate"
+    LEFT_OUT = "left_out"
     REPORT = "report"
 
 
@@ -41,10 +42,11 @@ class _Section(BaseModel):
 
 
 class DataConfig(_Section):
-    """Where the recordings are and how they are prepared."""
+    """Where the recordings are and how they are prepared; units that `exclude` names take no part in anything."""
 
     source: Path
     reader: str = "motor-drive-raw"
+    exclude: tuple[str, ...] = ()
     identify_on: str | None = None
     on_nan: Literal["error", "drop_episode"] = "error"
     prepare: tuple[dict[str, Any], ...] = ()
@@ -147,6 +149,22 @@ class ObserverConfig(_Section):
     deployed: str | None = None
 
 
+class EvaluateConfig(_Section):
+    """Evaluation on units that took no part.
+
+    With `folds` the pooled units are parted into so many folds, and for each the study is made once more on all other units; 0 leaves that out.
+    """
+
+    folds: int = Field(0, ge=0)
+
+    @field_validator("folds")
+    @classmethod
+    def _several(cls, value: int) -> int:
+        if value == 1:
+            raise ValueError("folds should be 0 or at least 2: one fold would leave no unit to learn from")
+        return value
+
+
 class RequireConfig(_Section):
     """Requirements whose violation ends the run with exit code 3."""
 
@@ -166,6 +184,7 @@ class StudyConfig(_Section):
     uncertainty: UncertaintyConfig = UncertaintyConfig()
     synthesis: SynthesisConfig = SynthesisConfig()
     observer: ObserverConfig = ObserverConfig()
+    evaluate: EvaluateConfig = EvaluateConfig()
     require: RequireConfig = RequireConfig()
 
     def dump(self) -> dict[str, Any]:

@@ -74,10 +74,15 @@ class Context:
 
     @cached_property
     def population(self) -> Population:
-        """The prepared recordings."""
+        """The prepared recordings of the units that take part."""
         from ..data import read_parquet
 
-        return read_parquet(self.facts.recordings if self.facts.recordings.is_absolute() else self.store.folder / self.facts.recordings)
+        return read_parquet(self.recordings).select(self.facts.groups)
+
+    @property
+    def recordings(self) -> Path:
+        """Where the prepared recordings are."""
+        return self.store.folder / self.facts.recordings  # an absolute path stays as it is
 
     @cached_property
     def lifting(self) -> Lifting:

@@ -15,7 +15,7 @@ from ..synthesis.result import Synthesis
 from ..uncertainty import Tightness, UncertainModel, VariationAndNoise
 from .config import Stage
 from .context import Context
-from .stages import calibrate
+from .stages import calibrate, left_out
 
 
 def collect_metrics(context: Context, until: Stage, total_s: float | None) -> dict[str, Any]:
@@ -26,6 +26,8 @@ def collect_metrics(context: Context, until: Stage, total_s: float | None) -> di
     for stage, name, collect in _SECTIONS:
         if stage in done:
             metrics[name] = collect(context)
+    if Stage.LEFT_OUT in done and left_out.wanted(context.config):
+        metrics["left_out"] = load_artifact(context.store.path(left_out.FOLDER), left_out.KIND)[0]
     clean: dict[str, Any] = plain(metrics)
     return clean
 

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +42,14 @@ class Outcome:
     shown: list[Array]
     facts: dict[str, Any] | None = None
     estimated: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A piece of work and the names of its results: a list of them, or one."""
+
+    names: tuple[str, ...]
+    work: Callable[[], Any]
 
 
 def evaluate_observers(
@@ -120,19 +127,11 @@ def run(context: Context) -> list[Path]:
     shown_on = tuple(on.index(keys[i]) for i in shown if keys[i] in on)
 
     observers, models = load_observers(context), {name: context.models(name) for name in context.model_names}
-    makers = baseline_makers(context, models)
-    groups = alike(observers.values())
-    work: list[Callable[[], Any]] = [partial(evaluate_baseline, make, population, keys, units, shown) for make in makers.values()]
-    work += [partial(evaluate_observers, group, population, keys, units, shown) for group in groups]
-    work += [partial(evaluate_model, m, population, on, units, shown_on) for m in models.values()]
-    done = context.run("evaluate", work)
-    of_groups = dict(zip((o.name for g in groups for o in g), chain(*done[len(makers) : len(makers) + len(groups)]), strict=True))
-    results: dict[str, Outcome | str] = {name: of_groups[o.name] for name, o in observers.items()}
-    results |= dict(
-        zip([*makers, *(f"free run/{m}" for m in models)], done[: len(makers)] + done[len(makers) + len(groups) :], strict=True)
-    )
-    free_runs = {m: outcome for m in models if isinstance(outcome := results[f"free run/{m}"], Outcome)}
-    estimates = {name: outcome for name in (*observers, *makers) if isinstance(outcome := results[name], Outcome)}
+    work = estimation(context, population, keys, units, shown)
+    work += [Piece((f"free run/{m}",), partial(evaluate_model, found, population, on, units, shown_on)) for m, found in models.items()]
+    results = outcomes(context, work)
+    free_runs = {m: outcome for m in models if isinstance(outcome := results.pop(f"free run/{m}"), Outcome)}
+    estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
 
     band = gearbox_band_hz(context.config, population, _top_speed(context, models))
     rows = []
@@ -146,15 +145,36 @@ def run(context: Context) -> list[Path]:
         "band_hz": band,
         "roles": roles,
         "shown": [[k.unit, k.condition, k.episode] for k in (keys[i] for i in shown)],
-        "baselines": {name: facts_of(name, results[name]) for name in makers},
+        "baselines": {name: facts_of(name, outcome) for name, outcome in results.items() if name not in observers},
     }
     content |= {"observers": list(estimates), "models": list(models), "states": population.states}
     save_artifact(folder, "evaluation", content, _arrays(population, keys, on, shown, shown_on, roles, estimates, free_runs))
     return [folder / "evaluation.json", folder / "arrays.npz"]
 
 
-def baseline_makers(context: Context, models: dict[str, ModelSet]) -> dict[str, Callable[[], Baseline]]:
+def estimation(
+    context: Context, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...] = ()
+) -> list[Piece]:
+    """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
+    makers = baseline_makers(context)
+    work = [Piece((name,), partial(evaluate_baseline, make, population, keys, units, shown)) for name, make in makers.items()]
+    for group in alike(load_observers(context).values()):
+        names = tuple(observer.name for observer in group)
+        work.append(Piece(names, partial(evaluate_observers, group, population, keys, units, shown)))
+    return work
+
+
+def outcomes(context: Context, work: Sequence[Piece]) -> dict[str, Outcome | str]:
+    """Do the work; return outcomes by name, observers of the study first, in its order."""
+    found: dict[str, Outcome | str] = {}
+    for piece, result in zip(work, context.run("evaluate", [piece.work for piece in work]), strict=True):
+        found |= dict(zip(piece.names, result if isinstance(result, list) else [result], strict=True))
+    return {name: found[name] for name in dict.fromkeys((*load_observers(context), *found))}
+
+
+def baseline_makers(context: Context) -> dict[str, Callable[[], Baseline]]:
     """Return what makes every baseline that is no correction of a model: the extended filter of the first lifted model, and those without a model."""
+    models = {name: context.models(name) for name in context.model_names}
     asked, first = context.config.observer.baselines, next(iter(models.values()))
     nominal = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
     tuning = tuning_set(context, first)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.artifacts import save_artifact
-from ...core.errors import DataError
+from ...core.errors import ConfigError, DataError
 from ...data import (
     EpisodeKey,
     Population,
@@ -55,9 +55,13 @@ class GroupFacts:
 
 
 def open_source(config: StudyConfig) -> Population:
-    """Open the study's recordings, lazily."""
+    """Open the study's recordings, lazily, without the units that are excluded."""
     data = config.data
-    return open_population(data.reader, data.source, prepare=data.prepare, csv=data.csv)
+    population = open_population(data.reader, data.source, prepare=data.prepare, csv=data.csv)
+    unknown = [unit for unit in data.exclude if unit not in population.unit_ids]
+    if unknown:
+        raise ConfigError(f"data.exclude: the recordings have no unit {', '.join(unknown)}, only {', '.join(population.unit_ids)}.")
+    return population.select([u for u in population.unit_ids if u not in data.exclude])
 
 
 def check_source(config: StudyConfig, single_allowed: bool) -> None:

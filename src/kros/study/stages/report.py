@@ -16,7 +16,7 @@ def run(context: Context) -> list[Path]:
     from ...report import render
     from ..metrics import collect_metrics
 
-    return [render(context.store.folder, collect_metrics(context, Stage.EVALUATE, None), partial(context.map, "report"))]
+    return [render(context.store.folder, collect_metrics(context, Stage.LEFT_OUT, None), partial(context.map, "report"))]
 
 
 def render_run(folder: Path) -> Path:

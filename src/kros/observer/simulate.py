@@ -72,7 +72,7 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
         raise DimensionError(
             f"Running {len(observers)} observers side by side: they differ in lifting, measured states or inputs; run them one by one."
         )
-    if any(o.runtime.delay or o.runtime.limited for o in observers) or not np.isfinite(y).all():
+    if any(o.runtime.delay or o.runtime.limited for o in observers):
         return np.stack([run_carefully(o, y, u, parameters, Estimate.PREDICT) for o in observers])
     n, n_lifted, m, k = lifting.n_states, lifting.n_lifted, observer.B.shape[1], len(observers)
     order = max(o.controller.n_states for o in observers)
@@ -83,6 +83,8 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
     lifted, inflow, measurement = row[..., :n_lifted], row[..., n_lifted + order : n_lifted + order + m], row[..., n_lifted + order + m :]
     for own, first in zip(row, observers, strict=True):
         own[..., :n] = first.initial(y[0], parameters)
+    missing = ~np.isfinite(y)
+    gone = missing.any(axis=(1, 2))
     estimates = np.empty((n_samples, k, batch, n))
     following = np.empty((k, batch, n + order))
     plain = not (lifting.history or lifting.input_functions)
@@ -101,6 +103,8 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
                 inflow[...] = lifting.lift_inputs(held, window, values)
                 earlier = lifting.window.advance(window, held)
             measurement[...] = y[sample]
+            if gone[sample]:  # what is predicted stands for what is missing, so that it corrects nothing
+                np.copyto(measurement, row[..., list(observer.measured)], where=missing[sample])
             np.matmul(row, step, out=following)
             row[..., :n] = following[..., :n]
             row[..., n_lifted : n_lifted + order] = following[..., n:]

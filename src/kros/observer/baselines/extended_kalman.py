@@ -74,6 +74,7 @@ class ExtendedKalman:
         Parameters
         ----------
         y : ndarray, shape (n_samples, batch, q)
+            NaN or infinite where a measurement is missing: nothing is corrected at that sample, and the covariance grows.
         u : ndarray, shape (n_samples, batch, m)
         parameters : mapping of str to array_like, shape (batch,)
 
@@ -94,19 +95,24 @@ class ExtendedKalman:
             name: np.broadcast_to(np.asarray(v, dtype=float), (batch,)) for name, v in {**self.parameters, **(parameters or {})}.items()
         }
         x = np.zeros((k, batch, n))
-        x[..., C] = y[0]
+        x[..., C] = np.where(np.isfinite(y[0]), y[0], 0.0)
         P = np.broadcast_to(self.P0, (k, batch, n, n)).copy()
         drift, drive = np.ascontiguousarray(self.A[:n].T), np.ascontiguousarray(self.B[:n].T)
         linear, coupling = self.A[:n, :n], self.A[:n, n:]
+        missing = ~np.isfinite(y)
+        gone = missing.any(axis=(1, 2))
         driven = u @ drive if not lifting.input_functions else None
         estimates = np.empty((n_samples, k, batch, n))
         earlier: Array | None = None
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             for sample in range(n_samples):
                 estimates[sample] = x
-                PC = P[..., C]
+                PC, nu = P[..., C], y[sample] - x[..., C]
                 L = _divided(PC, PC[..., C, :] + self.R)
-                x = x + (L @ (y[sample] - x[..., C])[..., None])[..., 0]
+                if gone[sample]:
+                    lost = missing[sample].any(axis=-1)  # a sample with a measurement missing is left out whole
+                    L, nu = np.where(lost[:, None, None], 0.0, L), np.where(lost[:, None], 0.0, nu)
+                x = x + (L @ nu[..., None])[..., 0]
                 P = P - L @ PC.swapaxes(-1, -2)
                 held = np.broadcast_to(u[sample], (k, *u[sample].shape))
                 if lifting.history:

@@ -1,0 +1,131 @@
+"""Errors against severity: estimators on disturbed measurements of a few episodes, compared with the recordings as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DimensionError
+from .batch import EpisodeBatch
+from .disturb import Disturbance, Measured
+from .errors import error_percent
+
+Array = npt.NDArray[np.float64]
+Run = Callable[[Measured, Array], Sequence[Array] | Array]
+_AT_ONCE = 20_000_000  # numbers of all estimates that are in memory, 160 MB
+
+
+@dataclass(frozen=True, eq=False)
+class DisturbedEpisodes:
+    """Episodes that observers run on under a list of disturbances.
+
+    Parameters
+    ----------
+    batch : EpisodeBatch
+    measured : tuple of int
+    parameters : mapping of str to ndarray, shape (batch,)
+        Calibrated lifting parameters of the machine behind every episode.
+    sample_period_s : float
+    disturbances : tuple of Disturbance
+    seed : int
+    """
+
+    batch: EpisodeBatch
+    measured: tuple[int, ...]
+    parameters: Mapping[str, Array]
+    sample_period_s: float
+    disturbances: tuple[Disturbance, ...]
+    seed: int = 0
+
+    @property
+    def given(self) -> Measured:
+        """Measurements as recorded; their range is the largest value of all episodes."""
+        y = np.ascontiguousarray(self.batch.states[..., list(self.measured)])
+        return Measured(y, self.parameters, self.sample_period_s, np.abs(y).max(axis=(0, 1)))
+
+    def errors(self, run: Run, estimators: int = 1) -> Array:
+        """Run estimators on all episodes under all disturbances.
+
+        Parameters
+        ----------
+        run : callable
+            Takes measurements and inputs (n_samples, batch, m) and returns the estimates of every estimator, shape (estimator, n_samples, batch, ...);
+            states beyond the recorded ones are left out.
+        estimators : int
+            How many `run` returns, which limits what is run at once.
+
+        Returns
+        -------
+        ndarray, shape (estimator, 1 + disturbance, batch, n)
+            ``100 rms(x_hat - x) / max|x|``; first of the measurements as they are. Not finite where an estimate diverged or there is none.
+        """
+        batch, given = self.batch, self.given
+        n, pieces = batch.states.shape[-1], []
+        together = max(1, _AT_ONCE // (estimators * batch.states.size))
+        none: list[Disturbance | None] = [None]
+        for start in range(0, 1 + len(self.disturbances), together):
+            wanted = (none + list(self.disturbances))[start : start + together]
+            part = _stacked(given, wanted, self.seed)
+            estimates = run(part, np.tile(batch.inputs, (1, len(wanted), 1)))
+            pieces.append([self._percent(estimate[..., :n], len(wanted)) for estimate in estimates])
+        return np.concatenate([np.array(piece) for piece in pieces], axis=1)
+
+    def _percent(self, estimate: Array, count: int) -> Array:
+        width = len(self.batch.keys)
+        if estimate.shape[1] != count * width:
+            raise DimensionError(f"Disturbed episodes: expected estimates of {count * width} episodes, found {estimate.shape}.")
+        parts = [estimate[:, i * width : (i + 1) * width] for i in range(count)]
+        return np.stack([error_percent(part, self.batch.states, self.batch.lengths) for part in parts])
+
+
+def _stacked(given: Measured, wanted: Sequence[Disturbance | None], seed: int) -> Measured:
+    if wanted[0] is not None:
+        return given.under([d for d in wanted if d is not None], seed)
+    rest = given.under([d for d in wanted[1:] if d is not None], seed)
+    parameters = {name: np.concatenate([values, rest.parameters[name]]) for name, values in given.parameters.items()}
+    return Measured(np.concatenate([given.y, rest.y], axis=1), parameters, given.sample_period_s, given.size)
+
+
+def robustness_rows(
+    name: str, errors: Array, episodes: DisturbedEpisodes, channels: Sequence[str], estimated: Sequence[int] | None = None
+) -> list[dict[str, Any]]:
+    """Return a row for every disturbance, severity, condition and channel: mean and worst unit of `DisturbedEpisodes.errors`.
+
+    Parameters
+    ----------
+    name : str
+        Of the observer.
+    errors : ndarray, shape (1 + disturbance, batch, n)
+    episodes : DisturbedEpisodes
+    channels : sequence of str, length n
+    estimated : sequence of int, optional
+        Channels that the observer estimates; default all.
+
+    Returns
+    -------
+    list of dict
+        ``disturbance`` is "none" and ``severity`` 0 for the measurements as they are; errors are None where an estimate diverged.
+    """
+    keys, rows = episodes.batch.keys, []
+    told = [("none", 0.0), *((d.kind.value, float(d.severity)) for d in episodes.disturbances)]
+    for condition in dict.fromkeys(k.condition for k in keys):
+        units = {u: [i for i, k in enumerate(keys) if (k.unit, k.condition) == (u, condition)] for u in dict.fromkeys(k.unit for k in keys)}
+        per_unit = np.stack([errors[:, chosen].mean(axis=1) for chosen in units.values() if chosen])  # (unit, 1 + disturbance, n)
+        for i, (kind, severity) in enumerate(told):
+            for j in range(len(channels)) if estimated is None else estimated:
+                values = per_unit[:, i, j]
+                known = bool(np.isfinite(values).all())
+                row = {"observer": name, "disturbance": kind, "severity": severity, "condition": condition, "channel": channels[j]}
+                rows.append(
+                    row
+                    | {
+                        "error_percent": {"mean": float(values.mean()), "worst": float(values.max())}
+                        if known
+                        else {"mean": None, "worst": None}
+                    }
+                )
+    return rows

@@ -64,7 +64,8 @@ def test_noise_gives_the_error_that_the_lyapunov_equation_promises():
 def test_losing_everything_is_the_open_loop():
     x, u = plant(300)
     lost = measured(x).under([Disturbance(Kind.DROPPED, 1.0)])
-    assert np.isfinite(lost.y[0]).all() and np.isnan(lost.y[1:]).all()
+    assert np.isfinite(lost.y[0]).all()
+    assert np.isnan(lost.y[1:]).all()
     o = observer(LIFTED)
     open_loop = observer(LIFTED, 0 * L)
     phases = {"phase": np.linspace(0, 3, x.shape[1])}
@@ -117,7 +118,8 @@ def test_every_kind_does_what_its_name_says():
     for column in gaps.T:
         edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isnan(column), [0]])))
         lengths = edges[1::2] - edges[::2]
-        assert np.all(lengths % 50 == 0) and 9 <= len(lengths) <= 10  # two neighbours may touch
+        assert np.all(lengths % 50 == 0)
+        assert 9 <= len(lengths) <= 10
     rounded = given.under([Disturbance("quantisation", 0.01)]).y
     assert np.abs(rounded - given.y).max() <= 0.005 * given.size[0] * (1 + 1e-9)
     late = given.under([Disturbance("delay", 7)]).y

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from matplotlib.figure import Figure
+from scipy.signal import welch
 
 from kros.core.artifacts import save_artifact, write_json
 from kros.core.errors import ConfigError, DataError
@@ -27,8 +28,9 @@ from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.report import plot, render, write_figures
 from kros.report.encode import to_svg
-from kros.report.figures import FIGURES, draw_all
+from kros.report.figures import FIGURES, draw, draw_all
 from kros.report.figures.entries import entry_names
+from kros.report.figures.error_spectra import of_episode
 from kros.report.figures.forms import paper_bounds
 from kros.report.figures.forms_entrywise import entry_bounds
 from kros.report.figures.outlier_scores import referred_range
@@ -37,6 +39,7 @@ from kros.report.figures.synthesis_bode import scaled_filter
 from kros.report.figures.trajectories import longest_steady, steady_stretches
 from kros.report.figures.uncertain_model import beside
 from kros.report.figures.weights import in_gauge
+from kros.report.names import observer_label
 from kros.report.run_folder import NotShownError, RunFolder
 from kros.report.theme import Tone
 from kros.synthesis.result import Injection, Status, Synthesis
@@ -450,6 +453,32 @@ def test_same_run_gives_the_same_figures(finished: tuple[Path, dict[str, Any]], 
     assert first == second
     drawn = [[to_svg(r.drawing.figure, r.name) for r in draw_all(RunFolder(finished[0])) if r.drawing] for _ in range(2)]
     assert drawn[0] == drawn[1]
+
+
+def test_observer_figures_show_nominal_above_worst_off_nominal_and_the_errors(finished: tuple[Path, dict[str, Any]]) -> None:
+    run = RunFolder(finished[0])
+    pair = ["linear_edmd/mixed", "koopman_edmd/mixed"]
+    figure = draw("observers_in_time_paper", run).drawing.figure
+    titles = [axes.get_title("left") for axes in figure.axes[::6]]
+    assert titles == ["nominal: unit 001, episode 1", "worst off-nominal: unit 002, episode 1"]
+    assert [line.get_label() for line in figure.axes[0].lines] == ["recorded", *map(observer_label, pair)]
+    spectra = of_episode(run, run.shown[1], pair)
+    for name in pair:
+        error = run.shown[1].observers[name].astype(float) - run.shown[1].states
+        _, density = welch(error, 1 / DT, "hann", 512, axis=0)
+        assert spectra[name] == pytest.approx(density, rel=1e-9)
+    drawn = draw("loaded_spectra", run).drawing.figure.axes[0].lines[1].get_ydata()
+    error = run.shown[2].observers[pair[1]].astype(float) - run.shown[2].states
+    assert drawn == pytest.approx(welch(error[:, 0], 1 / DT, "hann", 512)[1][1 : 1 + len(drawn)], rel=1e-9)
+
+
+def test_figures_of_the_papers_observers_need_them(finished: tuple[Path, dict[str, Any]]) -> None:
+    run = RunFolder(finished[0])
+    for shown in run.shown:
+        for model in ("linear_edmd", "koopman_edmd"):
+            del shown.observers[f"{model}/mixed"]
+    for name in ("observers_in_time_paper", "loaded_paper"):
+        assert "no observer of the paper's method" in draw(name, run).reason
 
 
 def test_phase_figure_shows_the_calibration(finished: tuple[Path, dict[str, Any]]) -> None:

@@ -8,7 +8,7 @@ import pytest
 from kros.report.canvas import decibel, power_of_ten, spread, thin, thin_log
 from kros.report.error_table import error_table
 from kros.report.figures.errors_chart import log_ticks
-from kros.report.names import best_models, main_observers, model_label, number, observer_label, observer_look
+from kros.report.names import best_models, deployed_pair, main_observers, model_label, number, observer_label, observer_look, paper_pair
 from kros.report.theme import Tone
 from kros.report.verdict import verdict
 
@@ -146,6 +146,19 @@ def test_main_observers_are_few_and_the_deployed_comes_last() -> None:
     assert main_observers(names, "koopman/mixed") == ["linear/mixed", "koopman/open_loop", "koopman/kalman_tuned", "koopman/mixed"]
     assert main_observers(names, None)[-1] == "koopman/mixed"
     assert main_observers(["linear_edmd/open_loop"], None) == ["linear_edmd/open_loop"]
+
+
+def test_pairs_are_a_linear_and_a_koopman_observer() -> None:
+    names = [
+        f"{m}/{k}"
+        for m in ("koopman", "linear", "koopman_edmd", "linear_edmd")
+        for k in ("open_loop", "kalman_tuned", "mixed", "residual_h2")
+    ]
+    assert deployed_pair(names, "koopman/residual_h2") == ["linear/residual_h2", "koopman/residual_h2"]
+    assert deployed_pair(["koopman/open_loop", "koopman/kalman_tuned", "koopman/mixed"], None) == ["koopman/kalman_tuned", "koopman/mixed"]
+    assert paper_pair(names) == ["linear_edmd/mixed", "koopman_edmd/mixed"]
+    assert paper_pair(["linear_edmd/mixed", "koopman/mixed"]) == ["linear_edmd/mixed"]
+    assert paper_pair(["koopman/mixed", "learned"]) == []
 
 
 def test_koopman_and_linear_twins_differ_in_colour() -> None:

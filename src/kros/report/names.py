@@ -125,6 +125,20 @@ def main_observers(names: Sequence[str], deployed: str | None) -> list[str]:
     return [n for n in dict.fromkeys(wanted) if n in known]
 
 
+def deployed_pair(names: Sequence[str], deployed: str | None) -> list[str]:
+    """Return the observer that is handed over and its linear twin; beside a lonely one its tuned Kalman filter."""
+    known = main_observers(names, deployed)
+    main = [n for n in known if split_observer(n)[1] != "open_loop"] or known
+    robust = [n for n in main if split_observer(n)[1] not in BASELINES]
+    return robust if len(robust) > 1 else main
+
+
+def paper_pair(names: Iterable[str]) -> list[str]:
+    """Return the paper's linear and Koopman observer, or what there is of them."""
+    known = list(names)
+    return [n for n in ("linear_edmd/mixed", "koopman_edmd/mixed") if n in known]
+
+
 def axis_label(channel: str, unit: str) -> str:
     """Return a channel's name with its unit of measure, for an axis."""
     readable = _UNITS.get(unit, unit)

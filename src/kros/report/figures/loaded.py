@@ -1,63 +1,58 @@
-"""Estimation errors of the nominal unit in a condition that no model has seen (the paper's Figures 13 and 14).
+"""Estimation errors of the nominal unit in a condition that no model has seen: the pair that is handed over (as in the paper's Figure 13).
 
 Needs: the evaluation's kept episodes in a second condition.
 """
 
 from __future__ import annotations
 
-from ...evaluate.errors import error_spectrum
-from ..canvas import grid, legend, logarithmic
-from ..names import BASELINES, condition_label, episode_title, main_observers, observer_label, observer_look, split_observer
+from collections.abc import Sequence
+
+from ..canvas import grid, legend
+from ..names import condition_label, deployed_pair, episode_title, observer_label, observer_look
 from ..run_folder import NotShownError, RunFolder, Shown
 from .drawing import Drawing
-from .spectra import band
-from .trajectories import Line, draw_lines, hide_times, label_rows, states, steady_window, zoom_s
+from .trajectories import Line, draw_lines, hide_times, label_rows, shade, states, steady_window, zoom_s
 
 NAME, TITLE = "loaded", "Errors in the other condition"
 
 
 def draw(run: RunFolder) -> Drawing:
-    """Draw errors over the episode, over a zoom, and as spectra."""
+    """Draw the pair that a study hands over."""
+    return draw_pair(run, deployed_pair(list(loaded_episode(run).observers), run.deployed))
+
+
+def loaded_episode(run: RunFolder) -> Shown:
+    """Return the kept episode of the nominal unit in another condition."""
     shown = next((s for s in run.shown if s.key.condition != run.identify_on), None)
     if shown is None or not shown.observers:
         raise NotShownError("the recordings have one condition only")
-    names = _compared(list(shown.observers), run.deployed)
-    channels = states(run)[:4]
-    figure, axes = grid(len(channels), 3, 1.35, width_ratios=(1.5, 1, 1))
+    return shown
+
+
+def draw_pair(run: RunFolder, names: Sequence[str]) -> Drawing:
+    """Draw errors over the episode and over a zoom at constant speed."""
+    shown, channels = loaded_episode(run), states(run)[:4]
+    figure, axes = grid(len(channels), 2, 1.35, width_ratios=(1.3, 1))
     length_s = zoom_s(run, shown)
-    window, band_hz = steady_window(run, shown, length_s), run.evaluation.get("band_hz")
-    for i, (full, zoom, spectrum) in enumerate(axes):
-        lines = _errors(shown, names, i)
+    window = steady_window(run, shown, length_s)
+    for i, (full, zoom) in enumerate(axes):
+        lines = errors_of(shown, names, i)
         draw_lines(full, shown.time_s, lines, width=0.9)
         draw_lines(zoom, shown.time_s, lines, window, width=1.3)
-        for label, error, look in lines:
-            freqs, density = error_spectrum(error.astype(float), run.sample_period_s)
-            spectrum.plot(freqs[1:], density[1:], look.style, color=look.colour, label=label)
-        logarithmic(spectrum)
-        spectrum.set_xlim(0, min(3.5 * band_hz[1], freqs[-1]) if band_hz else freqs[-1])
-        band(spectrum, band_hz)
+        shade(full, shown.time_s, window)
     hide_times(axes[:-1].ravel())
     figure.align_ylabels(axes[:, 0])
     label_rows(axes[:, 0], channels, suffix=" error")
     axes[0, 0].set_title(episode_title(shown.key))
-    axes[0, 1].set_title(f"{length_s:g} s of it")
-    axes[0, 2].set_title("PSD, unit²/Hz")
-    axes[-1, 0].set_xlabel("time (s)")
-    axes[-1, 1].set_xlabel("time (s)")
-    axes[-1, 2].set_xlabel("frequency (Hz)")
+    axes[0, 1].set_title(f"{length_s:g} s of it" + (" at constant speed" if run.calibrated else ""))
+    for panel in axes[-1]:
+        panel.set_xlabel("time (s)")
     legend(figure, axes[0, 0])
     return Drawing(figure, _caption(run, shown))
 
 
-def _compared(observers: list[str], deployed: str | None) -> list[str]:
-    """The observer that is handed over and its twin; beside a lonely one the tuned Kalman filters."""
-    known = main_observers(observers, deployed)
-    main = [n for n in known if split_observer(n)[1] != "open_loop"] or known
-    robust = [n for n in main if split_observer(n)[1] not in BASELINES]
-    return robust if len(robust) > 1 else main
-
-
-def _errors(shown: Shown, names: list[str], channel: int) -> list[Line]:
+def errors_of(shown: Shown, names: Sequence[str], channel: int) -> list[Line]:
+    """Return recorded minus estimated, a line an observer."""
     return [(observer_label(n), shown.states[:, channel] - shown.observers[n][:, channel], observer_look(n)) for n in names]
 
 

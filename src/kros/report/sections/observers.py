@@ -36,7 +36,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "own parameters. An estimate for the next "
         "sample uses data up to this one."
     )
-    return Section("observers", "Observers at work", [text], [], ["observers_in_time", "observer_spectra"])
+    return Section("observers", "Observers at work", [text], [], ["observers_in_time", "observers_in_time_paper", "observer_spectra"])
 
 
 def errors(table: ErrorTable, deployed: str | None, measured: tuple[str, ...] = ()) -> Table:

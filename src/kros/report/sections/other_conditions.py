@@ -11,11 +11,11 @@ from ..run_folder import RunFolder
 
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
-    """Return the figure of errors in another condition; None where there is one condition."""
+    """Return the figures of errors in another condition; None where there is one condition."""
     study = metrics["study"]
     others = [c for c in study["conditions"] if c != study["identify_on"]]
     if not others or not metrics.get("evaluation"):
         return None
     names = ", ".join(condition_label(c) for c in others)
     text = f"Models, weights and observers know only “{condition_label(study['identify_on'])}”. Here they meet what they were not made for: {names}."
-    return Section("other-conditions", names[:1].upper() + names[1:], [text], [], ["loaded"])
+    return Section("other-conditions", names[:1].upper() + names[1:], [text], [], ["loaded", "loaded_paper", "loaded_spectra"])

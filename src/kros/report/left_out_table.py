@@ -1,0 +1,111 @@
+"""Errors of observers on units that were left out of their making: mean over the units with its interval, and the worst unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..data.population import natural_key
+from ..evaluate import unit_interval
+
+Key = tuple[str, str]
+PAPER = "koopman_edmd/mixed"
+"""The paper's own observer, which band powers are compared with."""
+
+
+@dataclass(frozen=True)
+class LeftOutCell:
+    """Error of one observer in one channel, percent of range; None where some estimate diverged.
+
+    Parameters
+    ----------
+    mean : float or None
+        Over the units.
+    low, high : float or None
+        95 % interval of the mean, from a bootstrap over units.
+    worst : float or None
+    worst_unit : str or None
+    units : mapping of str to float or None
+    band_db : float or None
+        Power of the error around the gearbox frequency, mean over the units, in dB relative to that of `PAPER`.
+    """
+
+    mean: float | None
+    low: float | None
+    high: float | None
+    worst: float | None
+    worst_unit: str | None
+    units: Mapping[str, float | None]
+    band_db: float | None = None
+
+
+@dataclass(frozen=True)
+class LeftOutTable:
+    """Errors of all observers in one condition.
+
+    Parameters
+    ----------
+    condition : str
+    channels : tuple of str
+    cells : mapping of observer to mapping of channel to LeftOutCell
+    """
+
+    condition: str
+    channels: tuple[str, ...]
+    cells: Mapping[str, Mapping[str, LeftOutCell]]
+
+
+def left_out_tables(rows: Sequence[Mapping[str, Any]], identify_on: str) -> list[LeftOutTable]:
+    """Summarise the rows of ``metrics.json``'s ``left_out``, one table a condition, the one that was identified on first.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        observer, unit, condition, channel, error_percent and, where there is a gearbox, gearbox_band_power.
+    identify_on : str
+    """
+    conditions = sorted({r["condition"] for r in rows}, key=lambda c: (c != identify_on, natural_key(c)))
+    return [_table(condition, [r for r in rows if r["condition"] == condition]) for condition in conditions]
+
+
+def _table(condition: str, rows: Sequence[Mapping[str, Any]]) -> LeftOutTable:
+    grouped: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        grouped.setdefault((row["observer"], row["channel"]), []).append(row)
+    means = _intervals({key: [r["error_percent"] for r in found] for key, found in grouped.items()})
+    cells: dict[str, dict[str, LeftOutCell]] = {}
+    for (observer, channel), found in grouped.items():
+        papers = _power(grouped.get((PAPER, channel), []))
+        cells.setdefault(observer, {})[channel] = _cell(found, means.get((observer, channel)), papers)
+    return LeftOutTable(condition, tuple(dict.fromkeys(channel for _, channel in grouped)), cells)
+
+
+def _intervals(errors: Mapping[Key, Sequence[float | None]]) -> dict[Key, tuple[float, float]]:
+    """Return the intervals of all means that can be formed, cells with as many units together: they share the draws."""
+    finite = {key: values for key, values in errors.items() if all(v is not None and np.isfinite(v) for v in values)}
+    found: dict[Key, tuple[float, float]] = {}
+    for count in {len(values) for values in finite.values()} - {1}:
+        keys = [key for key, values in finite.items() if len(values) == count]
+        low, high = unit_interval(np.array([finite[key] for key in keys], float).T)
+        found |= {key: (float(a), float(b)) for key, a, b in zip(keys, low, high, strict=True)}
+    return found
+
+
+def _cell(rows: Sequence[Mapping[str, Any]], interval: tuple[float, float] | None, papers: float | None) -> LeftOutCell:
+    units = {r["unit"]: r["error_percent"] for r in rows}
+    own = _power(rows)
+    band_db = float(10 * np.log10(own / papers)) if own and papers else None
+    if interval is None:
+        return LeftOutCell(None, None, None, None, None, units, band_db)
+    worst = max(units, key=lambda u: float(units[u]))
+    return LeftOutCell(float(np.mean(list(units.values()))), *interval, float(units[worst]), worst, units, band_db)
+
+
+def _power(rows: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the mean power around the gearbox frequency; None where it is unknown or infinite."""
+    powers = [r.get("gearbox_band_power") for r in rows]
+    known = [float(p) for p in powers if p is not None and np.isfinite(p)]
+    return float(np.mean(known)) if known and len(known) == len(powers) else None

@@ -2,23 +2,29 @@
 
 from .batch import EpisodeBatch
 from .bootstrap import unit_interval
+from .contractions import Contractions
 from .disturb import SEVERITIES, Disturbance, Kind, Measured, hold_missing, standard_disturbances
 from .errors import ErrorSummary, error_percent, error_rms, error_spectrum, summarise
+from .monte_carlo import Candidate, MonteCarlo, sample_errors
 from .robustness import DisturbedEpisodes, robustness_rows
 
 __all__ = [
     "SEVERITIES",
+    "Candidate",
+    "Contractions",
     "Disturbance",
     "DisturbedEpisodes",
     "EpisodeBatch",
     "ErrorSummary",
     "Kind",
     "Measured",
+    "MonteCarlo",
     "error_percent",
     "error_rms",
     "error_spectrum",
     "hold_missing",
     "robustness_rows",
+    "sample_errors",
     "standard_disturbances",
     "summarise",
     "unit_interval",

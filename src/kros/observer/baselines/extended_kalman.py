@@ -99,7 +99,7 @@ class ExtendedKalman:
         P = np.broadcast_to(self.P0, (k, batch, n, n)).copy()
         drift, drive = np.ascontiguousarray(self.A[:n].T), np.ascontiguousarray(self.B[:n].T)
         linear, coupling = self.A[:n, :n], self.A[:n, n:]
-        missing = np.asarray(~np.isfinite(y))
+        missing: npt.NDArray[np.bool_] = np.logical_not(np.isfinite(y))
         gone = missing.any(axis=(1, 2))
         driven = u @ drive if not lifting.input_functions else None
         estimates = np.empty((n_samples, k, batch, n))
@@ -110,7 +110,7 @@ class ExtendedKalman:
                 PC, nu = P[..., C], y[sample] - x[..., C]
                 L = _divided(PC, PC[..., C, :] + self.R)
                 if gone[sample]:
-                    lost = missing[sample].any(axis=-1)  # a sample with a measurement missing is left out whole
+                    lost = np.asarray(missing[sample].any(axis=-1))  # a sample with a measurement missing is left out whole
                     L, nu = np.where(lost[:, None, None], 0.0, L), np.where(lost[:, None], 0.0, nu)
                 x = x + (L @ nu[..., None])[..., 0]
                 P = P - L @ PC.swapaxes(-1, -2)

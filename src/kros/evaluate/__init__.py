@@ -1,7 +1,7 @@
 """Evaluation: errors and spectra of estimates and free runs against recordings, also of disturbed ones; Monte Carlo over uncertain sets."""
 
 from .batch import EpisodeBatch
-from .bootstrap import unit_interval
+from .bootstrap import draw_interval, unit_interval
 from .contractions import Contractions
 from .disturb import SEVERITIES, Disturbance, Kind, Measured, hold_missing, standard_disturbances
 from .errors import ErrorSummary, error_percent, error_rms, error_spectrum, summarise
@@ -19,6 +19,7 @@ __all__ = [
     "Kind",
     "Measured",
     "MonteCarlo",
+    "draw_interval",
     "error_percent",
     "error_rms",
     "error_spectrum",

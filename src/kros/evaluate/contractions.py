@@ -16,8 +16,8 @@ import numpy.typing as npt
 from ..core.lti import StateSpace, block_diagonal, gain
 
 Array = npt.NDArray[Any]
-_CORNERS = (1e-4, 2.0)  # rad per sample
-_DAMPING = (0.05, 1.0)
+_CORNERS = np.log([1e-4, 2.0])  # of rad per sample
+_DAMPING = np.log([0.05, 1.0])
 _BOUNDARY = 0.5  # share of members of norm one
 
 
@@ -48,8 +48,8 @@ class Contractions:
         first, middle = _orthonormal(rng, members, rows, k), _orthonormal(rng, members, k, k)
         last = np.swapaxes(_orthonormal(rng, members, columns, k), -1, -2)
         degree = (np.arange(members) % 3)[:, None, None] * np.ones((1, 2, k), int)
-        corner = np.exp(rng.uniform(*np.log(_CORNERS), size=degree.shape))
-        damping = np.exp(rng.uniform(*np.log(_DAMPING), size=degree.shape))
+        corner = np.exp(rng.uniform(_CORNERS[0], _CORNERS[1], size=degree.shape))
+        damping = np.exp(rng.uniform(_DAMPING[0], _DAMPING[1], size=degree.shape))
         pair = np.exp(corner * (-damping + 1j * np.sqrt(1 - damping**2)))
         single = np.exp(-corner) * np.where(rng.random(degree.shape) < 0.5, 1.0, -1.0)
         poles = np.stack([np.where(degree == 2, pair, single), np.where(degree == 2, np.conj(pair), np.nan)], axis=-1)

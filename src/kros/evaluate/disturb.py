@@ -57,6 +57,8 @@ class Disturbance:
     kind : Kind or str
     severity : float
         In the unit of its kind; zero disturbs nothing.
+    draw : int
+        Number of the random draw; disturbances of one kind and draw share it.
 
     Raises
     ------
@@ -66,6 +68,7 @@ class Disturbance:
 
     kind: Kind
     severity: float
+    draw: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kind", Kind(self.kind))
@@ -77,7 +80,7 @@ class Disturbance:
 
 
 SEVERITIES: dict[Kind, tuple[float, ...]] = {
-    Kind.DROPPED: (0.02, 0.05, 0.1, 0.2, 0.3, 0.5),
+    Kind.DROPPED: (0.05, 0.1, 0.2, 0.3, 0.5),
     Kind.GAP: (0.01, 0.03, 0.1, 0.3, 1.0),
     Kind.BIAS: (1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
     Kind.QUANTISATION: (1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
@@ -88,7 +91,7 @@ SEVERITIES: dict[Kind, tuple[float, ...]] = {
 
 
 def standard_disturbances(kinds: Sequence[Kind] = tuple(Kind)) -> list[Disturbance]:
-    """Return the disturbances of a study: five or six severities of every kind."""
+    """Return the disturbances of a study: five severities of every kind."""
     return [Disturbance(kind, severity) for kind in kinds for severity in SEVERITIES[kind]]
 
 
@@ -135,7 +138,7 @@ class Measured:
         y = np.empty((n_samples, len(disturbances), batch, q))
         parameters = {name: np.repeat(values[None], len(disturbances), axis=0) for name, values in self.parameters.items()}
         for i, disturbance in enumerate(disturbances):
-            rng = np.random.default_rng([seed, list(Kind).index(disturbance.kind)])
+            rng = np.random.default_rng([seed, list(Kind).index(disturbance.kind), disturbance.draw])
             if disturbance.kind is Kind.PHASE:
                 y[:, i] = self.y
                 for values in parameters.values():

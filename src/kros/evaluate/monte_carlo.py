@@ -4,14 +4,16 @@ Members of the set are drawn as stable, causal contractions of the form
 
 .. math:: \Delta(z) = r\,U_1\,B_1(z)\,U_2\,B_2(z)\,U_3
 
-with U random orthonormal matrices, B diagonal Blaschke products (all-pass, of degree 0, 1 or 2 in every entry) and a size r that is 1 for one member in two and
-uniform below 1 for the others. They stand where the certificate puts them, in the study's own form, between the weights as used. The power of the
-error is linear in what the observer does not know about, so that all members and all observers of one set cost one matrix product:
+with U random orthonormal matrices, B diagonal Blaschke products (all-pass, of degree 0, 1 or 2 in every entry) and a size r that is 1 for one
+member in two and uniform below 1 for the others. They stand where the certificate puts them, in the study's own form, between the weights as used.
+The power of the error is linear in the spectrum of what the observer does not know about, so that all members and all observers of one set cost
+one matrix product:
 
 .. math:: \|e\|^2 = \frac{1}{\pi}\int_0^\pi \operatorname{tr}\, T^H T\, \Phi\, d\theta + \|T_n\|^2, \qquad \Phi = (X M)(X M)^H
 
-with ``X = Delta (I - N Delta)^-1``. The integral is a sum over a grid that is dense around all poles; the largest member of every observer is computed again from its
-state-space model, by a Lyapunov equation. The machines of the population take the place of X M by ``(Gp - G) W_u``, T by the response from the state.
+with ``X = Delta (I - N Delta)^-1``. The integral is a sum over a grid that is dense around all poles; the largest member of every observer is
+computed again from its state-space model, by a Lyapunov equation. The machines of the population take the place of X M by ``(Gp - G) W_u``, T by
+the response from the state.
 
 Symbols
 -------

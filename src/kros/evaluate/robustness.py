@@ -93,7 +93,7 @@ def _stacked(given: Measured, wanted: Sequence[Disturbance | None], seed: int) -
 def robustness_rows(
     name: str, errors: Array, episodes: DisturbedEpisodes, channels: Sequence[str], estimated: Sequence[int] | None = None
 ) -> list[dict[str, Any]]:
-    """Return a row for every disturbance, severity, condition and channel: mean and worst unit of `DisturbedEpisodes.errors`.
+    """Return a row for every disturbance, severity, condition and channel: mean and worst unit of `DisturbedEpisodes.errors`, first draws alone.
 
     Parameters
     ----------
@@ -111,11 +111,11 @@ def robustness_rows(
         ``disturbance`` is "none" and ``severity`` 0 for the measurements as they are; errors are None where an estimate diverged.
     """
     keys, rows = episodes.batch.keys, []
-    told = [("none", 0.0), *((d.kind.value, float(d.severity)) for d in episodes.disturbances)]
+    told = [(0, "none", 0.0)] + [(i, d.kind.value, float(d.severity)) for i, d in enumerate(episodes.disturbances, 1) if not d.draw]
     for condition in dict.fromkeys(k.condition for k in keys):
         units = {u: [i for i, k in enumerate(keys) if (k.unit, k.condition) == (u, condition)] for u in dict.fromkeys(k.unit for k in keys)}
         per_unit = np.stack([errors[:, chosen].mean(axis=1) for chosen in units.values() if chosen])  # (unit, 1 + disturbance, n)
-        for i, (kind, severity) in enumerate(told):
+        for i, kind, severity in told:
             for j in range(len(channels)) if estimated is None else estimated:
                 values = per_unit[:, i, j]
                 known = bool(np.isfinite(values).all())

@@ -83,8 +83,8 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
     lifted, inflow, measurement = row[..., :n_lifted], row[..., n_lifted + order : n_lifted + order + m], row[..., n_lifted + order + m :]
     for own, first in zip(row, observers, strict=True):
         own[..., :n] = first.initial(y[0], parameters)
-    missing: npt.NDArray[np.bool_] = np.logical_not(np.isfinite(y))
-    gone = missing.any(axis=(1, 2))
+    missing = ~np.isfinite(y)
+    gone = np.atleast_1d(missing.any(axis=(1, 2)))
     estimates = np.empty((n_samples, k, batch, n))
     following = np.empty((k, batch, n + order))
     plain = not (lifting.history or lifting.input_functions)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, SynthesisError
-from ..evaluate import EpisodeBatch, error_percent
+from ..data.population import EpisodeKey
+from ..evaluate import EpisodeBatch, error_percent, hold_missing
 from ..identify import ModelSet
 from ..lifting import Lifting
 from ..observer import ExtendedKalman, Features, FilteredDifference, Learned, Moments, cutoffs_hz, rates, start_covariance
@@ -43,23 +44,33 @@ class Baseline:
         States that it estimates.
     facts : dict
         For the records.
+    bears_missing : bool
+        Whether it knows what to do where a measurement is missing; others get the last one that arrived.
     """
 
     by_unit: Mapping[str, Estimator]
     measured: tuple[int, ...]
     estimated: tuple[int, ...]
     facts: dict[str, Any]
+    bears_missing: bool = False
 
     def run(self, batch: EpisodeBatch, parameters: Parameters) -> Array:
         """Estimate all episodes, each with the estimator of its unit; NaN for states that are not estimated."""
-        estimate = np.empty_like(batch.states)
-        groups: dict[str, list[int]] = {}
-        for i, key in enumerate(batch.keys):
-            groups.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
-        for name, rows in groups.items():
-            y = batch.states[:, rows][..., list(self.measured)]
-            estimate[:, rows] = self.by_unit[name].run(y, batch.inputs[:, rows], {k: v[rows] for k, v in parameters.items()})
-        return estimate
+        return self.estimate(batch.keys, batch.states[..., list(self.measured)], batch.inputs, parameters)
+
+    def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Parameters) -> Array:
+        """Estimate episodes from measurements of any origin, shape (n_samples, batch, q); not finite where one is missing."""
+        pieces: dict[str, list[int]] = {}
+        for i, key in enumerate(keys):
+            pieces.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
+        y = y if self.bears_missing else hold_missing(y)
+        found: Array | None = None
+        for name, rows in pieces.items():
+            part = self.by_unit[name].run(y[:, rows], u[:, rows], {k: v[rows] for k, v in parameters.items()})
+            found = np.empty((*y.shape[:2], part.shape[-1])) if found is None else found
+            found[:, rows] = part
+        assert found is not None
+        return found
 
 
 def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) -> Baseline:
@@ -92,7 +103,7 @@ def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) 
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
     shape_name, level, Q = tried[first]
     facts = {"status": "tuned", "process_noise_level": 10**level, "process_noise_shape": shape_name}
-    return Baseline({"": replace(filters, Q=Q)}, models.measured, tuple(range(n)), facts)
+    return Baseline({"": replace(filters, Q=Q)}, models.measured, tuple(range(n)), facts, bears_missing=True)
 
 
 def make_difference(tuning: TuningSet, measured: tuple[int, ...]) -> Baseline:

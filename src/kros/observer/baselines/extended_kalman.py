@@ -99,8 +99,8 @@ class ExtendedKalman:
         P = np.broadcast_to(self.P0, (k, batch, n, n)).copy()
         drift, drive = np.ascontiguousarray(self.A[:n].T), np.ascontiguousarray(self.B[:n].T)
         linear, coupling = self.A[:n, :n], self.A[:n, n:]
-        missing: npt.NDArray[np.bool_] = np.logical_not(np.isfinite(y))
-        gone = missing.any(axis=(1, 2))
+        missing = ~np.isfinite(y)
+        gone = np.atleast_1d(missing.any(axis=(1, 2)))
         driven = u @ drive if not lifting.input_functions else None
         estimates = np.empty((n_samples, k, batch, n))
         earlier: Array | None = None

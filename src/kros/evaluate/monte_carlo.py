@@ -38,6 +38,7 @@ from .contractions import Contractions
 Array = npt.NDArray[Any]
 _POINTS, _LOWEST = 240, 1e-6
 _AROUND = np.concatenate([-np.geomspace(30, 0.1, 10), [0.0], np.geomspace(0.1, 30, 10)])  # of a pole's angle, in units of its damping
+_ALIKE = 0.1  # relative distance of poles that share their points
 _TOGETHER = 40  # members whose spectra are in memory
 
 
@@ -100,7 +101,7 @@ def sample_errors(
     theta, weights = _grid(problem, loops, units)
     freqs, m, n = theta / (2 * np.pi * problem.nominal.dt), problem.nominal.n_inputs, problem.nominal.n_states
     responses = [loop.frequency_response(freqs) for loop in loops]
-    noise = np.array([np.sum(weights[:, None, None] * np.abs(r[..., m + n :]) ** 2) for r in responses])
+    noise = np.array([h2_norm(StateSpace(loop.A, loop.B[:, m + n :], loop.C, loop.D[:, m + n :], loop.dt)) ** 2 for loop in loops])
     W_L = problem.W_L.frequency_response(freqs)
     T = [r[..., problem.port] @ W_L for r in responses]
     if problem.remainder_left is not None:
@@ -175,6 +176,8 @@ def _grid(problem: ObserverProblem, loops: Sequence[StateSpace], units: StateSpa
     if units is not None:
         poles.append(np.linalg.eigvals(units.A).ravel())
     log = np.log(np.maximum(np.abs(np.concatenate(poles)), 1e-3)) + 1j * np.abs(np.angle(np.concatenate(poles)))
+    alike = np.round(np.log(np.maximum([-log.real, log.imag], _LOWEST)) / _ALIKE)
+    log = log[np.unique(alike, axis=1, return_index=True)[1]]
     near = (log.imag[:, None] - log.real[:, None] * _AROUND).ravel()
     theta = np.concatenate([[0.0], np.geomspace(_LOWEST, np.pi, _POINTS), near])
     theta = np.unique(np.round(theta[(theta >= 0) & (theta <= np.pi)], 9))

@@ -150,12 +150,16 @@ class ObserverConfig(_Section):
 
 
 class EvaluateConfig(_Section):
-    """Evaluation on units that took no part.
+    """Evaluation on units that took no part, on disturbed measurements, and on machines that might be.
 
     With `folds` the pooled units are parted into so many folds, and for each the study is made once more on all other units; 0 leaves that out.
+    With `robustness` observers of the kind of model that is handed over run on disturbed measurements of a few units, with "all" every observer on all
+    units in all conditions. `monte_carlo` is the number of random members of the certified set that observers are computed for; 0 leaves that out.
     """
 
     folds: int = Field(0, ge=0)
+    robustness: bool | Literal["all"] = True
+    monte_carlo: int = Field(100, ge=0)
 
     @field_validator("folds")
     @classmethod

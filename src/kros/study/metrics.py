@@ -28,6 +28,8 @@ def collect_metrics(context: Context, until: Stage, total_s: float | None) -> di
             metrics[name] = collect(context)
     if Stage.LEFT_OUT in done and left_out.wanted(context.config):
         metrics["left_out"] = load_artifact(context.store.path(left_out.FOLDER), left_out.KIND)[0]
+    if Stage.EVALUATE in done:
+        metrics |= _disturbed(context)
     clean: dict[str, Any] = plain(metrics)
     return clean
 
@@ -153,6 +155,14 @@ def _evaluation(context: Context) -> list[dict[str, Any]]:
 
 def _evaluation_record(context: Context) -> dict[str, Any]:
     return load_artifact(context.store.path("evaluation"), "evaluation")[0]
+
+
+def _disturbed(context: Context) -> dict[str, Any]:
+    """Errors against severity, and over noise and random members of the set; only what the study asks for."""
+    if not context.store.path("disturbed", "disturbed.json").exists():
+        return {}
+    content = load_artifact(context.store.path("disturbed"), "disturbed")[0]
+    return {key: content[key] for key in ("robustness", "monte_carlo") if key in content}
 
 
 def _outliers(context: Context) -> list[dict[str, Any]]:

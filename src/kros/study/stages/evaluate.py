@@ -19,6 +19,7 @@ from ...evaluate import EpisodeBatch, ErrorSummary, summarise
 from ...identify import ModelSet, free_run
 from ...observer import Observer, run_observers
 from ..context import Context
+from ..disturbed import Trial, make_trial, run_disturbed
 from ..estimators import Baseline, make_difference, make_extended, make_learned
 from ..presets import gearbox_band_hz
 from . import calibrate
@@ -35,13 +36,15 @@ _SAMPLES_AT_ONCE = 20_000_000  # of all estimates that are in memory, 160 MB
 class Outcome:
     """What one model or observer did on the test episodes: errors, and trajectories of the episodes that are shown.
 
-    A baseline that is made here leaves its `facts`; `estimated` are the states that it estimates, all where it is None.
+    A baseline that is made here leaves its `facts`, and its errors on disturbed measurements where these are asked for; `estimated` are the states
+    that it estimates, all where it is None.
     """
 
     summary: ErrorSummary
     shown: list[Array]
     facts: dict[str, Any] | None = None
     estimated: tuple[int, ...] | None = None
+    disturbed: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +87,22 @@ def _model_of(observer: Observer) -> tuple[Any, ...]:
 
 
 def evaluate_baseline(
-    make: Callable[[], Baseline], population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
+    make: Callable[[], Baseline],
+    population: Population,
+    keys: tuple[EpisodeKey, ...],
+    units: UnitParameters,
+    shown: tuple[int, ...],
+    trial: Trial | None = None,
 ) -> Outcome | str:
-    """Make a baseline and run it on test episodes; the reason where it cannot be made."""
+    """Make a baseline and run it on test episodes, and on disturbed ones; the reason where it cannot be made."""
     try:
         baseline = make()
     except KrosError as error:
         return str(error)
     batch = EpisodeBatch.read(population, keys)
     outcome = _outcome(baseline.run(batch, batch.parameters(units)), batch, population.sample_period_s, shown)
-    return replace(outcome, facts=baseline.facts, estimated=baseline.estimated)
+    disturbed = None if trial is None else trial.errors_of_baseline(baseline)
+    return replace(outcome, facts=baseline.facts, estimated=baseline.estimated, disturbed=disturbed)
 
 
 def evaluate_model(
@@ -127,7 +136,8 @@ def run(context: Context) -> list[Path]:
     shown_on = tuple(on.index(keys[i]) for i in shown if keys[i] in on)
 
     observers, models = load_observers(context), {name: context.models(name) for name in context.model_names}
-    work = estimation(context, population, keys, units, shown)
+    trial = make_trial(context, keys, units, roles)
+    work = estimation(context, population, keys, units, shown, trial)
     work += [Piece((f"free run/{m}",), partial(evaluate_model, found, population, on, units, shown_on)) for m, found in models.items()]
     results = outcomes(context, work)
     free_runs = {m: outcome for m in models if isinstance(outcome := results.pop(f"free run/{m}"), Outcome)}
@@ -149,15 +159,21 @@ def run(context: Context) -> list[Path]:
     }
     content |= {"observers": list(estimates), "models": list(models), "states": population.states}
     save_artifact(folder, "evaluation", content, _arrays(population, keys, on, shown, shown_on, roles, estimates, free_runs))
-    return [folder / "evaluation.json", folder / "arrays.npz"]
+    disturbed = {name: (o.disturbed, o.estimated) for name, o in estimates.items() if o.disturbed is not None}
+    return [folder / "evaluation.json", folder / "arrays.npz", *run_disturbed(context, trial, observers, disturbed)]
 
 
 def estimation(
-    context: Context, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...] = ()
+    context: Context,
+    population: Population,
+    keys: tuple[EpisodeKey, ...],
+    units: UnitParameters,
+    shown: tuple[int, ...] = (),
+    trial: Trial | None = None,
 ) -> list[Piece]:
     """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
     makers = baseline_makers(context)
-    work = [Piece((name,), partial(evaluate_baseline, make, population, keys, units, shown)) for name, make in makers.items()]
+    work = [Piece((name,), partial(evaluate_baseline, make, population, keys, units, shown, trial)) for name, make in makers.items()]
     for group in alike(load_observers(context).values()):
         names = tuple(observer.name for observer in group)
         work.append(Piece(names, partial(evaluate_observers, group, population, keys, units, shown)))

@@ -4,6 +4,7 @@ from .baselines.difference import FilteredDifference, cutoffs_hz, rates
 from .baselines.extended_kalman import ExtendedKalman, start_covariance
 from .baselines.kalman import kalman_candidates, luenberger_candidates, noise_covariances
 from .baselines.learned import Features, Learned, Moments
+from .driven import driven_coordinates, refit_measured_rows, with_memory
 from .memory import Past, remembering_observer
 from .observer import Observer
 from .phase_lock import Tracked, track_parameter
@@ -40,6 +41,7 @@ __all__ = [
     "attack",
     "attack_running",
     "cutoffs_hz",
+    "driven_coordinates",
     "kalman_candidates",
     "luenberger_candidates",
     "mean_error_dynamics",
@@ -47,6 +49,7 @@ __all__ = [
     "one_step_residual",
     "one_step_rows",
     "rates",
+    "refit_measured_rows",
     "relift_certificate",
     "relift_report",
     "remembering_observer",
@@ -57,4 +60,5 @@ __all__ = [
     "start_covariance",
     "track_parameter",
     "tune_observer",
+    "with_memory",
 ]

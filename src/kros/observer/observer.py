@@ -36,6 +36,11 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 
+def memory_names(count: int) -> tuple[str, ...]:
+    """Names of an observer's states that nothing is recorded for."""
+    return tuple(f"memory_{i + 1}" for i in range(count))
+
+
 @dataclass(frozen=True, eq=False)
 class Observer:
     """Nominal lifted model with a correction.
@@ -127,6 +132,13 @@ class Observer:
     def replaces(self) -> bool:
         """Whether measurements take the place of the estimates of measured states: a gain alone, equal to these states' columns of A."""
         return self.controller.n_states == 0 and np.array_equal(self.A[:, list(self.measured)], self.into @ self.controller.D)
+
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """States that recordings hold: all but those of a memory, ``memory_1, ...`` at the end."""
+        states = self.lifting.states
+        first = next((i for i in range(len(states)) if states[i:] == memory_names(len(states) - i)), len(states))
+        return states[:first]
 
     def initial(self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Return the first estimate: the first measurement where there is one, other states zero; shape (..., n).

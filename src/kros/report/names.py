@@ -21,6 +21,7 @@ _METHODS = {
     "worst_case_h2": "worst-case H2",
     "worst_case_hinf": "worst-case H∞",
     "residual_h2": "residual-shaped H2",
+    "memory": "with memory",
     "filtered_difference": "filtered difference",
     "learned": "learned",
 }

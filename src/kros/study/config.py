@@ -21,6 +21,7 @@ FORMS = Literal[
     "inverse_input_multiplicative",
     "inverse_output_multiplicative",
 ]
+METHODS = Literal["mixed", "worst_case_h2", "worst_case_hinf", "residual_h2", "memory"]
 BASELINES = Literal["open_loop", "kalman_white", "kalman_tuned", "luenberger", "ekf", "filtered_difference", "learned"]
 
 
@@ -127,7 +128,7 @@ class UncertaintyConfig(_Section):
 class SynthesisConfig(_Section):
     """Observer synthesis."""
 
-    methods: tuple[Literal["mixed", "worst_case_h2", "worst_case_hinf", "residual_h2"], ...] = ("mixed", "worst_case_h2", "residual_h2")
+    methods: tuple[METHODS, ...] = ("mixed", "worst_case_h2", "residual_h2", "memory")
     injection: Literal["state", "input"] = "state"
     input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
     noise: dict[str, float] = Field(default_factory=dict, description="standard deviation of the measurement noise per measured channel")
@@ -135,6 +136,7 @@ class SynthesisConfig(_Section):
     max_states: int | None = Field(
         None, ge=0, description="most states of the filter of worst_case_h2; reduced and polished where it has more"
     )
+    memory_states: int = Field(12, ge=1, description="states besides the recorded ones of the observer with a memory")
     time_limit_s: float = Field(60.0, gt=0)
 
 

@@ -42,7 +42,7 @@ def open_data(config: StudyConfig, data: Path) -> Population:
 
 def check_channels(population: Population, observer: Observer) -> None:
     """Refuse recordings whose channels or sampling period are not those of the run."""
-    expected, found = (observer.lifting.states, observer.inputs), (population.states, population.inputs)
+    expected, found = (observer.recorded, observer.inputs), (population.states, population.inputs)
     if expected != found:
         raise DataError(f"Channels: the run has states and inputs {expected}, the recordings {found}; read them the same way.")
     if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=1e-6):
@@ -129,7 +129,7 @@ def _write(out: Path, population: Population, observer: Observer, units: dict[st
     from pyarrow import parquet
 
     text = pa.dictionary(pa.int32(), pa.string())
-    names = [f"{s}_hat" for s in observer.lifting.states]
+    names = [f"{s}_hat" for s in observer.recorded]
     schema = pa.schema([("unit", text), ("condition", text), ("episode", text), ("k", pa.int64()), *((n, pa.float64()) for n in names)])
     out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.partial")
@@ -139,7 +139,7 @@ def _write(out: Path, population: Population, observer: Observer, units: dict[st
                 keys = population.episodes[start : start + _BATCH]
                 batch = EpisodeBatch.read(population, keys)
                 values = batch.parameters(units) if observer.lifting.parameters else None
-                estimate = run_observer(observer, batch.states[..., list(observer.measured)], batch.inputs, values)
+                estimate = run_observer(observer, batch.states[..., list(observer.measured)], batch.inputs, values)[..., : len(names)]
                 for i, key in enumerate(keys):
                     table = _table(key, estimate[: batch.lengths[i], i], schema)
                     writer.write_table(table, row_group_size=len(table))

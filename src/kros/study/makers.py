@@ -18,6 +18,7 @@ from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, m
 from ..synthesis.robust.causal import causal_h2
 from ..uncertainty import fit_magnitude
 from .baselines import kalman_tuned, make_luenberger
+from .memory_maker import make_memory
 from .residual_maker import OwnModel, make_residual_h2
 from .tuning import TuningSet, rank
 
@@ -48,6 +49,7 @@ class Task:
     max_order: int
     max_states: int | None
     covered: tuple[str, ...] = ()
+    memory_states: int = 12
 
     def observer(self, synthesis: Synthesis) -> Observer:
         """Return the observer as it runs."""
@@ -55,7 +57,7 @@ class Task:
         own = synthesis if isinstance(synthesis, OwnModel) else None
         return Observer(
             name=self.name,
-            lifting=models.lifting,
+            lifting=models.lifting if own is None or own.lifting is None else own.lifting,
             A=models.A[row] if own is None or own.A is None else own.A,
             B=models.B[row] if own is None or own.B is None else own.B,
             measured=models.measured,
@@ -241,6 +243,7 @@ MAKERS: dict[str, Callable[[Task], Made]] = {
     "worst_case_hinf": make_worst_case_hinf,
     "mixed": make_mixed,
     "residual_h2": make_residual_h2,
+    "memory": make_memory,
     "open_loop": open_loop,
     "kalman_white": kalman_white,
     "kalman_tuned": kalman_tuned,

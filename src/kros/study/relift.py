@@ -1,4 +1,4 @@
-"""The certificate of every observer as it runs, with what it says about training episodes; observers of one kind of model share these."""
+"""The certificate of every observer as it runs, with what it says about training episodes; observers of one lifting run side by side."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import save_artifact
+from ..lifting import Lifting
 from ..observer import (
     Observer,
     ReliftCertificate,
@@ -22,14 +23,18 @@ from ..observer import (
     relift_certificate,
     relift_report,
     run_observers,
+    with_memory,
 )
-from .makers import Product, Task
 from .tuning import Judge, TuningSet, hidden_mean
+
+if TYPE_CHECKING:
+    from .makers import Product, Task
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 _EPISODE_S = 5.0
 _SEEN_S, _BLIND_S, _BLIND_EPISODES = 0.5, 1.5, 3
+LOST = 100.0  # percent of the range: an estimate that says nothing
 _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has no global slope bounds
 
 
@@ -72,14 +77,26 @@ def certify_running(tasks: Sequence[Task], products: Sequence[Product]) -> list[
     observers = [task.observer(p.synthesis) for task, p in zip(tasks, products, strict=True) if p.synthesis is not None]
     if not observers:
         return []
-    task, first = tasks[0], observers[0]
+    task = tasks[0]
     judge = first_episodes(task.tuning).read().first(_EPISODE_S / task.models.sample_period_s)
-    batch, values = judge.batch, judge.parameters if first.lifting.parameters else None
-    units = [key.unit for key in batch.keys]
-    residual = one_step_residual(first.lifting, first.A, first.B, batch.states, batch.inputs, values)
-    n = first.lifting.n_states
-    scales = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
-    certificates = [certify(observer, scales, task) for observer in observers]
+    found = {r.name: r for group in by_lifting(observers) for r in running_of(group, judge, task)}
+    return [found[observer.name] for observer in observers]
+
+
+def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:
+    """Return observers in groups that can run side by side: those with a memory have states of their own."""
+    groups: dict[Lifting, list[Observer]] = {}
+    for observer in observers:
+        groups.setdefault(observer.lifting, []).append(observer)
+    return list(groups.values())
+
+
+def running_of(observers: Sequence[Observer], judge: Judge, task: Task) -> list[Running]:
+    """Certify observers of one lifting, and compare with what they do."""
+    first, batch = observers[0], judge.batch
+    values, units = judge.parameters if first.lifting.parameters else None, [key.unit for key in batch.keys]
+    scales = scales_of(observers, judge, task)
+    certificates = [certify(observer, own, task) for observer, own in zip(observers, scales, strict=True)]
     estimates = run_observers(observers, judge.measurements(first.measured), batch.inputs, values)
     rows = [
         relift_report(c, o, batch.states, batch.inputs, units, batch.lengths, values, estimates=x) if c.certified else []
@@ -90,6 +107,20 @@ def certify_running(tasks: Sequence[Task], products: Sequence[Product]) -> list[
     return [Running(o.name, c, r, float(h), float(b)) for o, c, r, h, b in zip(observers, certificates, rows, hidden, blind, strict=True)]
 
 
+def scales_of(observers: Sequence[Observer], judge: Judge, task: Task) -> list[ReliftScales]:
+    """Return the sizes that every observer's gain refers to: ranges, the residual of its own model in this population, quantisation."""
+    known: dict[bytes, ReliftScales] = {}
+    for observer in observers:
+        model, n = observer.A.tobytes() + observer.B.tobytes(), len(observer.recorded)
+        if model not in known:
+            values, batch = judge.parameters if observer.lifting.parameters else None, judge.batch
+            driven = with_memory(observer, batch.states, batch.inputs, values)
+            residual = one_step_residual(observer.lifting, observer.A, observer.B, driven, batch.inputs, values)[..., :n]
+            typical = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
+            known[model] = typical.with_memory(observer.lifting.n_states - n)
+    return [known[observer.A.tobytes() + observer.B.tobytes()] for observer in observers]
+
+
 def first_episodes(tuning: TuningSet) -> TuningSet:
     """Return the first training episode of every unit."""
     firsts = {key.unit: key for key in reversed(tuning.keys)}
@@ -98,7 +129,7 @@ def first_episodes(tuning: TuningSet) -> TuningSet:
 
 def blind_percent(observers: Sequence[Observer], judge: Judge, dt: float) -> Array:
     """Return the largest error of a state in percent of its range where measurements stop arriving, shape (observer,); infinite where it grows on."""
-    short, first = judge.few(_BLIND_EPISODES).first((_SEEN_S + _BLIND_S) / dt), observers[0]
+    short, first = judge.part(range(min(_BLIND_EPISODES, len(judge.batch.keys)))).first((_SEEN_S + _BLIND_S) / dt), observers[0]
     y = short.measurements(first.measured)
     y[round(_SEEN_S / dt) :] = np.nan
     values = short.parameters if first.lifting.parameters else None

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import SynthesisError
+from ..lifting import Lifting
 from ..observer import Observer, ResidualModel, residual_models
 from ..synthesis import Synthesis, residual_h2
 from .tuning import rank
@@ -29,15 +30,16 @@ class OwnModel(Synthesis):
     ----------
     A : ndarray, shape (n_lifted, n_lifted)
     B : ndarray, shape (n_lifted, m)
+    lifting : Lifting, optional
+        Where it is not that of the nominal model.
+    reason : str
+        Why there is no certificate for the uncertain set.
     """
 
     A: Array | None = None
     B: Array | None = None
-
-    @property
-    def reason(self) -> str:
-        """Why there is no certificate for the uncertain set."""
-        return "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
+    lifting: Lifting | None = None
+    reason: str = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
 
 
 def make_residual_h2(task: Task) -> Made:

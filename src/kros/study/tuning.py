@@ -47,22 +47,21 @@ class Judge:
         short = EpisodeBatch(b.keys, np.minimum(b.lengths, cut), b.states[:cut], np.ascontiguousarray(b.inputs[:cut]))
         return Judge(short, self.parameters)
 
-    def few(self, count: int) -> Judge:
-        """Return the first episodes alone."""
-        b = self.batch
-        batch = EpisodeBatch(b.keys[:count], b.lengths[:count], b.states[:, :count], np.ascontiguousarray(b.inputs[:, :count]))
-        return Judge(batch, {name: values[:count] for name, values in self.parameters.items()})
+    def part(self, rows: Sequence[int]) -> Judge:
+        """Return some of the episodes."""
+        b, rows = self.batch, list(rows)
+        batch = EpisodeBatch(tuple(b.keys[i] for i in rows), b.lengths[rows], b.states[:, rows], np.ascontiguousarray(b.inputs[:, rows]))
+        return Judge(batch, {name: values[rows] for name, values in self.parameters.items()})
 
     def measurements(self, measured: Sequence[int]) -> Array:
         """Return the measured states, shape (n_samples, batch, q)."""
         return np.ascontiguousarray(self.batch.states[..., list(measured)])
 
     def percent(self, observer: Observer) -> Array:
-        """Return the mean error of every state in percent of its range, shape (n,); infinite where the observer diverges."""
+        """Return the mean error of every recorded state in percent of its range, shape (n,); infinite where the observer diverges."""
         values = self.parameters if observer.lifting.parameters else None
         estimate = run_observer(observer, self.batch.states[..., list(observer.measured)], self.batch.inputs, values)
-        percent = error_percent(estimate, self.batch.states, self.batch.lengths).mean(axis=0)
-        return np.where(np.isfinite(percent), percent, np.inf)
+        return self.compare([estimate])[0]
 
     def percent_of_all(self, observers: Sequence[Observer]) -> Array:
         """Return the same for observers of one model that differ in their corrections, shape (observer, n): several at a time run side by side."""
@@ -74,8 +73,9 @@ class Judge:
         return np.array(found)
 
     def compare(self, estimates: Iterable[Array]) -> Array:
-        """Return the same for estimates that are there already, shape (observer, n)."""
-        found = [error_percent(estimate, self.batch.states, self.batch.lengths).mean(axis=0) for estimate in estimates]
+        """Return the same for estimates that are there already, shape (observer, n); those of a memory have nothing to be compared with."""
+        n = self.batch.states.shape[-1]
+        found = [error_percent(estimate[..., :n], self.batch.states, self.batch.lengths).mean(axis=0) for estimate in estimates]
         return np.where(np.isfinite(found), found, np.inf)
 
 

@@ -52,9 +52,9 @@ class ReliftScales:
     Parameters
     ----------
     error : ndarray, shape (n,)
-        Range of every state: a scaled error of 0.01 is one percent of the range.
+        Range of every state: a scaled error of 0.01 is one percent of the range. Infinite for a state whose error does not count.
     residual : ndarray, shape (n,)
-        Size of the one-step residual in every state.
+        Size of the one-step residual in every state; zero for a state without.
     noise : ndarray, shape (q,)
         Size of every measurement's noise.
     """
@@ -67,7 +67,10 @@ class ReliftScales:
         for name in ("error", "residual", "noise"):
             values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
             object.__setattr__(self, name, values)
-            if not (np.isfinite(values).all() and np.all(values >= 0)) or (name == "error" and not values.all()):
+            sized = (
+                np.all(values > 0) and np.isfinite(values).any() if name == "error" else np.isfinite(values).all() and np.all(values >= 0)
+            )
+            if not sized:
                 raise DimensionError(f"Re-lift scales: {name} should be finite sizes above zero, found {values}.")
 
     @classmethod
@@ -86,11 +89,15 @@ class ReliftScales:
         rms = np.sqrt(np.mean(residual.reshape(-1, n) ** 2, axis=0))
         return cls(np.asarray(ranges, dtype=float), rms * np.sqrt(n), sigma * np.sqrt(len(sigma)))
 
+    def with_memory(self, count: int) -> ReliftScales:
+        """Return the scales for an observer with a memory of so many states: they have no residual, and their errors do not count."""
+        return ReliftScales(np.append(self.error, np.full(count, np.inf)), np.append(self.residual, np.zeros(count)), self.noise)
+
     @classmethod
     def ones(cls, observer: Observer) -> ReliftScales:
         """Return the scales that change nothing."""
-        n = observer.lifting.n_states
-        return cls(np.ones(n), np.ones(n), np.ones(len(observer.measured)))
+        n = len(observer.recorded)
+        return cls(np.ones(n), np.ones(n), np.ones(len(observer.measured))).with_memory(observer.lifting.n_states - n)
 
 
 @dataclass(frozen=True, eq=False)

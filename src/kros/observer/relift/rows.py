@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DimensionError
+from ..driven import with_memory
 from ..observer import Observer
 from ..residual import one_step_residual
 from ..simulate import run_observer
@@ -74,6 +75,7 @@ def relift_report(
         Of this observer; certified.
     observer : Observer
     states : ndarray, shape (n_samples, batch, n)
+        Of an observer with a memory the recorded states, which drive the memory of the machine (`with_memory`).
     inputs : ndarray, shape (n_samples, batch, m)
     units : sequence of str
         Unit of every episode.
@@ -95,8 +97,8 @@ def relift_report(
     values = {**observer.parameters, **(parameters or {})} if observer.lifting.parameters else None
     if estimates is None:
         estimates = run_observer(observer, states[..., list(observer.measured)], inputs, values)
-    scales = certificate.scales
-    omega = held_residual(observer, states, inputs, values)
+    scales, omega = certificate.scales, held_residual(observer, states, inputs, values)
+    states = with_memory(observer, states, inputs, values)
     system = certificate.system(observer)
     first = first_error(observer, states[0] - estimates[0], len(system.A) - observer.controller.n_states)
     n = observer.lifting.n_states
@@ -120,11 +122,18 @@ def relift_report(
 
 
 def held_residual(observer: Observer, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
-    """Return the one-step residual from the first sample on, shape (n_samples - 1, batch, n); earlier values equal the first ones, as in the observer."""
+    """Return the one-step residual from the first sample on, shape (n_samples - 1, batch, n); earlier values equal the first ones, as in the observer.
+
+    That of a memory is zero: recorded states drive it through the observer's own rows.
+    """
     h = observer.lifting.history
     if h:
         states, inputs = (np.concatenate([np.repeat(v[:1], h, axis=0), v]) for v in (states, inputs))
-    return one_step_residual(observer.lifting, observer.A, observer.B, states, inputs, parameters)
+    residual = one_step_residual(
+        observer.lifting, observer.A, observer.B, with_memory(observer, states, inputs, parameters), inputs, parameters
+    )
+    residual[..., states.shape[-1] :] = 0.0
+    return residual
 
 
 def first_error(observer: Observer, error: Array, width: int) -> Array:

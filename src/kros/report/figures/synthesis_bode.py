@@ -25,13 +25,14 @@ if TYPE_CHECKING:
 
 NAME, TITLE = "synthesis", "Plant, weights and correction filters"
 Array = npt.NDArray[Any]
+NO_FILTER = ("memory",)  # measurements take the place of estimates: there is no correction of a model to draw
 _POINTS = 260
 _FLOOR_DB = 220.0  # filters for almost noiseless measurements and small weights are far apart
 
 
 def draw(run: RunFolder) -> Drawing:
     """Draw one panel a model."""
-    robust = {n: s for n, s in run.syntheses.items() if split_observer(n)[1] not in BASELINES}
+    robust = {n: s for n, s in run.syntheses.items() if split_observer(n)[1] not in (*BASELINES, *NO_FILTER)}
     chosen = [m for m in best_models(run.models) if any(n.startswith(f"{m}/") for n in robust)]
     if not chosen:
         raise NotShownError("no robust observer has been synthesized")

@@ -65,7 +65,7 @@ def evaluate_observers(
     found = []
     for start in range(0, len(observers), together):
         estimates = run_observers(observers[start : start + together], y, batch.inputs, parameters)
-        found += [_outcome(estimate, batch, population.sample_period_s, shown) for estimate in estimates]
+        found += [_outcome(e[..., : len(population.states)], batch, population.sample_period_s, shown) for e in estimates]
     return found
 
 

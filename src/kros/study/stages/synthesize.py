@@ -22,7 +22,7 @@ from ...uncertainty import Structure, UncertainModel
 from ..context import Context
 from ..makers import Product, Task, produce
 from ..methods import preferred, slowest_first, suitable
-from ..relift import Running, certify_running, save_running
+from ..relift import LOST, Running, certify_running, save_running
 from ..residual_maker import OwnModel
 from ..tuning import TUNING_EPISODES, TUNING_UNITS, TuningSet
 from . import calibrate
@@ -30,7 +30,6 @@ from . import calibrate
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 _AS_GOOD = 1.01  # ratio of errors that is no reason to prefer one observer to another
-_LOST = 100.0  # percent of the range: an estimate that says nothing
 WORST_CASE = ("worst_case_h2", "worst_case_hinf")
 
 
@@ -94,7 +93,7 @@ def choose_deployed(wanted: str | None, made: list[str], running: Sequence[Runni
             raise SynthesisError(f"observer.deployed = {wanted!r}: there is no such observer, only {', '.join(made)}; name one of them.")
         return wanted
     certified = [r for r in running if r.certificate.certified and np.isfinite(r.hidden_percent)]
-    candidates = [r for r in certified if r.blind_percent < _LOST] or certified
+    candidates = [r for r in certified if r.blind_percent < LOST] or certified
     least = min((r.hidden_percent for r in candidates), default=np.inf)
     best = preferred([r.name for r in candidates if r.hidden_percent <= _AS_GOOD * least] or made)
     if best is None:
@@ -113,6 +112,7 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     methods = suitable(config.observer.baselines + config.synthesis.methods, name, refined=name not in context.edmd_names)
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings |= {"max_order": config.uncertainty.max_order, "max_states": config.synthesis.max_states, "covered": uncertain.unit_ids}
+    settings |= {"memory_states": config.synthesis.memory_states}
     return [
         Task(f"{name}/{method.name}", method.name, models, unit, problem, refusal, noise, tuning_set(context, models), **settings)
         for method in methods
@@ -187,7 +187,7 @@ def certified_problem(task: Task, tasks: list[Task], products: list[Product]) ->
 
 def certificate(task: Task, synthesis: Synthesis, problem: ObserverProblem | None) -> dict[str, Any]:
     """Recompute what can be said about an observer, however it was made, and whether it holds for every unit's model."""
-    facts: dict[str, Any] = {"order": synthesis.controller.n_states, "spectral_radius_max": None, "worst_case_h2": None}
+    facts: dict[str, Any] = {"order": states_beside(task, synthesis), "spectral_radius_max": None, "worst_case_h2": None}
     if isinstance(synthesis, OwnModel):
         return facts | {"reason": synthesis.reason}
     if problem is None:
@@ -201,6 +201,12 @@ def certificate(task: Task, synthesis: Synthesis, problem: ObserverProblem | Non
     except SynthesisError as error:
         log.warning("%s: no certificate, %s", task.name, error)
         return facts | {"reason": str(error)}
+
+
+def states_beside(task: Task, synthesis: Synthesis) -> int:
+    """Return the number of states besides the recorded ones: of the correction filter, and of a memory."""
+    observer = task.observer(synthesis)
+    return observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
 
 
 def of_units(task: Task, synthesis: Synthesis, problem: ObserverProblem) -> dict[str, Any]:

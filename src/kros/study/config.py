@@ -21,7 +21,7 @@ FORMS = Literal[
     "inverse_input_multiplicative",
     "inverse_output_multiplicative",
 ]
-METHODS = Literal["mixed", "worst_case_h2", "worst_case_hinf", "residual_h2", "memory"]
+METHODS = Literal["mixed", "paper", "worst_case_h2", "worst_case_hinf", "residual_h2", "memory"]
 BASELINES = Literal["open_loop", "kalman_white", "kalman_tuned", "luenberger", "ekf", "filtered_difference", "learned"]
 
 

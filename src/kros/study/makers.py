@@ -19,6 +19,7 @@ from ..synthesis.robust.causal import causal_h2
 from ..uncertainty import fit_magnitude
 from .baselines import kalman_tuned, make_luenberger
 from .memory_maker import make_memory
+from .paper_maker import make_paper
 from .residual_maker import OwnModel, make_residual_h2
 from .tuning import TuningSet, rank
 
@@ -242,6 +243,7 @@ MAKERS: dict[str, Callable[[Task], Made]] = {
     "worst_case_h2": make_worst_case_h2,
     "worst_case_hinf": make_worst_case_hinf,
     "mixed": make_mixed,
+    "paper": make_paper,
     "residual_h2": make_residual_h2,
     "memory": make_memory,
     "open_loop": open_loop,

@@ -12,6 +12,7 @@ missed. ``--set KEY=VALUE`` changes the study; with ``--out`` runs are kept, and
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import tempfile
 import time
@@ -26,6 +27,7 @@ from kros.core.artifacts import write_json
 from kros.report.left_out_table import PAPER, LeftOutCell, LeftOutTable, left_out_tables
 from kros.report.names import BASELINES, split_observer
 from kros.study import load_config, run_study
+from kros.study.config import SynthesisConfig
 from kros.study.demo import simulate_to
 from kros.study.executors import available_cores
 from kros.study.progress import Lines
@@ -79,7 +81,10 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
             recordings, "harmonic-drive", options.units, options.episodes, options.seconds, options.seed, spread, loop, False, "parquet"
         )
     study = folder / "study.toml"
-    study.write_text(f'[data]\nsource = "recordings"\nreader = "parquet"\n[evaluate]\nfolds = {options.folds}\n')
+    methods = json.dumps(["paper", *SynthesisConfig().methods])
+    study.write_text(
+        f'[data]\nsource = "recordings"\nreader = "parquet"\n[synthesis]\nmethods = {methods}\n[evaluate]\nfolds = {options.folds}\n'
+    )
     result = run_study(load_config(study, options.set), folder / "run", workers=options.workers, progress=Lines())
     left_out: dict[str, Any] = result.metrics["left_out"]
     for number, reason in left_out["failed"].items():

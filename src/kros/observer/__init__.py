@@ -5,7 +5,7 @@ from .baselines.extended_kalman import ExtendedKalman, start_covariance
 from .baselines.kalman import kalman_candidates, luenberger_candidates, noise_covariances
 from .baselines.learned import Features, Learned, Moments
 from .driven import driven_coordinates, refit_measured_rows, with_memory
-from .memory import Past, remembering_observer
+from .memory import Past, observer_with_memory, remembering_observer, tune_memory
 from .observer import Observer
 from .phase_lock import Tracked, track_parameter
 from .relift.adversary import Attack, attack, attack_running
@@ -46,6 +46,7 @@ __all__ = [
     "luenberger_candidates",
     "mean_error_dynamics",
     "noise_covariances",
+    "observer_with_memory",
     "one_step_residual",
     "one_step_rows",
     "rates",
@@ -59,6 +60,7 @@ __all__ = [
     "run_observers",
     "start_covariance",
     "track_parameter",
+    "tune_memory",
     "tune_observer",
     "with_memory",
 ]

@@ -26,20 +26,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import null_space
 from scipy.signal import lfilter
 
-from ..core.errors import DataError, DimensionError
-from ..core.lti import gain
-from ..core.norms import gramian
-from ..lifting import Lifting
-from ..synthesis.residual.shaping import Bank
-from ..synthesis.result import Injection
-from .observer import Observer
+from ...core.errors import DataError, DimensionError
+from ...core.norms import gramian
+from ...lifting import Lifting
+from ...synthesis.residual.shaping import Bank
 
 Array = npt.NDArray[np.float64]
-BANK = Bank(40)
-_THIN, _SKIP, _RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 4, 300, 1e-5, 0.5, 0.1, 1e-13
+DELAYS = 40
+THIN, SKIP = 4, 300
+_EPISODES, _RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 5, 1e-5, 0.5, 0.1, 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +81,7 @@ class Past:
         lengths: npt.ArrayLike,
         units: Sequence[str],
         parameters: Mapping[str, npt.ArrayLike] | None = None,
-        bank: Bank = BANK,
+        bank: Bank | None = None,
     ) -> Past:
         """Collect moments of recordings.
 
@@ -98,7 +95,8 @@ class Past:
         lengths : array_like of int, shape (batch,)
         units : sequence of str, length batch
         parameters : mapping of str to array_like, shape (batch,)
-        bank : Bank
+        bank : Bank, optional
+            By default 40 delays, and a lag of the tracking errors that forgets in a fifth of the shortest episode: controllers integrate.
 
         Raises
         ------
@@ -112,17 +110,18 @@ class Past:
             raise DimensionError(
                 f"Observer with memory: functions of the lifting should read {', '.join(sorted(seen))} alone, found {', '.join(lifting.functions)}."
             )
-        hidden, lengths = _hidden(lifting, measured), np.asarray(lengths, dtype=int)
-        if not hidden or lengths.min() <= 2 * _SKIP:
+        hidden, lengths = hidden_of(lifting, measured), np.asarray(lengths, dtype=int)
+        if not hidden or lengths.min() <= 2 * SKIP:
             raise DataError(
-                f"Observer with memory: needs a state that is not measured and episodes of more than {2 * _SKIP} samples, "
+                f"Observer with memory: needs a state that is not measured and episodes of more than {2 * SKIP} samples, "
                 f"found {len(hidden)} and {lengths.min()}."
             )
+        bank = bank or Bank(DELAYS, (1 - _EPISODES / int(lengths.min()),))
         y = states[..., list(measured)]
         static = _static(inputs, y)
         share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
         free = tuple(int(j) for j in np.flatnonzero(share.max(axis=0) < _FOLLOWS))
-        z = _seen(lifting, tuple(measured), static, free, y, inputs, parameters)
+        z = seen_by(lifting, tuple(measured), static, free, y, inputs, parameters)
         names = tuple(dict.fromkeys(units))
         size = bank.delays * z.shape[-1] + len(bank.poles) * len(measured)
         gram, cross, power = (
@@ -132,7 +131,7 @@ class Past:
         )
         counts = np.zeros(len(names))
         for i, unit in enumerate(units):
-            rows, k = np.arange(_SKIP, lengths[i], _THIN), names.index(unit)
+            rows, k = np.arange(SKIP, lengths[i], THIN), names.index(unit)
             s, truth = _bank_states(bank, z[:, i], rows, len(measured)), states[rows, i][:, hidden]
             gram[k] += s.T @ s
             cross[k] += s.T @ truth
@@ -141,7 +140,9 @@ class Past:
         each = counts[:, None]
         return cls(lifting, tuple(measured), bank, static, free, names, gram / each[:, None], cross / each[:, None], power / each)
 
-    def model(self, order: int, without: Sequence[str] = (), importance: npt.ArrayLike = 1.0) -> tuple[Array, Array, Array]:
+    def model(
+        self, order: int, without: Sequence[str] = (), importance: npt.ArrayLike = 1.0, deviation: float = 0.0
+    ) -> tuple[Array, Array, Array]:
         """Return a stable model ``h+ = F h + G z``, ``x_h = H h`` of an order, of all units but some; F (order, order).
 
         Raises
@@ -154,6 +155,7 @@ class Past:
         Notes
         -----
         `importance`, shape (h,) or a number, weights the hidden states' mean square errors, each relative to what the whole bank leaves of it.
+        With `deviation` every lifted function's effect is known but for an independent factor 1 +- deviation, which differs from machine to machine.
         """
         rows = [i for i, unit in enumerate(self.units) if unit not in without]
         if not rows:
@@ -166,6 +168,10 @@ class Past:
         S, E = self.bank.system(channels)
         present = [i for i in range(len(S)) if i < delays * channels or i % channels < q]
         S, E = S[np.ix_(present, present)], E[present]
+        functions = len(self.lifting.functions)
+        for channel in range(channels - functions, channels):
+            own = np.arange(channel, delays * channels, channels)
+            P[np.ix_(own, own)] *= 1 + deviation**2
         W = _ridge(P, cross, self.bank, channels)
         left = np.sqrt(np.maximum(power - 2 * np.sum(W * cross.T, axis=1) + np.sum((W @ P) * W, axis=1), _NEGLIGIBLE * power))
         values, vectors = np.linalg.eigh(gramian(S.T, (W * (np.sqrt(importance) / left)[:, None]).T, 1.0))
@@ -178,67 +184,8 @@ class Past:
         return down @ S @ up, down @ E, W @ up
 
 
-def remembering_observer(
-    name: str,
-    past: Past,
-    memories: int,
-    inputs: Sequence[str],
-    states: Array,
-    recorded: Array,
-    sample_period_s: float,
-    parameters: Mapping[str, npt.ArrayLike] | None = None,
-    without: Sequence[str] = (),
-    importance: npt.ArrayLike = 1.0,
-) -> Observer:
-    """Return an observer with states of its own, for all units but some.
-
-    Parameters
-    ----------
-    name : str
-    past : Past
-    memories : int
-        States besides the original ones: they take the place of a correction filter's.
-    inputs : sequence of str
-    states : ndarray, shape (n_samples, batch, n)
-        Recordings to fit the measured states' rows on, of the units that take part.
-    recorded : ndarray, shape (n_samples, batch, m)
-        Their inputs.
-    sample_period_s : float
-    parameters : mapping of str to array_like, shape (batch,)
-    without : sequence of str
-    importance : array_like, shape (h,)
-        Weights of the hidden states' mean square errors, each relative to what the whole bank leaves of it.
-
-    Returns
-    -------
-    Observer
-        Its lifting has ``memory_1, ...`` after the original states; its correction is a gain.
-    """
-    lifting, measured = past.lifting, past.measured
-    n, q, m, hidden = lifting.n_states, len(measured), recorded.shape[-1], _hidden(lifting, measured)
-    F, G, H = past.model(len(hidden) + memories, without, importance)
-    turn = np.vstack([H, null_space(H / np.linalg.norm(H, axis=1)[:, None]).T])
-    back = np.linalg.inv(turn)
-    F, G = turn @ F @ back, turn @ G
-    z = _seen(lifting, measured, past.static, past.free, states[..., list(measured)], recorded, parameters)
-    following = _measured_rows(F, G, z, states[..., list(measured)])
-    place = [*hidden, *range(n, n + memories)]
-    raw = np.zeros((n + memories, q + m + len(lifting.functions)))  # of y, u and sigma, in place of z
-    own = np.zeros((n + memories, n + memories))
-    channels = [*range(q), *(q + j for j in past.free), *range(q + m, raw.shape[1])]
-    raw[np.ix_(place, channels)], own[np.ix_(place, place)] = G, F
-    raw[np.ix_(list(measured), channels)], own[np.ix_(list(measured), place)] = following[:, len(F) :], following[:, : len(F)]
-    raw[:, q : q + m] -= raw[:, :q] @ past.static
-    raw[list(measured), range(q)] += 1.0
-    own[:, list(measured)] = raw[:, :q]
-    widened = Lifting((*lifting.states, *(f"memory_{i + 1}" for i in range(memories))), lifting.functions, lifting.parameters)
-    silent = np.zeros((len(lifting.functions), widened.n_lifted))
-    A = np.vstack([np.hstack([own, raw[:, q + m :]]), silent])
-    B, D = (np.vstack([M, silent[:, : M.shape[1]]]) for M in (raw[:, q : q + m], raw[:, :q]))
-    return Observer(name, widened, A, B, measured, tuple(inputs), gain(D, sample_period_s), Injection.STATE, sample_period_s)
-
-
-def _hidden(lifting: Lifting, measured: Sequence[int]) -> list[int]:
+def hidden_of(lifting: Lifting, measured: Sequence[int]) -> list[int]:
+    """Indices of the states that are not measured."""
     return [i for i in range(lifting.n_states) if i not in measured]
 
 
@@ -257,7 +204,7 @@ def _static(inputs: Array, y: Array) -> Array:
     return np.asarray(np.linalg.lstsq(_centred(rows), _centred(values), rcond=1e-9)[0].T, dtype=float)
 
 
-def _seen(
+def seen_by(
     lifting: Lifting,
     measured: tuple[int, ...],
     static: Array,
@@ -287,15 +234,3 @@ def _ridge(P: Array, cross: Array, bank: Bank, channels: int) -> Array:
     size = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))
     weights = np.linalg.solve(P / np.outer(size, size) + _RIDGE * np.eye(len(P)), cross / size[:, None]) / size[:, None]
     return np.asarray((change.T @ weights).T)
-
-
-def _measured_rows(F: Array, G: Array, z: Array, y: Array) -> Array:
-    """Fit the change of the measured states on h and z, shape (q, order + channels)."""
-    h = np.zeros((*z.shape[:2], len(F)))
-    driven = z @ G.T
-    for k in range(len(z) - 1):
-        h[k + 1] = h[k] @ F.T + driven[k]
-    regressors = np.concatenate([h, z], axis=-1)[_SKIP:-1:_THIN].reshape(-1, len(F) + z.shape[-1])
-    change = np.diff(y, axis=0)[_SKIP::_THIN].reshape(-1, y.shape[-1])
-    size = np.maximum(np.sqrt(np.mean(regressors**2, axis=0)), np.finfo(float).tiny)
-    return np.asarray((np.linalg.lstsq(regressors / size, change, rcond=None)[0] / size[:, None]).T)

@@ -5,8 +5,9 @@ from .bootstrap import draw_interval, unit_interval
 from .contractions import Contractions
 from .disturb import SEVERITIES, Disturbance, Kind, Measured, hold_missing, standard_disturbances
 from .errors import ErrorSummary, error_percent, error_rms, error_spectrum, summarise
+from .intervals import interval_rows, mean_intervals
 from .monte_carlo import Candidate, MonteCarlo, sample_errors
-from .robustness import DisturbedEpisodes, robustness_rows
+from .robustness import DisturbedEpisodes, robustness_rows, severity_of_growth
 
 __all__ = [
     "SEVERITIES",
@@ -24,8 +25,11 @@ __all__ = [
     "error_rms",
     "error_spectrum",
     "hold_missing",
+    "interval_rows",
+    "mean_intervals",
     "robustness_rows",
     "sample_errors",
+    "severity_of_growth",
     "standard_disturbances",
     "summarise",
     "unit_interval",

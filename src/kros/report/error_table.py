@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ..data.population import natural_key
+from ..evaluate import mean_intervals
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,8 @@ class ErrorCell:
     worst_unit : str or None
     diverged : int
         Units whose estimate diverged.
+    interval : (float, float) or None
+        95 % interval of the mean, by a bootstrap over the off-nominal units; None with fewer than three.
     """
 
     nominal: float | None
@@ -29,6 +32,7 @@ class ErrorCell:
     worst: float | None
     worst_unit: str | None
     diverged: int
+    interval: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,11 @@ def _table(condition: str, rows: Sequence[Mapping[str, Any]], home: bool) -> Err
     grouped: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
     for row in rows:
         grouped.setdefault(row["observer"], {}).setdefault(row["channel"], []).append(row)
-    cells = {o: {c: _cell(found) for c, found in by_channel.items()} for o, by_channel in grouped.items()}
+    intervals = mean_intervals(rows)
+    cells = {
+        o: {c: replace(_cell(found), interval=intervals.get((o, condition, c))) for c, found in by_channel.items()}
+        for o, by_channel in grouped.items()
+    }
     ranked = frozenset(c for c in channels if home or condition != "load" or c != "current")
     return ErrorTable(condition, channels, tuple(grouped), cells, ranked)
 

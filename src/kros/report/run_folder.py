@@ -255,6 +255,18 @@ class RunFolder:
         return content
 
     @cached_property
+    def disturbed(self) -> dict[str, Any]:
+        """What was found on disturbed measurements and on random members of the set; empty where the study asks for neither."""
+        folder = self.folder / "disturbed"
+        return load_artifact(folder, "disturbed")[0] if (folder / "disturbed.json").exists() else {}
+
+    @cached_property
+    def members(self) -> dict[str, Array]:
+        """Norms of the errors over random members of the set, ``members/<observer>`` and ``units/<observer>``."""
+        self._require(self.folder / "disturbed" / "arrays.npz", "no member of an uncertain set was drawn")
+        return dict(read_arrays(self.folder / "disturbed" / "arrays.npz"))
+
+    @cached_property
     def arrays(self) -> dict[str, Array]:
         """Trajectories and spectra of the evaluation."""
         self._require(self.folder / "evaluation" / "arrays.npz", "the observers have not been evaluated yet")

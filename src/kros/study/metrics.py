@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..core.artifacts import load_artifact, plain, read_json
+from ..evaluate import interval_rows
 from ..synthesis.result import Synthesis
 from ..uncertainty import Tightness, UncertainModel, VariationAndNoise
 from .config import Stage
@@ -153,6 +154,10 @@ def _evaluation(context: Context) -> list[dict[str, Any]]:
     return rows
 
 
+def _intervals(context: Context) -> list[dict[str, Any]]:
+    return interval_rows(_evaluation(context))
+
+
 def _evaluation_record(context: Context) -> dict[str, Any]:
     return load_artifact(context.store.path("evaluation"), "evaluation")[0]
 
@@ -185,4 +190,5 @@ _SECTIONS = (
     (Stage.EVALUATE, "models", _free_run),
     (Stage.EVALUATE, "observers", _observers_and_baselines),
     (Stage.EVALUATE, "evaluation", _evaluation),
+    (Stage.EVALUATE, "intervals", _intervals),
 )

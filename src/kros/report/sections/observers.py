@@ -21,7 +21,7 @@ def result(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     measured = run.measured_states
     text = (
         "RMS error in percent of the signal's range on held-out episodes that nothing was fitted to. Off nominal: mean over the "
-        "units other than the nominal one, and the "
+        "units other than the nominal one, with its 95 % interval by a bootstrap over these units, and the "
         "worst of them. Best of each column in bold; the observer that is handed over is set off."
     )
     return Section("results", "Results", [text], [errors(t, deployed, measured) for t in tables], ["errors"])
@@ -46,7 +46,7 @@ def errors(table: ErrorTable, deployed: str | None, measured: tuple[str, ...] = 
     for observer in table.observers:
         cells = [Cell(observer_label(observer))]
         for channel in channels:
-            cells += _cells(table, channel, table.cells[observer].get(channel))
+            cells += _cells(table, channel, table.cells[observer].get(channel), channel not in measured)
         rows.append(cells)
     head = ["observer", *(["nominal", "mean", "worst"] * len(channels))]
     groups = [("", 1), *((c.replace("_", " ") + ("" if c in table.ranked else " (not ranked)"), 3) for c in channels)]
@@ -58,10 +58,11 @@ def errors(table: ErrorTable, deployed: str | None, measured: tuple[str, ...] = 
     return Table(head, rows, caption, groups, emphasised=emphasised)
 
 
-def _cells(table: ErrorTable, channel: str, cell: ErrorCell | None) -> list[Cell]:
+def _cells(table: ErrorTable, channel: str, cell: ErrorCell | None, with_interval: bool) -> list[Cell]:
     if cell is None:
         return [Cell("–")] * 3
     if cell.mean is None:
         return [Cell(number(cell.nominal)), Cell("diverged", note=f"{cell.diverged} units"), Cell("–")]
     values = {what: getattr(cell, what) for what in ("nominal", "mean", "worst")}
-    return [Cell(number(v), strong=v is not None and v == table.best(channel, w)) for w, v in values.items()]
+    notes = {"mean": "" if cell.interval is None or not with_interval else f"{number(cell.interval[0], 2)}–{number(cell.interval[1], 2)}"}
+    return [Cell(number(v), strong=v is not None and v == table.best(channel, w), note=notes.get(w, "")) for w, v in values.items()]

@@ -108,8 +108,10 @@ def _ratio(own: float | None, theirs: float) -> str:
 
 def _covered(metrics: Mapping[str, Any]) -> list[str]:
     """The uncertain set of the observer that is handed over."""
-    model = split_observer(metrics["study"].get("deployed") or "")[0]
-    entry = metrics.get("uncertainty", {}).get(model)
+    name = metrics["study"].get("deployed") or ""
+    entry = metrics.get("uncertainty", {}).get(split_observer(name)[0])
+    if split_observer(name)[1] == "memory":
+        return ["It was identified from the recordings of these units, not designed for a set of machines."]
     if entry is None or entry["peak_db"].get(entry["form"]) is None:
         return []
     peak, cover = minus(f"{entry['peak_db'][entry['form']]:.1f}"), entry["weight"]["cover_max"]
@@ -129,8 +131,9 @@ def _certificate(metrics: Mapping[str, Any]) -> list[str]:
         near = f", at most {number(gap)} % above what any correction of this kind can reach" if gap is not None else ""
         sentences.append(f"Its error is certified for every unit inside the uncertain set{near}.")
     if entry.get("relift_certified") is not None:
+        which = "A second certificate" if entry.get("worst_case_h2") is not None else "A certificate"
         sentences.append(
-            "A second certificate covers it as it runs, lifted anew at every step."
+            f"{which} covers it as it runs, lifted anew at every step, on any machine."
             if entry["relift_certified"]
             else "No certificate could be found for it as it runs, lifted anew at every step."
         )

@@ -137,6 +137,7 @@ class SynthesisConfig(_Section):
         None, ge=0, description="most states of the filter of worst_case_h2; reduced and polished where it has more"
     )
     memory_states: int = Field(12, ge=1, description="states besides the recorded ones of the observer with a memory")
+    tune: bool = Field(False, description="whether residual_h2 is tuned on training episodes, which takes some seconds a kind of model")
     time_limit_s: float = Field(60.0, gt=0)
 
 

@@ -51,6 +51,7 @@ class Task:
     max_states: int | None
     covered: tuple[str, ...] = ()
     memory_states: int = 12
+    tune: bool = False
 
     def observer(self, synthesis: Synthesis) -> Observer:
         """Return the observer as it runs."""

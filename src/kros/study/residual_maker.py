@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from ..core.errors import SynthesisError
 from ..lifting import Lifting
-from ..observer import Observer, ResidualModel, residual_models
+from ..observer import Observer, ResidualModel, residual_models, tune_observer
 from ..synthesis import Synthesis, residual_h2
-from .tuning import rank
+from .population_tuning import STEPS, tuned_where_better
+from .tuning import Judge, rank
 
 if TYPE_CHECKING:
     from .makers import Made, Task
@@ -70,8 +71,26 @@ def make_residual_h2(task: Task) -> Made:
             "Residual-shaped observer: it diverges on the training episodes, where it is retracted and lifted at every step."
         )
     facts: dict[str, Any] = {"training_error_to_open_loop": ranks[best][1], "order_reduction_percent": made[best].gap_percent}
-    names = [task.models.lifting.states[i] for i in models[best].refitted]
-    return made[best], facts | {"rows_fitted_to_single_steps": names}, task.problem
+    facts["rows_fitted_to_single_steps"] = [task.models.lifting.states[i] for i in models[best].refitted]
+    if not task.tune:
+        return made[best], facts, task.problem
+    synthesis, found = tuned(task, judge, made[best])
+    return synthesis, facts | found, task.problem
+
+
+def tuned(task: Task, judge: Judge, synthesis: Synthesis) -> tuple[Synthesis, dict[str, Any]]:
+    """Return the synthesis with gains and rows tuned on training episodes, where that is better on those that were held out."""
+    start = task.observer(synthesis)
+    kept, facts = tuned_where_better(task, judge, start, _steps)
+    if kept is start:
+        return synthesis, facts
+    own = {f.name: getattr(synthesis, f.name) for f in fields(Synthesis)} | {"controller": kept.controller}
+    return OwnModel(**own, A=kept.A, B=kept.B, reason="the observer runs rows that were tuned on training episodes"), facts
+
+
+def _steps(judge: Judge, start: Observer) -> Observer:
+    values = judge.parameters if start.lifting.parameters else None
+    return tune_observer(start, judge.batch.states, judge.batch.inputs, values, iterations=STEPS).observer
 
 
 def promising(task: Task) -> list[ResidualModel]:

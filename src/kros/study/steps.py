@@ -37,7 +37,7 @@ LEARNING = (
     Step(Stage.CALIBRATE, calibrate.run, ("calibrate", "lifting")),
     Step(Stage.IDENTIFY, identify.run, ("identify", "lifting")),
     Step(Stage.QUANTIFY, quantify.run, ("uncertainty",)),
-    Step(Stage.SYNTHESIZE, synthesize.run, ("synthesis", "observer")),
+    Step(Stage.SYNTHESIZE, synthesize.run, ("synthesis", "observer", "require")),
 )
 """From recordings to observers."""
 

@@ -51,7 +51,8 @@ def run(context: Context) -> list[Path]:
     folder = context.store.path("observers")
     running = [r for found in context.run("certify as it runs", as_it_runs(tasks, products)) for r in found]
     files += save_running(folder, running)
-    deployed = choose_deployed(context.config.observer.deployed, made, running)
+    covered = [name for name in made if facts[name]["worst_case_h2"] is not None] if context.config.require.robust else []
+    deployed = choose_deployed(context.config.observer.deployed, made, [r for r in running if not covered or r.name in covered])
     for found in running:
         facts[found.name] |= found.facts()
     save_artifact(folder, "observers", {"names": made, "deployed": deployed, "facts": facts})
@@ -86,7 +87,8 @@ def choose_deployed(wanted: str | None, made: list[str], running: Sequence[Runni
     """Return the observer that is handed over: the one asked for, else the most accurate one that is certified as it runs and bears gaps.
 
     Accuracy is that on training episodes, of the states that are not measured. Where no observer bears missing measurements, those that are certified
-    compete; where there is none either, the best guarantee of the best model decides.
+    compete; where there is none either, the best guarantee of the best model decides. A study that requires robustness names only observers that
+    are certified for the uncertain set, where there are any.
     """
     if wanted is not None:
         if wanted not in made:
@@ -112,7 +114,7 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     methods = suitable(config.observer.baselines + config.synthesis.methods, name, refined=name not in context.edmd_names)
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings |= {"max_order": config.uncertainty.max_order, "max_states": config.synthesis.max_states, "covered": uncertain.unit_ids}
-    settings |= {"memory_states": config.synthesis.memory_states}
+    settings |= {"memory_states": config.synthesis.memory_states, "tune": config.synthesis.tune}
     return [
         Task(f"{name}/{method.name}", method.name, models, unit, problem, refusal, noise, tuning_set(context, models), **settings)
         for method in methods

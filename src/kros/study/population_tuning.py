@@ -1,0 +1,73 @@
+"""Population tuning in a study: an observer improved on training episodes, kept as it was where anything speaks against that."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from ..core.errors import KrosError
+from ..data.population import EpisodeKey
+from ..observer import Observer, relift_certificate
+from .relift import LOST, blind_percent, first_episodes, scales_of
+from .tuning import Judge, hidden_mean
+
+if TYPE_CHECKING:
+    from .makers import Task
+
+log = logging.getLogger(__name__)
+TUNE_S, STEPS = 5.0, 8
+
+
+def tuned_where_better(
+    task: Task,
+    judge: Judge,
+    start: Observer,
+    tune: Callable[[Judge, Observer], Observer],
+    settle: Callable[[Judge, Observer], Observer] = lambda _, observer: observer,
+) -> tuple[Observer, dict[str, Any]]:
+    """Tune an observer on most training episodes, and return what is better on the others.
+
+    The tuned one is kept where it does not get worse on the episodes that tuning did not see, survives missing measurements if the first one does, and is
+    certified as it runs.
+
+    Parameters
+    ----------
+    task : Task
+    judge : Judge
+        Training episodes.
+    start : Observer
+    tune : callable
+        From episodes and an observer to a better one.
+    settle : callable
+        What is done to the observer that is kept, with the first episodes of all units.
+
+    Returns
+    -------
+    Observer
+    dict
+        For the records: whether the tuned one was kept, and the errors that decided.
+    """
+    held = held_out(judge.batch.keys)
+    unseen, first = judge.part([i for i in range(len(held)) if held[i]]), first_episodes(task.tuning).read()
+    seen = judge.first(TUNE_S / task.models.sample_period_s).part([i for i in range(len(held)) if not held[i]])
+    try:
+        tuned = tune(seen, start)
+    except KrosError as error:
+        log.info("%s stays as it was: %s", task.name, error)
+        return settle(first, start), {"tuned": False}
+    before, after = (float(hidden_mean(unseen.percent(o), o.measured)) for o in (start, tuned))
+    blind = blind_percent([start, tuned], first, task.models.sample_period_s)
+    settled = settle(first, tuned)
+    better = after <= before and bool(blind[1] < LOST or blind[0] >= LOST)
+    kept = better and relift_certificate(settled, scales=scales_of([settled], first, task)[0], mismatch=False).certified
+    facts = {"tuned": kept, "held_out_percent": {"before": before, "after": after}}
+    return settled if kept else settle(first, start), facts
+
+
+def held_out(keys: Sequence[EpisodeKey]) -> list[bool]:
+    """Tell which episodes tuning does not see: the last one of every unit, or every third unit's where units have one each."""
+    last = {key.unit: i for i, key in enumerate(keys)}
+    if len(last) == len(keys):
+        return [i % 3 == 2 for i in range(len(keys))]
+    return [last[key.unit] == i for i, key in enumerate(keys)]

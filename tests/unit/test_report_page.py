@@ -22,6 +22,7 @@ from kros.core.errors import ConfigError, DataError
 from kros.core.lti import StateSpace, gain
 from kros.data import from_arrays, write_parquet
 from kros.data.population import Channel, EpisodeKey, Population, Role, Unit
+from kros.evaluate import standard_disturbances
 from kros.identify import KoopmanMatrices, ModelSet, PhaseCalibration, PhaseSpec, UnitPhase
 from kros.identify.refine import RefinedModels, TradeOff
 from kros.lifting import Lifting
@@ -266,6 +267,35 @@ def write_evaluation(run: Path, names: list[str]) -> list[dict[str, Any]]:
     return rows
 
 
+def write_disturbed(run: Path, names: list[str]) -> dict[str, Any]:
+    """Every disturbance, with one observer that diverges, and a histogram for one."""
+    told = [("none", 0.0), *((d.kind.value, d.severity) for d in standard_disturbances())]
+    robustness = [
+        {
+            "observer": n,
+            "disturbance": kind,
+            "severity": severity,
+            "condition": "noload",
+            "channel": c,
+            "error_percent": {"mean": None, "worst": None}
+            if n.endswith("mixed") and severity
+            else {"mean": 1 + severity, "worst": 2 + severity},
+        }
+        for n in names
+        for kind, severity in told
+        for c in STATES
+    ]
+    members = np.random.default_rng(6).uniform(0.1, 0.9, 50)
+    row = {"observer": "koopman_edmd/worst_case_h2", "members": 50, "bound": 1.0, "largest": 0.9, "exceeded": False, "noise": 0.05}
+    row |= {"quantiles": {"0.05": 0.1, "0.5": 0.5, "0.95": 0.8}, "unit_median": 0.3, "unit_worst": 0.4}
+    noise = [{"observer": n, "condition": "noload", "channel": c, "units": 1, "error_percent": 1.0} for n in names for c in STATES]
+    noise = [{**r, "over_noise": [0.9, 1.1], "over_units": None, "over_both": None} for r in noise]
+    content = {"robustness": robustness, "monte_carlo": {"members": 50, "sets": [row], "noise": noise}}
+    arrays = {f"{what}/{row['observer']}": values for what, values in (("members", members), ("units", members[:4]))}
+    save_artifact(run / "disturbed", "disturbed", {**content, "units": ["001"], "seconds": 3.0}, arrays)
+    return content
+
+
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory, uncertain: dict[str, UncertainModel]) -> tuple[Path, dict[str, Any]]:
     """A finished run and its metrics."""
@@ -283,6 +313,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory, uncertain: dict[str, Unce
     }
     metrics = {
         **early_metrics(),
+        **write_disturbed(run, names),
         "models": {k: {"order": 4, "spectral_radius_max": 0.99, "freerun_error_percent": {}} for k in ("koopman_edmd", "linear_edmd")},
         "uncertainty": {k: entry for k in ("koopman_edmd", "linear_edmd")},
         "observers": {n: {"order": 0, "status": "certified", "worst_case_h2": 1.0, "spectral_radius_max": 0.99} for n in names},

@@ -109,8 +109,7 @@ def look(name: str) -> Look:
     return _LOOKS.get(split_observer(name)[1], Look(Tone.GREY.light, ":"))
 
 
-def severity_text(kind: Kind, severity: float) -> str:
-    """Return a severity for people, in the unit of its axis; a dash where there is none."""
-    if severity == 0:
-        return "any"
-    return number(severity * AXES[kind].factor, 2)
+def severity_text(kind: Kind, severity: float, smallest: float) -> str:
+    """Return a severity for people, in the unit of its axis; no more than "less" than the smallest one that was tried, and a dash where there is none."""
+    text = number(max(severity, smallest) * AXES[kind].factor, 2)
+    return f"< {text}" if severity < smallest else text

@@ -68,7 +68,8 @@ def _doubled(found: Curves, name: str, kind: Kind, measured: Sequence[str]) -> s
         return "–"
     with np.errstate(divide="ignore"):
         errors = np.exp(np.mean([np.log(by_channel[c].errors) for c in hidden], axis=0))
-    return severity_text(kind, severity_of_growth(by_channel[hidden[0]].severities, errors))
+    severities = by_channel[hidden[0]].severities
+    return severity_text(kind, severity_of_growth(severities, errors), float(severities[1]))
 
 
 def _sets(sets: Sequence[Mapping[str, Any]], deployed: str | None) -> Table | None:

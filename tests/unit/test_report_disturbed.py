@@ -1,0 +1,96 @@
+"""Curves, doubling severities and intervals as the report tells them."""
+
+import numpy as np
+import pytest
+
+from kros.core.errors import DataError, DimensionError
+from kros.evaluate import Kind, draw_interval, interval_rows, mean_intervals, severity_of_growth, unit_interval
+from kros.report.disturbances import curves, severity_text, shown_observers
+from kros.report.error_table import error_table
+
+
+def test_noise_doubles_an_error_where_its_own_share_is_root_three():
+    """``e^2 = e_0^2 + (g s)^2``: doubled at ``s = sqrt(3) e_0 / g``, wherever it was sampled."""
+    e_0, g = 0.2, 30.0
+    for severities in ([0, 1e-3, 1e-2, 1e-1], [0, 1.0]):
+        s = np.array(severities)
+        assert severity_of_growth(s, np.sqrt(e_0**2 + (g * s) ** 2)) == pytest.approx(np.sqrt(3) * e_0 / g)
+
+
+def test_growth_beyond_what_was_tried_and_divergence():
+    assert severity_of_growth([0, 1, 2], [1.0, 1.5, 1.9]) == np.inf
+    assert severity_of_growth([0, 1, 2], [1.0, 1.5, np.nan]) == 2  # lost somewhere between: not before the last one that is known
+    assert severity_of_growth([0, 1, 2], [np.inf, np.inf, np.inf]) == 0
+    with pytest.raises(DimensionError, match="zero"):
+        severity_of_growth([1, 2], [1.0, 2.0])
+
+
+def row(observer, kind, severity, mean, condition="noload"):
+    error = {"mean": mean, "worst": None if mean is None else 2 * mean}
+    return {"observer": observer, "disturbance": kind, "severity": severity, "condition": condition, "channel": "v", "error_percent": error}
+
+
+def test_curves_begin_without_disturbance_and_take_one_condition():
+    rows = [row("a", "none", 0.0, 1.0), row("a", "bias", 0.1, 2.0), row("a", "bias", 0.2, None), row("a", "none", 0.0, 9.0, "load")]
+    curve = curves(rows, "noload")["a"][Kind.BIAS]["v"]
+    np.testing.assert_array_equal(curve.severities, [0, 0.1, 0.2])
+    np.testing.assert_array_equal(curve.errors, [1, 2, np.inf])
+    np.testing.assert_array_equal(curves(rows, "noload", "worst")["a"][Kind.BIAS]["v"].errors, [2, 4, np.inf])
+
+
+def test_severities_are_told_in_the_unit_of_their_axis():
+    assert severity_text(Kind.GAP, 0.25, 0.01) == "250"
+    assert severity_text(Kind.DROPPED, 0.01, 0.05) == "< 5.0"
+    assert severity_text(Kind.BIAS, np.inf, 1e-6) == "–"
+
+
+def test_the_figure_shows_the_kind_of_model_that_is_handed_over():
+    names = ["k/open_loop", "k/luenberger", "k/residual_h2", "l/residual_h2", "learned"]
+    assert shown_observers(names, "k/residual_h2") == ["k/residual_h2", "k/open_loop", "learned"]
+
+
+def evaluation(units=8, seed=0):
+    rng = np.random.default_rng(seed)
+    return [
+        {
+            "observer": o,
+            "unit": f"u{i}",
+            "role": "nominal" if i == 0 else "off_nominal",
+            "condition": "noload",
+            "channel": c,
+            "error_percent": e,
+        }
+        for o in ("a", "b")
+        for c in ("v", "i")
+        for i, e in enumerate(rng.uniform(1, 2, units))
+    ]
+
+
+def test_intervals_of_all_observers_are_those_of_each():
+    rows = evaluation()
+    found = mean_intervals(rows)
+    values = [r["error_percent"] for r in rows if (r["observer"], r["channel"], r["role"]) == ("b", "v", "off_nominal")]
+    np.testing.assert_allclose(found["b", "noload", "v"], unit_interval(values))
+    cell = error_table(rows, "noload")[0].cells["b"]["v"]
+    assert cell.interval == found["b", "noload", "v"]
+    assert cell.interval[0] < cell.mean < cell.interval[1]
+    assert len(interval_rows(rows)) == 4
+
+
+def test_no_interval_where_an_estimate_diverged_or_units_are_few():
+    rows = evaluation()
+    rows[1]["error_percent"] = None
+    assert ("a", "noload", "v") not in mean_intervals(rows)
+    assert mean_intervals(evaluation(units=3)) == {}
+
+
+def test_an_interval_over_noise_and_units_has_the_spread_of_both():
+    """Means of n units of one noisy run each: variances of units and noise add, over n."""
+    rng = np.random.default_rng(3)
+    units, noise, n = 1.0, 0.7, 30
+    values = 5 + units * rng.standard_normal((1, n)) + noise * rng.standard_normal((60, n))
+    lower, upper = draw_interval(values)
+    expected = 2 * 1.96 * np.sqrt((values.mean(axis=0).var() + values.var(axis=0).mean()) / n)
+    assert upper - lower == pytest.approx(expected, rel=0.05)
+    with pytest.raises(DataError, match="2 realisations"):
+        draw_interval(values[:1])

@@ -11,6 +11,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -35,8 +36,10 @@ from kros.synthesis import Injection
 DT = 0.001
 KOOPMAN = Lifting(("position", "velocity", "current"), ("sin(100*position + phase)",), ("phase",))
 LINEAR = Lifting(("position", "velocity", "current"))
-ORDERS = (0, 0, 0, 0, 4, 9, 12)  # open loop, two Kalman filters, Luenberger, worst-case H2, residual-shaped, mixed
-KINDS = 2  # refined and plain models, of either lifting
+ORDERS = (0, 4, 9, 12)  # of the corrections: gains, worst-case H2, residual-shaped, the paper's
+COUNTS = (8, 2, 2, 2)  # of either lifting, for refined and plain models together
+MEMORIES = 12  # states of the observer with a memory
+TOGETHER = 2  # run side by side: at this size a study has memory for no more
 
 
 def main() -> None:
@@ -62,10 +65,11 @@ def main() -> None:
 
     for lifting, name in ((KOOPMAN, "Koopman"), (LINEAR, "linear")):
         values = phase if lifting.parameters else None
-        for order in sorted(set(ORDERS)):
-            count = KINDS * ORDERS.count(order)
-            work = partial(run_observer, observer(lifting, order), y, u, values)
-            estimate = timed(f"{count} {name} observers, {order} filter states", work, count)
+        for order, count in zip(ORDERS, COUNTS, strict=True):
+            work = partial(run_observers, [observer(lifting, order)] * TOGETHER, y, u, values)
+            estimate = timed(f"{count} {name} observers, {order} filter states", work, count // TOGETHER)[0]
+        work = partial(run_observer, observer(with_memory(lifting), 0), y, u, values)
+        timed(f"1 {name} observer with a memory of {MEMORIES} states", work)
     A = np.pad(0.3 * rng.normal(size=(3, 4)), ((0, 1), (0, 0)))
     extended = ExtendedKalman(KOOPMAN, A, np.zeros((4, 2)), (0,), ("a", "b"), 0.01 * np.eye(3), np.eye(1), np.eye(3))
     timed("extended Kalman filter", lambda: extended.run(y, u, phase))
@@ -79,7 +83,7 @@ def main() -> None:
         ),
     )
     timed("learned estimator", lambda: moments.estimator().run(y, u, phase))
-    estimates = len(ORDERS) * 2 * KINDS + 3
+    estimates = 2 * (sum(COUNTS) + 1) + 3
     timed(f"errors and spectra of {estimates} estimates", lambda: summarise(estimate, states, lengths, DT), estimates)
     sys.stdout.write(f"{'all of the above':58s} {sum(found.values()):7.2f} s\n\nnot part of a study:\n")
     timed(
@@ -89,6 +93,11 @@ def main() -> None:
     late = observer(KOOPMAN, 9, Runtime(delay=3, upper=np.array([9.0, 9.0, 9.0])))
     timed("an observer with a delay of 3 samples and limits", lambda: run_observer(late, y, u, phase))
     timed("phase-locked loop", lambda: track_parameter(observer(KOOPMAN, 9), y, u, phase))
+
+
+def with_memory(lifting: Lifting) -> Lifting:
+    """The same lifting with states of the observer's own."""
+    return replace(lifting, states=(*lifting.states, *(f"memory_{i + 1}" for i in range(MEMORIES))))
 
 
 def observer(lifting: Lifting, order: int, runtime: Runtime | None = None) -> Observer:
@@ -101,7 +110,7 @@ def observer(lifting: Lifting, order: int, runtime: Runtime | None = None) -> Ob
     return Observer(
         "o",
         lifting,
-        0.3 * rng.normal(size=(n, n)),
+        0.5 * np.linalg.qr(rng.normal(size=(n, n)))[0],
         rng.normal(size=(n, 2)),
         (0,),
         ("a", "b"),

@@ -10,6 +10,7 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 _SEGMENT = 512  # samples of a Welch segment, as in the paper
 _TOGETHER = 20_000  # samples that are transformed at once: segments of these stay in the cache
+_TURNED = 256  # samples of all signals that are put in order at once, for the same reason
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +54,24 @@ def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt:
         Not-a-number or infinite where the estimate diverged.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        error = np.ascontiguousarray(np.moveaxis(estimate - truth, 0, -1))  # (batch, n, n_samples): every signal in one piece
+        error = _signals(estimate, truth)
         whole = bool(np.all(lengths == error.shape[-1]))
         rms = np.sqrt(np.einsum("bns,bns->bn", error, error) / lengths[:, None]) if whole else error_rms(estimate, truth, lengths)
         spectra = np.empty((len(lengths), _SEGMENT // 2 + 1, error.shape[1]))
         for length in np.unique(lengths):
-            rows = np.flatnonzero(lengths == length)
+            rows = slice(None) if whole else np.flatnonzero(lengths == length)
             freqs, density = error_spectrum(error[rows, :, :length], dt, axis=-1)
             spectra[rows] = np.swapaxes(density, 1, 2)
     return ErrorSummary(rms, _of_range(rms, truth, lengths), spectra, freqs)
+
+
+def _signals(estimate: Array, truth: Array) -> Array:
+    """The error with every signal in one piece, shape (batch, n, n_samples)."""
+    error = np.empty((*truth.shape[1:], len(truth)))
+    for start in range(0, len(truth), _TURNED):
+        part = slice(start, start + _TURNED)
+        error[..., part] = np.moveaxis(estimate[part] - truth[part], 0, -1)
+    return error
 
 
 def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:

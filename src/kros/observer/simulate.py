@@ -78,21 +78,22 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
     order = max(o.controller.n_states for o in observers)
     values = {**observer.parameters, **(parameters or {})}
     step = np.stack([_padded(o, order) for o in observers])
-    # One row a machine: [theta, x^c, u, y]. The product gives [x_hat+, x^c+].
-    row = np.zeros((k, batch, step.shape[1]))
+    # One column a machine, so that each quantity of all machines lies together: [theta, x^c, u, y]. The product gives [x_hat+, x^c+].
+    column = np.zeros((k, step.shape[2], batch))
+    row = np.swapaxes(column, 1, 2)
     lifted, inflow, measurement = row[..., :n_lifted], row[..., n_lifted + order : n_lifted + order + m], row[..., n_lifted + order + m :]
     for own, first in zip(row, observers, strict=True):
         own[..., :n] = first.initial(y[0], parameters)
     missing = ~np.isfinite(y)
     gone = np.atleast_1d(missing.any(axis=(1, 2)))
-    estimates = np.empty((n_samples, k, batch, n))
-    following = np.empty((k, batch, n + order))
+    estimates = np.empty((n_samples, k, n, batch))
+    following = np.empty((k, n + order, batch))
     plain = not (lifting.history or lifting.input_functions)
     held = np.broadcast_to(u[0], (k, *u[0].shape))
     earlier = lifting.window.hold(row[..., :n], held)
     with np.errstate(over="ignore", invalid="ignore"):
         for sample in range(n_samples):
-            estimates[sample] = row[..., :n]
+            estimates[sample] = column[:, :n]
             if plain:
                 lifting.lift_into(lifted, values)
                 inflow[...] = u[sample]
@@ -105,10 +106,10 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
             measurement[...] = y[sample]
             if gone[sample]:  # what is predicted stands for what is missing, so that it corrects nothing
                 np.copyto(measurement, row[..., list(observer.measured)], where=missing[sample])
-            np.matmul(row, step, out=following)
-            row[..., :n] = following[..., :n]
-            row[..., n_lifted : n_lifted + order] = following[..., n:]
-    return np.moveaxis(estimates, 0, 1)
+            np.matmul(step, column, out=following)
+            column[:, :n] = following[:, :n]
+            column[:, n_lifted : n_lifted + order] = following[:, n:]
+    return estimates.transpose(1, 0, 3, 2)
 
 
 def require_recordings(who: str, inputs: Sequence[str], y: Array, u: Array) -> None:
@@ -120,9 +121,8 @@ def require_recordings(who: str, inputs: Sequence[str], y: Array, u: Array) -> N
 
 
 def _padded(observer: Observer, order: int) -> Array:
-    """The one-step map, transposed, with silent controller states up to an order."""
+    """The one-step map with silent controller states up to an order."""
     n, nl, own = observer.lifting.n_states, observer.lifting.n_lifted, observer.controller.n_states
-    step = observer.one_step.T
     missing = order - own
-    step = np.insert(step, [nl + own] * missing, 0.0, axis=0)
-    return np.ascontiguousarray(np.insert(step, [n + own] * missing, 0.0, axis=1))
+    step = np.insert(observer.one_step, [nl + own] * missing, 0.0, axis=1)
+    return np.ascontiguousarray(np.insert(step, [n + own] * missing, 0.0, axis=0))

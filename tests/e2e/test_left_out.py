@@ -1,0 +1,187 @@
+"""Units that are left out: what is made for them comes from all others alone, and their errors are those of what was made."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from kros.core.artifacts import read_arrays, read_json
+from kros.data import read_parquet, split_episodes, write_parquet
+from kros.evaluate import unit_interval
+from kros.identify import ModelSet
+from kros.observer import Observer, run_observer
+from kros.report.left_out_table import PAPER, left_out_tables
+from kros.study import load_config, run_study
+from kros.study.config import Stage
+from kros.study.context import Context, Silent
+from kros.study.estimate import load_calibration, unit_parameters
+from kros.study.executors import SerialExecutor
+from kros.study.stages.left_out import held_parameters, without
+from kros.study.store import Store
+
+UNITS = ("001", "002", "003", "004")
+FAST = (
+    '[data]\nsource = "{source}"\nreader = "parquet"\n'
+    "[identify]\nrefine = false\n"
+    '[uncertainty]\nn_freqs = 60\nstructure = "scalar"\nmax_order = 1\n'
+    '[synthesis]\ninput_weight = 3.0\nmethods = ["residual_h2"]\n'
+    '[observer]\nbaselines = ["open_loop", "kalman_white", "filtered_difference", "learned"]\n'
+    "[evaluate]\nfolds = {folds}\nrobustness = false\nmonte_carlo = 0\n"
+)
+
+
+def study(folder, source, folds=0):
+    """Write a quick study of pendulums."""
+    path = folder / "study.toml"
+    path.write_text(FAST.format(source=source, folds=folds))
+    return path
+
+
+@pytest.fixture(scope="module")
+def pendulums(kros, tmp_path_factory):
+    """Recordings of four pendulums."""
+    folder = tmp_path_factory.mktemp("pendulums") / "recordings"
+    options = ("--units", len(UNITS), "--episodes", 3, "--seconds", 5)
+    assert kros("simulate", folder, "--plant", "pendulum", *options).exit_code == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(pendulums, tmp_path_factory):
+    """A study that leaves out the first and third, then the second and fourth."""
+    folder = tmp_path_factory.mktemp("left_out")
+    result = run_study(load_config(study(folder, pendulums, folds=2)), folder / "run", until=Stage.LEFT_OUT)
+    return folder / "run", result.metrics["left_out"]
+
+
+def test_a_fold_is_the_study_on_recordings_that_do_not_hold_its_units(pendulums, run, tmp_path):
+    write_parquet(read_parquet(pendulums).select(["002", "004"]), tmp_path / "others")
+    alone = tmp_path / "run"
+    run_study(load_config(study(tmp_path, tmp_path / "others")), alone, until=Stage.SYNTHESIZE)
+    fold = run[0] / "left_out" / "0"
+    for name in ("koopman_edmd", "linear_edmd"):
+        if (alone / "models" / name).exists():
+            one, other = ModelSet.load(fold / "models" / name), ModelSet.load(alone / "models" / name)
+            assert one.unit_ids == other.unit_ids == ("002", "004")
+            assert np.array_equal(one.A, other.A)
+            assert np.array_equal(one.B, other.B)
+            weights = [read_arrays(place / "uncertainty" / name / "arrays.npz") for place in (fold, alone)]
+            assert all(np.array_equal(weights[0][key], weights[1][key]) for key in weights[0])
+    made = sorted(p.relative_to(fold / "observers") for p in (fold / "observers").glob("*/*.json"))
+    assert made == sorted(p.relative_to(alone / "observers") for p in (alone / "observers").glob("*/*.json"))
+    assert made
+    for name in [*made, "relift.json"]:
+        assert (fold / "observers" / name).read_text() == (alone / "observers" / name).read_text()
+
+
+def test_every_unit_is_judged_once_by_what_its_fold_made(pendulums, run):
+    folder, left_out = run
+    assert left_out["folds"] == [["001", "003"], ["002", "004"]]
+    rows = [r for r in left_out["rows"] if r["channel"] == "velocity"]
+    observers = set(left_out["observers"])
+    assert {"linear_edmd/residual_h2", "filtered_difference", "learned"} <= observers
+    assert sorted((r["observer"], r["unit"]) for r in rows) == sorted((o, u) for o in observers for u in UNITS)
+    population = read_parquet(pendulums)
+    key = split_episodes(population)["003", population.conditions[0]].test[0]
+    states, inputs = population.read_parts(key)
+    observer = Observer.load(folder / "left_out" / "0" / "observers" / "linear_edmd" / "residual_h2.json")
+    error = run_observer(observer, states[:, None, list(observer.measured)], inputs[:, None])[:, 0] - states
+    found = next(r for r in rows if (r["observer"], r["unit"]) == ("linear_edmd/residual_h2", "003"))
+    assert found["fold"] == 0
+    assert found["rms"] == pytest.approx(np.sqrt(np.mean(error[:, 1] ** 2)))
+    assert left_out["observers"]["linear_edmd/open_loop"]["made"] == 2
+    assert left_out["observers"]["linear_edmd/open_loop"]["relift_certified"] in (0, 1, 2)
+    assert left_out["observers"]["learned"]["relift_certified"] is None
+
+
+def test_nothing_is_made_twice_and_what_is_not_asked_for_is_gone(kros, run):
+    folder = run[0]
+    again = kros("run", folder.parent / "study.toml", "--out", folder, "--until", "left_out")
+    assert again.exit_code == 0
+    assert all(line.endswith("unchanged") for line in again.stderr.splitlines() if line[:1].islower() or line[:1].isdigit())
+    made = json.loads((folder / "left_out" / "1" / "stages" / "synthesize.json").read_text())
+    shutil.copytree(folder, folder.parent / "copy")
+    off = kros(
+        "run", folder.parent / "study.toml", "--out", folder.parent / "copy", "--until", "left_out", "--set", "evaluate.folds=0", "--json"
+    )
+    assert "left_out" not in json.loads(off.stdout)
+    assert not (folder.parent / "copy" / "left_out" / "left_out.json").exists()
+    assert read_json(folder / "left_out" / "1" / "stages" / "synthesize.json") == made
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("evaluate.folds=1", "at least 2"),
+        ("evaluate.folds=-2", "greater than or equal to 0"),
+        ("evaluate.folds=5", "there are 4 units"),
+        ('data.exclude=["004", "xyz"]', "no unit xyz"),
+        ('data.exclude=["001", "002", "003"]', "at least two units"),
+    ],
+)
+def test_folds_that_cannot_be_made_are_refused_at_once(kros, pendulums, tmp_path, setting, told):
+    result = kros("run", study(tmp_path, pendulums), "--out", tmp_path / "run", "--set", setting)
+    assert result.exit_code == 2
+    assert told in result.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_too_few_units_left_to_learn_from(kros, pendulums, tmp_path):
+    settings = ("--set", "evaluate.folds=2", "--set", 'data.exclude=["004"]')
+    result = kros("run", study(tmp_path, pendulums), "--out", tmp_path / "run", *settings)
+    assert result.exit_code == 2
+    assert "leaves 1 of 3 units" in result.stderr
+
+
+def test_an_excluded_unit_is_nowhere(pendulums, tmp_path):
+    path = study(tmp_path, pendulums)
+    result = run_study(load_config(path, ['data.exclude=["002"]']), tmp_path / "run", until=Stage.IDENTIFY)
+    assert [row["unit"] for row in result.metrics["units"]] == ["001", "003", "004"]
+    written = [p for part in ("population", "factors", "models") for p in (tmp_path / "run" / part).rglob("*.json")]
+    assert len(written) >= 3
+    assert not [p for p in written if '"002"' in p.read_text()]
+
+
+def test_a_unit_that_is_left_out_is_calibrated_as_a_new_one(kros, tmp_path):
+    """Its phase comes from its own training episodes; what the fold knows of it is the branch."""
+    assert kros("simulate", tmp_path / "drives", "--units", 3, "--episodes", 2, "--seconds", 8).exit_code == 0
+    config = load_config(study(tmp_path, tmp_path / "drives"), ['data.exclude=["001003"]', "observer.deployed='learned'"])
+    fold, whole = tmp_path / "fold", tmp_path / "whole"
+    run_study(config, fold, until=Stage.CALIBRATE)
+    run_study(load_config(study(tmp_path, tmp_path / "drives")), whole, until=Stage.CALIBRATE)
+    contexts = [Context(config, Store(folder), SerialExecutor(), Silent()) for folder in (whole, fold)]
+    phases = held_parameters(contexts[0], ["001003"], contexts[1])
+    assert phases == unit_parameters(
+        contexts[0].population.select(["001003"]), load_calibration(Store(fold)), contexts[1].facts.identify_on
+    )
+    assert "001003" not in load_calibration(Store(fold)).units
+    made = without(contexts[1], ["001002"])
+    assert made.data.exclude == ("001003", "001002")
+    assert made.data.source == tmp_path / "drives"
+    assert made.observer.deployed is None
+
+
+def test_the_table_holds_means_intervals_worst_units_and_powers():
+    errors = {PAPER: [8.0, 10.0, 12.0], "koopman/memory": [1.0, 2.0, 6.0], "learned": [1.0, None, 2.0]}
+    rows = [
+        {
+            "observer": o,
+            "unit": str(i),
+            "condition": "noload",
+            "channel": "velocity",
+            "error_percent": e,
+            "gearbox_band_power": e and 1e-3 * e,
+        }
+        for o, values in errors.items()
+        for i, e in enumerate(values)
+    ]
+    (table,) = left_out_tables(rows, "noload")
+    cell = table.cells["koopman/memory"]["velocity"]
+    assert (cell.mean, cell.worst, cell.worst_unit) == (3.0, 6.0, "2")
+    assert (cell.low, cell.high) == pytest.approx(tuple(float(v[0]) for v in unit_interval(np.array([[1.0], [2.0], [6.0]]))))
+    assert cell.band_db == pytest.approx(10 * np.log10(3 / 10))
+    assert table.cells[PAPER]["velocity"].band_db == pytest.approx(0)
+    assert table.cells["learned"]["velocity"].mean is None

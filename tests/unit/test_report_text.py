@@ -159,6 +159,8 @@ def test_pairs_are_a_linear_and_a_koopman_observer() -> None:
     assert paper_pair(names) == ["linear_edmd/mixed", "koopman_edmd/mixed"]
     assert paper_pair(["linear_edmd/mixed", "koopman/mixed"]) == ["linear_edmd/mixed"]
     assert paper_pair(["koopman/mixed", "learned"]) == []
+    assert paper_pair([*names, "linear_edmd/paper", "koopman_edmd/paper"]) == ["linear_edmd/paper", "koopman_edmd/paper"]
+    assert paper_pair([*names, "koopman_edmd/paper"]) == ["linear_edmd/mixed", "koopman_edmd/mixed"]
 
 
 def test_koopman_and_linear_twins_differ_in_colour() -> None:

@@ -16,6 +16,7 @@ _METHODS = {
     "luenberger": "Luenberger",
     "ekf": "extended Kalman",
     "mixed": "mixed H2-H∞",
+    "paper": "mixed H2-H∞, entrywise weights",
     "h2": "H2",
     "hinf": "H∞",
     "worst_case_h2": "worst-case H2",
@@ -91,8 +92,8 @@ def observer_look(name: str) -> Look:
     if method in _METHOD_TONES:
         return Look(_METHOD_TONES[method].light, "-" if is_koopman(model) or not model else "--")
     if is_koopman(model):
-        return Look({"mixed": Tone.GREEN, "h2": Tone.SKY, "hinf": Tone.SKY}.get(method, Tone.BLUE).light)
-    return Look(Tone.ORANGE.light, "-" if method != "mixed" else "--")
+        return Look({"mixed": Tone.GREEN, "paper": Tone.GREEN, "h2": Tone.SKY, "hinf": Tone.SKY}.get(method, Tone.BLUE).light)
+    return Look(Tone.ORANGE.light, "--" if method in ("mixed", "paper") else "-")
 
 
 def form_label(form: str) -> str:
@@ -135,9 +136,10 @@ def deployed_pair(names: Sequence[str], deployed: str | None) -> list[str]:
 
 
 def paper_pair(names: Iterable[str]) -> list[str]:
-    """Return the paper's linear and Koopman observer, or what there is of them."""
+    """Return the paper's linear and Koopman observer, or what there is of them: with its own entrywise weights where a study made these."""
     known = list(names)
-    return [n for n in ("linear_edmd/mixed", "koopman_edmd/mixed") if n in known]
+    pairs = [[n for n in (f"linear_edmd/{method}", f"koopman_edmd/{method}") if n in known] for method in ("paper", "mixed")]
+    return max(pairs, key=len)
 
 
 def axis_label(channel: str, unit: str) -> str:

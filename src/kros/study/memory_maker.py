@@ -11,16 +11,15 @@ import numpy as np
 
 from ..core.errors import KrosError, SynthesisError
 from ..lifting import Lifting
-from ..observer import Observer, Past, driven_coordinates, refit_measured_rows, remembering_observer, tune_observer
+from ..observer import Observer, driven_coordinates, observer_with_memory
 from ..synthesis import Status
-from .population_tuning import STEPS, tuned_where_better
+from .population_tuning import tuned_where_better
 from .residual_maker import OwnModel
 from .tuning import Judge
 
 if TYPE_CHECKING:
     from .makers import Made, Task
 
-_FIT_S = 6.0
 _CIRCLE = {"sin": "cos", "cos": "sin"}
 _REASON = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
 
@@ -34,8 +33,11 @@ def make_memory(task: Task) -> Made:
         Where the lifting reads what is not measured or past, everything is measured, or recordings are too short.
     """
     began, judge = time.perf_counter(), task.tuning.read()
+    recipe = partial(identified, task, on_the_circle(task.models.lifting))
     try:
-        kept, facts = tuned_where_better(task, judge, fitted(task, judge), tuned, partial(in_coordinates, task))
+        kept, facts = tuned_where_better(
+            task, judge, recipe(judge, iterations=0), lambda seen, _: recipe(seen), partial(in_coordinates, task)
+        )
     except (KrosError, np.linalg.LinAlgError) as error:
         raise SynthesisError(str(error)) from error
     solve_s = time.perf_counter() - began
@@ -44,16 +46,22 @@ def make_memory(task: Task) -> Made:
     return made, {"memory_states": task.memory_states, **facts}, task.problem
 
 
-def fitted(task: Task, judge: Judge) -> Observer:
-    """Return the observer with a memory as regression and reduction give it."""
+def identified(task: Task, lifting: Lifting, judge: Judge, **options: Any) -> Observer:
+    """Return the observer that episodes give; `options` as in `observer_with_memory`."""
     models, batch = task.models, judge.batch
-    lifting = on_the_circle(models.lifting)
-    values = judge.parameters if lifting.parameters else None
-    units = [key.unit for key in batch.keys]
-    past = Past.of(lifting, models.measured, batch.states, batch.inputs, batch.lengths, units, values)
-    short = judge.first(_FIT_S / models.sample_period_s).batch
-    return remembering_observer(
-        task.name, past, task.memory_states, models.recorded_inputs, short.states, short.inputs, models.sample_period_s, values
+    return observer_with_memory(
+        task.name,
+        lifting,
+        models.measured,
+        models.recorded_inputs,
+        batch.states,
+        batch.inputs,
+        batch.lengths,
+        [key.unit for key in batch.keys],
+        models.sample_period_s,
+        judge.parameters if lifting.parameters else None,
+        task.memory_states,
+        **options,
     )
 
 
@@ -65,13 +73,6 @@ def on_the_circle(lifting: Lifting) -> Lifting:
         if outer in _CIRCLE and formula.text.strip().startswith(f"{outer}(") and formula.used & set(lifting.parameters):
             functions.append(_CIRCLE[outer] + formula.text.strip()[len(outer) :])
     return replace(lifting, functions=tuple(dict.fromkeys(functions)))
-
-
-def tuned(judge: Judge, start: Observer) -> Observer:
-    """Return the observer tuned on episodes, with the measured states' rows fitted to what came out."""
-    values = judge.parameters if start.lifting.parameters else None
-    found = tune_observer(start, judge.batch.states, judge.batch.inputs, values, iterations=STEPS)
-    return refit_measured_rows(found.observer, judge.batch.states, judge.batch.inputs, values)
 
 
 def in_coordinates(task: Task, judge: Judge, observer: Observer) -> Observer:

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from .makers import Task
 
 log = logging.getLogger(__name__)
-TUNE_S, STEPS = 5.0, 8
 
 
 def tuned_where_better(
@@ -50,9 +49,8 @@ def tuned_where_better(
     """
     held = held_out(judge.batch.keys)
     unseen, first = judge.part([i for i in range(len(held)) if held[i]]), first_episodes(task.tuning).read()
-    seen = judge.first(TUNE_S / task.models.sample_period_s).part([i for i in range(len(held)) if not held[i]])
     try:
-        tuned = tune(seen, start)
+        tuned = tune(judge.part([i for i in range(len(held)) if not held[i]]), start)
     except KrosError as error:
         log.info("%s stays as it was: %s", task.name, error)
         return settle(first, start), {"tuned": False}

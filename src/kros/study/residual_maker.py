@@ -12,7 +12,7 @@ from ..core.errors import SynthesisError
 from ..lifting import Lifting
 from ..observer import Observer, ResidualModel, residual_models, tune_observer
 from ..synthesis import Synthesis, residual_h2
-from .population_tuning import STEPS, tuned_where_better
+from .population_tuning import tuned_where_better
 from .tuning import Judge, rank
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 MAX_ORDER = 12
 _COMPARED = 3
+_TUNE_S, _STEPS = 5.0, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ def make_residual_h2(task: Task) -> Made:
 def tuned(task: Task, judge: Judge, synthesis: Synthesis) -> tuple[Synthesis, dict[str, Any]]:
     """Return the synthesis with gains and rows tuned on training episodes, where that is better on those that were held out."""
     start = task.observer(synthesis)
-    kept, facts = tuned_where_better(task, judge, start, _steps)
+    kept, facts = tuned_where_better(task, judge.first(_TUNE_S / task.models.sample_period_s), start, _steps)
     if kept is start:
         return synthesis, facts
     own = {f.name: getattr(synthesis, f.name) for f in fields(Synthesis)} | {"controller": kept.controller}
@@ -90,7 +91,7 @@ def tuned(task: Task, judge: Judge, synthesis: Synthesis) -> tuple[Synthesis, di
 
 def _steps(judge: Judge, start: Observer) -> Observer:
     values = judge.parameters if start.lifting.parameters else None
-    return tune_observer(start, judge.batch.states, judge.batch.inputs, values, iterations=STEPS).observer
+    return tune_observer(start, judge.batch.states, judge.batch.inputs, values, iterations=_STEPS).observer
 
 
 def promising(task: Task) -> list[ResidualModel]:

@@ -267,6 +267,17 @@ def write_evaluation(run: Path, names: list[str]) -> list[dict[str, Any]]:
     return rows
 
 
+def write_left_out(run: Path, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Every unit left out once, half as well estimated; one observer diverges."""
+    held = [
+        {**row, "fold": 0, "error_percent": row["error_percent"] and 2 * row["error_percent"]} for row in rows if row["role"] != "outlier"
+    ]
+    facts = {"made": 2, "orders": [2, 3], "relift_certified": 2, "robust": 1, "reasons": []}
+    content = {"folds": [["001"], ["002"]], "failed": {}, "rows": held, "observers": {row["observer"]: facts for row in rows}}
+    save_artifact(run / "left_out", "left_out", content)
+    return content
+
+
 def write_disturbed(run: Path, names: list[str]) -> dict[str, Any]:
     """Every disturbance, with one observer that diverges, and a histogram for one."""
     told = [("none", 0.0), *((d.kind.value, d.severity) for d in standard_disturbances())]
@@ -314,6 +325,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory, uncertain: dict[str, Unce
     metrics = {
         **early_metrics(),
         **write_disturbed(run, names),
+        "left_out": write_left_out(run, rows),
         "models": {k: {"order": 4, "spectral_radius_max": 0.99, "freerun_error_percent": {}} for k in ("koopman_edmd", "linear_edmd")},
         "uncertainty": {k: entry for k in ("koopman_edmd", "linear_edmd")},
         "observers": {n: {"order": 0, "status": "certified", "worst_case_h2": 1.0, "spectral_radius_max": 0.99} for n in names},

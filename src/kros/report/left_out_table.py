@@ -25,7 +25,7 @@ class LeftOutCell:
     mean : float or None
         Over the units.
     low, high : float or None
-        95 % interval of the mean, from a bootstrap over units.
+        95 % interval of the mean, from a bootstrap over units; None for a single unit too.
     worst : float or None
     worst_unit : str or None
     units : mapping of str to float or None
@@ -57,6 +57,11 @@ class LeftOutTable:
     channels: tuple[str, ...]
     cells: Mapping[str, Mapping[str, LeftOutCell]]
 
+    def best(self, channel: str, what: str) -> float | None:
+        """Return the smallest ``mean`` or ``worst`` of a channel; None where every observer diverged."""
+        values = [getattr(cells[channel], what) for cells in self.cells.values() if channel in cells]
+        return min((v for v in values if v is not None), default=None)
+
 
 def left_out_tables(rows: Sequence[Mapping[str, Any]], identify_on: str) -> list[LeftOutTable]:
     """Summarise the rows of ``metrics.json``'s ``left_out``, one table a condition, the one that was identified on first.
@@ -84,7 +89,7 @@ def _table(condition: str, rows: Sequence[Mapping[str, Any]]) -> LeftOutTable:
 
 
 def _intervals(errors: Mapping[Key, Sequence[float | None]]) -> dict[Key, tuple[float, float]]:
-    """Return the intervals of all means that can be formed, cells with as many units together: they share the draws."""
+    """Return the intervals of all means over several units, cells with as many units together: they share the draws."""
     finite = {key: values for key, values in errors.items() if all(v is not None and np.isfinite(v) for v in values)}
     found: dict[Key, tuple[float, float]] = {}
     for count in {len(values) for values in finite.values()} - {1}:
@@ -98,10 +103,12 @@ def _cell(rows: Sequence[Mapping[str, Any]], interval: tuple[float, float] | Non
     units = {r["unit"]: r["error_percent"] for r in rows}
     own = _power(rows)
     band_db = float(10 * np.log10(own / papers)) if own and papers else None
-    if interval is None:
+    known = {unit: float(error) for unit, error in units.items() if error is not None and np.isfinite(error)}
+    if len(known) < len(units):
         return LeftOutCell(None, None, None, None, None, units, band_db)
-    worst = max(units, key=lambda u: float(units[u]))
-    return LeftOutCell(float(np.mean(list(units.values()))), *interval, float(units[worst]), worst, units, band_db)
+    worst = max(known, key=lambda u: known[u])
+    low, high = interval if interval is not None else (None, None)
+    return LeftOutCell(float(np.mean(list(known.values()))), low, high, known[worst], worst, units, band_db)
 
 
 def _power(rows: Sequence[Mapping[str, Any]]) -> float | None:

@@ -267,6 +267,12 @@ class RunFolder:
         return dict(read_arrays(self.folder / "disturbed" / "arrays.npz"))
 
     @cached_property
+    def left_out(self) -> dict[str, Any]:
+        """What observers did on units that took no part in their making."""
+        self._require(self.folder / "left_out" / "left_out.json", "no unit was left out; set evaluate.folds")
+        return load_artifact(self.folder / "left_out", "left_out")[0]
+
+    @cached_property
     def arrays(self) -> dict[str, Array]:
         """Trajectories and spectra of the evaluation."""
         self._require(self.folder / "evaluation" / "arrays.npz", "the observers have not been evaluated yet")

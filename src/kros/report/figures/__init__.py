@@ -28,6 +28,7 @@ FIGURES = (
     "certificates",
     "members",
     "errors_chart",
+    "left_out",
     "observers_in_time",
     "observers_in_time_paper",
     "observer_spectra",

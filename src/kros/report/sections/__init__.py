@@ -7,7 +7,20 @@ from typing import Any
 
 from ..content import Section
 from ..run_folder import RunFolder
-from . import calibration, making, models, observers, other_conditions, outliers, recordings, relift, robustness, synthesis, uncertainty
+from . import (
+    calibration,
+    left_out,
+    making,
+    models,
+    observers,
+    other_conditions,
+    outliers,
+    recordings,
+    relift,
+    robustness,
+    synthesis,
+    uncertainty,
+)
 
 Metrics = Mapping[str, Any]
 
@@ -21,6 +34,7 @@ SECTIONS: tuple[Callable[[RunFolder, Metrics], Section | None], ...] = (
     synthesis.section,
     relift.section,
     observers.section,
+    left_out.section,
     robustness.section,
     other_conditions.section,
     making.section,

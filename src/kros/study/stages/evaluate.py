@@ -143,7 +143,7 @@ def run(context: Context) -> list[Path]:
     free_runs = {m: outcome for m in models if isinstance(outcome := results.pop(f"free run/{m}"), Outcome)}
     estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
 
-    band = gearbox_band_hz(context.config, population, _top_speed(context, models))
+    band = band_hz(context)
     rows = []
     for name, outcome in estimates.items():
         rows += error_rows(name, outcome.summary, keys, roles, population.states, band, outcome.estimated)
@@ -219,12 +219,14 @@ def _usable(context: Context) -> list[str]:
     return [u for u in context.facts.groups if u in ids]
 
 
-def _top_speed(context: Context, models: dict[str, ModelSet]) -> float:
+def band_hz(context: Context) -> tuple[float, float] | None:
+    """Return the band around the gearbox frequency at the population's top speed; None for other plants."""
     spec = context.phase_spec
     if spec is None:
-        return 0.0
-    first = next(iter(models.values()))
-    return float(first.input_scale[first.inputs.index(spec.reference)]) if spec.reference in first.inputs else 0.0
+        return None
+    first = context.models(context.model_names[0])
+    top_speed = float(first.input_scale[first.inputs.index(spec.reference)]) if spec.reference in first.inputs else 0.0
+    return gearbox_band_hz(context.config, context.population, top_speed)
 
 
 def unit_roles(context: Context) -> dict[str, str]:

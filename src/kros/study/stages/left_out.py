@@ -22,7 +22,7 @@ from ..context import Context, Progress
 from ..steps import LEARNING, Step, run_steps
 from ..store import Store, remove_tree
 from . import calibrate
-from .evaluate import Outcome, UnitParameters, error_rows, estimation, facts_of, outcomes
+from .evaluate import Outcome, UnitParameters, band_hz, error_rows, estimation, facts_of, outcomes
 
 log = logging.getLogger(__name__)
 FOLDER, KIND, FEWEST = "left_out", "left_out", 2
@@ -118,9 +118,8 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> list
     facts, population = whole.facts, whole.population.select(held)
     units, keys = held_parameters(whole, held, context), tuple(k for k in facts.test if k.unit in held)
     results = outcomes(context, estimation(context, population, keys, units))
-    band = load_artifact(whole.store.path("evaluation"), "evaluation")[0]["band_hz"]
     record = load_artifact(context.store.path("observers"), "observers")[0]
-    rows = []
+    band, rows = band_hz(whole), []
     for name, outcome in results.items():
         if isinstance(outcome, Outcome):
             rows += error_rows(name, outcome.summary, keys, dict.fromkeys(held, "left_out"), population.states, band, outcome.estimated)

@@ -6,7 +6,8 @@ Every population is simulated and studied with ``[evaluate] folds``: for each fo
 every condition: in how many folds an observer is certified as it runs ("runs") and for the uncertain set ("set"); mean over the units with the 95 %
 interval of a bootstrap over units, and the worst unit, of the states that are not measured, in percent of the range; power of the error around the
 gearbox frequency in dB relative to the paper's own observer, `koopman_edmd/mixed`. Below it: what is asked of the table, and by how much it is met or
-missed. ``--set KEY=VALUE`` changes the study; with ``--out`` runs are kept, and found done the next time.
+missed. ``--set KEY=VALUE`` changes the study; with ``--out`` runs are kept, and found done the next time
+(``kros run`` on a population's study.toml adds the report).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from kros.core.artifacts import write_json
 from kros.report.left_out_table import PAPER, LeftOutCell, LeftOutTable, left_out_tables
 from kros.report.names import BASELINES, split_observer
 from kros.study import load_config, run_study
-from kros.study.config import SynthesisConfig
+from kros.study.config import Stage, SynthesisConfig
 from kros.study.demo import simulate_to
 from kros.study.executors import available_cores
 from kros.study.progress import Lines
@@ -83,9 +84,11 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
     study = folder / "study.toml"
     methods = json.dumps(["paper", *SynthesisConfig().methods])
     study.write_text(
-        f'[data]\nsource = "recordings"\nreader = "parquet"\n[synthesis]\nmethods = {methods}\n[evaluate]\nfolds = {options.folds}\n'
+        f'[data]\nsource = "recordings"\nreader = "parquet"\n[synthesis]\nmethods = {methods}\n'
+        f"[evaluate]\nfolds = {options.folds}\nrobustness = false\nmonte_carlo = 0\n"
     )
-    result = run_study(load_config(study, options.set), folder / "run", workers=options.workers, progress=Lines())
+    config = load_config(study, options.set)
+    result = run_study(config, folder / "run", until=Stage.LEFT_OUT, workers=options.workers, progress=Lines())
     left_out: dict[str, Any] = result.metrics["left_out"]
     for number, reason in left_out["failed"].items():
         say(f"fold {number} failed: {reason}")

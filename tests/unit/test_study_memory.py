@@ -1,0 +1,158 @@
+"""Observers with a memory in a study: what they lift, what they are tuned on, when the tuned one is kept, and what is said where there is none."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from kros.data.population import EpisodeKey
+from kros.lifting import Lifting
+from kros.observer import observer_with_memory, relift_certificate
+from kros.plants import PLANTS
+from kros.report.verdict import verdict
+from kros.study.makers import Task, produce
+from kros.study.memory_maker import on_the_circle
+from kros.study.population_tuning import held_out, tuned_where_better
+from kros.study.relift import certify_running
+from kros.study.stages.synthesize import certificate
+from kros.study.tuning import TuningSet
+
+STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "target_velocity")
+DRIVE = Lifting(STATES, ("sin(100*position + phase)",), ("phase",))
+
+
+@pytest.fixture(scope="module")
+def tuning():
+    made = PLANTS["harmonic-drive"](n_units=3, n_episodes=3, seconds=3.0, seed=1).simulate()
+    truth = made.truth.as_dict()["units"]
+    keys = tuple(k for k in made.population.episodes if k.condition == "noload")
+    return TuningSet(made.population, keys, {u: {"phase": truth[u]["phase_rad"][0]} for u in made.population.unit_ids})
+
+
+def task(tuning, lifting=DRIVE, measured=(0,), **settings):
+    models = SimpleNamespace(
+        name="koopman",
+        lifting=lifting,
+        measured=measured,
+        recorded_inputs=INPUTS,
+        input_scale=np.array([6.0, 3.0]),
+        output_scale=np.array([6.0, 3.0, 0.3, 1.0])[: lifting.n_lifted],
+        sample_period_s=0.001,
+        parameters={"phase": np.zeros(1)} if lifting.parameters else {},
+        A=np.zeros((1, lifting.n_lifted, lifting.n_lifted)),
+        B=np.zeros((1, lifting.n_lifted, 2)),
+        index=lambda unit: 0,
+    )
+    options = {"input_weight": "identity", "time_limit_s": 1.0, "max_order": 2, "max_states": None, "memory_states": 4, **settings}
+    return Task("koopman/memory", "memory", models, "001001", None, "there is no set", np.array([1e-5]), tuning, **options)
+
+
+@pytest.fixture(scope="module")
+def made(tuning):
+    own = task(tuning)
+    return own, produce(own)
+
+
+def test_a_calibrated_angle_is_seen_as_a_whole():
+    functions = ("sin(100*position + phase)", "sin(position)", "cos(2*position - phase)", "sin(position + phase)*velocity")
+    found = on_the_circle(Lifting(STATES, functions, ("phase",)))
+    assert found.functions == (*functions, "cos(100*position + phase)", "sin(2*position - phase)")
+    assert on_the_circle(found) == found
+    assert on_the_circle(Lifting(STATES)) == Lifting(STATES)
+
+
+def test_the_last_episodes_are_held_out():
+    def keys(*names):
+        return [EpisodeKey(name[0], "on", name[1:]) for name in names]
+
+    assert held_out(keys("a1", "a2", "a3", "b1", "b2")) == [False, False, True, False, True]
+    assert held_out(keys("a1", "b1", "c1", "d1")) == [False, False, True, False]
+
+
+def test_a_study_makes_what_the_recipe_makes(made, tuning):
+    own, product = made
+    assert product.facts["memory_states"] == 4
+    assert set(product.facts["held_out_percent"]) == {"before", "after"}
+    observer = own.observer(product.synthesis)
+    assert observer.recorded == STATES
+    assert observer.lifting.functions == ("sin(100*position + phase)", "cos(100*position + phase)")
+    judge = tuning.read()
+    seen = judge.part([i for i, held in enumerate(held_out(judge.batch.keys)) if not held]) if product.facts["tuned"] else judge
+    expected = observer_with_memory(
+        "o",
+        on_the_circle(DRIVE),
+        (0,),
+        INPUTS,
+        seen.batch.states,
+        seen.batch.inputs,
+        seen.batch.lengths,
+        [k.unit for k in seen.batch.keys],
+        0.001,
+        seen.parameters,
+        4,
+        **({} if product.facts["tuned"] else {"iterations": 0}),
+    )
+    np.testing.assert_allclose(judge.percent(observer), judge.percent(expected), rtol=1e-6)
+    assert max(judge.percent(observer)) < 20
+
+
+def test_it_is_certified_as_it_runs_and_its_order_counts_the_memory(made):
+    own, product = made
+    running = certify_running([own], [product])[0]
+    assert running.certificate.certified
+    assert running.rows
+    assert all(row.holds for row in running.rows)
+    assert running.blind_percent < 100
+    facts = certificate(own, product.synthesis, None)
+    assert facts["order"] == 4
+    assert "states of its own" in facts["reason"]
+
+
+@pytest.mark.parametrize(
+    ("lifting", "measured", "words"),
+    [
+        (Lifting(STATES, ("sin(velocity)",)), (0,), "should read position alone"),
+        (Lifting(STATES, ("position[-1]",)), (0,), "functions of the lifting should read"),
+        (Lifting(STATES, (), (), INPUTS, ("position*target_velocity",)), (0,), "functions of the lifting should read"),
+        (Lifting(STATES), (0, 1, 2), "needs a state that is not measured"),
+        (Lifting((*STATES[:2], "memory_1")), (0,), "names of states and parameters must differ"),
+    ],
+)
+def test_where_there_is_none_the_reason_is_told(tuning, lifting, measured, words):
+    product = produce(task(tuning, lifting, measured))
+    assert product.synthesis is None
+    assert product.facts["status"] == "failed"
+    assert words in product.facts["reason"]
+
+
+def test_tuning_is_kept_where_nothing_speaks_against_it(tuning, made):
+    own, product = made
+    start, judge = own.observer(product.synthesis), tuning.read()
+
+    def changed(factor):
+        return replace(start, A=np.concatenate([start.A[:1], factor * start.A[1:2], start.A[2:]]))
+
+    worse, facts = tuned_where_better(own, judge, start, lambda seen, o: changed(0.5))
+    assert worse is start
+    assert not facts["tuned"]
+    assert facts["held_out_percent"]["after"] > facts["held_out_percent"]["before"]
+    rough = changed(0.5)
+    better, facts = tuned_where_better(own, judge, rough, lambda seen, o: start)
+    assert better is start
+    assert facts["tuned"]
+    lost = replace(start, A=np.concatenate([1.5 * start.A[:1], start.A[1:]]))  # what predicts the measurement matters where there is none
+    lost = replace(lost, controller=replace(lost.controller, D=lost.A[:, :1]))
+    assert tuned_where_better(own, judge, start, lambda seen, o: lost)[0] is start
+    assert relift_certificate(start, mismatch=False).certified
+
+
+def test_the_verdict_claims_no_set_for_it():
+    entry = {"relift_certified": True, "worst_case_h2": None}
+    metrics = {"study": {"units": 3, "conditions": ["noload"], "identify_on": "noload", "deployed": "koopman/memory"}}
+    told = " ".join(
+        verdict(metrics | {"observers": {"koopman/memory": entry}, "uncertainty": {"koopman": {"peak_db": {"x": 1.0}, "form": "x"}}})
+    )
+    assert "“Koopman, with memory”" in told
+    assert "not designed for a set of machines" in told
+    assert "A certificate covers it as it runs" in told

@@ -1,0 +1,111 @@
+r"""Disturbance observers from a model: the load as a state that wanders, and a Kalman predictor for both.
+
+With the one-step model ``x+ = A_s x + a sigma(x) + B_s u`` of the unloaded machine, a load tau adds ``E tau``,
+
+    [ x   ]+   [ A_s  E  ] [ x   ]   [ a ]            [ B_s ]
+    [ tau ]  = [ 0   rho ] [ tau ] + [ 0 ] sigma(x) + [ 0   ] u + w,      rho = exp(-2 pi f_c T),
+
+and the residual of recordings under a known load gives E by least squares. For rho = 1 the steady state under a constant load is exact: the
+innovation has no mean, so neither has the error of anything that it determines. This asks more of the model than `load_observer`
+does, namely that its states, the controller's integrator among them, are the machine's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DataError, DimensionError
+from ...core.lti import gain
+from ...lifting import Lifting
+from ...synthesis.result import Injection
+from ...synthesis.riccati.constant_gain import kalman
+from ..observer import Observer
+from .calibrate import LOAD
+
+Array = npt.NDArray[np.float64]
+
+
+def load_direction(residual: npt.ArrayLike, load: npt.ArrayLike) -> Array:
+    """Return how a load enters the one-step residual, E of shape (n,), by least squares with the means taken off.
+
+    Parameters
+    ----------
+    residual : array_like, shape (n_samples, ..., n)
+        `one_step_residual` of recordings under a known load.
+    load : array_like, shape (n_samples, ...)
+        Of the same samples.
+
+    Raises
+    ------
+    DataError
+        When the load does not change.
+    """
+    omega, tau = np.asarray(residual, dtype=float), np.asarray(load, dtype=float).ravel()
+    omega = omega.reshape(-1, omega.shape[-1])
+    if len(omega) != len(tau):
+        raise DimensionError(f"Direction of the load: {len(omega)} residuals and {len(tau)} loads; cut both to the same samples.")
+    tau = tau - tau.mean()
+    if not tau @ tau > 0:
+        raise DataError("Direction of the load: the known load does not change; record moves under it.")
+    return np.asarray((omega - omega.mean(axis=0)).T @ tau / (tau @ tau))
+
+
+def disturbance_observer(
+    name: str,
+    observer: Observer,
+    direction: npt.ArrayLike,
+    process: npt.ArrayLike,
+    noise: npt.ArrayLike,
+    wander: float,
+    corner_hz: float = 0.0,
+    parameters: Mapping[str, float] | None = None,
+) -> Observer:
+    """Return a Kalman predictor for the states and the load.
+
+    Parameters
+    ----------
+    name : str
+    observer : Observer
+        Its model is taken; its lifting has no delays and no functions of inputs, and reads no hidden states.
+    direction : array_like, shape (n,)
+        E.
+    process : array_like, shape (n, n)
+        Covariance of the residual without load.
+    noise : array_like, shape (q,)
+        Standard deviation of the measurement's noise.
+    wander : float
+        Standard deviation of the load's change from sample to sample.
+    corner_hz : float
+        Above it the load is expected to fade; 0 for a random walk.
+    parameters : mapping of str to float
+        Default values of the lifting's parameters, the observer's own where absent.
+
+    Raises
+    ------
+    DimensionError
+        When the lifting reads earlier values or has functions of inputs, or sizes do not fit.
+    SynthesisError
+        When the load cannot be told from the measurement.
+    """
+    lifting, E = observer.lifting, np.asarray(direction, dtype=float)
+    n, functions = lifting.n_states, len(lifting.functions)
+    if lifting.history or lifting.input_functions or E.shape != (n,):
+        raise DimensionError(
+            f"Disturbance observer {name}: needs a lifting of present states alone and a direction of shape ({n},), found {E.shape}."
+        )
+    rho = float(np.exp(-2 * np.pi * corner_hz * observer.sample_period_s))
+    states = np.block([[observer.A[:n, :n], E[:, None]], [np.zeros((1, n)), np.array([[rho]])]])
+    Q = np.zeros((n + 1, n + 1))
+    Q[:n, :n], Q[n, n] = process, wander**2
+    C = np.eye(n + 1)[list(observer.measured)]
+    L = kalman(states, C, Q, np.diag(np.square(noise)), observer.sample_period_s).controller.D
+    silent = np.zeros((functions, n + 1 + functions))
+    A = np.vstack([np.hstack([states, np.vstack([observer.A[:n, n:], np.zeros((1, functions))])]), silent])
+    B = np.vstack([observer.B[:n], np.zeros((1 + functions, observer.B.shape[1]))])
+    gains = gain(np.vstack([L, np.zeros((functions, len(observer.measured)))]), observer.sample_period_s)
+    widened = Lifting((*lifting.states, LOAD), lifting.functions, lifting.parameters)
+    own = {**observer.parameters, **(parameters or {})}
+    return Observer(name, widened, A, B, observer.measured, observer.inputs, gains, Injection.STATE, observer.sample_period_s, own)

@@ -60,7 +60,5 @@ def test_what_is_made_says_that_its_weights_cover_nothing(task):
     assert facts["unstructured_excess"] > 1
     assert problem is task.problem
     assert any("bound entries" in note for note in made.notes)
-    assert (
-        float(task.problem.__class__.error_system(as_published(task.problem, gain(0.1 * np.eye(2), DT)), made.controller).spectral_radius())
-        < 1
-    )
+    loop = as_published(task.problem, gain(0.1 * np.eye(2), DT)).error_system(made.controller)
+    assert float(loop.spectral_radius()) < 1

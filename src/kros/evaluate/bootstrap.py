@@ -39,7 +39,8 @@ def unit_interval(values: npt.ArrayLike, share: float = 0.95, draws: int = 4000,
     if values.ndim < 1 or len(values) < 2 or not 0 < share < 1:
         raise DataError(f"Bootstrap over units: needs at least 2 units and a share between 0 and 1, found {values.shape} and {share}.")
     rows = np.random.default_rng(seed).integers(len(values), size=(draws, len(values)))
-    counts = np.apply_along_axis(np.bincount, 1, rows, minlength=len(values)) / len(values)
+    places = rows + len(values) * np.arange(draws)[:, None]
+    counts = np.bincount(places.ravel(), minlength=draws * len(values)).reshape(draws, len(values)) / len(values)
     means = np.tensordot(counts, values, 1)
     lower, upper = np.quantile(means, [(1 - share) / 2, (1 + share) / 2], axis=0)
     return np.asarray(lower), np.asarray(upper)

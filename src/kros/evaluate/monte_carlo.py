@@ -36,8 +36,8 @@ from ..synthesis.robust.causal import perturbed
 from .contractions import Contractions
 
 Array = npt.NDArray[Any]
-_POINTS, _LOWEST = 240, 1e-6
-_AROUND = np.concatenate([-np.geomspace(30, 0.1, 10), [0.0], np.geomspace(0.1, 30, 10)])  # of a pole's angle, in units of its damping
+_POINTS, _LOWEST = 160, 1e-6
+_AROUND = np.concatenate([-np.geomspace(20, 0.15, 8), [0.0], np.geomspace(0.15, 20, 8)])  # of a pole's angle, in units of its damping
 _ALIKE = 0.1  # relative distance of poles that share their points
 _TOGETHER = 40  # members whose spectra are in memory
 

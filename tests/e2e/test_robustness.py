@@ -1,0 +1,43 @@
+"""A study tells what its observers do on disturbed measurements and on machines that might be."""
+
+from kros.evaluate import Kind
+
+
+def test_every_disturbance_is_told_for_the_observers_of_the_kind_that_is_handed_over(metrics):
+    rows = metrics["robustness"]
+    kind = metrics["study"]["deployed"].rpartition("/")[0]
+    observers = {r["observer"] for r in rows}
+    made = {n for n, o in metrics["observers"].items() if o.get("status") != "failed" and n.startswith(f"{kind}/")}
+    assert observers == made | {"filtered_difference", "learned"} | ({"koopman/ekf"} if "koopman/ekf" in metrics["observers"] else set())
+    assert {r["disturbance"] for r in rows} == {"none", *(k.value for k in Kind)}
+    assert {r["condition"] for r in rows} == {metrics["study"]["identify_on"]}
+    for row in rows:
+        mean, worst = row["error_percent"]["mean"], row["error_percent"]["worst"]
+        assert (mean is None) == (worst is None)
+        assert mean is None or 0 < mean <= worst
+    assert {r["channel"] for r in rows if r["observer"] == "filtered_difference"} == {"velocity"}
+
+
+def test_no_member_of_the_set_exceeds_the_certificate(metrics):
+    found = metrics["monte_carlo"]
+    assert found["sets"]
+    for row in found["sets"]:
+        assert row["bound"] == metrics["observers"][row["observer"]]["worst_case_h2"]
+        assert row["noise"] <= row["quantiles"]["0.05"] * (1 + 1e-2)
+        assert row["largest"] <= row["bound"] * (1 + 1e-9)
+        assert row["unit_worst"] <= row["bound"] * (1 + 1e-2)  # by quadrature
+        assert not row["exceeded"]
+
+
+def test_intervals_of_noise_and_units_surround_the_mean(metrics):
+    for row in metrics["monte_carlo"]["noise"]:
+        for key in ("over_units", "over_both"):
+            low, high = row[key]
+            assert low <= row["error_percent"] <= high
+    for row in metrics["intervals"]:
+        values = [
+            r["error_percent"]
+            for r in metrics["evaluation"]
+            if all(r[k] == row[k] for k in ("observer", "condition", "channel")) and r["role"] == row["role"]
+        ]
+        assert row["interval"][0] <= sum(values) / len(values) <= row["interval"][1]

@@ -99,6 +99,17 @@ def test_verdict_tells_the_numbers() -> None:
     assert "Flagged as not belonging to the batch: z (loaded)." in text
 
 
+def test_verdict_tells_of_units_that_were_left_out() -> None:
+    rows = [row("koopman/worst_case_h2", unit, channel, e) for unit, e in (("b", 0.3), ("c", 0.5)) for channel in ("position", "velocity")]
+    told = " ".join(verdict({**METRICS, "left_out": {"rows": rows}}, ("position",)))
+    assert (
+        "Made without the unit it runs on, the same kind of observer estimates velocity to 0.400 % (0.500 % on the worst unit, c)" in told
+    )
+    rows[1]["error_percent"] = None
+    assert "diverges on some units" in " ".join(verdict({**METRICS, "left_out": {"rows": rows}}, ("position",)))
+    assert "Made without" not in " ".join(verdict(METRICS, ("position",)))
+
+
 @pytest.mark.parametrize("absent", ["evaluation", "observers", "outliers"])
 def test_verdict_without_a_part(absent: str) -> None:
     text = " ".join(verdict({k: v for k, v in METRICS.items() if k != absent}))

@@ -7,6 +7,7 @@ from typing import Any
 
 from ..data.population import DEFAULT_CONDITION
 from .error_table import ErrorTable, error_table
+from .left_out_table import left_out_tables
 from .names import BASELINES, condition_label, form_label, minus, number, observer_label, split_observer
 from .sections.outliers import flagged_text
 
@@ -26,7 +27,7 @@ def verdict(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[
 
 def findings(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[str]:
     """Return what was recorded, what is handed over and how well it works, and who is flagged."""
-    return [*_recorded(metrics), *_handed_over(metrics, measured), *_flagged(metrics)]
+    return [*_recorded(metrics), *_handed_over(metrics, measured), *_left_out(metrics, measured), *_flagged(metrics)]
 
 
 def trust(metrics: Mapping[str, Any]) -> list[str]:
@@ -60,6 +61,21 @@ def _handed_over(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[
     for method, label in (("open_loop", "Open loop, the nominal model alone,"), ("kalman_tuned", "The tuned Kalman filter")):
         sentences += _comparison(table, name, method, label, known)
     return sentences + _better(table, name, known)
+
+
+def _left_out(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str]:
+    """What the same method does on units that took no part."""
+    name, rows = metrics["study"].get("deployed"), metrics.get("left_out", {}).get("rows", [])
+    tables = left_out_tables([r for r in rows if r["observer"] == name], metrics["study"]["identify_on"])
+    if not tables:
+        return []
+    cells = {c: cell for c, cell in tables[0].cells[name].items() if c not in measured}
+    if any(cell.mean is None for cell in cells.values()):
+        return ["Made without the unit it runs on, the same kind of observer diverges on some units: do not use it on new ones."]
+    parts = [
+        f"{c.replace('_', ' ')} to {number(v.mean)} % ({number(v.worst)} % on the worst unit, {v.worst_unit})" for c, v in cells.items()
+    ]
+    return [f"Made without the unit it runs on, the same kind of observer estimates {_join(parts)}, in the mean."] if parts else []
 
 
 def _better(table: ErrorTable, name: str, channels: list[str]) -> list[str]:

@@ -44,6 +44,34 @@ def test_one_model_a_double_pendulum_predicts_better_than_linear_models(recordin
     assert sum(velocities) / 6 > 0.95
 
 
+def run_script(name, recordings, *options):
+    command = [sys.executable, EXAMPLES / "double_pendulum" / name, *options]
+    done = subprocess.run(command, env={**os.environ, "KROS_DATA": str(recordings)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_other_joint_is_what_makes_drives_of_double_pendulums_unlike(recordings):
+    rows = [line.split() for line in run_script("alike.py", recordings, "--factors", "100").splitlines()[1:]]
+    peaks = {(row[0], "other" in row): float(row[row.index("dB") - 1]) for row in rows}
+    for model in ("Koopman", "linear"):
+        assert peaks[model, True] > 10 > 0 > peaks[model, False]
+
+
+def test_a_drive_that_was_left_out_is_estimated_as_well_as_by_a_regression(recordings, tmp_path):
+    small = ["identify.refine=false", 'synthesis.methods=["residual_h2"]', 'observer.baselines=["open_loop"]']
+    small += ["uncertainty.n_freqs=50", "uncertainty.structure=scalar", "uncertainty.max_order=1"]
+    settings = [part for setting in small for part in ("--set", setting)]
+    options = ["--out", tmp_path / "out", "--json", "--drives", "C.0-elbow", "--alone", "--memories", "4", *settings]
+    found = json.loads(run_script("left_out.py", recordings, *options))
+    velocity = {name: row["velocity"]["mean"] for name, row in found.items()}
+    for name in ("koopman_edmd/residual_h2", "all training episodes, memory of 4, tuned"):
+        assert found[name]["running"] == 1
+        assert velocity[name] < min(1.3 * velocity["learned"], 0.8 * velocity["filtered_difference"])
+        assert velocity[name] < 0.1 * velocity["koopman_edmd/open_loop"]
+    assert found["koopman_edmd/open_loop"]["robust"] == 0
+
+
 def test_quanser_qube(recordings, tmp_path):
     metrics = run_example("quanser_qube", recordings, tmp_path / "run")
     assert metrics["study"]["units"] == 1

@@ -1,0 +1,181 @@
+"""Observers on measured drives that they do not know: every drive, or both of a build, left out of a study and estimated by what came out of it.
+
+A study (`study.toml`, with any `--set` of `kros run`) is made once a fold, from the training episodes of all other drives. Its observers, the extended
+Kalman filter of its first lifted model, a filtered difference, a regression on the past and observers with a memory run on every episode of the
+drives that were left out, those in which the drive stands still excepted. Errors are in percent of the largest value of an episode.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kros.core.artifacts import load_artifact
+from kros.data import Population, read_parquet, split_episodes
+from kros.evaluate import EpisodeBatch, error_percent, unit_interval
+from kros.identify import ModelSet
+from kros.lifting import Lifting
+from kros.observer import Observer, observer_with_memory, relift_certificate, run_observer
+from kros.study import Stage, StudyConfig, load_config, run_study
+from kros.study.estimators import make_difference, make_extended, make_learned
+from kros.study.tuning import TuningSet
+
+HERE = Path(__file__).parent
+STILL_RAD = 0.05  # a drive that moves less stands still, and percent of its noise say nothing
+SHOWN = ("velocity", "torque")
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one estimator did on one drive: mean errors of the states over its episodes, and what holds for it."""
+
+    drive: str
+    percent: np.ndarray
+    states: int | None
+    running: bool | None
+    robust: bool | None
+
+
+def main() -> None:
+    """Run all folds and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/double_pendulum_left_out"))
+    parser.add_argument("--drives", nargs="+", help="leave out these alone")
+    parser.add_argument("--builds", action="store_true", help="leave out both drives of a build at once")
+    parser.add_argument("--alone", action="store_true", help="without the other joint's motion as inputs: the commanded torque alone")
+    parser.add_argument("--memories", type=int, nargs="*", default=[4, 12], help="states of the observers with a memory")
+    parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="as for kros run")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    if "KROS_DATA" not in os.environ:
+        sys.exit("Set KROS_DATA to the folder that holds dfki_double_pendulum; study.toml says where it is published.")
+    settings = [f"data.source={Path(os.environ['KROS_DATA']) / 'dfki_double_pendulum'}", *options.settings]
+    config = load_config(HERE / "study.toml", settings)
+    config = without_other_joint(config) if options.alone else config
+    run_study(config, options.out / "all", Stage.READ)
+    source = next((options.out / "all").glob("*/population.json")).parent
+    recordings, table = read_parquet(source), dict[str, list[Row]]()
+    for held in folds(recordings.unit_ids, options.builds, options.drives):
+        changes = {"source": source.absolute(), "reader": "parquet", "prepare": (), "csv": None, "exclude": held}
+        folder = options.out / "+".join(held)
+        run_study(config.model_copy(update={"data": config.data.model_copy(update=changes)}), folder, Stage.SYNTHESIZE)
+        for name, rows in judged(recordings, held, folder, options.memories).items():
+            table.setdefault(name, []).extend(rows)
+    sys.stdout.write(json.dumps(summary(table)) + "\n" if options.json else text(summary(table)))
+
+
+def without_other_joint(config: StudyConfig) -> StudyConfig:
+    """Return the study with the commanded torque as its only input."""
+    mapping = dict(config.data.csv or {})
+    mapping["channel"] = [c for c in mapping["channel"] if not c["name"].startswith("other")]
+    units = [u["columns"].items() for u in mapping["unit"]]
+    columns = [{name: column for name, column in own if not name.startswith("other")} for own in units]
+    mapping["unit"] = [{**u, "columns": own} for u, own in zip(mapping["unit"], columns, strict=True)]
+    return config.model_copy(update={"data": config.data.model_copy(update={"csv": mapping})})
+
+
+def folds(drives: Sequence[str], builds: bool, wanted: Sequence[str] | None) -> list[tuple[str, ...]]:
+    """Return the drives of every fold: one, or those of a build."""
+    of = {d: d.partition("-")[0] if builds else d for d in drives}
+    found = [tuple(d for d in drives if of[d] == name) for name in dict.fromkeys(of.values())]
+    return [held for held in found if wanted is None or set(held) & set(wanted)]
+
+
+def judged(recordings: Population, held: Sequence[str], folder: Path, memories: Sequence[int]) -> dict[str, list[Row]]:
+    """Run everything on the episodes of drives that were left out."""
+    others = recordings.select([u for u in recordings.unit_ids if u not in held])
+    train = tuple(k for s in split_episodes(others).values() for k in s.train)
+    tuning = TuningSet(others, train, {u: {} for u in others.unit_ids})
+    table: dict[str, list[Row]] = {}
+    for drive in held:
+        keys = [k for k in recordings.keys(drive) if np.ptp(recordings.read(k)[:, 0]) > STILL_RAD]
+        batch = EpisodeBatch.read(recordings, keys)
+
+        def add(name: str, estimate: np.ndarray, *facts: Any, batch: EpisodeBatch = batch, drive: str = drive) -> None:
+            percent = error_percent(estimate[..., : batch.states.shape[-1]], batch.states, batch.lengths).mean(axis=0)
+            table.setdefault(name, []).append(Row(drive, percent, *facts))
+
+        for name, observer, facts in [*of_study(folder), *with_memory(tuning, memories)]:
+            own = observer.controller.n_states + observer.lifting.n_states - batch.states.shape[-1]
+            run = run_observer(observer, batch.states[..., list(observer.measured)], batch.inputs)
+            add(name, run, own, facts["relift_certified"], facts.get("worst_case_h2") is not None)
+        for name, make in baselines(tuning, folder).items():
+            add(name, make().run(batch, {}), None, None, None)
+    return table
+
+
+def of_study(folder: Path) -> list[tuple[str, Observer, Mapping[str, Any]]]:
+    """Return the observers of a fold's study with what its records say."""
+    record = load_artifact(folder / "observers", "observers")[0]
+    return [(name, Observer.load(folder / "observers" / f"{name}.json"), record["facts"][name]) for name in record["names"]]
+
+
+def with_memory(tuning: TuningSet, memories: Sequence[int]) -> list[tuple[str, Observer, Mapping[str, Any]]]:
+    """Return linear observers with a memory from all training episodes, as regression gives them and tuned."""
+    batch, population = tuning.read().batch, tuning.population
+    units = [k.unit for k in batch.keys]
+    found = []
+    for count in memories:
+        for steps, how in ((0, ""), (25, ", tuned")):
+            name = f"all training episodes, memory of {count}{how}"
+            observer = observer_with_memory(
+                name, Lifting(population.states), (0,), population.inputs, batch.states, batch.inputs, batch.lengths, units,
+                population.sample_period_s, memories=count, episodes=len(units), iterations=steps,
+            )  # fmt: skip
+            found.append((name, observer, {"relift_certified": relift_certificate(observer, mismatch=False).certified}))
+    return found
+
+
+def baselines(tuning: TuningSet, folder: Path) -> dict[str, Any]:
+    """Return what makes the baselines that are no correction of a model."""
+    names = [n for n in ("koopman", "koopman_edmd") if (folder / "models" / n).exists()]
+    models = ModelSet.load(folder / "models" / names[0])
+    nominal = load_artifact(folder / "uncertainty", "choice")[0]["nominal"]
+    resolution = load_artifact(folder / "population", "facts")[0]["resolution"]
+    noise = np.array([resolution[models.lifting.states[i]] / np.sqrt(12) for i in models.measured])
+    return {
+        f"{names[0]}/ekf": partial(make_extended, tuning, models, nominal, noise),
+        "filtered_difference": partial(make_difference, tuning, models.measured),
+        "learned": partial(make_learned, tuning, models.lifting, models.measured),
+        "learned, linear": partial(make_learned, tuning, Lifting(models.lifting.states), models.measured),
+    }
+
+
+def summary(table: Mapping[str, Sequence[Row]]) -> dict[str, dict[str, Any]]:
+    """Return means over the drives with their interval, and the worst drive, by estimator."""
+    found = {}
+    for name, rows in table.items():
+        percent = np.array([row.percent[1:] for row in rows])
+        low, high = unit_interval(percent) if len(rows) > 1 else (percent[0], percent[0])
+        states = sorted({row.states for row in rows if row.states is not None})
+        errors = {
+            channel: {"mean": float(percent[:, i].mean()), "interval": [float(low[i]), float(high[i])], "worst": float(percent[:, i].max())}
+            for i, channel in enumerate(SHOWN)
+        }
+        proofs = {key: None if getattr(rows[0], key) is None else sum(getattr(r, key) for r in rows) for key in ("running", "robust")}
+        found[name] = {"drives": len(rows), "states": states, **proofs, **errors}
+    return found
+
+
+def text(found: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the table."""
+    lines = [f"{'observer':44s} {'states':>7s} {'as it runs':>10s} {'in the set':>10s} {'velocity':>30s} {'torque':>30s}"]
+    for name, row in found.items():
+        proofs = ["-" if row[key] is None else f"{row[key]}/{row['drives']}" for key in ("running", "robust")]
+        cells = [f"{e['mean']:8.3g} {'({:.3g}, {:.3g})'.format(*e['interval']):>13s} {e['worst']:7.3g}" for e in (row[c] for c in SHOWN)]
+        states = "-" if not row["states"] else "/".join(map(str, row["states"]))
+        lines.append(f"{name:44s} {states:>7s} {proofs[0]:>10s} {proofs[1]:>10s} {cells[0]:>30s} {cells[1]:>30s}")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ..core.errors import KrosError
 from ..data.population import EpisodeKey
 from ..observer import Observer, relift_certificate
-from .relift import LOST, blind_percent, first_episodes, scales_of
+from .relift import LOST, blind_percent, scales_of
 from .tuning import Judge, hidden_mean
 
 if TYPE_CHECKING:
@@ -48,7 +48,8 @@ def tuned_where_better(
         For the records: whether the tuned one was kept, and the errors that decided.
     """
     held = held_out(judge.batch.keys)
-    unseen, first = judge.part([i for i in range(len(held)) if held[i]]), first_episodes(task.tuning).read()
+    unseen = judge.part([i for i in range(len(held)) if held[i]])
+    first = judge.part([i for i, key in enumerate(judge.batch.keys) if key.unit not in {k.unit for k in judge.batch.keys[:i]}])
     try:
         tuned = tune(judge.part([i for i in range(len(held)) if not held[i]]), start)
     except KrosError as error:

@@ -27,7 +27,7 @@ from typing import Any
 
 from kros.core.artifacts import write_json
 from kros.report.left_out_table import PAPER, LeftOutCell, LeftOutTable, left_out_tables
-from kros.report.names import BASELINES, split_observer
+from kros.report.names import BASELINES, number, split_observer
 from kros.study import load_config, run_study
 from kros.study.config import Stage, SynthesisConfig
 from kros.study.demo import simulate_to
@@ -35,6 +35,11 @@ from kros.study.executors import available_cores
 from kros.study.progress import Lines
 
 HOME, HIDDEN, LEARNED, ENTRYWISE = "noload", ("velocity", "current"), "learned", "koopman_edmd/paper"
+SHOWN = (
+    *("koopman/open_loop", "koopman/kalman_tuned", "koopman/luenberger", "koopman/ekf", "filtered_difference", LEARNED),
+    *(PAPER, ENTRYWISE, "linear_edmd/paper", "koopman/worst_case_h2", "koopman/residual_h2", "koopman_edmd/residual_h2"),
+    *("linear/residual_h2", "koopman/memory", "linear/memory"),
+)
 Facts = Mapping[str, Mapping[str, Any]]
 
 
@@ -51,6 +56,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=available_cores())
     parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[])
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--markdown", action="store_true", help="print tables as in docs/observers.md, of the observers named there")
     options = parser.parse_args()
     verdicts = []
     with tempfile.TemporaryDirectory() as scratch:
@@ -66,7 +72,9 @@ def main() -> None:
                 continue
             say(f"{title} ({time.perf_counter() - began:.0f} s)")
             tables = left_out_tables(left_out["rows"], HOME)
-            for table in tables:
+            if options.markdown:
+                say("\n".join(["", *markdown(tables, left_out["observers"], options.folds), ""]))
+            for table in [] if options.markdown else tables:
                 show(table, left_out["observers"], options.folds)
             verdicts.append((title, asked({t.condition: t for t in tables}, left_out["observers"], options.folds)))
             say("\n".join(verdicts[-1][1]))
@@ -92,8 +100,8 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
     config = load_config(study, options.set)
     result = run_study(config, folder / "run", until=Stage.LEFT_OUT, workers=options.workers, progress=Lines())
     left_out: dict[str, Any] = result.metrics["left_out"]
-    for number, reason in left_out["failed"].items():
-        say(f"fold {number} failed: {reason}")
+    for fold, reason in left_out["failed"].items():
+        say(f"fold {fold} failed: {reason}")
     write_json(folder / "left_out.json", left_out)
     return left_out
 
@@ -111,6 +119,13 @@ def show(table: LeftOutTable, facts: Facts, folds: int) -> None:
         say(f"{name:31s} {orders:>5s} {proofs[0]:>5s} {proofs[1]:>5s} " + " ".join(numbers(cells.get(c)) for c in channels))
 
 
+def rounded(cell: LeftOutCell | None) -> str:
+    """Return mean, interval and worst unit to three digits."""
+    if cell is None or cell.mean is None:
+        return "– | –" if cell is None else "diverged | –"
+    return f"{number(cell.mean)} ({number(cell.low)}–{number(cell.high)}) | {number(cell.worst)}"
+
+
 def numbers(cell: LeftOutCell | None) -> str:
     """Return the numbers of one channel."""
     if cell is None:
@@ -119,6 +134,22 @@ def numbers(cell: LeftOutCell | None) -> str:
         return f"{'diverged':>45s}"
     band = f"{cell.band_db:8.1f}" if cell.band_db is not None else f"{'-':>8s}"
     return f"{cell.mean:8.4f} {f'({cell.low:.4f}, {cell.high:.4f})':>18s} {cell.worst:8.4f} {band}"
+
+
+def markdown(tables: list[LeftOutTable], facts: Facts, folds: int) -> list[str]:
+    """Return the rows of a table for people: velocity and current at home, velocity elsewhere, powers around the gearbox frequency at home."""
+    places = [(tables[0], "velocity"), (tables[0], "current"), *((table, "velocity") for table in tables[1:])]
+    head = [f"{channel}, {table.condition} | worst" for table, channel in places]
+    lines = [" | ".join(["| observer | states | runs | set", *head, "band, velocity | current |"]), "|---" * (2 * len(places) + 6) + "|"]
+    for name in (n for n in SHOWN if n in tables[0].cells):
+        own, cells = facts[name], tables[0].cells[name]
+        row = [f"`{name}`", "/".join(map(str, own["orders"])) or "–"]
+        row += ["–" if own[key] is None else f"{own[key]}/{folds}" for key in ("relift_certified", "robust")]
+        row += [rounded(table.cells[name].get(channel)) for table, channel in places]
+        bands = [cells[c].band_db if c in cells else None for c in HIDDEN]
+        row += ["–" if b is None else f"{b:.0f}".replace("-", "−") for b in bands]
+        lines.append(f"| {' | '.join(row)} |")
+    return lines
 
 
 def asked(tables: Mapping[str, LeftOutTable], facts: Facts, folds: int) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...evaluate.errors import error_spectrum
-from ..names import is_koopman, observer_label, observer_look, split_observer
+from ..names import observer_label, observer_look, split_observer
 from ..run_folder import RunFolder, Shown
 from .spectra import band, band_shares, density_label, draw_spectra, robust_top, share_text
 from .trajectories import states
@@ -57,14 +57,18 @@ def draw_rows(run: RunFolder, axes: npt.NDArray[Any], rows: Sequence[SpectraRow]
         axes[-1, i].set_xlabel("frequency (Hz)")
 
 
-def share_sentence(run: RunFolder, spectra: Mapping[str, Array], pair: Sequence[str], where: str) -> str:
-    """Return what is shaded, and how much of the linear twin's power in it the lifted observer leaves."""
+def share_sentence(run: RunFolder, spectra: Mapping[str, Array], paper: Sequence[str], pair: Sequence[str], where: str) -> str:
+    """Return what is shaded, and how much of the other's power in it the paper's Koopman observer and the one that is handed over leave."""
     band_hz = run.evaluation.get("band_hz")
     if band_hz is None:
         return ""
+    compared = [(paper[-1], paper[0])] if len(paper) > 1 else []
+    compared.append((pair[-1], paper[-1] if paper else pair[0]))
+    parts = []
+    for own, other in compared:
+        if own != other and {own, other} <= spectra.keys():
+            shares = band_shares(run.arrays["freqs_hz"], spectra[own], spectra[other], states(run)[:4], band_hz)
+            parts.append(f"{observer_label(own)} leaves {share_text(shares, states(run))} of the power of {observer_label(other)}")
     text = " Shaded: the band around the gearbox frequency at top speed"
-    twin, own = pair[0], pair[-1]
-    if is_koopman(own) != is_koopman(twin) and {own, twin} <= spectra.keys():
-        shares = band_shares(run.arrays["freqs_hz"], spectra[own], spectra[twin], states(run)[:4], band_hz)
-        text += f", where {where} {observer_label(own)} leaves, relative to {observer_label(twin)}, this much power: {share_text(shares, states(run))}"
+    text += f", where {where} " + ", and ".join(parts) if parts else ""
     return text + f". Linear scales end at the largest value above {_ABOVE_HZ:g} Hz."

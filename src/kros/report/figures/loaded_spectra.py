@@ -29,4 +29,4 @@ def draw(run: RunFolder) -> Drawing:
     draw_rows(run, axes, rows)
     legend(figure, axes[-1, 0], columns=2)
     text = f"Power spectral densities of the errors in the episode above ({condition_label(shown.key.condition)})."
-    return Drawing(figure, text + share_sentence(run, spectra, names, "in this episode"))
+    return Drawing(figure, text + share_sentence(run, spectra, paper, names, "in this episode"))

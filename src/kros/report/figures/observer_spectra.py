@@ -35,4 +35,4 @@ def draw(run: RunFolder) -> Drawing:
     legend(figure, axes[-1, 0], columns=2)
     text = "Power spectral densities of the estimation errors: the episode that is shown above of the nominal and of the worst off-nominal unit, "
     text += "and the mean over all units but the nominal one."
-    return Drawing(figure, text + share_sentence(run, others, names, "off nominal"))
+    return Drawing(figure, text + share_sentence(run, others, paper, names, "off nominal"))

@@ -66,7 +66,7 @@ def _caption(run: RunFolder, names: Sequence[str]) -> str:
     measured = " and ".join(c.name for c in states(run) if c.measured)
     text = f"Estimates from {measured} alone, as recorded. "
     if run.calibrated and any(is_koopman(n) for n in names):
-        text += "On the right, how much of the gearbox oscillation each of them follows; a linear model can only give the average. "
+        text += "On the right, how much of the gearbox oscillation each of them follows. "
     return (
         text + "The start shows how fast an observer finds the true state: all begin at the first measurement with everything else at zero."
     )

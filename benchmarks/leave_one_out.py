@@ -3,7 +3,8 @@
     python benchmarks/leave_one_out.py --loop stiff soft --spread 1 3 --units 12 --folds 3 --out populations/
 
 Every population is simulated and studied with ``[evaluate] folds``: for each fold the whole study is made on the other units. Prints a table for
-every condition: in how many folds an observer is certified as it runs ("runs") and for the uncertain set ("set"); mean over the units with the 95 %
+every condition: in how many folds an observer is certified as it runs ("runs") and for the uncertain set ("set"), and in how many it could be made
+where not in all; mean over the units with the 95 %
 interval of a bootstrap over units, and the worst unit, of the states that are not measured, in percent of the range; power of the error around the
 gearbox frequency in dB relative to the paper's own observer, `koopman_edmd/mixed`. Below it: what is asked of the table, and by how much it is met or
 missed. ``--set KEY=VALUE`` changes the study; with ``--out`` runs are kept, and found done the next time
@@ -116,7 +117,8 @@ def show(table: LeftOutTable, facts: Facts, folds: int) -> None:
         own = facts[name]
         orders = "/".join(map(str, own["orders"])) or "-"
         proofs = [f"{own[key]}/{folds}" if own[key] is not None else "-" for key in ("relift_certified", "robust")]
-        say(f"{name:31s} {orders:>5s} {proofs[0]:>5s} {proofs[1]:>5s} " + " ".join(numbers(cells.get(c)) for c in channels))
+        made = name if own["made"] == folds else f"{name} ({own['made']}/{folds})"
+        say(f"{made:31s} {orders:>5s} {proofs[0]:>5s} {proofs[1]:>5s} " + " ".join(numbers(cells.get(c)) for c in channels))
 
 
 def rounded(cell: LeftOutCell | None) -> str:
@@ -143,7 +145,8 @@ def markdown(tables: list[LeftOutTable], facts: Facts, folds: int) -> list[str]:
     lines = [" | ".join(["| observer | states | runs | set", *head, "band, velocity | current |"]), "|---" * (2 * len(places) + 6) + "|"]
     for name in (n for n in SHOWN if n in tables[0].cells):
         own, cells = facts[name], tables[0].cells[name]
-        row = [f"`{name}`", "/".join(map(str, own["orders"])) or "–"]
+        made = "" if own["made"] == folds else f" ({own['made']}/{folds})"
+        row = [f"`{name}`{made}", "/".join(map(str, own["orders"])) or "–"]
         row += ["–" if own[key] is None else f"{own[key]}/{folds}" for key in ("relift_certified", "robust")]
         row += [rounded(table.cells[name].get(channel)) for table, channel in places]
         bands = [cells[c].band_db if c in cells else None for c in HIDDEN]

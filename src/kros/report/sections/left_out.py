@@ -39,7 +39,8 @@ def _table(table: LeftOutTable, facts: Mapping[str, Mapping[str, Any]], folds: i
     rows = []
     for observer, cells in table.cells.items():
         own = facts[observer]
-        row = [Cell(observer_label(observer)), Cell("/".join(map(str, own["orders"])) or "–")]
+        made = "" if own["made"] == folds else f"in {own['made']} of {folds} folds"
+        row = [Cell(observer_label(observer), note=made), Cell("/".join(map(str, own["orders"])) or "–")]
         row += [Cell(_count(own[key], folds)) for key in ("relift_certified", "robust")]
         for channel in channels:
             row += _cells(table, channel, cells.get(channel), powers)

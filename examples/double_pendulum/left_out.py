@@ -162,18 +162,29 @@ def summary(table: Mapping[str, Sequence[Row]]) -> dict[str, dict[str, Any]]:
             for i, channel in enumerate(SHOWN)
         }
         proofs = {key: None if getattr(rows[0], key) is None else sum(getattr(r, key) for r in rows) for key in ("running", "robust")}
-        found[name] = {"drives": len(rows), "states": states, **proofs, **errors}
+        found[name] = {"drives": len(rows), "states": states, **proofs, **errors, "to_learned": to_learned(rows, table["learned"])}
     return found
+
+
+def to_learned(rows: Sequence[Row], learned: Sequence[Row]) -> list[float]:
+    """Return the geometric mean over the drives of the velocity error relative to the learned estimator's, drive by drive, and its interval."""
+    other = {row.drive: row.percent[1] for row in learned}
+    ratios = np.log([row.percent[1] / other[row.drive] for row in rows])
+    low, high = unit_interval(ratios) if len(rows) > 1 else (ratios[0], ratios[0])
+    return [float(np.exp(value)) for value in (ratios.mean(), low, high)]
 
 
 def text(found: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the table."""
-    lines = [f"{'observer':44s} {'states':>7s} {'as it runs':>10s} {'in the set':>10s} {'velocity':>30s} {'torque':>30s}"]
+    lines = [
+        f"{'observer':44s} {'states':>7s} {'as it runs':>10s} {'in the set':>10s} {'velocity':>30s} {'to learned':>20s} {'torque':>30s}"
+    ]
     for name, row in found.items():
         proofs = ["-" if row[key] is None else f"{row[key]}/{row['drives']}" for key in ("running", "robust")]
         cells = [f"{e['mean']:8.3g} {'({:.3g}, {:.3g})'.format(*e['interval']):>13s} {e['worst']:7.3g}" for e in (row[c] for c in SHOWN)]
+        ratio = "{:.3g} ({:.3g}, {:.3g})".format(*row["to_learned"])
         states = "-" if not row["states"] else "/".join(map(str, row["states"]))
-        lines.append(f"{name:44s} {states:>7s} {proofs[0]:>10s} {proofs[1]:>10s} {cells[0]:>30s} {cells[1]:>30s}")
+        lines.append(f"{name:44s} {states:>7s} {proofs[0]:>10s} {proofs[1]:>10s} {cells[0]:>30s} {ratio:>20s} {cells[1]:>30s}")
     return "\n".join(lines) + "\n"
 
 

@@ -9,13 +9,14 @@ from .accuracy import LoadAccuracy, load_accuracy, ripple_power
 from .calibrate import LoadCalibration, calibrate_load
 from .disturbance import disturbance_observer, load_direction
 from .from_current import TorqueScale, calibrate_torque, load_from_current
-from .level import AngleLoad, RunningAngleLoad
+from .level import AngleLoad, LoadAndCurrent, RunningAngleLoad
 from .made import load_observer
 from .signals import known_load, low_passed, without_level
 
 __all__ = [
     "AngleLoad",
     "LoadAccuracy",
+    "LoadAndCurrent",
     "LoadCalibration",
     "RunningAngleLoad",
     "TorqueScale",

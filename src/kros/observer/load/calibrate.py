@@ -70,7 +70,7 @@ def calibrate_load(
     sample_period_s: float,
     parameters: Mapping[str, npt.ArrayLike] | None = None,
     current: int | None = None,
-    level_s: float = 3.0,
+    level_s: float = 10.0,
     corner_hz: float | None = None,
     limit: float | None = None,
     delays: int = 20,

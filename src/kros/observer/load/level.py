@@ -1,4 +1,4 @@
-r"""The level of a load that is fixed to an angle.
+r"""The level of a load that is fixed to an angle, and drives at their current limit.
 
 What is seen of a load lacks its level (`without_level`). A mass mounted off the axis takes ``tau = c_1 sin(theta) + c_2 cos(theta)`` plus what is fast. The
 same filter makes ``psi = H phi`` of ``phi = [sin(theta), cos(theta)]``, so that the seen part tells c by least squares as soon as the machine turns,
@@ -7,6 +7,10 @@ same filter makes ``psi = H phi`` of ``phi = [sin(theta), cos(theta)]``, so that
           \hat\tau = \hat\tau_s + (\varphi - \psi)^T \hat c .
 
 Only what is missing is filled in: fast and unexpected loads pass as they are seen, and without load c stays near zero.
+
+A controller at its limit holds its integrator back, and from then on differs from the one that an observer knows. Where the total current comes out beyond
+the limit, the excess is taken off the load, and forgotten as slowly as levels are. If that would move the load by more than `believed` from
+what c says of the angle, it is no load: changes are counted anew from there, and the excess is taken off what the unloaded machine needs.
 """
 
 from __future__ import annotations
@@ -16,9 +20,17 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .signals import without_level
+from ...core.errors import DimensionError
 
 Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LoadAndCurrent:
+    """Load and total current with their levels, both of one shape and, as they are here, in the current's unit."""
+
+    load: Array
+    current: Array
 
 
 @dataclass(frozen=True)
@@ -28,49 +40,87 @@ class AngleLoad:
     Parameters
     ----------
     level_s : float, s
-        Of the load observer.
+        Of the load observer (`LoadCalibration`).
     sample_period_s : float
     settling_s : float, s
         Time at full swing (sin^2 of one half) after which half of c is believed.
+    limit : float
+        Of the current; infinite where there is none.
+    believed : float
+        Most that a load at the current's limit differs from what the angle says, as a share of the limit.
     """
 
     level_s: float
     sample_period_s: float
     settling_s: float = 0.1
+    limit: float = np.inf
+    believed: float = 0.5
 
-    def run(self, seen: npt.ArrayLike, position: npt.ArrayLike) -> Array:
-        """Return loads with their level, shape (n_samples, batch), from seen parts and measured angles in rad, of that shape."""
-        seen, position = np.asarray(seen, dtype=float), np.asarray(position, dtype=float)
-        phi = np.stack([np.sin(position), np.cos(position)], axis=-1)
-        psi = without_level(phi, self.level_s, self.sample_period_s)
-        gram = np.cumsum(psi[..., :, None] * psi[..., None, :], axis=0) * self.sample_period_s + self._trust
-        right = np.cumsum(psi * seen[..., None], axis=0) * self.sample_period_s
-        return np.asarray(seen + np.sum((phi - psi) * np.linalg.solve(gram, right[..., None])[..., 0], axis=-1))
+    def run(self, seen: npt.ArrayLike, current: npt.ArrayLike, position: npt.ArrayLike) -> LoadAndCurrent:
+        """Return loads and currents with their levels.
 
-    @property
-    def _trust(self) -> Array:
-        return 0.5 * self.settling_s * np.eye(2)
+        Parameters
+        ----------
+        seen : array_like, shape (n_samples, batch)
+            The observer's load, in the current's unit.
+        current : array_like, shape (n_samples, batch)
+            The observer's current.
+        position : array_like, shape (n_samples, batch), rad
+            As measured.
+        """
+        seen, current, position = (np.asarray(x, dtype=float) for x in (seen, current, position))
+        if seen.ndim != 2 or not seen.shape == current.shape == position.shape:
+            raise DimensionError(
+                f"Level of a load: seen part {seen.shape}, current {current.shape} and position {position.shape} should all be (n_samples, batch)."
+            )
+        running, found = self.start(position[0]), LoadAndCurrent(np.empty_like(seen), np.empty_like(seen))
+        for k in range(len(seen)):
+            found.load[k], found.current[k] = running.step(seen[k], current[k], position[k])
+        return found
 
-    def start(self, position: float) -> RunningAngleLoad:
-        """Return the same, sample by sample, for a machine that starts at an angle in rad."""
-        return RunningAngleLoad(self, float(position))
+    def start(self, position: npt.ArrayLike) -> RunningAngleLoad:
+        """Return the same sample by sample, for machines that start at angles in rad, shape (batch,)."""
+        return RunningAngleLoad(self, np.atleast_1d(np.asarray(position, dtype=float)))
 
 
 class RunningAngleLoad:
-    """`AngleLoad` sample by sample."""
+    """`AngleLoad` sample by sample, for some machines at once."""
 
-    def __init__(self, settings: AngleLoad, position: float) -> None:
+    def __init__(self, settings: AngleLoad, position: Array) -> None:
         self.settings = settings
         self._pole = float(np.exp(-settings.sample_period_s / settings.level_s))
-        self._before = np.array([np.sin(position), np.cos(position)])
-        self._psi, self._gram, self._right = np.zeros(2), settings._trust, np.zeros(2)
+        self._phi = np.stack([np.sin(position), np.cos(position)])
+        self._psi, self._right = np.zeros_like(self._phi), np.zeros_like(self._phi)
+        self._excess, self._need = np.zeros_like(position), np.zeros_like(position)  # taken off the load, and off the unloaded current
+        trust = np.full_like(position, 0.5 * settings.settling_s)
+        self._gram = np.stack([trust, np.zeros_like(position), trust])  # of sin sin, sin cos, cos cos
 
-    def step(self, seen: float, position: float) -> float:
-        """Return the load now, from its seen part and the measured angle in rad."""
-        phi = np.array([np.sin(position), np.cos(position)])
-        self._psi = self._pole * self._psi + phi - self._before
-        self._before = phi
-        dt = self.settings.sample_period_s
-        self._gram = self._gram + np.outer(self._psi, self._psi) * dt
-        self._right = self._right + self._psi * seen * dt
-        return float(seen + (phi - self._psi) @ np.linalg.solve(self._gram, self._right))
+    def step(self, seen: Array, current: Array, position: Array) -> tuple[Array, Array]:
+        """Return load and total current now, from the observer's and the measured angles in rad; all of shape (batch,)."""
+        phi = np.stack([np.sin(position), np.cos(position)])
+        self._psi = psi = self._pole * self._psi + phi - self._phi
+        self._phi = phi
+        self._excess *= self._pole
+        self._need *= self._pole
+        coefficients = self._coefficients()
+        of_angle = np.sum(phi * coefficients, axis=0)
+        load = seen - self._excess + of_angle - np.sum(psi * coefficients, axis=0)
+        total = current - seen - self._need + load
+        bounded = np.clip(total, -self.settings.limit, self.settings.limit)
+        beyond = bounded != total
+        if beyond.any():
+            shifted = load - (total - bounded)
+            trusted = beyond & (np.abs(shifted - of_angle) <= self.settings.believed * self.settings.limit)
+            anew = beyond & ~trusted
+            self._excess[trusted] += (total - bounded)[trusted]
+            load[trusted] = shifted[trusted]
+            psi[:, anew], self._excess[anew], load[anew] = 0.0, seen[anew], of_angle[anew]
+            self._need[anew] = (current - seen + load - bounded)[anew]
+        learns = np.where(beyond, 0.0, self.settings.sample_period_s)
+        self._gram += learns * np.stack([psi[0] ** 2, psi[0] * psi[1], psi[1] ** 2])
+        self._right += learns * psi * (seen - self._excess)
+        return load, bounded
+
+    def _coefficients(self) -> Array:
+        a, b, d = self._gram
+        return np.stack([d * self._right[0] - b * self._right[1], a * self._right[1] - b * self._right[0]]) / (a * d - b * b)

@@ -75,7 +75,8 @@ def run_study(
     if not fresh and not (out / "study.json").exists():
         raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
     read.check_source(config, single_allowed=list(Stage).index(until) <= list(Stage).index(Stage.IDENTIFY))
-    left_out.check_folds(config, read.open_source(config))
+    if left_out.wanted(config):
+        left_out.check_folds(config, read.open_source(config))
     store = Store(out)
     try:
         with open_executor(workers, scheduler) as executor:

@@ -35,8 +35,7 @@ def wanted(config: StudyConfig) -> bool:
 
 def check_folds(config: StudyConfig, population: Population) -> None:
     """Refuse more folds than there are units, or so few that one of them leaves no population to learn from."""
-    if wanted(config):
-        parted([u.id for u in population.units if u.group != OUTLIERS], config.evaluate.folds)
+    parted([u.id for u in population.units if u.group != OUTLIERS], config.evaluate.folds)
 
 
 def parted(units: Sequence[str], folds: int) -> list[list[str]]:

@@ -5,21 +5,35 @@ import pytest
 
 from kros.core.errors import DataError, DimensionError
 from kros.lifting import Lifting
-from kros.observer import Observer, Past, relift_certificate, remembering_observer, run_observer, tune_observer
+from kros.observer import (
+    Observer,
+    Past,
+    observer_with_memory,
+    relift_certificate,
+    remembering_observer,
+    run_observer,
+    tune_memory,
+    tune_observer,
+)
 from kros.synthesis import Injection, kalman
 from kros.synthesis.residual.shaping import Bank
 
 DT = 0.01
 LIFTING = Lifting(("p", "c"), ("sin(5*p + phase)",), ("phase",))
-NAMES = ("target", "push")
+NAMES, UNITS = ("target", "push"), list("aabbcc")
 
 
-def controlled(n_samples=2500, batch=6, seed=0):
-    """The hidden state is the command of a controller with an integrator: it is known from the past of tracking errors, not from p."""
+def controlled(n_samples=2500, batch=6, seed=0, home=0.0):
+    """The hidden state is the command of a controller with an integrator: it is known from the past of tracking errors, not from p.
+
+    With `home` machines rest in places of that standard deviation at first: M is exact.
+    """
     rng = np.random.default_rng(seed)
     target = np.cumsum(0.01 * rng.normal(size=(n_samples, batch)), axis=0)
     push, phase = rng.normal(size=(n_samples, batch)), rng.uniform(-3, 3, batch)
     x, integral = np.zeros((n_samples, batch, 2)), np.zeros(batch)
+    x[0, :, 0] = home * rng.normal(size=batch)
+    target += x[0, :, 0] - target[0]
     for k in range(n_samples - 1):
         p, c = x[k].T
         error = target[k] - p
@@ -126,3 +140,48 @@ def test_it_starts_at_rest(made):
     estimates = run_observer(observer, y, u, phase)
     np.testing.assert_allclose(estimates[1, :, 1:], estimates[0, :, 1:], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(observer.start([0.7], {"phase": phase["phase"][2]}).step([0.7], u[0, 2]), estimates[1, 2], rtol=1e-12)
+
+
+def test_tuning_finds_the_controller_of_which_the_hidden_state_is_the_command():
+    x, u, phase = controlled(home=3.0)
+    past = Past.of(LIFTING, (0,), x, u, [2500] * 6, UNITS, phase, Bank(20))
+    (F, _, _), criterion = tune_memory(past.model(2), past, x, u, UNITS, phase, iterations=40, least_gain=1e-6)
+    assert list(criterion) == sorted(criterion, reverse=True)
+    np.testing.assert_allclose(np.sort(np.linalg.eigvals(F).real), [0.5, 0.99], atol=2e-3)
+
+
+def test_deviation_is_what_recordings_of_machines_that_deviate_would_say():
+    x, u, phase = controlled()
+    make = [
+        Past.of(Lifting(("p", "c"), (f"{a}*sin(5*p + phase)",), ("phase",)), (0,), x, u, [2500] * 6, UNITS, phase, Bank(20))
+        for a in (0.6, 1.4)
+    ]
+    plain = Past.of(LIFTING, (0,), x, u, [2500] * 6, UNITS, phase, Bank(20))
+    both = Past(
+        LIFTING,
+        (0,),
+        plain.bank,
+        plain.static,
+        plain.free,
+        plain.units,
+        *((getattr(make[0], n) + getattr(make[1], n)) / 2 for n in ("gram", "cross", "power")),
+    )
+    for found, expected in zip(plain.model(4, deviation=0.4), both.model(4), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
+
+
+def test_the_whole_way_gives_an_observer_that_is_certified():
+    x, u, phase = controlled(home=3.0)
+    observer = observer_with_memory("o", LIFTING, (0,), NAMES, x, u, [2500] * 6, UNITS, DT, phase, memories=1, deviation=0.0)
+    fresh, v, other = controlled(seed=1, home=3.0)
+    missed = (observer.run(fresh[..., :1], v, other)[..., :2] - fresh)[..., 1]
+    assert size(missed) < 0.02 * size(fresh[..., 1])  # one memory is all there is to know: what is left are starts, forgotten as 0.99^k
+    assert relift_certificate(observer, mismatch=False).certified
+
+
+def test_a_model_that_is_not_stable_is_refused():
+    x, u, phase = controlled(n_samples=700)
+    past = Past.of(LIFTING, (0,), x, u, [700] * 6, UNITS, phase, Bank(20))
+    F, G, H = past.model(2)
+    with pytest.raises(DataError, match="not stable"):
+        tune_memory((1.5 * F / np.abs(np.linalg.eigvals(F)).max(), G, H), past, x, u, UNITS, phase)

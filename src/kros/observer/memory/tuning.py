@@ -2,27 +2,35 @@ r"""Tuning of linear models for hidden states: all coefficients, dynamics includ
 
 The estimates are ``x_h = H (q I - F)^-1 G z`` with z as recorded (`seen_by`): no observer has to be run for a step. The criterion is
 
-.. math:: \sum_i s_i \log \Bigl( \sum_u \overline{e_{iu}^2}^{\,p/2} \Bigr)^{1/p},
+.. math:: \sum_i s_i \log \bigl( \operatorname{mean}_u \overline{e_{iu}^2} \bigr)^{1/2},
 
-with :math:`\overline{e_{iu}^2}` the mean square error of hidden state i on unit u: p = 2 is the mean over units, and the larger p the more the
-worst unit decides. Every episode counts twice, with the lifted functions' share larger and smaller by `deviation`: machines on which they act
-more or less than on the mean machine look like that, and an observer that relied on what it was told of them would fail where others adapt.
+with :math:`\overline{e_{iu}^2}` the mean square error of hidden state i on unit u. Every episode counts twice, with the lifted functions larger and smaller
+by a share: machines on which they act more or less than on the mean machine look like that, and an observer that relied on what it was told of
+them would fail where others adapt. Steps are taken in coordinates in which the states are white along the recordings, all coefficients free: of the many
+models with the same estimates, the nearest one. In those of companion forms or of single modes the search ends early.
+
+References
+----------
+T. McKelvey, A. Helmersson and T. Ribarits, "Data driven local coordinates for multivariable linear systems and their application to system
+identification", Automatica 40 (2004) 1629-1635.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from ...core.errors import DataError
-from .blocks import Array, Block, Model, Run, blocks_of, joined
-from .past import THIN, Past, hidden_of, seen_by
+from .blocks import Array, Block, Model, blocks_of, joined
+from .past import Past, hidden_of, seen_by
 
 _DAMPING = (1e-7, 1e-3, 1e4)
-_SIDE_BY_SIDE = 8  # episodes: keeps derivatives in some ten megabytes
+_THIN, _SIDE_BY_SIDE = 8, 4  # episodes: keeps derivatives in some ten megabytes
+_ALIKE = 1e-13  # share of a direction below which rounding decides
 _MEMORIES = 3  # models forget within this part of an episode: what is slower, recordings of this length cannot judge
 
 
@@ -35,9 +43,8 @@ def tune_memory(
     parameters: Mapping[str, npt.ArrayLike] | None = None,
     importance: npt.ArrayLike = 1.0,
     deviation: float = 0.0,
-    power: float = 2.0,
     iterations: int = 25,
-    least_gain: float = 3e-4,
+    least_gain: float = 1e-4,
 ) -> tuple[Model, tuple[float, ...]]:
     """Improve a model of `Past.model` on recordings.
 
@@ -55,8 +62,6 @@ def tune_memory(
         Weights s of the logarithms.
     deviation : float
         Share by which the lifted functions' effect may differ from machine to machine.
-    power : float
-        p, at least 2.
     iterations : int
         Most steps.
     least_gain : float
@@ -73,7 +78,7 @@ def tune_memory(
     DataError
         When the model diverges on the recordings.
     """
-    problem = _Tuning.of(past, states, inputs, units, parameters, importance, deviation, power)
+    problem = _Tuning.of(past, states, inputs, units, parameters, importance, deviation)
     low, damping, high = _DAMPING
     blocks, slowest = blocks_of(*model), max(float(np.abs(np.linalg.eigvals(model[0])).max()), 1 - _MEMORIES / len(states))
     if not slowest < 1:
@@ -81,13 +86,10 @@ def tune_memory(
     error = problem.errors(blocks)
     criterion = [problem.criterion(error)]
     for _ in range(iterations):
-        blocks = blocks_of(*joined(blocks))
-        H, g = problem.normal_equations(blocks, error)
-        size = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
-        H, g = H / np.outer(size, size), g / size
+        H, g, change = problem.normal_equations(blocks, error)
         while damping <= high:
-            step = np.split(np.linalg.solve(H + damping * np.eye(len(g)), g) / size, np.cumsum([b.size for b in blocks])[:-1])
-            trial = [b.moved(s).within(slowest) for b, s in zip(blocks, step, strict=True)]
+            step = change(np.asarray(np.linalg.solve(H + damping * np.eye(len(g)), g), dtype=float))
+            trial = [b.within(slowest) for b in blocks_of(*_sum(joined(blocks), step))]
             error_then = problem.errors(trial)
             if problem.criterion(error_then) < criterion[-1]:
                 break
@@ -110,7 +112,6 @@ class _Tuning:
     rest: Array
     unit: npt.NDArray[np.intp]
     share: Array
-    power: float
 
     @classmethod
     def of(
@@ -122,7 +123,6 @@ class _Tuning:
         parameters: Mapping[str, npt.ArrayLike] | None,
         importance: npt.ArrayLike,
         deviation: float,
-        power: float,
     ) -> _Tuning:
         """Collect the channels, twice where machines deviate."""
         hidden = hidden_of(past.lifting, past.measured)
@@ -140,14 +140,14 @@ class _Tuning:
         rest = np.zeros(z.shape[:2])
         rest[lifted] = z[lifted, :, 0]
         share = np.broadcast_to(np.asarray(importance, dtype=float), len(hidden))
-        return cls(z, truth, rest, unit, share / share.sum(), power)
+        return cls(z, truth, rest, unit, share / share.sum())
 
     def errors(self, blocks: Sequence[Block]) -> Array:
         """Mean square errors, shape (unit, h)."""
         found, counts = np.zeros((self.unit.max() + 1, len(self.truth))), np.bincount(self.unit)
         with np.errstate(over="ignore", invalid="ignore"):
             for part in self._parts():
-                missed = self._missed(blocks, part)[1]
+                missed = self._missed(blocks, part)[2]
                 np.add.at(found, self.unit[part], np.mean(missed**2, axis=-1).T)
         return found / counts[:, None]
 
@@ -155,30 +155,68 @@ class _Tuning:
         """The criterion of mean square errors by unit; infinite where the model diverges."""
         if not np.isfinite(error).all():
             return np.inf
-        return float(self.share @ np.log(np.mean(error ** (self.power / 2), axis=0)) / self.power)
+        return float(self.share @ np.log(error.mean(axis=0)) / 2)
 
-    def normal_equations(self, blocks: Sequence[Block], error: Array) -> tuple[Array, Array]:
-        """Gauss-Newton matrix and right side for all coefficients of all blocks."""
-        counts = np.bincount(self.unit)[:, None]
-        weight = self.share * error ** (self.power / 2 - 1) / np.sum(error ** (self.power / 2), axis=0) / counts
-        rows = np.arange(0, self.z.shape[-1], THIN)
-        size = sum(b.size for b in blocks)
-        H, g = np.zeros((size, size)), np.zeros(size)
+    def normal_equations(self, blocks: Sequence[Block], error: Array) -> tuple[Array, Array, Callable[[Array], Model]]:
+        """Gauss-Newton matrix and right side for scaled coefficients, and what takes a step to changes of F, G, H.
+
+        Coefficients are those of all states and channels, white along the recordings, in the rows of white states: directions that change no
+        estimate, and those between nearly alike channels, cost nothing.
+        """
+        n, outputs = sum(len(b.F) for b in blocks), len(self.truth)
+        rows = np.arange(0, self.z.shape[-1], _THIN)
+        into, out = self._whitening(blocks, rows)
+        width = into.shape[1]
+        weight = self.share / error.sum(axis=0) / len(rows) / np.bincount(self.unit)[:, None]
+        H, g = np.zeros((n * (width + outputs),) * 2), np.zeros(n * (width + outputs))
         for part in self._parts():
-            runs, missed = self._missed(blocks, part)
-            root = np.sqrt(weight[self.unit[part]].T / len(rows))[..., None].astype(np.float32)
-            slopes = np.concatenate([b.slopes(run, rows) for b, run in zip(blocks, runs, strict=True)])
-            slopes *= root
-            X = slopes.reshape(size, -1)
+            h, rest, missed = self._missed(blocks, part)
+            signals = np.tensordot(into.T, np.concatenate([h, self.z[:, part]]), 1)
+            rest = np.tensordot(into.T, np.concatenate([rest, self.rest[:, part]]), 1)
+            inner = np.concatenate([b.responses(signals, rest, rows) for b in blocks])
+            direct = np.zeros((outputs, n, *missed.shape[:2], len(rows)))
+            direct[range(outputs), :, range(outputs)] = h[..., rows]
+            root = np.sqrt(weight[self.unit[part]].T)[..., None]
+            X = np.concatenate([(part_of * root).reshape(-1, root[..., 0].size * len(rows)) for part_of in (inner, direct)])
             H += X @ X.T
-            g += X @ (missed[..., rows] * root).astype(np.float32).ravel()
-        return H, g
+            g += X @ (missed[..., rows] * root).ravel()
+        turn = block_diag(np.kron(np.linalg.pinv(out).T, np.eye(width)), np.kron(np.eye(outputs), out))
+        H, g = turn.T @ H @ turn, turn.T @ g
+        size = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
 
-    def _missed(self, blocks: Sequence[Block], part: slice) -> tuple[list[Run], Array]:
-        """Runs of all blocks on some episodes, and what their estimates miss."""
+        def change(step: Array) -> Model:
+            inner, direct = np.split(turn @ (step / size), [n * width])
+            moved = inner.reshape(n, width) @ into.T
+            return moved[:, :n], moved[:, n:], direct.reshape(outputs, n)
+
+        return H / np.outer(size, size), g / size, change
+
+    def _whitening(self, blocks: Sequence[Block], rows: npt.NDArray[np.intp]) -> tuple[Array, Array]:
+        """What makes all states and channels white along the recordings, and what makes the states so."""
+        n = sum(len(b.F) for b in blocks)
+        moments = np.zeros((n + len(self.z),) * 2)
+        for part in self._parts():
+            flat = np.concatenate([self._missed(blocks, part)[0], self.z[:, part]])[..., rows]
+            moments += np.einsum("ibk,jbk->ij", flat, flat, optimize=True) / (len(self.unit) * len(rows))
+        return _white(moments), _white(moments[:n, :n])
+
+    def _missed(self, blocks: Sequence[Block], part: slice) -> tuple[Array, Array, Array]:
+        """States of all blocks on some episodes, their rest, and what the estimates miss."""
         runs = [b.run(self.z[:, part], self.rest[:, part]) for b in blocks]
-        estimate = sum(np.tensordot(b.H, run.h, 1) for b, run in zip(blocks, runs, strict=True))
-        return runs, np.asarray(self.truth[:, part] - estimate)
+        h, rest = np.concatenate([r[0] for r in runs]), np.concatenate([r[1] for r in runs])
+        return h, rest, self.truth[:, part] - np.tensordot(np.hstack([b.H for b in blocks]), h, 1)
 
     def _parts(self) -> list[slice]:
         return [slice(i, i + _SIDE_BY_SIDE) for i in range(0, len(self.unit), _SIDE_BY_SIDE)]
+
+
+def _sum(model: Model, change: Model) -> Model:
+    return model[0] + change[0], model[1] + change[1], model[2] + change[2]
+
+
+def _white(moments: Array) -> Array:
+    """T with ``T' moments T`` the identity, of full column rank where moments lack some."""
+    size = np.sqrt(np.maximum(np.diag(moments), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(moments / np.outer(size, size))
+    kept = values > _ALIKE * values[-1]
+    return np.asarray(vectors[:, kept] / np.sqrt(values[kept]) / size[:, None])

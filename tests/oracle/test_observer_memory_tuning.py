@@ -1,0 +1,103 @@
+"""Models of hidden states: blocks against plain recursions, tuning against the Kalman predictor, deviation on machines unlike those recorded."""
+
+import numpy as np
+import pytest
+
+from kros.lifting import Lifting
+from kros.observer import Observer, Past, observer_with_memory, run_observer, tune_memory
+from kros.observer.memory.blocks import blocks_of, joined
+from kros.synthesis import Injection, kalman
+from kros.synthesis.residual.shaping import Bank
+
+DT = 0.01
+
+
+def random_model(order, seed=0):
+    rng = np.random.default_rng(seed)
+    F = rng.normal(size=(order, order))
+    F *= 0.9 / np.abs(np.linalg.eigvals(F)).max()
+    return F, rng.normal(size=(order, 3)), rng.normal(size=(2, order))
+
+
+def recursion(model, z, start):
+    F, G, H = model
+    h = np.zeros((*z.shape[1:], len(F)))
+    h[:, 0] = np.linalg.solve(np.eye(len(F)) - F, G @ start).T
+    for k in range(z.shape[2] - 1):
+        h[:, k + 1] = h[:, k] @ F.T + z[:, :, k].T @ G.T
+    return np.moveaxis(h @ H.T, 2, 0), np.moveaxis(h, 2, 0)
+
+
+@pytest.mark.parametrize("order", [1, 4, 5])
+def test_blocks_estimate_what_the_model_does(order):
+    model, z = random_model(order), np.random.default_rng(1).normal(size=(3, 2, 60))
+    blocks = blocks_of(*model)
+    found = sum(np.tensordot(b.H, b.run(z, z[..., 0])[0], 1) for b in blocks)
+    np.testing.assert_allclose(found, recursion(model, z, z[..., 0])[0], rtol=1e-7, atol=1e-9)
+    for power in range(4):
+        F, G, H = joined(blocks)
+        expected = model[2] @ np.linalg.matrix_power(model[0], power) @ model[1]
+        np.testing.assert_allclose(H @ np.linalg.matrix_power(F, power) @ G, expected, rtol=1e-7, atol=1e-9)
+
+
+def test_delays_are_blocks_too():
+    F, G, H = np.eye(4, k=-1), np.eye(4, 3), np.ones((2, 4))
+    f, g, h = joined(blocks_of(F, G, H))
+    for power in range(5):
+        np.testing.assert_allclose(h @ np.linalg.matrix_power(f, power) @ g, H @ np.linalg.matrix_power(F, power) @ G, atol=1e-4)
+
+
+def test_responses_are_the_derivatives():
+    z, rows, step = np.random.default_rng(2).normal(size=(3, 2, 60)), np.arange(60), 1e-6
+    blocks = blocks_of(*random_model(4))
+    F, G, H = joined(blocks)
+    before, h = recursion((F, G, H), z, z[..., 0])
+    signals, rest = np.concatenate([h, z]), np.concatenate([h[..., 0], z[..., 0]])
+    found = np.concatenate([b.responses(signals, rest, rows) for b in blocks])
+    for i, j in [(0, 1), (1, 3), (2, 0), (3, 5), (0, 6)]:
+        W = np.hstack([F, G])
+        W[i, j] += step
+        change = (recursion((W[:, :4], W[:, 4:], H), z, z[..., 0])[0] - before) / step
+        np.testing.assert_allclose(found[i, j], change, rtol=1e-4, atol=1e-4)
+
+
+def test_tuning_reaches_the_kalman_predictor_from_a_poor_model():
+    rng = np.random.default_rng(3)
+    F, G, Q = np.array([[1.0, 0.1], [-0.3, 0.8]]), np.array([[0.0], [1.0]]), np.diag([1e-3, 4e-2])
+    x, u = np.zeros((4000, 6, 2)), rng.normal(size=(4000, 6, 1))
+    for k in range(3999):
+        x[k + 1] = x[k] @ F.T + u[k] @ G.T + rng.normal(size=(6, 2)) * np.sqrt(np.diag(Q))
+    plain = Lifting(("x", "v"))
+    past = Past.of(plain, (0,), x, u, [4000] * 6, list("abcdef"), bank=Bank(2))
+    _, criterion = tune_memory(past.model(2), past, x, u, list("abcdef"), least_gain=1e-5)
+    best = kalman(F, np.eye(1, 2), Q, np.array([[1e-15]]), DT)
+    ideal = Observer("k", plain, F, G, (0,), ("u",), best.controller, Injection.STATE, DT)
+    least = np.sqrt(np.mean((run_observer(ideal, x[..., :1], u) - x)[..., 1] ** 2))
+    assert np.exp(criterion[-1]) == pytest.approx(least, rel=0.01)
+    assert np.exp(criterion[0]) > 1.05 * least
+
+
+def ripple(shares, seed=0, n_samples=2500):
+    """A motor whose torque ripples: its velocity is hidden, and how much it ripples differs from machine to machine."""
+    rng, batch = np.random.default_rng(seed), len(shares)
+    push = np.cumsum(rng.normal(size=(n_samples, batch)), axis=0)
+    push = 0.1 * (push - np.concatenate([np.zeros((100, batch)), push[:-100]]))
+    x = np.zeros((n_samples, batch, 2))
+    for k in range(n_samples - 1):
+        p, v = x[k].T
+        x[k + 1, :, 0] = p + DT * v + 1e-5 * rng.normal(size=batch)
+        x[k + 1, :, 1] = 0.95 * v + 0.1 * push[k] + 0.05 * shares * np.sin(5 * p) + 0.01 * rng.normal(size=batch)
+    return x, push[..., None]
+
+
+def test_with_deviation_a_machine_unlike_those_recorded_is_estimated_better():
+    plain = Lifting(("p", "v"), ("sin(5*p)",))
+    x, u = ripple(np.ones(6))
+    other, push = ripple(np.full(4, 2.5), seed=1)
+    errors = []
+    for deviation in (0.0, 0.6):
+        observer = observer_with_memory(
+            "o", plain, (0,), ("push",), x, u, [2500] * 6, list("aabbcc"), DT, memories=2, deviation=deviation, iterations=8
+        )
+        errors.append(np.std((observer.run(other[..., :1], push)[..., :2] - other)[400:, :, 1]))
+    assert errors[1] < 0.95 * errors[0]

@@ -17,7 +17,7 @@ from typing import Any
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
 from ...data.population import OUTLIERS, Population
-from ..config import Stage, StudyConfig
+from ..config import RequireConfig, Stage, StudyConfig
 from ..context import Context, Progress
 from ..steps import LEARNING, Step, run_steps
 from ..store import Store, remove_tree
@@ -77,7 +77,7 @@ def remove_beyond(folder: Path, folds: int) -> None:
     """Remove what an earlier run with more folds left."""
     if folder.is_dir():
         for other in folder.iterdir():
-            if other.is_dir() and int(other.name) >= folds:
+            if other.is_dir() and other.name.isdecimal() and int(other.name) >= folds:
                 remove_tree(other)
 
 
@@ -95,11 +95,12 @@ def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> di
 
 
 def without(whole: Context, held: Sequence[str]) -> StudyConfig:
-    """Return the study on the prepared recordings of all other units."""
+    """Return the study on the prepared recordings of all other units, which hands nothing over and so requires nothing."""
     config = whole.config
     prepared = {"source": whole.recordings.absolute(), "reader": "parquet", "prepare": (), "csv": None}
     data = config.data.model_copy(update={**prepared, "identify_on": whole.facts.identify_on, "exclude": (*absent(whole), *held)})
-    changes: dict[str, Any] = {"data": data, "observer": config.observer.model_copy(update={"deployed": None})}
+    observer = config.observer.model_copy(update={"deployed": None})
+    changes: dict[str, Any] = {"data": data, "observer": observer, "require": RequireConfig()}
     if config.uncertainty.nominal in held:
         changes["uncertainty"] = config.uncertainty.model_copy(update={"nominal": None})
     return config.model_copy(update=changes)

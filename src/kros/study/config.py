@@ -172,6 +172,25 @@ class EvaluateConfig(_Section):
         return value
 
 
+class LoadConfig(_Section):
+    """Load torque: what is mounted on `units` in a condition; without `moment` nothing is done about it.
+
+    The load is ``moment sin(angle - angle_rad) + inertia angle''``, both divided by the torque constant: in units of current. Without `units`
+    the first two that were recorded in the condition are taken; all others are judged on. `limit` is the current's.
+    """
+
+    moment: float | None = None
+    inertia: float = Field(0.0, ge=0)
+    angle_rad: float = 0.0
+    condition: str = "load"
+    units: tuple[str, ...] = ()
+    angle: str = "position"
+    current: str = "current"
+    limit: float | None = Field(None, gt=0)
+    memories: int = Field(8, ge=0)
+    level_s: float = Field(10.0, gt=0)
+
+
 class RequireConfig(_Section):
     """Requirements whose violation ends the run with exit code 3."""
 
@@ -192,6 +211,7 @@ class StudyConfig(_Section):
     synthesis: SynthesisConfig = SynthesisConfig()
     observer: ObserverConfig = ObserverConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
+    load: LoadConfig = LoadConfig()
     require: RequireConfig = RequireConfig()
 
     def dump(self) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from ..synthesis.result import Synthesis
 from ..uncertainty import Tightness, UncertainModel, VariationAndNoise
 from .config import Stage
 from .context import Context
+from .load import load_metrics
 from .stages import calibrate, left_out
 
 
@@ -30,7 +31,7 @@ def collect_metrics(context: Context, until: Stage, total_s: float | None) -> di
     if Stage.LEFT_OUT in done and left_out.wanted(context.config):
         metrics["left_out"] = load_artifact(context.store.path(left_out.FOLDER), left_out.KIND)[0]
     if Stage.EVALUATE in done:
-        metrics |= _disturbed(context)
+        metrics |= _disturbed(context) | load_metrics(context)
     clean: dict[str, Any] = plain(metrics)
     return clean
 

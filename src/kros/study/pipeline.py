@@ -19,7 +19,7 @@ from .store import Store, remove_tree
 
 STEPS = (
     *LEARNING,
-    Step(Stage.EVALUATE, evaluate.run, ("evaluate",)),
+    Step(Stage.EVALUATE, evaluate.run, ("evaluate", "load")),
     Step(Stage.LEFT_OUT, left_out.run, ("evaluate",), left_out.wanted),
     Step(Stage.REPORT, report.run, ("name", "require")),
 )

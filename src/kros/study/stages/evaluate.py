@@ -21,6 +21,7 @@ from ...observer import Observer, run_observers
 from ..context import Context
 from ..disturbed import Trial, make_trial, run_disturbed
 from ..estimators import Baseline, make_difference, make_extended, make_learned
+from ..load import run_load
 from ..presets import gearbox_band_hz
 from . import calibrate
 from .synthesize import measurement_noise, tuning_set
@@ -160,7 +161,7 @@ def run(context: Context) -> list[Path]:
     content |= {"observers": list(estimates), "models": list(models), "states": population.states}
     save_artifact(folder, "evaluation", content, _arrays(population, keys, on, shown, shown_on, roles, estimates, free_runs))
     disturbed = {name: (o.disturbed, o.estimated) for name, o in estimates.items() if o.disturbed is not None}
-    return [folder / "evaluation.json", folder / "arrays.npz", *run_disturbed(context, trial, observers, disturbed)]
+    return [folder / "evaluation.json", folder / "arrays.npz", *run_disturbed(context, trial, observers, disturbed), *run_load(context, observers)]
 
 
 def estimation(

@@ -18,7 +18,7 @@ from .certificate import ReliftCertificate
 from .error import ErrorSystem
 
 Array = npt.NDArray[np.float64]
-_CLOSE = 1 + 1e-8  # rounding of a simulation of many thousand steps, whose rows take differences of positions a thousand times
+_CLOSE = 1 + 1e-6  # rounding: a memory takes differences of positions a thousand times, and where slopes are constant the bound is the error itself
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from .certificate import ReliftCertificate
 from .error import ErrorSystem
 
 Array = npt.NDArray[np.float64]
-_CLOSE = 1 + 1e-6  # rounding: a memory takes differences of positions a thousand times, and where slopes are constant the bound is the error itself
+# Rounding: a memory takes differences of positions a thousand times, and where slopes are constant the bound is the error itself.
+_CLOSE = 1 + 1e-6
 
 
 @dataclass(frozen=True)

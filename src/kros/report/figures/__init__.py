@@ -35,6 +35,7 @@ FIGURES = (
     "loaded",
     "loaded_paper",
     "loaded_spectra",
+    "load_torque",
     "robustness",
     "robustness_second",
     "outlier_scores",

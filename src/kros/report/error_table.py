@@ -85,8 +85,12 @@ def _table(condition: str, rows: Sequence[Mapping[str, Any]], home: bool) -> Err
         o: {c: replace(_cell(found), interval=intervals.get((o, condition, c))) for c, found in by_channel.items()}
         for o, by_channel in grouped.items()
     }
-    ranked = frozenset(c for c in channels if home or condition != "load" or c != "current")
-    return ErrorTable(condition, channels, tuple(grouped), cells, ranked)
+    return ErrorTable(condition, channels, tuple(grouped), cells, ranked_channels(channels, condition, home))
+
+
+def ranked_channels(channels: Sequence[str], condition: str, home: bool) -> frozenset[str]:
+    """Return the channels in which a smaller error is better: all but the current of a loaded drive, where models come from another condition."""
+    return frozenset(c for c in channels if home or condition != "load" or c != "current")
 
 
 def _cell(rows: Sequence[Mapping[str, Any]]) -> ErrorCell:

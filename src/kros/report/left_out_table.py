@@ -10,6 +10,7 @@ import numpy as np
 
 from ..data.population import natural_key
 from ..evaluate import unit_interval
+from .error_table import ranked_channels
 
 Key = tuple[str, str]
 PAPER = "koopman_edmd/mixed"
@@ -51,14 +52,19 @@ class LeftOutTable:
     condition : str
     channels : tuple of str
     cells : mapping of observer to mapping of channel to LeftOutCell
+    ranked : frozenset of str
+        Channels in which a smaller number is better; the current of a loaded drive shows the load.
     """
 
     condition: str
     channels: tuple[str, ...]
     cells: Mapping[str, Mapping[str, LeftOutCell]]
+    ranked: frozenset[str]
 
     def best(self, channel: str, what: str) -> float | None:
-        """Return the smallest ``mean`` or ``worst`` of a channel; None where every observer diverged."""
+        """Return the smallest ``mean`` or ``worst`` of a channel; None where every observer diverged, or in a channel that is not ranked."""
+        if channel not in self.ranked:
+            return None
         values = [getattr(cells[channel], what) for cells in self.cells.values() if channel in cells]
         return min((v for v in values if v is not None), default=None)
 
@@ -73,10 +79,10 @@ def left_out_tables(rows: Sequence[Mapping[str, Any]], identify_on: str) -> list
     identify_on : str
     """
     conditions = sorted({r["condition"] for r in rows}, key=lambda c: (c != identify_on, natural_key(c)))
-    return [_table(condition, [r for r in rows if r["condition"] == condition]) for condition in conditions]
+    return [_table(c, [r for r in rows if r["condition"] == c], c == identify_on) for c in conditions]
 
 
-def _table(condition: str, rows: Sequence[Mapping[str, Any]]) -> LeftOutTable:
+def _table(condition: str, rows: Sequence[Mapping[str, Any]], home: bool) -> LeftOutTable:
     grouped: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for row in rows:
         grouped.setdefault((row["observer"], row["channel"]), []).append(row)
@@ -85,7 +91,8 @@ def _table(condition: str, rows: Sequence[Mapping[str, Any]]) -> LeftOutTable:
     for (observer, channel), found in grouped.items():
         papers = _power(grouped.get((PAPER, channel), []))
         cells.setdefault(observer, {})[channel] = _cell(found, means.get((observer, channel)), papers)
-    return LeftOutTable(condition, tuple(dict.fromkeys(channel for _, channel in grouped)), cells)
+    channels = tuple(dict.fromkeys(channel for _, channel in grouped))
+    return LeftOutTable(condition, channels, cells, ranked_channels(channels, condition, home))
 
 
 def _intervals(errors: Mapping[Key, Sequence[float | None]]) -> dict[Key, tuple[float, float]]:

@@ -28,12 +28,13 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "for every machine inside the uncertain set of the fold's units. Both count folds."
     )
     paragraphs = [text, certified, *(f"Fold {int(n) + 1} failed: {reason}" for n, reason in found["failed"].items())]
-    measured = run.measured_states
-    tables = [_table(t, found["observers"], folds, measured) for t in left_out_tables(found["rows"], metrics["study"]["identify_on"])]
+    measured, study = run.measured_states, metrics["study"]
+    shown = left_out_tables(found["rows"], study["identify_on"])
+    tables = [_table(table, found["observers"], folds, measured, study.get("deployed")) for table in shown]
     return Section("left-out", "On units that were left out", paragraphs, tables, ["left_out"])
 
 
-def _table(table: LeftOutTable, facts: Mapping[str, Mapping[str, Any]], folds: int, measured: Sequence[str]) -> Table:
+def _table(table: LeftOutTable, facts: Mapping[str, Mapping[str, Any]], folds: int, measured: Sequence[str], deployed: str | None) -> Table:
     channels = [c for c in table.channels if c not in measured] or list(table.channels)
     powers = any(cell.band_db is not None for cells in table.cells.values() for cell in cells.values())
     rows = []
@@ -46,12 +47,15 @@ def _table(table: LeftOutTable, facts: Mapping[str, Mapping[str, Any]], folds: i
             row += _cells(table, channel, cells.get(channel), powers)
         rows.append(row)
     head = ["mean", "95 %", "worst", *(["band (dB)"] if powers else [])]
-    groups = [("", 2), ("certified", 2), *((c.replace("_", " "), len(head)) for c in channels)]
+    titles = [c.replace("_", " ") + ("" if c in table.ranked else " (not ranked)") for c in channels]
+    groups = [("", 2), ("certified", 2), *((title, len(head)) for title in titles)]
     where = "" if table.condition == DEFAULT_CONDITION else f", {condition_label(table.condition)}"
     caption = f"Errors on units that were left out, percent of range{where}. Best in bold."
     if powers:
         caption += f" Band: power of the error around the gearbox frequency, relative to “{observer_label(PAPER)}”."
-    return Table(["observer", "states", "as it runs", "for the set", *(head * len(channels))], rows, caption, groups)
+    emphasised = [i for i, observer in enumerate(table.cells) if observer == deployed]
+    head = ["observer", "states", "as it runs", "for the set", *(head * len(channels))]
+    return Table(head, rows, caption, groups, emphasised=emphasised)
 
 
 def _count(value: int | None, folds: int) -> str:

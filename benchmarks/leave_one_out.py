@@ -20,14 +20,14 @@ import tempfile
 import time
 import traceback
 from collections.abc import Mapping
-from itertools import product
+from itertools import chain, product
 from math import inf, sqrt
 from pathlib import Path
 from typing import Any
 
 from kros.core.artifacts import write_json
 from kros.report.left_out_table import PAPER, LeftOutCell, LeftOutTable, left_out_tables
-from kros.report.names import BASELINES, number, split_observer
+from kros.report.names import BASELINES, minus, number, split_observer
 from kros.study import load_config, run_study
 from kros.study.config import Stage, SynthesisConfig
 from kros.study.demo import simulate_to
@@ -149,7 +149,7 @@ def markdown(tables: list[LeftOutTable], facts: Facts, folds: int) -> list[str]:
         row += ["–" if own[key] is None else f"{own[key]}/{folds}" for key in ("relift_certified", "robust")]
         row += [rounded(table.cells[name].get(channel)) for table, channel in places]
         bands = [cells[c].band_db if c in cells else None for c in HIDDEN]
-        row += ["–" if b is None else f"{b:.0f}".replace("-", "−") for b in bands]
+        row += ["–" if b is None else minus(f"{b:.1f}") for b in bands]
         lines.append(f"| {' | '.join(row)} |")
     return lines
 
@@ -163,7 +163,9 @@ def asked(tables: Mapping[str, LeftOutTable], facts: Facts, folds: int) -> list[
         lines += best_of_certified(tables[HOME], certified, chosen, facts, f"(a) certified {what} in all folds")
     if chosen is None:
         return lines
-    return [*lines, *against_paper(tables, chosen), *against_learned(tables, chosen)]
+    in_velocity = min((n for n in certified if own(n)), key=lambda n: worst(tables[HOME], n, "velocity"))
+    compared = [against_paper(tables, n) + against_learned(tables, n) for n in dict.fromkeys((chosen, in_velocity))]
+    return [*lines, *chain.from_iterable(compared)]
 
 
 def own(name: str) -> bool:
@@ -215,7 +217,9 @@ def against_paper(tables: Mapping[str, LeftOutTable], name: str) -> list[str]:
         for channel in HIDDEN:
             found = table.cells[name][channel].band_db
             text = "unknown" if found is None else f"{found:.1f} dB"
-            lines.append(f"(b) gearbox band, {condition}, {channel}: {text}, asked -10 dB {met(found is not None and found <= -10)}")
+            lines.append(
+                f"(b) gearbox band, {condition}, {channel} of {name}: {text}, asked -10 dB {met(found is not None and found <= -10)}"
+            )
     return lines
 
 
@@ -225,7 +229,9 @@ def against_learned(tables: Mapping[str, LeftOutTable], name: str) -> list[str]:
     for condition, channel, most in (*((c, "velocity", 1.0) for c in tables), (HOME, "current", 1.1)):
         for what, value in (("mean", mean), ("worst", worst)):
             ratio = value(tables[condition], name, channel) / value(tables[condition], LEARNED, channel)
-            lines.append(f"(c) {condition}, {channel}, {what}: {ratio:.3f} of the learned estimator's, asked {most:g} {met(ratio <= most)}")
+            lines.append(
+                f"(c) {condition}, {channel} of {name}, {what}: {ratio:.3f} of the learned estimator's, asked {most:g} {met(ratio <= most)}"
+            )
     return lines
 
 

@@ -10,7 +10,7 @@ Only what is missing is filled in: fast and unexpected loads pass as they are se
 
 A controller at its limit holds its integrator back, and from then on differs from the one that an observer knows. Where the total current comes out beyond
 the limit, the excess is taken off the load, and forgotten as slowly as levels are. If that would move the load by more than `believed` from
-what c says of the angle, it is no load: changes are counted anew from there, and the excess is taken off what the unloaded machine needs.
+what c says of the angle, it is no load: changes are counted anew from there, and what excess remains is taken off what the unloaded machine needs.
 """
 
 from __future__ import annotations
@@ -115,7 +115,9 @@ class RunningAngleLoad:
             self._excess[trusted] += (total - bounded)[trusted]
             load[trusted] = shifted[trusted]
             psi[:, anew], self._excess[anew], load[anew] = 0.0, seen[anew], of_angle[anew]
-            self._need[anew] = (current - seen + load - bounded)[anew]
+            total[anew] = (current - seen - self._need + load)[anew]
+            bounded[anew] = np.clip(total[anew], -self.settings.limit, self.settings.limit)
+            self._need[anew] += (total - bounded)[anew]
         learns = np.where(beyond, 0.0, self.settings.sample_period_s)
         self._gram += learns * np.stack([psi[0] ** 2, psi[0] * psi[1], psi[1] ** 2])
         self._right += learns * psi * (seen - self._excess)

@@ -1,0 +1,193 @@
+"""Load estimates against analytic loads, a linear machine under a known step, and the simulator's truth."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from kros.core.errors import ConfigError, DataError, DimensionError
+from kros.lifting import Lifting
+from kros.observer import Observer, one_step_residual, relift_certificate, run_observer
+from kros.observer.load import (
+    AngleLoad,
+    calibrate_load,
+    calibrate_torque,
+    disturbance_observer,
+    known_load,
+    load_accuracy,
+    load_direction,
+    load_from_current,
+    load_observer,
+    low_passed,
+    ripple_power,
+    without_level,
+)
+from kros.plants import HarmonicDrivePopulation
+
+DT = 1e-3
+TIME = np.arange(5000) * DT
+
+
+def test_a_mounted_mass_takes_gravity_and_inertia() -> None:
+    """theta = a sin(w t) has the acceleration -w^2 theta."""
+    position = 0.4 * np.sin(2 * np.pi * TIME)
+    load = known_load(position, DT, 0.2, 0.01, angle_rad=0.3)
+    truth = 0.2 * np.sin(position - 0.3) - 0.01 * (2 * np.pi) ** 2 * position
+    assert np.abs(load - truth)[500:-500].max() < 1e-4
+
+
+def test_a_constant_load_leaves_no_trace_and_a_step_is_forgotten() -> None:
+    assert not without_level(np.full(1000, 0.7), 2.0, DT).any()
+    step = (TIME >= 1).astype(float)
+    np.testing.assert_allclose(without_level(step, 2.0, DT)[1000:], np.exp(-np.arange(4000) * DT / 2.0), rtol=1e-9)
+
+
+def test_low_pass_keeps_slow_and_has_no_delay() -> None:
+    slow, fast = np.sin(2 * np.pi * TIME), np.sin(2 * np.pi * 50 * TIME)
+    inner = slice(1000, -1000)
+    assert np.abs(low_passed(slow + fast, 5.0, DT) - slow)[inner].max() < 2e-3
+    with pytest.raises(ConfigError, match="500 Hz"):
+        low_passed(slow, 600.0, DT)
+
+
+def test_the_torque_constant_from_one_known_load() -> None:
+    """An error of the current that is the torque over 40 N m, with a bias: both are found exactly, and the torque with them."""
+    torque = 8.0 * np.sin(np.pi * TIME)
+    error = torque / 40.0 + 0.01
+    scale = calibrate_torque(error, torque, DT)
+    assert scale.torque_constant == pytest.approx(40.0, rel=1e-9)
+    assert scale.residual_percent < 1e-6
+    np.testing.assert_allclose(load_from_current(error + 0.3, 0.3, scale), torque, atol=1e-3)
+    with pytest.raises(DataError, match="check signs"):
+        calibrate_torque(-error, torque, DT)
+
+
+def test_the_level_of_an_angle_fixed_load_comes_back() -> None:
+    """What is seen starts at zero; after a second of moves the level is there, whatever load it started under."""
+    position = np.stack([1.0 + 3.0 * TIME, -2.0 + 0.5 * np.sin(4 * TIME)], axis=1)
+    load = 0.2 * np.sin(position - 0.3)
+    seen = without_level(load, 2.0, DT)
+    found = AngleLoad(2.0, DT, settling_s=1e-6).run(seen, seen, position).load
+    assert np.abs(found - load)[1000:].max() < 1e-3
+    assert np.abs(seen - load)[1000:2000].max() > 0.05
+    alone = AngleLoad(2.0, DT).run(np.zeros_like(seen), seen, position).load
+    assert not alone.any()  # nothing seen, nothing filled in
+
+
+def test_the_level_bears_a_controller_at_its_limit() -> None:
+    """From 3 s on the integrator differs by 2: without the limit the load is off by as much, with it the angle says what the load is."""
+    position = (3.0 * TIME)[:, None]
+    load = 0.2 * np.sin(position)
+    wrong = np.where(TIME >= 3, 2.0, 0.0)[:, None]
+    seen = without_level(load + wrong, 50.0, DT)
+    free = AngleLoad(50.0, DT).run(seen, seen, position).load
+    limited = AngleLoad(50.0, DT, limit=1.0).run(seen, seen, position)
+    assert np.abs(free - load)[3500:].max() > 1.0
+    assert np.abs(limited.load - load)[3500:].max() < 0.05
+    assert np.abs(limited.current).max() <= 1.0
+    with pytest.raises(DimensionError, match="n_samples, batch"):
+        AngleLoad(2.0, DT).run(seen[:, 0], seen[:, 0], position[:, 0])
+
+
+def test_the_disturbance_observer_is_exact_in_the_steady_state() -> None:
+    """A mass with friction, pushed by its input and an unknown step: the innovation's mean vanishes, and with it every error."""
+    A, B, E = np.array([[1.0, 0.01], [0.0, 0.98]]), np.array([[0.0], [0.01]]), np.array([0.0, 0.03])
+    rng = np.random.default_rng(0)
+    u, load = rng.standard_normal((2000, 1, 1)), np.where(np.arange(2000) < 500, 0.0, 0.7)
+    x = np.zeros((2000, 1, 2))
+    for k in range(1999):
+        x[k + 1, 0] = A @ x[k, 0] + B @ u[k, 0] + E * load[k]
+    lifting = Lifting(("position", "velocity"))
+    direction = load_direction(one_step_residual(lifting, A, B, x, u), load[:-1])
+    np.testing.assert_allclose(direction, E, atol=1e-12)
+    model = Observer.open_loop("mass", lifting, A, B, (0,), ("force",), 0.01)
+    observer = disturbance_observer("mass/load", model, direction, 1e-6 * np.eye(2), [1e-3], 1e-2)
+    estimate = run_observer(observer, x[..., :1], u)
+    assert observer.lifting.states[-1] == "load"
+    np.testing.assert_allclose(estimate[-1, 0], [*x[-1, 0], 0.7], atol=1e-9)
+    np.testing.assert_allclose(estimate[499, 0], [*x[499, 0], 0.0], atol=1e-9)
+    with pytest.raises(DataError, match="does not change"):
+        load_direction(np.zeros((10, 2)), np.ones(10))
+
+
+def test_ripple_is_counted_in_the_moving_band() -> None:
+    """A wave of amplitude a that turns with the gear has the power a^2 / 2, at every speed; a slow load has none."""
+    speed = (2.0 + np.sin(TIME))[:, None]
+    position = np.cumsum(speed, axis=0) * DT
+    wave = 0.03 * np.sin(100 * position + 0.4)
+    power = ripple_power(wave + 0.2 * np.sin(TIME)[:, None], position, speed, 100.0, DT)
+    assert power[0] == pytest.approx(0.03**2 / 2, rel=0.02)
+    with pytest.raises(DataError, match="never turns so fast"):
+        ripple_power(wave, position, 0.01 * speed, 100.0, DT)
+
+
+@pytest.fixture(scope="module")
+def drives() -> SimpleNamespace:
+    """Three drives, the load known on the first; observers that learned from it, and what they say of the others."""
+    simulated = HarmonicDrivePopulation(n_units=3, n_episodes=3, seconds=7.0, seed=1, loop="soft").simulate()
+    population, truth = simulated.population, simulated.truth
+    train = [k for k in population.episodes if k.episode != "2" and (k.condition == "noload" or k.unit == population.unit_ids[0])]
+    test = [k for k in population.episodes if k.episode == "2" and k.unit != population.unit_ids[0]]
+    phases = dict(zip(truth.unit_ids, truth.phase_rad, strict=True))
+
+    def read(keys: list) -> SimpleNamespace:
+        values = np.stack([population.read(k) for k in keys], axis=1)
+        load = np.stack([truth.load_torque(k) if k.condition == "load" else np.zeros(len(values)) for k in keys], axis=1)
+        phase = np.array([phases[k.unit] for k in keys])
+        return SimpleNamespace(x=values[..., :3], u=values[..., 3:], load=load.astype(float), phase={"phase": phase})
+
+    known, others = read(train), read(test)
+    found = {}
+    for kind, lifting in {
+        "koopman": Lifting(population.states, ("sin(100*position + phase)",), ("phase",)),
+        "linear": Lifting(population.states),
+    }.items():
+        own = [batch.phase if lifting.parameters else None for batch in (known, others)]
+        calibration = calibrate_load(lifting, (0,), known.x, known.u, known.load, DT, own[0], 2, corner_hz=20.0)
+        observer = load_observer(f"{kind}/load", calibration, population.inputs, 6)
+        estimate = run_observer(observer, others.x[..., :1], others.u, own[1])
+        leveled = AngleLoad(calibration.level_s, DT).run(estimate[..., 3], estimate[..., 2], others.x[..., 0])
+        found[kind] = SimpleNamespace(observer=observer, estimate=estimate, leveled=leveled)
+    return SimpleNamespace(known=known, others=others, **found)
+
+
+def test_loads_of_units_that_took_no_part_are_found(drives: SimpleNamespace) -> None:
+    """Slow errors under load stay near the floor without, with the level and for the seen part."""
+    accuracy = load_accuracy(drives.koopman.leveled.load, drives.others.load, DT, skip=2000)
+    assert accuracy.ratio < 1.5
+    assert accuracy.percent < 35
+    seen = load_accuracy(drives.koopman.estimate[..., 3], without_level(drives.others.load, 10.0, DT), DT)
+    assert seen.ratio < 1.5
+
+
+def test_total_current_and_load_are_separate(drives: SimpleNamespace) -> None:
+    """The total current is better known than the load that it carries is large, and the load is no copy of it."""
+    loaded = drives.others.load.any(axis=0)
+    error = drives.koopman.leveled.current - drives.others.x[..., 2]
+    assert np.sqrt(np.mean(error[2000:, loaded] ** 2)) < 0.3 * np.sqrt(np.mean(drives.others.load[2000:, loaded] ** 2))
+    states = drives.koopman.observer.lifting.states
+    assert states[:5] == ("position", "velocity", "current", "load", "memory_1")
+
+
+def test_ripple_in_the_load_is_far_below_that_of_the_current(drives: SimpleNamespace) -> None:
+    """The gear's share of the recorded current, which the paper's linear estimate hands on, is down by more than 10 dB."""
+    free = ~drives.others.load.any(axis=0)
+    position, speed = drives.others.x[:, free, 0], drives.others.u[:, free, 1]
+    powers = [ripple_power(s[:, free], position, speed, 100.0, DT) for s in (drives.koopman.estimate[..., 3], drives.others.x[..., 2])]
+    assert 10 * np.log10(powers[1].mean() / powers[0].mean()) > 10
+
+
+def test_the_load_observer_is_certified_as_it_runs(drives: SimpleNamespace) -> None:
+    assert relift_certificate(drives.koopman.observer).certified
+
+
+def test_calibration_says_what_it_misses(drives: SimpleNamespace) -> None:
+    known, lifting = drives.known, Lifting(("position", "velocity", "current"))
+    with pytest.raises(DataError, match="with and without load"):
+        calibrate_load(lifting, (0,), known.x, known.u, 0 * known.load, DT)
+    with pytest.raises(DataError, match="come to the current's limit"):
+        calibrate_load(lifting, (0,), known.x, known.u, known.load, DT, current=2, limit=0.1)
+    with pytest.raises(DimensionError, match="agree"):
+        calibrate_load(lifting, (0,), known.x, known.u, known.load[:-1], DT)
+    with pytest.raises(DataError, match="0 of"):
+        load_accuracy(known.load, 0 * known.load, DT)

@@ -10,13 +10,14 @@ from scipy.linalg import null_space
 
 from ...core.lti import gain
 from ...lifting import Lifting
+from ...synthesis.residual.shaping import Bank
 from ...synthesis.result import Injection
 from ..observer import Observer
 from .blocks import Array, Model
-from .past import SKIP, THIN, Past, hidden_of, seen_by
+from .past import DELAYS, SHORT, SKIP, THIN, Past, hidden_of, seen_by
 from .tuning import tune_memory
 
-DEVIATION = 0.3
+DEVIATION = 0.4
 
 
 def observer_with_memory(
@@ -33,6 +34,7 @@ def observer_with_memory(
     memories: int = 12,
     importance: npt.ArrayLike = 1.0,
     deviation: float = DEVIATION,
+    longest_s: float | None = None,
     samples: int = 6000,
     episodes: int = 2,
     iterations: int = 25,
@@ -59,6 +61,9 @@ def observer_with_memory(
         Weights of the hidden states' logarithmic errors.
     deviation : float
         Share by which the lifted functions' effect may differ from machine to machine.
+    longest_s : float, s, optional
+        Time constant of the longest memory; by default a twenty-fifth of the shortest episode. Controllers integrate, and a long memory does so
+        too: of a command it knows more, until the command meets a limit that the memory does not know.
     samples, episodes : int
         The first so many samples of the first so many episodes of every unit are tuned on.
     iterations : int
@@ -71,13 +76,15 @@ def observer_with_memory(
     DataError
         When every state is measured, or an episode is too short.
     """
-    past = Past.of(lifting, measured, states, recorded, lengths, units, parameters)
+    counts = np.asarray(lengths, dtype=int)
+    slowest = 1 - (SHORT / int(counts.min()) if longest_s is None else sample_period_s / longest_s)
+    past = Past.of(lifting, measured, states, recorded, counts, units, parameters, Bank(DELAYS, (slowest,)))
     model = past.model(len(hidden_of(lifting, measured)) + memories, importance=importance, deviation=deviation)
     few = [i for i in range(len(units)) if list(units[:i]).count(units[i]) < episodes]
-    cut = min(samples, int(np.min(np.asarray(lengths, dtype=int)[few])))
+    cut = min(samples, int(counts[few].min()))
     x, u, own = states[:cut, few], recorded[:cut, few], [units[i] for i in few]
     values = {key: np.asarray(value, dtype=float)[few] for key, value in (parameters or {}).items()}
-    model, _ = tune_memory(model, past, x, u, own, values, importance, deviation, iterations=iterations)
+    model, _ = tune_memory(model, past, x, u, own, values, importance, deviation, slowest, iterations)
     return embedded(name, past, model, inputs, x, u, sample_period_s, values)
 
 

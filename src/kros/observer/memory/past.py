@@ -36,7 +36,8 @@ from ...synthesis.residual.shaping import Bank
 Array = npt.NDArray[np.float64]
 DELAYS = 40
 THIN, SKIP = 4, 300
-_EPISODES, _RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 5, 1e-5, 0.5, 0.1, 1e-13
+SHORT = 25  # memories forget within this part of an episode unless told otherwise
+_RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 1e-5, 0.5, 0.1, 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +97,8 @@ class Past:
         units : sequence of str, length batch
         parameters : mapping of str to array_like, shape (batch,)
         bank : Bank, optional
-            By default 40 delays, and a lag of the tracking errors that forgets in a fifth of the shortest episode: controllers integrate.
+            By default 40 delays, and a lag of the tracking errors that forgets in a twenty-fifth of the shortest episode: controllers
+            integrate.
 
         Raises
         ------
@@ -116,7 +118,7 @@ class Past:
                 f"Observer with memory: needs a state that is not measured and episodes of more than {2 * SKIP} samples, "
                 f"found {len(hidden)} and {lengths.min()}."
             )
-        bank = bank or Bank(DELAYS, (1 - _EPISODES / int(lengths.min()),))
+        bank = bank or Bank(DELAYS, (1 - SHORT / int(lengths.min()),))
         y = states[..., list(measured)]
         static = _static(inputs, y)
         share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]

@@ -43,6 +43,7 @@ def tune_memory(
     parameters: Mapping[str, npt.ArrayLike] | None = None,
     importance: npt.ArrayLike = 1.0,
     deviation: float = 0.0,
+    slowest: float | None = None,
     iterations: int = 25,
     least_gain: float = 1e-4,
 ) -> tuple[Model, tuple[float, ...]]:
@@ -62,6 +63,8 @@ def tune_memory(
         Weights s of the logarithms.
     deviation : float
         Share by which the lifted functions' effect may differ from machine to machine.
+    slowest : float, optional
+        Bound of the model's poles; by default what recordings of this length can judge, or the model's own slowest pole.
     iterations : int
         Most steps.
     least_gain : float
@@ -80,7 +83,8 @@ def tune_memory(
     """
     problem = _Tuning.of(past, states, inputs, units, parameters, importance, deviation)
     low, damping, high = _DAMPING
-    blocks, slowest = blocks_of(*model), max(float(np.abs(np.linalg.eigvals(model[0])).max()), 1 - _MEMORIES / len(states))
+    blocks, own = blocks_of(*model), float(np.abs(np.linalg.eigvals(model[0])).max())
+    slowest = max(own, 1 - _MEMORIES / len(states) if slowest is None else slowest)
     if not slowest < 1:
         raise DataError("Tuning an observer with memory: the model is not stable; start from one that is.")
     error = problem.errors(blocks)

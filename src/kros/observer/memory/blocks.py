@@ -43,27 +43,32 @@ class Block:
 
     def run(self, z: Array, rest: Array) -> tuple[Array, Array]:
         """Return the states h along channels z (channels, batch, n_samples) that were `rest` (channels, batch) before, and at rest."""
-        held, held_rest, late = self._through(z, rest)
+        held, held_rest = self._through(z, rest)
         at_once, before = self.G, self._behind @ self.G
-        return np.tensordot(at_once, held, 1) - np.tensordot(before, late, 1), np.tensordot(at_once - before, held_rest, 1)
+        h = np.tensordot(at_once, held, 1)
+        h[..., 1:] -= np.tensordot(before, held[..., :-1], 1)
+        h[..., 0] -= before @ held_rest
+        return h, (at_once - before) @ held_rest
 
-    def responses(self, signals: Array, rest: Array, rows: npt.NDArray[np.intp]) -> Array:
-        """Return what signals added to each of its states do to the estimates, shape (d, signals, h, batch, rows)."""
-        held, _, late = self._through(signals, rest)
-        now, before = held[..., rows], late[..., rows]
+    def responses(self, signals: Array, rest: Array, every: int) -> Array:
+        """Return what signals added to each of its states do to the estimates, shape (d, signals, h, batch, n_samples / every)."""
+        held, held_rest = self._through(signals, rest)
+        now = held[..., ::every]
+        before = np.concatenate([held_rest[..., None], held[..., every - 1 : -1 : every]], axis=-1)[..., : now.shape[-1]]
         behind, (outputs, n) = self.H @ self._behind, self.H.shape
         found = np.empty((n, len(now), outputs, *now.shape[1:]))
         for i, o in np.ndindex(n, outputs):
             found[i, :, o] = self.H[o, i] * now - behind[o, i] * before
         return found
 
-    def _through(self, signals: Array, rest: Array) -> tuple[Array, Array, Array]:
-        """Signals through the scalar filter, their rest, and the same one sample later."""
+    def _through(self, signals: Array, rest: Array) -> tuple[Array, Array]:
+        """Signals through the scalar filter, and their rest."""
         F = self.F
         poles = np.array([1.0, -F[0, 0]] if len(F) == 1 else [1.0, -np.trace(F), np.linalg.det(F)])
         at_rest = rest / poles.sum()
-        held = lfilter([0.0, 1.0], poles, signals - rest[..., None]) + at_rest[..., None]
-        return held, at_rest, np.concatenate([at_rest[..., None], held[..., :-1]], axis=-1)
+        held = np.asarray(lfilter([0.0, 1.0], poles, signals - rest[..., None]))
+        held += at_rest[..., None]
+        return held, at_rest
 
 
 def blocks_of(F: Array, G: Array, H: Array) -> list[Block]:

@@ -68,7 +68,7 @@ def tune_memory(
     iterations : int
         Most steps.
     least_gain : float
-        Decrease of the criterion below which the search ends.
+        Decrease of the criterion in two steps below which the search ends.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def tune_memory(
             break
         blocks, error, damping = trial, error_then, max(damping / 10, low)
         criterion.append(problem.criterion(error))
-        if criterion[-2] - criterion[-1] < least_gain:
+        if len(criterion) > 2 and criterion[-3] - criterion[-1] < least_gain:
             break
     return joined(blocks), tuple(criterion)
 
@@ -168,22 +168,21 @@ class _Tuning:
         estimate, and those between nearly alike channels, cost nothing.
         """
         n, outputs = sum(len(b.F) for b in blocks), len(self.truth)
-        rows = np.arange(0, self.z.shape[-1], _THIN)
-        into, out = self._whitening(blocks, rows)
+        into, out = self._whitening(blocks)
         width = into.shape[1]
-        weight = self.share / error.sum(axis=0) / len(rows) / np.bincount(self.unit)[:, None]
+        weight = self.share / error.sum(axis=0) / np.bincount(self.unit)[:, None]
         H, g = np.zeros((n * (width + outputs),) * 2), np.zeros(n * (width + outputs))
         for part in self._parts():
             h, rest, missed = self._missed(blocks, part)
             signals = np.tensordot(into.T, np.concatenate([h, self.z[:, part]]), 1)
             rest = np.tensordot(into.T, np.concatenate([rest, self.rest[:, part]]), 1)
-            inner = np.concatenate([b.responses(signals, rest, rows) for b in blocks])
-            direct = np.zeros((outputs, n, *missed.shape[:2], len(rows)))
-            direct[range(outputs), :, range(outputs)] = h[..., rows]
+            inner = np.concatenate([b.responses(signals, rest, _THIN) for b in blocks])
+            direct = np.zeros((outputs, *h[..., ::_THIN].shape[:1], outputs, *h[..., ::_THIN].shape[1:]))
+            direct[range(outputs), :, range(outputs)] = h[..., ::_THIN]
             root = np.sqrt(weight[self.unit[part]].T)[..., None]
-            X = np.concatenate([(part_of * root).reshape(-1, root[..., 0].size * len(rows)) for part_of in (inner, direct)])
+            X = np.concatenate([(part_of * root).reshape(-1, root[..., 0].size * inner.shape[-1]) for part_of in (inner, direct)])
             H += X @ X.T
-            g += X @ (missed[..., rows] * root).ravel()
+            g += X @ (missed[..., ::_THIN] * root).ravel()
         turn = block_diag(np.kron(np.linalg.pinv(out).T, np.eye(width)), np.kron(np.eye(outputs), out))
         H, g = turn.T @ H @ turn, turn.T @ g
         size = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
@@ -195,13 +194,14 @@ class _Tuning:
 
         return H / np.outer(size, size), g / size, change
 
-    def _whitening(self, blocks: Sequence[Block], rows: npt.NDArray[np.intp]) -> tuple[Array, Array]:
+    def _whitening(self, blocks: Sequence[Block]) -> tuple[Array, Array]:
         """What makes all states and channels white along the recordings, and what makes the states so."""
         n = sum(len(b.F) for b in blocks)
         moments = np.zeros((n + len(self.z),) * 2)
         for part in self._parts():
-            flat = np.concatenate([self._missed(blocks, part)[0], self.z[:, part]])[..., rows]
-            moments += np.einsum("ibk,jbk->ij", flat, flat, optimize=True) / (len(self.unit) * len(rows))
+            flat = np.concatenate([self._missed(blocks, part)[0][..., ::_THIN], self.z[:, part, ::_THIN]]).reshape(len(moments), -1)
+            moments += flat @ flat.T
+        moments *= _THIN / self.z[0].size
         return _white(moments), _white(moments[:n, :n])
 
     def _missed(self, blocks: Sequence[Block], part: slice) -> tuple[Array, Array, Array]:

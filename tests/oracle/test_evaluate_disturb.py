@@ -128,6 +128,9 @@ def test_every_kind_does_what_its_name_says():
     wrong = given.under([Disturbance("phase", 0.5), Disturbance("bias", 0.0)])
     np.testing.assert_array_equal(wrong.parameters["phase"], [0.5] * 4 + [0.0] * 4)
     np.testing.assert_array_equal(wrong.y, np.concatenate([given.y, given.y], axis=1))
+    still = measured(0 * x)
+    for kind in (Kind.QUANTISATION, Kind.NOISE, Kind.BIAS):
+        np.testing.assert_array_equal(still.under([Disturbance(kind, 0.1)]).y, still.y)  # shares of no range are nothing
 
 
 @pytest.mark.parametrize(("kind", "severity"), [("dropped", 1.2), ("bias", -1.0), ("noise", np.nan), ("gap", np.inf), ("delay", 1.5)])

@@ -191,7 +191,7 @@ def _bias(measured: Measured, severity: float, rng: np.random.Generator) -> Arra
 
 def _quantisation(measured: Measured, severity: float, rng: np.random.Generator) -> Array:
     step = severity * measured.size
-    return measured.y if not severity else np.rint(measured.y / step) * step
+    return np.asarray(np.where(step > 0, np.rint(measured.y / np.where(step > 0, step, 1.0)) * step, measured.y))
 
 
 def _noise(measured: Measured, severity: float, rng: np.random.Generator) -> Array:

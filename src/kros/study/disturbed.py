@@ -107,7 +107,8 @@ def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, di
     given = tuple(chosen if everything else sorted(chosen, key=lambda k: roles[k.unit] != "nominal")[:FEW_UNITS])
     if not given:
         return None
-    disturbances = tuple(standard_disturbances()) if config.robustness else ()
+    calibrated = any(units.values())
+    disturbances = tuple(standard_disturbances([k for k in Kind if calibrated or k is not Kind.PHASE])) if config.robustness else ()
     if config.monte_carlo:
         disturbances += noise_draws(context, given, models.measured)
     samples = round((ALL_S if everything else FEW_S) / dt)

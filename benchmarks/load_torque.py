@@ -60,7 +60,7 @@ def main() -> None:
     parser.add_argument("--known", type=int, default=2, help="units with a known load")
     parser.add_argument("--memories", type=int, nargs="+", default=[8])
     parser.add_argument("--level", type=float, nargs="+", default=[10.0], help="seconds after which a constant load is forgotten")
-    parser.add_argument("--iterations", type=int, default=0, help="steps of tuning")
+    parser.add_argument("--iterations", type=int, default=10, help="steps of tuning")
     parser.add_argument("--settle", type=float, default=2.0, help="seconds at the start that do not count")
     parser.add_argument("--unlimited", action="store_true", help="as if the current had no limit")
     parser.add_argument("--certify", action="store_true")

@@ -123,7 +123,7 @@ def test_ripple_is_counted_in_the_moving_band() -> None:
 
 @pytest.fixture(scope="module")
 def drives() -> SimpleNamespace:
-    """Three drives, the load known on the first; observers that learned from it, and what they say of the others."""
+    """Three drives, the load known on the first; an observer that learned from it, and what it says of the others."""
     simulated = HarmonicDrivePopulation(n_units=3, n_episodes=3, seconds=7.0, seed=1, loop="soft").simulate()
     population, truth = simulated.population, simulated.truth
     train = [k for k in population.episodes if k.episode != "2" and (k.condition == "noload" or k.unit == population.unit_ids[0])]
@@ -137,35 +137,29 @@ def drives() -> SimpleNamespace:
         return SimpleNamespace(x=values[..., :3], u=values[..., 3:], load=load.astype(float), phase={"phase": phase})
 
     known, others = read(train), read(test)
-    found = {}
-    for kind, lifting in {
-        "koopman": Lifting(population.states, ("sin(100*position + phase)",), ("phase",)),
-        "linear": Lifting(population.states),
-    }.items():
-        own = [batch.phase if lifting.parameters else None for batch in (known, others)]
-        calibration = calibrate_load(lifting, (0,), known.x, known.u, known.load, DT, own[0], 2, corner_hz=20.0)
-        observer = load_observer(f"{kind}/load", calibration, population.inputs, 6)
-        estimate = run_observer(observer, others.x[..., :1], others.u, own[1])
-        leveled = AngleLoad(calibration.level_s, DT).run(estimate[..., 3], estimate[..., 2], others.x[..., 0])
-        found[kind] = SimpleNamespace(observer=observer, estimate=estimate, leveled=leveled)
-    return SimpleNamespace(known=known, others=others, **found)
+    lifting = Lifting(population.states, ("sin(100*position + phase)",), ("phase",))
+    calibration = calibrate_load(lifting, (0,), known.x, known.u, known.load, DT, known.phase, 2, corner_hz=20.0)
+    observer = load_observer("koopman/load", calibration, population.inputs, 6, samples=3000, iterations=2)
+    estimate = run_observer(observer, others.x[..., :1], others.u, others.phase)
+    leveled = AngleLoad(calibration.level_s, DT).run(estimate[..., 3], estimate[..., 2], others.x[..., 0])
+    return SimpleNamespace(known=known, others=others, observer=observer, estimate=estimate, leveled=leveled)
 
 
 def test_loads_of_units_that_took_no_part_are_found(drives: SimpleNamespace) -> None:
     """Slow errors under load stay near the floor without, with the level and for the seen part."""
-    accuracy = load_accuracy(drives.koopman.leveled.load, drives.others.load, DT, skip=2000)
+    accuracy = load_accuracy(drives.leveled.load, drives.others.load, DT, skip=2000)
     assert accuracy.ratio < 1.5
     assert accuracy.percent < 35
-    seen = load_accuracy(drives.koopman.estimate[..., 3], without_level(drives.others.load, 10.0, DT), DT)
+    seen = load_accuracy(drives.estimate[..., 3], without_level(drives.others.load, 10.0, DT), DT)
     assert seen.ratio < 1.5
 
 
 def test_total_current_and_load_are_separate(drives: SimpleNamespace) -> None:
     """The total current is better known than the load that it carries is large, and the load is no copy of it."""
     loaded = drives.others.load.any(axis=0)
-    error = drives.koopman.leveled.current - drives.others.x[..., 2]
+    error = drives.leveled.current - drives.others.x[..., 2]
     assert np.sqrt(np.mean(error[2000:, loaded] ** 2)) < 0.3 * np.sqrt(np.mean(drives.others.load[2000:, loaded] ** 2))
-    states = drives.koopman.observer.lifting.states
+    states = drives.observer.lifting.states
     assert states[:5] == ("position", "velocity", "current", "load", "memory_1")
 
 
@@ -173,12 +167,12 @@ def test_ripple_in_the_load_is_far_below_that_of_the_current(drives: SimpleNames
     """The gear's share of the recorded current, which the paper's linear estimate hands on, is down by more than 10 dB."""
     free = ~drives.others.load.any(axis=0)
     position, speed = drives.others.x[:, free, 0], drives.others.u[:, free, 1]
-    powers = [ripple_power(s[:, free], position, speed, 100.0, DT) for s in (drives.koopman.estimate[..., 3], drives.others.x[..., 2])]
+    powers = [ripple_power(s[:, free], position, speed, 100.0, DT) for s in (drives.estimate[..., 3], drives.others.x[..., 2])]
     assert 10 * np.log10(powers[1].mean() / powers[0].mean()) > 10
 
 
 def test_the_load_observer_is_certified_as_it_runs(drives: SimpleNamespace) -> None:
-    assert relift_certificate(drives.koopman.observer).certified
+    assert relift_certificate(drives.observer).certified
 
 
 def test_calibration_says_what_it_misses(drives: SimpleNamespace) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import numpy.typing as npt
 
 from ..memory import tune_memory
@@ -12,15 +13,18 @@ from ..memory.past import hidden_of
 from ..observer import Observer
 from .calibrate import LoadCalibration
 
+_OTHERS = 0.1  # weight of the recorded states' errors beside the load's
+
 
 def load_observer(
     name: str,
     calibration: LoadCalibration,
     inputs: Sequence[str],
     memories: int = 8,
-    importance: npt.ArrayLike = 1.0,
+    importance: npt.ArrayLike | None = None,
+    deviation: float = 0.15,
     samples: int = 6000,
-    iterations: int = 0,
+    iterations: int = 10,
 ) -> Observer:
     """Return an observer with the recorded states, ``load``, and ``memory_1, ...``, which needs neither current nor load at run time.
 
@@ -31,7 +35,9 @@ def load_observer(
     inputs : sequence of str
     memories : int
     importance : array_like, shape (h,)
-        Weights of the hidden states' errors, the load's last.
+        Weights of the hidden states' errors, the load's last; by default a tenth for all but the load.
+    deviation : float
+        Share by which the lifted functions' effect may differ from machine to machine.
     samples : int
         The first so many of every recording are tuned on.
     iterations : int
@@ -43,8 +49,10 @@ def load_observer(
         It runs, is saved and certified (`relift_certificate`) as all are. `load`, and under load the current, lack their level (`AngleLoad`).
     """
     past = calibration.past
-    model = past.model(len(hidden_of(past.lifting, past.measured)) + memories, importance=importance)
+    hidden = len(hidden_of(past.lifting, past.measured))
+    importance = np.append(np.full(hidden - 1, _OTHERS), 1.0) if importance is None else importance
+    model = past.model(hidden + memories, importance=importance, deviation=deviation)
     x, u = calibration.states[:samples], calibration.inputs[:samples]
     if iterations:
-        model, _ = tune_memory(model, past, x, u, calibration.kinds, calibration.parameters, importance, iterations=iterations)
+        model, _ = tune_memory(model, past, x, u, calibration.kinds, calibration.parameters, importance, deviation, iterations=iterations)
     return embedded(name, past, model, inputs, x, u, calibration.sample_period_s, calibration.parameters or None)

@@ -55,7 +55,7 @@ def tuned_where_better(
     except KrosError as error:
         log.info("%s stays as it was: %s", task.name, error)
         return settle(first, start), {"tuned": False}
-    before, after = (float(hidden_mean(unseen.percent(o), o.measured)) for o in (start, tuned))
+    before, after = hidden_mean(unseen.percent_of_all([start, tuned]), start.measured).tolist()
     blind = blind_percent([start, tuned], first, task.models.sample_period_s)
     settled = settle(first, tuned)
     better = after <= before and bool(blind[1] < LOST or blind[0] >= LOST)

@@ -70,7 +70,7 @@ def test_the_level_of_an_angle_fixed_load_comes_back() -> None:
     found = AngleLoad(2.0, DT, settling_s=1e-6).run(seen, seen, position).load
     assert np.abs(found - load)[1000:].max() < 1e-3
     assert np.abs(seen - load)[1000:2000].max() > 0.05
-    alone = AngleLoad(2.0, DT).run(np.zeros_like(seen), seen, position).load
+    alone = AngleLoad(2.0, DT).run(np.zeros_like(seen[:500]), seen[:500], position[:500]).load
     assert not alone.any()  # nothing seen, nothing filled in
 
 

@@ -1,0 +1,64 @@
+"""Load torque in a study: what is made, judged, saved and told."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from kros.core.errors import ConfigError
+from kros.data import split_episodes
+from kros.lifting import Lifting
+from kros.observer import Observer
+from kros.plants import HarmonicDrivePopulation
+from kros.report.figures import load_torque
+from kros.study.config import LoadConfig
+from kros.study.context import Facts
+from kros.study.load import load_metrics, run_load
+from kros.study.store import Store
+
+POPULATION = HarmonicDrivePopulation(n_units=2, n_episodes=3, seconds=3.0, seed=0, loop="soft").simulate().population
+
+
+def context(folder: Path, **options: object) -> SimpleNamespace:
+    """A study of two drives with a linear model, up to its evaluation."""
+    population = POPULATION
+    splits = split_episodes(population).values()
+    train, test = (tuple(k for s in splits for k in getattr(s, part)) for part in ("train", "test"))
+    facts = Facts(folder, "noload", dict.fromkeys(population.unit_ids, "population"), train, test, {})
+    return SimpleNamespace(
+        config=SimpleNamespace(load=LoadConfig(**options)),
+        facts=facts,
+        population=population,
+        phase_spec=None,
+        lifting=Lifting(population.states),
+        model_names=("linear",),
+        models=lambda name: SimpleNamespace(measured=(0,)),
+        store=Store(folder),
+    )
+
+
+def test_a_declared_load_is_found_on_the_other_units(tmp_path: Path) -> None:
+    study = context(tmp_path, moment=0.2, inertia=0.01, units=("001002",), memories=2)
+    files = run_load(study, {})
+    assert all(path.exists() for path in files)
+    told = load_metrics(study)["load_torque"]
+    assert told["known"] == ["001002"]
+    (row,) = told["rows"]
+    assert row["observer"] == "linear/load"
+    assert row["error_to_floor"] == pytest.approx(row["error_rms"] / row["floor_rms"])
+    assert 0 < row["error_rms"] < row["load_rms"]
+    assert Observer.load(tmp_path / "load" / "linear.json").lifting.states[3] == "load"
+    assert "linear/load" in load_torque.draw(SimpleNamespace(folder=tmp_path, sample_period_s=1e-3)).caption
+
+
+def test_without_a_moment_nothing_is_done(tmp_path: Path) -> None:
+    study = context(tmp_path)
+    assert run_load(study, {}) == []
+    assert load_metrics(study) == {}
+
+
+def test_a_study_says_what_its_load_lacks(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="condition 'rain'"):
+        run_load(context(tmp_path, moment=0.2, condition="rain"), {})
+    with pytest.raises(ConfigError, match="no state 'torque'"):
+        run_load(context(tmp_path, moment=0.2, units=("001001",), current="torque"), {})

@@ -17,7 +17,7 @@ from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certifica
 from kros.report.run_folder import RunFolder
 from kros.report.sections.relift import section
 from kros.study.relift import Running, certify, first_episodes, save_running
-from kros.study.stages.synthesize import choose_deployed
+from kros.study.stages.synthesize import choose_deployed, robust_of
 from kros.study.tuning import TuningSet
 from kros.synthesis import Injection
 
@@ -126,3 +126,7 @@ def test_handed_over_is_the_most_accurate_observer_that_is_certified_as_it_runs(
     assert choose_deployed(None, made, running[4:]) == "koopman/worst_case_h2"
     with pytest.raises(SynthesisError, match="there is no such observer"):
         choose_deployed("ours", made, running)
+    facts: dict[str, Any] = {name: {"worst_case_h2": None} for name in made}
+    assert robust_of(running, facts) is running
+    facts["koopman/open_loop"]["worst_case_h2"] = 0.3
+    assert choose_deployed(None, made, robust_of(running, facts)) == "koopman/open_loop"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -51,8 +51,8 @@ def run(context: Context) -> list[Path]:
     folder = context.store.path("observers")
     running = [r for found in context.run("certify as it runs", as_it_runs(tasks, products)) for r in found]
     files += save_running(folder, running)
-    covered = [name for name in made if facts[name]["worst_case_h2"] is not None] if context.config.require.robust else []
-    deployed = choose_deployed(context.config.observer.deployed, made, [r for r in running if not covered or r.name in covered])
+    eligible = robust_of(running, facts) if context.config.require.robust else running
+    deployed = choose_deployed(context.config.observer.deployed, made, eligible)
     for found in running:
         facts[found.name] |= found.facts()
     save_artifact(folder, "observers", {"names": made, "deployed": deployed, "facts": facts})
@@ -87,8 +87,7 @@ def choose_deployed(wanted: str | None, made: list[str], running: Sequence[Runni
     """Return the observer that is handed over: the one asked for, else the most accurate one that is certified as it runs and bears gaps.
 
     Accuracy is that on training episodes, of the states that are not measured. Where no observer bears missing measurements, those that are certified
-    compete; where there is none either, the best guarantee of the best model decides. A study that requires robustness names only observers that
-    are certified for the uncertain set, where there are any.
+    compete; where there is none either, the best guarantee of the best model decides.
     """
     if wanted is not None:
         if wanted not in made:
@@ -101,6 +100,11 @@ def choose_deployed(wanted: str | None, made: list[str], running: Sequence[Runni
     if best is None:
         raise SynthesisError("No observer could be made; see the reasons above.")
     return best
+
+
+def robust_of(running: Sequence[Running], facts: Mapping[str, Mapping[str, Any]]) -> Sequence[Running]:
+    """Return the observers that are certified for the uncertain set, for a study that requires it; all where none is."""
+    return [r for r in running if facts[r.name].get("worst_case_h2") is not None] or running
 
 
 def tasks_of(context: Context, name: str) -> list[Task]:

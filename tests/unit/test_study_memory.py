@@ -15,8 +15,10 @@ from kros.study.makers import Task, produce
 from kros.study.memory_maker import on_the_circle
 from kros.study.population_tuning import held_out, tuned_where_better
 from kros.study.relift import certify_running
+from kros.study.residual_maker import OwnModel, tuned
 from kros.study.stages.synthesize import certificate
 from kros.study.tuning import TuningSet
+from kros.synthesis import kalman
 
 STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "target_velocity")
 DRIVE = Lifting(STATES, ("sin(100*position + phase)",), ("phase",))
@@ -30,7 +32,7 @@ def tuning():
     return TuningSet(made.population, keys, {u: {"phase": truth[u]["phase_rad"][0]} for u in made.population.unit_ids})
 
 
-def task(tuning, lifting=DRIVE, measured=(0,), **settings):
+def task(tuning, lifting=DRIVE, measured=(0,), name="koopman/memory", method="memory", **settings):
     models = SimpleNamespace(
         name="koopman",
         lifting=lifting,
@@ -45,7 +47,7 @@ def task(tuning, lifting=DRIVE, measured=(0,), **settings):
         index=lambda unit: 0,
     )
     options = {"input_weight": "identity", "time_limit_s": 1.0, "max_order": 2, "max_states": None, "memory_states": 4, **settings}
-    return Task("koopman/memory", "memory", models, "001001", None, "there is no set", np.array([1e-5]), tuning, **options)
+    return Task(name, method, models, "001001", None, "there is no set", np.array([1e-5]), tuning, **options)
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +148,22 @@ def test_tuning_is_kept_where_nothing_speaks_against_it(tuning, made):
     lost = replace(lost, controller=replace(lost.controller, D=lost.A[:, :1]))
     assert tuned_where_better(own, judge, start, lambda seen, o: lost)[0] is start
     assert relift_certificate(start, mismatch=False).certified
+
+
+def test_a_correction_filter_is_tuned_the_same_way(tuning):
+    own, judge = task(tuning, name="linear/residual_h2", method="residual_h2", lifting=Lifting(STATES)), tuning.read()
+    x, u = judge.batch.states, judge.batch.inputs
+    seen, following = np.concatenate([x, u], axis=-1)[:-1].reshape(-1, 5), x[1:].reshape(-1, 3)
+    rows = np.linalg.lstsq(seen, following, rcond=None)[0].T
+    covariance = np.cov((following - seen @ rows.T).T)
+    own.models.A[0], own.models.B[0] = 0.999 * rows[:, :3], rows[:, 3:]
+    start = kalman(own.models.A[0], np.eye(1, 3), covariance, np.array([[1e-10]]), 0.001)
+    kept, facts = tuned(own, judge, start)
+    assert facts["tuned"]
+    assert facts["held_out_percent"]["after"] < 0.9 * facts["held_out_percent"]["before"]
+    assert isinstance(kept, OwnModel)
+    assert kept.controller.n_states == start.controller.n_states
+    assert "tuned on training episodes" in certificate(own, kept, None)["reason"]
 
 
 def test_the_verdict_claims_no_set_for_it():

@@ -6,6 +6,7 @@ import pytest
 from kros.lifting import Lifting
 from kros.observer import Observer, Past, observer_with_memory, run_observer, tune_memory
 from kros.observer.memory.blocks import blocks_of, joined
+from kros.observer.memory.tuning import _slowing
 from kros.synthesis import Injection, kalman
 from kros.synthesis.residual.shaping import Bank
 
@@ -102,3 +103,14 @@ def test_with_deviation_a_machine_unlike_those_recorded_is_estimated_better():
         )
         errors.append(np.std((observer.run(other[..., :1], push)[..., :2] - other)[400:, :, 1]))
     assert errors[1] < 0.95 * errors[0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_slows_the_slowest_pole_is_the_derivative_of_the_spectral_radius(seed):
+    F, step = random_model(4, seed)[0], 1e-7
+    radius = np.abs(np.linalg.eigvals(F)).max()
+    for i, j in np.ndindex(4, 4):
+        moved = F.copy()
+        moved[i, j] += step
+        change = (np.abs(np.linalg.eigvals(moved)).max() - radius) / step
+        assert _slowing(F)[i, j] == pytest.approx(change, rel=1e-4, abs=1e-5)

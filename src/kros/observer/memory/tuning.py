@@ -31,6 +31,7 @@ from .past import Past, hidden_of, seen_by
 _DAMPING = (1e-7, 1e-3, 1e4)
 _THIN, _SIDE_BY_SIDE = 8, 4  # episodes: keeps derivatives in some ten megabytes
 _ALIKE = 1e-13  # share of a direction below which rounding decides
+_BOUND, _AT_BOUND = 1e4, 1 - 1e-6  # a pole at its bound stays there instead of ending the search
 _MEMORIES = 3  # models forget within this part of an episode: what is slower, recordings of this length cannot judge
 
 
@@ -90,10 +91,14 @@ def tune_memory(
     error = problem.errors(blocks)
     criterion = [problem.criterion(error)]
     for _ in range(iterations):
-        H, g, change = problem.normal_equations(blocks, error)
+        H, g, outward, change = problem.normal_equations(blocks, error)
+        bounded = np.outer(outward, outward) * _BOUND if _radius(blocks) > slowest * _AT_BOUND else np.zeros_like(H)
         while damping <= high:
-            step = change(np.asarray(np.linalg.solve(H + damping * np.eye(len(g)), g), dtype=float))
-            trial = [b.within(slowest) for b in blocks_of(*_sum(joined(blocks), step))]
+            damped = H + damping * np.eye(len(g))
+            step = np.linalg.solve(damped, g)
+            if outward @ step > 0:
+                step = np.linalg.solve(damped + bounded, g)
+            trial = [b.within(slowest) for b in blocks_of(*_sum(joined(blocks), change(np.asarray(step, dtype=float))))]
             error_then = problem.errors(trial)
             if problem.criterion(error_then) < criterion[-1]:
                 break
@@ -161,8 +166,8 @@ class _Tuning:
             return np.inf
         return float(self.share @ np.log(error.mean(axis=0)) / 2)
 
-    def normal_equations(self, blocks: Sequence[Block], error: Array) -> tuple[Array, Array, Callable[[Array], Model]]:
-        """Gauss-Newton matrix and right side for scaled coefficients, and what takes a step to changes of F, G, H.
+    def normal_equations(self, blocks: Sequence[Block], error: Array) -> tuple[Array, Array, Array, Callable[[Array], Model]]:
+        """Gauss-Newton matrix and right side for scaled coefficients, the direction that slows the slowest pole, and what takes a step to F, G, H.
 
         Coefficients are those of all states and channels, white along the recordings, in the rows of white states: directions that change no
         estimate, and those between nearly alike channels, cost nothing.
@@ -192,7 +197,9 @@ class _Tuning:
             moved = inner.reshape(n, width) @ into.T
             return moved[:, :n], moved[:, n:], direct.reshape(outputs, n)
 
-        return H / np.outer(size, size), g / size, change
+        slows = np.hstack([_slowing(joined(blocks)[0]), np.zeros((n, len(self.z)))]) @ into
+        outward = turn.T @ np.concatenate([slows.ravel(), np.zeros(outputs * n)]) / size
+        return H / np.outer(size, size), g / size, outward / np.linalg.norm(outward), change
 
     def _whitening(self, blocks: Sequence[Block]) -> tuple[Array, Array]:
         """What makes all states and channels white along the recordings, and what makes the states so."""
@@ -216,6 +223,18 @@ class _Tuning:
 
 def _sum(model: Model, change: Model) -> Model:
     return model[0] + change[0], model[1] + change[1], model[2] + change[2]
+
+
+def _radius(blocks: Sequence[Block]) -> float:
+    return max(float(np.abs(np.linalg.eigvals(b.F)).max()) for b in blocks)
+
+
+def _slowing(F: Array) -> Array:
+    """Derivative of the spectral radius by F, shape (n, n)."""
+    values, vectors = np.linalg.eig(F)
+    k = int(np.abs(values).argmax())
+    turn = np.conj(values[k]) / np.abs(values[k])
+    return np.asarray((turn * np.outer(np.linalg.inv(vectors)[k], vectors[:, k])).real)
 
 
 def _white(moments: Array) -> Array:

@@ -402,7 +402,8 @@ def test_identifiers_are_unique_and_references_lead_somewhere(page: str) -> None
 
 
 def test_every_figure_is_on_the_page_with_a_caption(page: str) -> None:
-    assert page.count("<figure") == page.count("<figcaption>") == len(FIGURES)
+    expected = set(FIGURES) - {"load_torque"}  # of studies that declare a load alone
+    assert page.count("<figure") == page.count("<figcaption>") == len(expected)
     assert "is left out" not in page
 
 

@@ -31,7 +31,7 @@ class LeftOutCell:
     worst_unit : str or None
     units : mapping of str to float or None
     band_db : float or None
-        Power of the error around the gearbox frequency, mean over the units, in dB relative to that of `PAPER`.
+        Power of the error around the gearbox frequency, mean over the units, in dB relative to that of `PAPER` on the same units.
     """
 
     mean: float | None
@@ -89,8 +89,8 @@ def _table(condition: str, rows: Sequence[Mapping[str, Any]], home: bool) -> Lef
     means = _intervals({key: [r["error_percent"] for r in found] for key, found in grouped.items()})
     cells: dict[str, dict[str, LeftOutCell]] = {}
     for (observer, channel), found in grouped.items():
-        papers = _power(grouped.get((PAPER, channel), []))
-        cells.setdefault(observer, {})[channel] = _cell(found, means.get((observer, channel)), papers)
+        band_db = _band_db(found, grouped.get((PAPER, channel), []))
+        cells.setdefault(observer, {})[channel] = _cell(found, means.get((observer, channel)), band_db)
     channels = tuple(dict.fromkeys(channel for _, channel in grouped))
     return LeftOutTable(condition, channels, cells, ranked_channels(channels, condition, home))
 
@@ -106,10 +106,8 @@ def _intervals(errors: Mapping[Key, Sequence[float | None]]) -> dict[Key, tuple[
     return found
 
 
-def _cell(rows: Sequence[Mapping[str, Any]], interval: tuple[float, float] | None, papers: float | None) -> LeftOutCell:
+def _cell(rows: Sequence[Mapping[str, Any]], interval: tuple[float, float] | None, band_db: float | None) -> LeftOutCell:
     units = {r["unit"]: r["error_percent"] for r in rows}
-    own = _power(rows)
-    band_db = float(10 * np.log10(own / papers)) if own and papers else None
     known = {unit: float(error) for unit, error in units.items() if error is not None and np.isfinite(error)}
     if len(known) < len(units):
         return LeftOutCell(None, None, None, None, None, units, band_db)
@@ -118,8 +116,12 @@ def _cell(rows: Sequence[Mapping[str, Any]], interval: tuple[float, float] | Non
     return LeftOutCell(float(np.mean(list(known.values()))), low, high, known[worst], worst, units, band_db)
 
 
-def _power(rows: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the mean power around the gearbox frequency; None where it is unknown or infinite."""
-    powers = [r.get("gearbox_band_power") for r in rows]
-    known = [float(p) for p in powers if p is not None and np.isfinite(p)]
-    return float(np.mean(known)) if known and len(known) == len(powers) else None
+def _band_db(rows: Sequence[Mapping[str, Any]], papers: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the ratio of mean powers around the gearbox frequency over the units that both have; None where one is unknown or infinite."""
+    own, theirs = ({r["unit"]: r.get("gearbox_band_power") for r in found} for found in (rows, papers))
+    shared = [unit for unit in own if unit in theirs]
+    pairs = np.array([[own[unit], theirs[unit]] for unit in shared], float)
+    if not shared or not np.isfinite(pairs).all() or not pairs.sum(axis=0).all():
+        return None
+    powers = pairs.mean(axis=0)
+    return float(10 * np.log10(powers[0] / powers[1]))

@@ -50,6 +50,8 @@ def prove(modes: list[ErrorSystem], memory: int, time_limit_s: float, *, tight: 
         found = _first_proof([proposal] if proposal else [], corners, system)
         if found is not None and (best is None or found[0].gain < best[0].gain):
             best = found
+        if best is not None and not tight:
+            break
     if best is not None:
         return best, "", ReliftStatus.CERTIFIED
     return None, f"No Lyapunov function was found for all slopes in the box ({said}).", ReliftStatus.NOT_FOUND

@@ -70,6 +70,7 @@ def test_the_last_episodes_are_held_out():
 
     assert held_out(keys("a1", "a2", "a3", "b1", "b2")) == [False, False, True, False, True]
     assert held_out(keys("a1", "b1", "c1", "d1")) == [False, False, True, False]
+    assert held_out(keys("a1", "b1")) == [False, True]
 
 
 def test_a_study_makes_what_the_recipe_makes(made, tuning):
@@ -144,6 +145,8 @@ def test_tuning_is_kept_where_nothing_speaks_against_it(tuning, made):
     better, facts = tuned_where_better(own, judge, rough, lambda seen, o: start)
     assert better is start
     assert facts["tuned"]
+    alone = judge.part([0])
+    assert tuned_where_better(own, alone, start, lambda seen, o: changed(0.5)) == (start, {"tuned": False})
     lost = replace(start, A=np.concatenate([1.5 * start.A[:1], start.A[1:]]))  # what predicts the measurement matters where there is none
     lost = replace(lost, controller=replace(lost.controller, D=lost.A[:, :1]))
     assert tuned_where_better(own, judge, start, lambda seen, o: lost)[0] is start

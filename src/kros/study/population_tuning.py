@@ -6,7 +6,9 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..core.errors import KrosError
+import numpy as np
+
+from ..core.errors import DataError, KrosError
 from ..data.population import EpisodeKey
 from ..observer import Observer, relift_certificate
 from .relift import LOST, blind_percent, scales_of
@@ -51,8 +53,10 @@ def tuned_where_better(
     unseen = judge.part([i for i in range(len(held)) if held[i]])
     first = judge.part([i for i, key in enumerate(judge.batch.keys) if key.unit not in {k.unit for k in judge.batch.keys[:i]}])
     try:
+        if all(held):
+            raise DataError("tuning needs a second training episode, to be judged on.")
         tuned = tune(judge.part([i for i in range(len(held)) if not held[i]]), start)
-    except KrosError as error:
+    except (KrosError, np.linalg.LinAlgError) as error:
         log.info("%s stays as it was: %s", task.name, error)
         return settle(first, start), {"tuned": False}
     before, after = hidden_mean(unseen.percent_of_all([start, tuned]), start.measured).tolist()
@@ -68,5 +72,6 @@ def held_out(keys: Sequence[EpisodeKey]) -> list[bool]:
     """Tell which episodes tuning does not see: the last one of every unit, or every third unit's where units have one each."""
     last = {key.unit: i for i, key in enumerate(keys)}
     if len(last) == len(keys):
-        return [i % 3 == 2 for i in range(len(keys))]
+        period = min(3, len(keys))
+        return [i % period == period - 1 for i in range(len(keys))]
     return [last[key.unit] == i for i, key in enumerate(keys)]

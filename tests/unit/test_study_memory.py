@@ -95,7 +95,7 @@ def test_a_study_makes_what_the_recipe_makes(made, tuning):
         seen.parameters,
         4,
         episodes=1,
-        iterations=8 if product.facts["tuned"] else 0,
+        iterations=4 if product.facts["tuned"] else 0,
     )
     np.testing.assert_allclose(judge.percent(observer), judge.percent(expected), rtol=1e-6)
     assert max(judge.percent(observer)) < 20

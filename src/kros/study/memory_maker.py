@@ -20,7 +20,7 @@ from .tuning import Judge
 if TYPE_CHECKING:
     from .makers import Made, Task
 
-_EFFORT = {"episodes": 1, "iterations": 8}  # of every unit; more take longer, for one or two per cent on units that were left out
+_EFFORT = {"episodes": 1, "iterations": 4}  # of every unit; more take longer, for one or two per cent on units that were left out
 _CIRCLE = {"sin": "cos", "cos": "sin"}
 _REASON = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
 

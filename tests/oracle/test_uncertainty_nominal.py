@@ -9,7 +9,7 @@ from kros.core import StateSpace
 from kros.core.errors import ConfigError, DimensionError
 from kros.uncertainty import Form, all_bounds, choose_nominal, choose_nominals, optimal_cover, residual
 from kros.uncertainty.population.nominal import frequency_weights
-from kros.uncertainty.small import lower_factor, triangle
+from kros.uncertainty.small import condition_number, lower_factor, triangle
 from kros.uncertainty.weights.cover_search import cost_from_below_db, couplings
 
 FORMS = list(Form)
@@ -168,3 +168,12 @@ def test_what_cannot_be_searched_is_refused() -> None:
     G[1, 2, 0, 0] = np.nan
     with pytest.raises(DimensionError, match=r"units \[1\] have NaN"):
         choose_nominal(G, "additive")
+
+
+def test_condition_numbers_of_pairs_are_those_of_the_svd():
+    rng = np.random.default_rng(5)
+    turns = [np.linalg.qr(rng.normal(size=(300, 2, 2)) + 1j * rng.normal(size=(300, 2, 2)))[0] for _ in range(2)]
+    expected = 10 ** rng.uniform(0, 12, 300)
+    matrices = turns[0] * np.stack([np.ones(300), 1 / expected], axis=-1)[:, None] @ turns[1]
+    np.testing.assert_allclose(condition_number(matrices), expected, rtol=1e-3)  # rounding of the determinant at 1e12 is 1e-4 of it
+    assert condition_number(np.ones((1, 2, 2)))[0] == np.inf

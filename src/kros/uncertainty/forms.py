@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
-from .small import entries_first, entries_last, multiply, pseudo_inverse_first
+from .small import condition_number, entries_first, entries_last, multiply, pseudo_inverse_first
 
 Array = npt.NDArray[Any]
 
@@ -193,7 +193,7 @@ def existence(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike
     else:
         inside = _in_range(_turn(G), _turn(Gp), rtol)
     matrix = inverted_matrix(form, G, residual(form, G, Gp))
-    return inside & (np.linalg.cond(matrix) < MAX_CONDITION)
+    return inside & (condition_number(matrix) < MAX_CONDITION)
 
 
 def _plants(nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from .forms import MAX_CONDITION, Form, as_form, inverted_matrix, rebuild, residual
-from .small import entries_first, lower_factor, multiply, pseudo_inverse_first, sigma_max_first
+from .small import condition_number, entries_first, lower_factor, multiply, pseudo_inverse_first, sigma_max_first
 
 Array = npt.NDArray[Any]
 
@@ -171,7 +171,7 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
     size = sigma_max(responses)
     ratio = np.divide(error, size, out=np.zeros_like(error), where=size > 0)
     if form.value.startswith("inverse"):
-        ratio[~(np.linalg.cond(inverted_matrix(form, nominal, E)) <= MAX_CONDITION)] = np.nan
+        ratio[~(condition_number(inverted_matrix(form, nominal, E)) <= MAX_CONDITION)] = np.nan
     return ratio
 
 
@@ -194,7 +194,7 @@ def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLik
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
     E = residual(form, G, Gp)
     if form.value.startswith("inverse"):
-        regular = np.linalg.cond(inverted_matrix(form, G, E)) <= MAX_CONDITION
+        regular = condition_number(inverted_matrix(form, G, E)) <= MAX_CONDITION
         E = np.where(regular[..., None, None], E, 0.0)
     return E, Gp - rebuild(form, G, E)
 

@@ -79,6 +79,19 @@ def sigma_max_squared(matrices: Array) -> Array:
     return (first + second) / 2 + np.sqrt(half**2 + squared(cross))
 
 
+def condition_number(matrices: Array) -> Array:
+    """Return condition numbers of square matrices (..., n, n), shape (...); infinite where singular.
+
+    Of 2 x 2 ones it is `sigma_max^2 / |det|`; rounding in the determinant decides beyond about 1e14 only.
+    """
+    if matrices.shape[-1] != 2:
+        return np.asarray(np.linalg.cond(matrices))
+    entries = entries_first(matrices)
+    det = np.abs(entries[0, 0] * entries[1, 1] - entries[0, 1] * entries[1, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(sigma_max_squared(entries) / det)
+
+
 def lower_factor(pseudo_inverse: Array) -> Array:
     """Return square `L` with `P P^H = L L^H` for entries-first P of shape (r, s, ...), r <= s.
 

@@ -11,6 +11,7 @@ from kros.lifting import Lifting
 from kros.observer import observer_with_memory, relift_certificate
 from kros.plants import PLANTS
 from kros.report.verdict import verdict
+from kros.study.config import MemoryConfig
 from kros.study.makers import Task, produce
 from kros.study.memory_maker import on_the_circle
 from kros.study.population_tuning import held_out, tuned_where_better
@@ -46,7 +47,14 @@ def task(tuning, lifting=DRIVE, measured=(0,), name="koopman/memory", method="me
         B=np.zeros((1, lifting.n_lifted, 2)),
         index=lambda unit: 0,
     )
-    options = {"input_weight": "identity", "time_limit_s": 1.0, "max_order": 2, "max_states": None, "memory_states": 4, **settings}
+    options = {
+        "input_weight": "identity",
+        "time_limit_s": 1.0,
+        "max_order": 2,
+        "max_states": None,
+        "memory": MemoryConfig(states=4),
+        **settings,
+    }
     return Task(name, method, models, "001001", None, "there is no set", np.array([1e-5]), tuning, **options)
 
 

@@ -136,9 +136,29 @@ class SynthesisConfig(_Section):
     max_states: int | None = Field(
         None, ge=0, description="most states of the filter of worst_case_h2; reduced and polished where it has more"
     )
-    memory_states: int = Field(12, ge=1, description="states besides the recorded ones of the observer with a memory")
     tune: bool = Field(False, description="whether residual_h2 is tuned on training episodes, which takes some seconds a kind of model")
     time_limit_s: float = Field(60.0, gt=0)
+
+
+class MemoryConfig(_Section):
+    """The observer with a memory.
+
+    As many tuning `steps` as these, on so many `episodes` of every unit, keep a study short; 25 and 2 take half a minute, and are what an observer that
+    goes into machines is worth. `importance` weights the logarithmic errors of states that are not measured, by name; one where none is given.
+    """
+
+    states: int = Field(12, ge=1, description="states besides the recorded ones")
+    steps: int = Field(4, ge=0)
+    episodes: int = Field(1, ge=1)
+    importance: dict[str, float] = Field(default_factory=dict)
+
+    @field_validator("importance")
+    @classmethod
+    def _positive(cls, value: dict[str, float]) -> dict[str, float]:
+        for name, weight in value.items():
+            if not 0 < weight < float("inf"):
+                raise ValueError(f"memory.importance.{name} should be a positive number")
+        return value
 
 
 class ObserverConfig(_Section):
@@ -209,6 +229,7 @@ class StudyConfig(_Section):
     identify: IdentifyConfig = IdentifyConfig()
     uncertainty: UncertaintyConfig = UncertaintyConfig()
     synthesis: SynthesisConfig = SynthesisConfig()
+    memory: MemoryConfig = MemoryConfig()
     observer: ObserverConfig = ObserverConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     load: LoadConfig = LoadConfig()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -18,6 +18,7 @@ from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, m
 from ..synthesis.robust.causal import causal_h2
 from ..uncertainty import fit_magnitude
 from .baselines import kalman_tuned, make_luenberger
+from .config import MemoryConfig
 from .memory_maker import make_memory
 from .paper_maker import make_paper
 from .residual_maker import OwnModel, make_residual_h2
@@ -50,7 +51,7 @@ class Task:
     max_order: int
     max_states: int | None
     covered: tuple[str, ...] = ()
-    memory_states: int = 12
+    memory: MemoryConfig = field(default_factory=MemoryConfig)
     tune: bool = False
 
     def observer(self, synthesis: Synthesis) -> Observer:
@@ -135,7 +136,9 @@ def make_worst_case_h2(task: Task) -> Made:
         assumed = surroundings.of(problem)
         return of_few_states(task, assumed, worst_case_h2(assumed, max_order=task.max_order)), surroundings.facts(), assumed
     rough = partial(worst_case_h2, max_order=2, tolerance_db=3.0, refinements=0, fit=remembering(fit_magnitude), causal=False)
-    surroundings, _ = best_surroundings(task, problem, partial(rough, bounded=False, max_order=1))  # order 2 takes twice as long and chose the same
+    surroundings, _ = best_surroundings(
+        task, problem, partial(rough, bounded=False, max_order=1)
+    )  # order 2 takes twice as long and chose the same
     assumed = surroundings.of(problem)
     synthesis = rough(assumed)
     accurate = worst_case_h2(assumed, max_order=task.max_order, refinements=0, causal=False)  # of higher order: for its lower bound

@@ -20,7 +20,6 @@ from .tuning import Judge
 if TYPE_CHECKING:
     from .makers import Made, Task
 
-_EFFORT = {"episodes": 1, "iterations": 4}  # of every unit; more take longer, for one or two per cent on units that were left out
 _CIRCLE = {"sin": "cos", "cos": "sin"}
 _REASON = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
 
@@ -44,7 +43,7 @@ def make_memory(task: Task) -> Made:
     solve_s = time.perf_counter() - began
     model: dict[str, Any] = {"A": kept.A, "B": kept.B, "lifting": kept.lifting, "reason": _REASON}
     made = OwnModel("memory", kept.controller, Status.CERTIFIED, kept.injection, solve_s=solve_s, **model)
-    return made, {"memory_states": task.memory_states, **facts}, task.problem
+    return made, {"memory_states": task.memory.states, **facts}, task.problem
 
 
 def identified(task: Task, lifting: Lifting, judge: Judge, **options: Any) -> Observer:
@@ -61,8 +60,9 @@ def identified(task: Task, lifting: Lifting, judge: Judge, **options: Any) -> Ob
         [key.unit for key in batch.keys],
         models.sample_period_s,
         judge.parameters if lifting.parameters else None,
-        task.memory_states,
-        **(_EFFORT | options),
+        task.memory.states,
+        [task.memory.importance.get(name, 1.0) for i, name in enumerate(models.lifting.states) if i not in models.measured],
+        **({"episodes": task.memory.episodes, "iterations": task.memory.steps} | options),
     )
 
 

@@ -161,7 +161,12 @@ def run(context: Context) -> list[Path]:
     content |= {"observers": list(estimates), "models": list(models), "states": population.states}
     save_artifact(folder, "evaluation", content, _arrays(population, keys, on, shown, shown_on, roles, estimates, free_runs))
     disturbed = {name: (o.disturbed, o.estimated) for name, o in estimates.items() if o.disturbed is not None}
-    return [folder / "evaluation.json", folder / "arrays.npz", *run_disturbed(context, trial, observers, disturbed), *run_load(context, observers)]
+    return [
+        folder / "evaluation.json",
+        folder / "arrays.npz",
+        *run_disturbed(context, trial, observers, disturbed),
+        *run_load(context, observers),
+    ]
 
 
 def estimation(

@@ -76,6 +76,9 @@ def check_source(config: StudyConfig, single_allowed: bool) -> None:
             f"No channel is measured: an observer needs a state that is available at run time, found states {', '.join(population.states)}; "
             "declare measured = true for at least one."
         )
+    hidden = [name for name in population.states if name not in population.measured]
+    if unknown := sorted(set(config.memory.importance) - set(hidden)):
+        raise ConfigError(f"memory.importance: {', '.join(unknown)} should be among the states that are not measured, {', '.join(hidden)}.")
 
 
 def read_group(task: GroupTask) -> GroupFacts:

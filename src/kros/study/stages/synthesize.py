@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import SynthesisError
+from ...data.population import EpisodeKey
 from ...identify import ModelSet
 from ...observer import Observer
 from ...synthesis import Injection, ObserverProblem, Synthesis, check_units
@@ -118,7 +119,7 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     methods = suitable(config.observer.baselines + config.synthesis.methods, name, refined=name not in context.edmd_names)
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings |= {"max_order": config.uncertainty.max_order, "max_states": config.synthesis.max_states, "covered": uncertain.unit_ids}
-    settings |= {"memory_states": config.synthesis.memory_states, "tune": config.synthesis.tune}
+    settings |= {"memory": config.memory, "tune": config.synthesis.tune}
     return [
         Task(f"{name}/{method.name}", method.name, models, unit, problem, refusal, noise, tuning_set(context, models), **settings)
         for method in methods
@@ -173,14 +174,21 @@ def measurement_noise(context: Context, models: ModelSet) -> Array:
 
 
 def tuning_set(context: Context, models: ModelSet) -> TuningSet:
-    """Return the training episodes that observers are tuned on: the first ones of the first units."""
+    """Return the training episodes that observers are tuned on: some of the first units, from the first to the last one of each."""
     facts, calibration = context.facts, calibrate.load(context)
     units = [u for u in facts.pooled if u in models.unit_ids][:TUNING_UNITS]
-    keys = tuple(k for u in units for k in facts.keys("train", u, facts.identify_on)[:TUNING_EPISODES])
+    keys = tuple(k for u in units for k in spread(facts.keys("train", u, facts.identify_on), TUNING_EPISODES))
     parameters: dict[str, dict[str, float]] = {
         u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in units
     }
     return TuningSet(context.population.select(units), keys, parameters)
+
+
+def spread(keys: Sequence[EpisodeKey], count: int) -> list[EpisodeKey]:
+    """Return so many episodes from the first to the last: what was recorded one after the other may be alike."""
+    if len(keys) <= count:
+        return list(keys)
+    return [keys[i] for i in np.linspace(0, len(keys) - 1, count).round().astype(int)]
 
 
 def certified_problem(task: Task, tasks: list[Task], products: list[Product]) -> ObserverProblem | None:

@@ -186,3 +186,10 @@ def test_the_verdict_claims_no_set_for_it():
     assert "“Koopman, with memory”" in told
     assert "not designed for a set of machines" in told
     assert "A certificate covers it as it runs" in told
+
+
+def test_an_observer_that_loses_the_machine_is_not_made(made, monkeypatch):
+    monkeypatch.setattr("kros.study.memory_maker.LOST", 0.0)
+    product = produce(made[0])
+    assert product.synthesis is None
+    assert "loses the machine" in product.facts["reason"]

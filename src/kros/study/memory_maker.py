@@ -14,8 +14,9 @@ from ..lifting import Lifting
 from ..observer import Observer, driven_coordinates, observer_with_memory
 from ..synthesis import Status
 from .population_tuning import tuned_where_better
+from .relift import LOST
 from .residual_maker import OwnModel
-from .tuning import Judge
+from .tuning import Judge, hidden_mean
 
 if TYPE_CHECKING:
     from .makers import Made, Task
@@ -30,7 +31,7 @@ def make_memory(task: Task) -> Made:
     Raises
     ------
     SynthesisError
-        Where the lifting reads what is not measured or past, everything is measured, or recordings are too short.
+        Where the lifting reads what is not measured or past, everything is measured, recordings are too short, or the observer loses the machine.
     """
     began, judge = time.perf_counter(), task.tuning.read()
     recipe = partial(identified, task, on_the_circle(task.models.lifting))
@@ -40,6 +41,12 @@ def make_memory(task: Task) -> Made:
         )
     except (KrosError, np.linalg.LinAlgError) as error:
         raise SynthesisError(str(error)) from error
+    percent = float(hidden_mean(judge.percent(kept), kept.measured))
+    if not percent < LOST:
+        raise SynthesisError(
+            f"Observer with a memory: it loses the machine on training episodes (error {percent:.3g} % of the range); "
+            "lifted functions that say nearly the same as the measurement do that, take them out of the lifting."
+        )
     solve_s = time.perf_counter() - began
     model: dict[str, Any] = {"A": kept.A, "B": kept.B, "lifting": kept.lifting, "reason": _REASON}
     made = OwnModel("memory", kept.controller, Status.CERTIFIED, kept.injection, solve_s=solve_s, **model)

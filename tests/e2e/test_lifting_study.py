@@ -33,6 +33,9 @@ refine = false
 n_freqs = 200
 max_order = 2
 
+[evaluate]
+robustness = false
+monte_carlo = 0
 [synthesis]
 input_weight = 3.0
 methods = ["worst_case_h2"]

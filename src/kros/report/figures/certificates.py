@@ -13,7 +13,7 @@ from ..names import observer_label, observer_look
 from ..run_folder import NotShownError, RunFolder
 from ..theme import Tone
 from .drawing import Drawing
-from .errors_chart import plain_log_ticks
+from .observer_rows import plain_log_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,7 +17,7 @@ from ..names import condition_label, method_label, model_label, split_observer
 from ..run_folder import NotShownError, RunFolder
 from ..theme import Tone
 from .drawing import Drawing
-from .errors_chart import log_ticks
+from .observer_rows import log_ticks
 from .trajectories import states
 
 if TYPE_CHECKING:

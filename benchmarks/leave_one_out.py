@@ -5,7 +5,7 @@
 Every population is simulated and studied with ``[evaluate] folds``: for each fold the whole study is made on the other units. Prints a table for
 every condition: in how many folds an observer is certified as it runs ("runs") and for the uncertain set ("set"), and in how many it could be made
 where not in all; mean over the units with the 95 % interval of a bootstrap over units, and the worst unit, of the states that are not measured, in
-percent of the range; power of the error around the gearbox frequency in dB relative to the paper's own observer, `koopman_edmd/mixed`. Below it:
+percent of the largest value; power of the error around the gearbox frequency in dB relative to the paper's own observer, `koopman_edmd/mixed`. Below it:
 what is asked of the table, and by how much it is met or missed. Observers with a memory are tuned longer than a study does by default, with
 velocity first. ``--set KEY=VALUE`` changes the study; with ``--out`` runs are kept, and found done
 the next time (``kros run`` on a population's study.toml adds the report).
@@ -111,7 +111,7 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
 def show(table: LeftOutTable, facts: Facts, folds: int) -> None:
     """Print one condition."""
     channels = [c for c in HIDDEN if c in table.channels]
-    say(f"\n{table.condition:31s} {'':>5s} {'certified':>11s} " + " ".join(f"{f'{c}, % of range':>45s}" for c in channels))
+    say(f"\n{table.condition:31s} {'':>5s} {'certified':>11s} " + " ".join(f"{f'{c}, % of the largest value':>45s}" for c in channels))
     columns = f"{'mean':>8s} {'(95 %)':>18s} {'worst':>8s} {'band dB':>8s}"
     say(f"{'observer':31s} {'order':>5s} {'runs':>5s} {'set':>5s} " + " ".join([columns] * len(channels)))
     for name, cells in table.cells.items():

@@ -319,7 +319,7 @@ class Drives:
         return row
 
     def current_percent(self, estimate: Array) -> list[float]:
-        """Error of the total current in percent of its range: without load, and under load where it stays off its limit."""
+        """Error of the total current in percent of the largest value: without load, and under load where it stays off its limit."""
         skip = round(self.options.settle / self.dt)
         truth = self.test.states[skip:, :, CURRENT]
         percent = 100 * np.sqrt(np.mean((estimate[skip:] - truth) ** 2, axis=0)) / np.abs(truth).max(axis=0)

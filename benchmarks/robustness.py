@@ -135,7 +135,7 @@ def show(metrics: dict[str, Any], loads: dict[str, dict[str, list[float]]]) -> N
     say("\nseverity at which the error doubles (unit of the metrics)")
     table(["observer", *(kind.value for kind in Kind)], [[name, *(doubled(found[name], kind) for kind in Kind)] for name in found])
     for channel in HIDDEN:
-        say(f"\n{channel}, percent of the range, mean over the units")
+        say(f"\n{channel}, percent of the largest value, mean over the units")
         head = ["observer", "0", *(f"{kind.value} {s * AXES[kind].factor:.3g}" for kind, chosen in CHOSEN.items() for s in chosen)]
         table(head, [[name, *at_chosen(found[name], channel)] for name in found if channel in found[name][Kind.BIAS]])
     say("\nerror without load, with it, and with twice the load: velocity and current, mean and worst")

@@ -51,7 +51,7 @@ def noise_free(truth: dict[str, float], torque: np.ndarray, period_s: float) -> 
 
 
 def percent_from_truth(models: ModelSet, population: Population, truths: dict[str, dict[str, float]]) -> np.ndarray:
-    """Free-run error of every unit on its last episode against the pendulum itself, percent of range, shape (unit, 2)."""
+    """Free-run error of every unit on its last episode against the pendulum itself, percent of the largest value, shape (unit, 2)."""
     rows = []
     for unit in population.unit_ids:
         i = models.index(unit)

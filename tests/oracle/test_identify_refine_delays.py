@@ -164,7 +164,7 @@ def test_an_episode_that_is_too_short_is_named() -> None:
 
 
 def test_a_unit_may_rest_in_the_episode_that_judges() -> None:
-    """From rest, without an input, the free run stays there: the error is zero, and so is its share of the range."""
+    """From rest, without an input, the free run stays there: the error is zero, and so is its share of the largest value."""
     population, keys, factor, _ = machines(2, 0.01, seed=9)
     resting = {key: population.read(key) * (key.episode != "3") for key in population.episodes}
     still = replace(population, source=resting.__getitem__)

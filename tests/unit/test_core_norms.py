@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 import kros.core
 from kros.core import DimensionError, KrosError, StateSpace, gain, h2_norm, hinf_norm
+from kros.core.linalg import radius_text
 
 
 @pytest.mark.parametrize(("pole", "dt"), [(1.0, 1.0), (-1.2, 1.0), (0.0, 0.0), (0.5, 0.0)])
@@ -58,3 +59,10 @@ def test_names_of_the_core_are_found_lazily():
     assert set(kros.core.__all__) <= set(dir(kros.core))
     with pytest.raises(AttributeError, match="no_such_name"):
         _ = kros.core.no_such_name
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(1 - 2.5e-8, "1 - 2.5e-08"), (1 + 3e-12, "1 + 3e-12"), (1.0, "1"), (0.5, "0.5"), (0.99987, "0.99987"), (1.2, "1.2")]
+)
+def test_spectral_radius_is_told_from_one(value, text):
+    assert radius_text(value) == text

@@ -28,11 +28,11 @@ class Kind(str, Enum):
     GAP
         Samples are missing in pieces of a length in s, at random places, a tenth of all samples and at least one piece an episode.
     BIAS
-        A constant is added to every measurement: share of its range.
+        A constant is added to every measurement: share of its largest value.
     QUANTISATION
-        Measurements are rounded to multiples of a step: share of the range.
+        Measurements are rounded to multiples of a step: share of the largest value.
     NOISE
-        White Gaussian noise is added: its standard deviation as a share of the range.
+        White Gaussian noise is added: its standard deviation as a share of the largest value.
     PHASE
         The machine's lifting parameter is wrong, by so much in its own unit, rad for a phase.
     DELAY

@@ -45,7 +45,7 @@ class ResidualModel:
     spectra : ndarray, shape (unit, f, n, n), complex
         Of every unit's one-step residual.
     promised : ndarray, shape (n,)
-        Root mean square error of every state that the Kalman predictor for these spectra promises, as a share of the range.
+        Root mean square error of every state that the Kalman predictor for these spectra promises, as a share of the largest value.
     """
 
     refitted: tuple[int, ...]

@@ -28,9 +28,9 @@ class Axis:
 AXES = {
     Kind.DROPPED: Axis("samples lost (%)", 100.0, logarithmic=False),
     Kind.GAP: Axis("gaps of (ms)", 1e3),
-    Kind.BIAS: Axis("bias (% of range)", 100.0),
-    Kind.QUANTISATION: Axis("resolution (% of range)", 100.0),
-    Kind.NOISE: Axis("noise (% of range)", 100.0),
+    Kind.BIAS: Axis("bias (% of the largest value)", 100.0),
+    Kind.QUANTISATION: Axis("resolution (% of the largest value)", 100.0),
+    Kind.NOISE: Axis("noise (% of the largest value)", 100.0),
     Kind.PHASE: Axis("wrong phase (rad)", logarithmic=False),
     Kind.DELAY: Axis("late by (samples)"),
 }
@@ -56,7 +56,7 @@ class Curve:
     Parameters
     ----------
     severities : ndarray, shape (k,)
-    errors : ndarray, shape (k,), percent of the range
+    errors : ndarray, shape (k,), percent of the largest value
         Infinite where an estimate diverged.
     """
 

@@ -12,7 +12,7 @@ from ..evaluate import mean_intervals
 
 @dataclass(frozen=True)
 class ErrorCell:
-    """Error of one observer in one channel, percent of range; None where an estimate diverged or there is no such unit.
+    """Error of one observer in one channel, percent of the largest value; None where an estimate diverged or there is no such unit.
 
     Parameters
     ----------
@@ -23,6 +23,8 @@ class ErrorCell:
     worst_unit : str or None
     diverged : int
         Units whose estimate diverged.
+    rms : float or None
+        Root mean square error in the channel's own unit of measure, over the units that `mean` is over.
     interval : (float, float) or None
         95 % interval of the mean, by a bootstrap over the off-nominal units; None with fewer than three.
     """
@@ -32,6 +34,7 @@ class ErrorCell:
     worst: float | None
     worst_unit: str | None
     diverged: int
+    rms: float | None = None
     interval: tuple[float, float] | None = None
 
 
@@ -68,7 +71,7 @@ def error_table(rows: Sequence[Mapping[str, Any]], identify_on: str) -> list[Err
     Parameters
     ----------
     rows : sequence of mapping
-        As in ``metrics.json``: observer, unit, role, condition, channel, error_percent.
+        As in ``metrics.json``: observer, unit, role, condition, channel, rms, error_percent.
     identify_on : str
     """
     conditions = sorted({r["condition"] for r in rows}, key=lambda c: (c != identify_on, natural_key(c)))
@@ -100,4 +103,10 @@ def _cell(rows: Sequence[Mapping[str, Any]]) -> ErrorCell:
     if not others or len(finite) < len(others):
         return ErrorCell(nominal, None, None, None, len(others) - len(finite))
     worst = max(finite, key=lambda r: float(r["error_percent"]))
-    return ErrorCell(nominal, sum(r["error_percent"] for r in finite) / len(finite), worst["error_percent"], worst["unit"], 0)
+    mean = sum(r["error_percent"] for r in finite) / len(finite)
+    return ErrorCell(nominal, mean, worst["error_percent"], worst["unit"], 0, _mean([r["rms"] for r in finite]))
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None

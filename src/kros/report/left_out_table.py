@@ -19,7 +19,7 @@ PAPER = "koopman_edmd/mixed"
 
 @dataclass(frozen=True)
 class LeftOutCell:
-    """Error of one observer in one channel, percent of range; None where some estimate diverged.
+    """Error of one observer in one channel, percent of the largest value; None where some estimate diverged.
 
     Parameters
     ----------

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import floor, isfinite, log10
+from typing import Any
 
 from ..data.population import DEFAULT_CONDITION, EpisodeKey
 from .theme import Tone
@@ -147,6 +148,11 @@ def axis_label(channel: str, unit: str) -> str:
     readable = _UNITS.get(unit, unit)
     name = channel.replace("_", " ")
     return f"{name} ({readable})" if readable else name
+
+
+def channel_units(metrics: Mapping[str, Any]) -> dict[str, str]:
+    """Return the unit of measure of every channel; nothing where the metrics do not tell."""
+    return dict(metrics["study"].get("channels", {}))
 
 
 def squared(unit: str) -> str:

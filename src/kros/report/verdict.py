@@ -8,7 +8,7 @@ from typing import Any
 from ..data.population import DEFAULT_CONDITION
 from .error_table import ErrorTable, error_table
 from .left_out_table import left_out_tables
-from .names import BASELINES, condition_label, form_label, minus, number, observer_label, split_observer
+from .names import BASELINES, channel_units, condition_label, form_label, minus, number, observer_label, split_observer
 from .sections.outliers import flagged_text
 
 
@@ -56,7 +56,8 @@ def _handed_over(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[
     known = [c for c in hidden if table.cells[name][c].mean is not None]
     if not known:
         return [*sentences, "Its estimates diverge on held-out episodes: do not use it."]
-    parts = [_channel(table, name, c) for c in known]
+    units = channel_units(metrics)
+    parts = [_channel(table, name, c, units.get(c, "")) for c in known]
     sentences.append(f"{source} estimates {_join(parts)} on held-out episodes of the other units, in the mean.")
     for method, label in (("open_loop", "Open loop, the nominal model alone,"), ("kalman_tuned", "The tuned Kalman filter")):
         sentences += _comparison(table, name, method, label, known)
@@ -89,10 +90,11 @@ def _better(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
     return [f"Better in the mean: {_join(parts)}."] if parts else []
 
 
-def _channel(table: ErrorTable, name: str, channel: str) -> str:
+def _channel(table: ErrorTable, name: str, channel: str, unit: str) -> str:
     cell = table.cells[name][channel]
     worst = f" ({number(cell.worst)} % on the worst unit, {cell.worst_unit})" if cell.worst is not None else ""
-    return f"{channel.replace('_', ' ')} to {number(cell.mean)} % of its range{worst}"
+    rms = f" (RMS {number(cell.rms)}{' ' + unit if unit not in ('', '1') else ''})" if cell.rms is not None else ""
+    return f"{channel.replace('_', ' ')} to {number(cell.mean)} % of the largest value{rms}{worst}"
 
 
 def _comparison(table: ErrorTable, name: str, method: str, label: str, channels: list[str]) -> list[str]:

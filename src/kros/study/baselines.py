@@ -23,7 +23,7 @@ EQUAL, RESIDUAL = "equal share of every range", "one-step residuals"
 def kalman_tuned(task: Task) -> Made:
     """Kalman gains for the white process noise that does best on training episodes.
 
-    Its size is swept over sixteen decades, its shape is that of the one-step residuals or the same share of every state's range.
+    Its size is swept over sixteen decades, its shape is that of the one-step residuals or the same share of every state's largest value.
     """
     shapes = {EQUAL: task.models.output_scale, RESIDUAL: task.models.residual_covariance.mean(axis=0)}
     R, dt = np.diag(task.noise**2), task.models.sample_period_s

@@ -116,7 +116,7 @@ def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, di
 
 
 def noise_draws(context: Context, keys: Sequence[EpisodeKey], measured: Sequence[int]) -> tuple[Disturbance, ...]:
-    """Return realisations of the noise that the study assumes, as declared or that of the quantisation; the largest share of a range counts."""
+    """Return realisations of the noise that the study assumes, as declared or that of the quantisation; the largest share of a largest value counts."""
     from .stages.synthesize import measurement_noise
 
     noise = measurement_noise(context, context.models(context.model_names[0]))

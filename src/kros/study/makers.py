@@ -226,7 +226,7 @@ class Surroundings:
     input_weight : float or "identity"
         Corner of the low-pass spectrum of the scaled inputs in Hz, or white inputs as in the paper.
     process_noise, measurement_noise : float
-        Standard deviation of white noise on every state and measurement per sample, as a share of the range; measurements have at least
+        Standard deviation of white noise on every state and measurement per sample, as a share of the largest value; measurements have at least
         the noise that was found in the recordings.
     """
 

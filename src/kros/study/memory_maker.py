@@ -44,7 +44,7 @@ def make_memory(task: Task) -> Made:
     percent = float(hidden_mean(judge.percent(kept), kept.measured))
     if not percent < LOST:
         raise SynthesisError(
-            f"Observer with a memory: it loses the machine on training episodes (error {percent:.3g} % of the range); "
+            f"Observer with a memory: it loses the machine on training episodes (error {percent:.3g} % of the largest value); "
             "lifted functions that say nearly the same as the measurement do that, take them out of the lifting."
         )
     solve_s = time.perf_counter() - began

@@ -43,6 +43,7 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
         "conditions": context.population.conditions,
         "identify_on": facts.identify_on,
         "sample_period_s": context.population.sample_period_s,
+        "channels": {c.name: c.unit for c in context.population.channels},
     }
     if Stage.IDENTIFY in done:
         study["alpha"] = context.models(context.edmd_names[0]).alpha

@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 _EPISODE_S = 5.0
 _SEEN_S, _BLIND_S, _BLIND_EPISODES = 0.5, 1.5, 3
-LOST = 100.0  # percent of the range: an estimate that says nothing
+LOST = 100.0  # percent of the largest value: an estimate that says nothing
 _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has no global slope bounds
 
 
@@ -42,7 +42,7 @@ _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has
 class Running:
     """What is known about one observer as it runs: its certificate, a row for every unit, and the size of its errors.
 
-    `hidden_percent` is the geometric mean over the states that are not measured of the mean error on training episodes, percent of the range;
+    `hidden_percent` is the geometric mean over the states that are not measured of the mean error on training episodes, percent of the largest value;
     `blind_percent` the largest error of a state in a short run in which measurements stop arriving.
     """
 
@@ -128,7 +128,7 @@ def first_episodes(tuning: TuningSet) -> TuningSet:
 
 
 def blind_percent(observers: Sequence[Observer], judge: Judge, dt: float) -> Array:
-    """Return the largest error of a state in percent of its range where measurements stop arriving, shape (observer,); infinite where it grows on."""
+    """Return the largest error of a state in percent of the largest value where measurements stop arriving, shape (observer,); infinite where it grows on."""
     short, first = judge.part(range(min(_BLIND_EPISODES, len(judge.batch.keys)))).first((_SEEN_S + _BLIND_S) / dt), observers[0]
     y = short.measurements(first.measured)
     y[round(_SEEN_S / dt) :] = np.nan

@@ -1,4 +1,4 @@
-"""Frequency responses of a study's models, every signal over its range."""
+"""Frequency responses of a study's models, every signal over its largest value."""
 
 from __future__ import annotations
 

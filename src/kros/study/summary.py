@@ -27,7 +27,7 @@ def observer_lines(result: RunResult) -> list[str]:
     if not rows:
         return []
     width = max(len(r["observer"]) for r in rows)
-    lines = [f"{'error in percent of range':<{width}}  " + "".join(f"{c:>12}" for c in channels)]
+    lines = ["mean error in percent of the largest value:", f"{'':<{width}}  " + "".join(f"{c:>12}" for c in channels)]
     for name in dict.fromkeys(r["observer"] for r in rows):
         means = []
         for channel in channels:

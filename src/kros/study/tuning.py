@@ -58,7 +58,7 @@ class Judge:
         return np.ascontiguousarray(self.batch.states[..., list(measured)])
 
     def percent(self, observer: Observer) -> Array:
-        """Return the mean error of every recorded state in percent of its range, shape (n,); infinite where the observer diverges."""
+        """Return the mean error of every recorded state in percent of the largest value, shape (n,); infinite where the observer diverges."""
         values = self.parameters if observer.lifting.parameters else None
         estimate = run_observer(observer, self.batch.states[..., list(observer.measured)], self.batch.inputs, values)
         return self.compare([estimate])[0]
@@ -91,7 +91,7 @@ def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, f
     Parameters
     ----------
     percent, limit : ndarray, shape (n,)
-        Errors of the candidate and of the open loop, percent of the range.
+        Errors of the candidate and of the open loop, percent of the largest value.
     measured : sequence of int
 
     Returns

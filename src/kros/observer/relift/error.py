@@ -52,7 +52,7 @@ class ReliftScales:
     Parameters
     ----------
     error : ndarray, shape (n,)
-        Range of every state: a scaled error of 0.01 is one percent of the range. Infinite for a state whose error does not count.
+        Range of every state: a scaled error of 0.01 is one percent of the largest value. Infinite for a state whose error does not count.
     residual : ndarray, shape (n,)
         Size of the one-step residual in every state; zero for a state without.
     noise : ndarray, shape (q,)

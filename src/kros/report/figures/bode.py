@@ -33,7 +33,7 @@ def draw(run: RunFolder) -> Drawing:
     nominal = _nominal(run)
     figure = bode_figure(models, nominal)
     n = len(models.unit_ids)
-    text = f"Frequency responses of all {n} {model_label(models.name)} models, every state over every input, each signal over its range."
+    text = f"Frequency responses of all {n} {model_label(models.name)} models, every state over every input, each signal over its largest value."
     text += " The spread of the lines is what the uncertainty model has to cover."
     return Drawing(figure, text)
 

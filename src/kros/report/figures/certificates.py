@@ -32,7 +32,7 @@ def draw(run: RunFolder) -> Drawing:
     draw_certificates(axes[0, 0], certified, bounds, run.deployed)
     return Drawing(
         figure,
-        "Disc: certified H2 norm of the error for every unit in the uncertain set, every channel over its range. Tick: lower bound, where one is known; "
+        "Disc: certified H2 norm of the error for every unit in the uncertain set, channels over their largest values. Tick: lower bound, where one is known; "
         "no correction filter can bring the disc to its left. Smaller is better, and comparable within one model.",
     )
 

@@ -36,7 +36,7 @@ def draw(run: RunFolder) -> Drawing:
         keep_comparable(panel, [v for c in cells.values() for v in (c.mean, c.worst, c.nominal) if v is not None])
     return Drawing(
         figure,
-        f"RMS error in percent of the signal's range, {condition_label(run.identify_on)}, held-out episodes. Disc: mean over "
+        f"RMS error in percent of the largest value, {condition_label(run.identify_on)}, held-out episodes. Disc: mean over "
         "off-nominal units; bar: worst of them; "
         "ring: nominal unit. Logarithmic axes; best on top by the channels that are not measured; the observer that is handed over in bold.",
     )

@@ -48,7 +48,7 @@ def row_panels(channels: Sequence[str], order: Sequence[str], deployed: str | No
     for panel, channel in zip(axes[0], channels, strict=True):
         panel.set_xscale("log")
         panel.set_title(channel.replace("_", " "))
-        panel.set_xlabel("error (% of range)")
+        panel.set_xlabel("error (% of the largest value)")
         panel.grid(visible=False, axis="y")
     axes[0, 0].set_yticks(range(len(order)), [observer_label(o) for o in order])
     for label, observer in zip(axes[0, 0].get_yticklabels(), order, strict=True):

@@ -49,7 +49,7 @@ def draw_channel(run: RunFolder, number: int) -> Drawing:
     for panel, kind in zip(panels, kinds, strict=False):
         _panel(panel, kind, {n: found[n][kind][channel] for n in names if channel in found[n].get(kind, {})}, run.deployed)
     for panel in axes[:, 0]:
-        panel.set_ylabel("error (% of range)")
+        panel.set_ylabel("error (% of the largest value)")
     smallest = min(float(found[n][k][channel].errors[0]) for n in names for k in found[n] if channel in found[n][k])
     _error_axis(panels[0], smallest)
     for panel in panels[len(kinds) :]:

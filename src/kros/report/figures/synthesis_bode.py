@@ -46,7 +46,7 @@ def draw(run: RunFolder) -> Drawing:
     axes[0, 0].set_ylabel("largest singular value (dB)")
     return Drawing(
         figure,
-        "Largest singular values over frequency, every signal over its range. Where the weights are low the nominal model can be "
+        "Largest singular values over frequency, every signal over its largest value. Where the weights are low the nominal model can be "
         "trusted and needs little correction; where "
         "they are high the measurements have to speak, as far as their noise allows. K maps what was not predicted to the correction.",
     )
@@ -79,7 +79,7 @@ def _panel(axes: Axes, run: RunFolder, name: str, syntheses: dict[str, Synthesis
 
 
 def scaled_filter(synthesis: Synthesis, models: ModelSet) -> StateSpace:
-    """Return the correction filter with innovation and correction over the ranges of their signals.
+    """Return the correction filter with innovation and correction over the largest values of their signals.
 
     Parameters
     ----------

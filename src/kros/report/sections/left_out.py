@@ -21,7 +21,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     text = (
         f"The units are parted into {folds} folds, and for each fold the whole study is made on all other units: calibration, models, weights, observers, "
         "their tuning, and what is learned. Its observers run on the fold's own units, as they would on new machines: a unit's phase comes from its own "
-        "training episodes. Errors in percent of the range on held-out episodes: mean over the units with its 95 % interval, and the worst unit."
+        "training episodes. Errors in percent of the largest value on held-out episodes: mean over the units with its 95 % interval, and the worst unit."
     )
     certified = (
         "Certified as it runs: a bound on the error with re-lifting at every step, from the model's own rows. Certified for the set: a bound on the error "
@@ -50,7 +50,7 @@ def _table(table: LeftOutTable, facts: Mapping[str, Mapping[str, Any]], folds: i
     titles = [c.replace("_", " ") + ("" if c in table.ranked else " (not ranked)") for c in channels]
     groups = [("", 2), ("certified", 2), *((title, len(head)) for title in titles)]
     where = "" if table.condition == DEFAULT_CONDITION else f", {condition_label(table.condition)}"
-    caption = f"Errors on units that were left out, percent of range{where}. Best in bold."
+    caption = f"Errors on units that were left out, percent of the largest value{where}. Best in bold."
     if powers:
         caption += f" Band: power of the error around the gearbox frequency, relative to “{observer_label(PAPER)}”."
     emphasised = [i for i, observer in enumerate(table.cells) if observer == deployed]

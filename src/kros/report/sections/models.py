@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ...core.linalg import radius_text
 from ..content import Cell, Section, Table
-from ..names import model_label, number
+from ..names import minus, model_label, number
 from ..run_folder import RunFolder
 
 
@@ -42,14 +43,14 @@ def _table(models: Mapping[str, Any]) -> Table:
     rows = []
     for name, entry in models.items():
         errors = entry.get("freerun_error_percent", {})
-        cells = [Cell(model_label(name)), Cell(str(entry["order"])), Cell(f"{entry['spectral_radius_max']:.6f}")]
+        cells = [Cell(model_label(name)), Cell(str(entry["order"])), Cell(minus(radius_text(entry["spectral_radius_max"])))]
         for c in channels:
             for statistic in ("median", "worst"):
                 value = errors.get(c, {}).get(statistic)
                 cells.append(Cell(number(value), strong=value is not None and value == best[c, statistic]))
         rows.append(cells)
     head = ["model", "states", "largest pole", *(["median", "worst"] * len(channels))]
-    caption = "Free run of every held-out episode, error in percent of the signal's range, over units. Best in bold."
+    caption = "Free run of every held-out episode, error in percent of the largest value, over units. Best in bold."
     return Table(head, rows, caption if channels else "", [("", 3), *((c, 2) for c in channels)] if channels else ())
 
 

@@ -40,7 +40,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     rows = [_row(name, entry, record["rows"].get(name, [])) for name, entry in observers.items()]
     head = ["observer", "gain", "mismatch gain", "bound", "error", "bound", "error"]
     emphasised = [i for i, name in enumerate(observers) if name == deployed]
-    caption = "Errors in percent of the ranges, RMS over time, the states' squares added."
+    caption = "Errors in percent of the largest value, RMS over time, the states' squares added."
     table = Table(head, rows, caption, [("", 3), ("median unit", 2), ("worst unit", 2)], emphasised=emphasised)
     assumptions = record["certificates"].get(deployed, {}).get("assumptions", [])
     conditions = [f"Assumed for “{observer_label(deployed)}”: {'; '.join(assumptions)}."] if deployed and assumptions else []

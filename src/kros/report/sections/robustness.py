@@ -95,9 +95,7 @@ def _sets(sets: Sequence[Mapping[str, Any]], deployed: str | None) -> Table | No
         "median member",
         "noise alone",
     ]
-    caption = (
-        "H2 norm of the error, every channel over its range, noise included. The largest member is computed again by a Lyapunov equation."
-    )
+    caption = "H2 norm of the error, every channel over its largest value, noise included. The largest member is computed again by a Lyapunov equation."
     return Table(head, rows, caption, emphasised=[i for i, row in enumerate(sets) if row["observer"] == deployed])
 
 
@@ -117,7 +115,7 @@ def _noise(rows: Sequence[Mapping[str, Any]], deployed: str | None) -> Table | N
         for row in rows
     ]
     caption = (
-        f"Mean error in percent of the range over {rows[0]['units']} units with fresh measurement noise of the level that the study assumes, on top of the "
+        f"Mean error in percent of the largest value over {rows[0]['units']} units with fresh measurement noise of the assumed level, on top of the "
         "recordings' own, and its 95 % intervals: over the noise alone, over the units alone, over both."
     )
     emphasised = [i for i, row in enumerate(rows) if row["observer"] == deployed]

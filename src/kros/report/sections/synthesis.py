@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ...core.linalg import radius_text
 from ..content import Cell, Section, Table
-from ..names import BASELINES, number, observer_label, split_observer
+from ..names import BASELINES, minus, number, observer_label, split_observer
 from ..run_folder import RunFolder
 
 _TEXT = (
@@ -76,7 +77,7 @@ def _row(name: str, entry: Mapping[str, Any]) -> list[Cell]:
         Cell(number(entry.get("worst_case_h2"), 4)),
         Cell(number(bound or None, 4)),
         Cell(number(entry.get("gap_percent") if bound else None)),
-        Cell("–" if radius is None else f"{radius:.6f}", strong=radius is not None and radius >= 1),
+        Cell("–" if radius is None else minus(radius_text(radius)), strong=radius is not None and radius >= 1),
         Cell(running),
         Cell(number(entry.get("solve_s"))),
     ]

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ...core.artifacts import save_artifact
 from ...core.errors import DataError, IdentificationError
+from ...core.linalg import radius_text
 from ...data.population import EpisodeKey, Population
 from ...identify import (
     Factor,
@@ -188,7 +189,7 @@ def fit(
         output_scale=scale[:n],
         input_scale=scale[n:],
         alpha=alpha,
-        status=tuple("ok" if r < limit else f"unstable, spectral radius {r:.6f}" for r in radius),
+        status=tuple("ok" if r < limit else f"unstable, spectral radius {radius_text(r)}" for r in radius),
     )
 
 

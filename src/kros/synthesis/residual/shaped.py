@@ -144,7 +144,7 @@ def residual_h2(
 
 
 def promised_errors(A: Array, C: Array, spectra: Spectra, noise: Array, scale: Array, dt: float, bank: Bank = BANKS[1]) -> Array:
-    """Return the root mean square error of every state, as a share of its range, that a residual-shaped observer would have on the spectra as measured.
+    """Return the root mean square error of every state, as a share of its largest value, that a residual-shaped observer would have on the spectra as measured.
 
     Parameters as in `residual_h2`; the mean over units is taken, the order is not reduced. Infinite where there is no observer.
     """

@@ -239,5 +239,5 @@ def _require_stable(unit_ids: Sequence[str], radius: Array, margin: float) -> No
     for unit, value in zip(unit_ids, radius, strict=True):
         if not value < 1 - margin:
             raise IdentificationError(
-                f"Refinement: the model of unit {unit} has a spectral radius of {radius_text(value)}, not below {radius_text(1 - margin)}; use a stronger prior."
+                f"Refinement: the model of unit {unit} has spectral radius {radius_text(value)}, not below {radius_text(1 - margin)}; use a stronger prior."
             )

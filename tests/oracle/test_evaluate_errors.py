@@ -1,0 +1,106 @@
+"""Errors of estimates against sums written out by hand, and spectra against the definition of a periodogram."""
+
+import numpy as np
+import pytest
+
+from kros.evaluate.errors import error_percent, error_rms, error_spectrum, summarise
+
+DT = 0.01
+
+
+def episodes(lengths, seed=0):
+    """Truth and estimate, shape (n_samples, batch, 2); what is behind an episode's end is wild and must not count."""
+    rng = np.random.default_rng(seed)
+    shape = (max(lengths), len(lengths), 2)
+    truth, estimate = rng.normal(size=shape) - 0.7, rng.normal(size=shape)
+    for b, length in enumerate(lengths):
+        truth[length:, b], estimate[length:, b] = 1e6, -1e6
+    return truth, estimate
+
+
+def by_hand(truth, estimate, lengths):
+    """RMS and percent of the largest absolute value, one number after the other."""
+    rms, percent = np.empty((2, len(lengths), 2))
+    for b, length in enumerate(lengths):
+        for channel in range(2):
+            squares = [(estimate[k, b, channel] - truth[k, b, channel]) ** 2 for k in range(length)]
+            rms[b, channel] = (sum(squares) / length) ** 0.5
+            percent[b, channel] = 100 * rms[b, channel] / max(abs(truth[k, b, channel]) for k in range(length))
+    return rms, percent
+
+
+@pytest.mark.parametrize("lengths", [(700, 700, 700), (700, 41, 600), (513,), (600, 600, 600, 600, 600, 600, 600, 550)])
+def test_errors_are_those_of_the_definition(lengths):
+    truth, estimate = episodes(lengths)
+    rms, percent = by_hand(truth, estimate, lengths)
+    counts = np.array(lengths)
+    found = summarise(estimate, truth, counts, DT)
+    for values in (found.rms, error_rms(estimate, truth, counts)):
+        np.testing.assert_allclose(values, rms, rtol=1e-12)
+    for values in (found.percent, error_percent(estimate, truth, counts)):
+        np.testing.assert_allclose(values, percent, rtol=1e-12)
+
+
+@pytest.mark.parametrize("lengths", [(700, 700), (700, 600)])
+def test_a_largest_value_may_be_negative(lengths):
+    """Minus four is the largest absolute value although every sample is below zero."""
+    truth = np.full((700, 2, 1), -1.0)
+    truth[5] = -4.0
+    percent = error_percent(truth + 2.0, truth, np.array(lengths))
+    np.testing.assert_allclose(percent, 50.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("lengths", [(10, 10), (10, 6)])
+def test_a_state_at_zero_has_no_percentage(lengths):
+    truth = np.zeros((10, 2, 1))
+    percent = error_percent(truth + 1.0, truth, np.array(lengths))
+    assert np.isnan(percent).all()
+
+
+def test_diverged_estimates_are_not_finite_and_nobody_is_warned():
+    truth, estimate = episodes((600, 600))
+    estimate[100:, 0, 0] = 1e300
+    found = summarise(estimate, truth, np.array([600, 600]), DT)
+    assert not np.isfinite(found.rms[0, 0])
+    assert np.isfinite(found.rms[1]).all()
+
+
+def periodogram(x):
+    """One-sided power spectral density by Welch's method, from its definition: Hann windows of 512 samples, half overlapping, means removed."""
+    window = np.array([0.5 - 0.5 * np.cos(2 * np.pi * k / 512) for k in range(512)])
+    k = np.arange(512)
+    frequencies = np.arange(257)
+    transform = np.exp(-2j * np.pi * np.outer(frequencies, k) / 512)
+    pieces = [x[start : start + 512] for start in range(0, len(x) - 511, 256)]
+    powers = [np.abs(transform @ (window * (piece - piece.mean()))) ** 2 for piece in pieces]
+    density = np.mean(powers, axis=0) * DT / np.sum(window**2)
+    density[1:-1] *= 2
+    return frequencies / (512 * DT), density
+
+
+def test_spectra_are_those_of_the_definition():
+    lengths = (1100, 1100, 900, 1100, 1100, 1100, 1100, 1100, 1100)  # more episodes of one length than are done at once
+    truth, estimate = episodes(lengths, seed=3)
+    found = summarise(estimate, truth, np.array(lengths), DT)
+    for b, length in enumerate(lengths):
+        for channel in range(2):
+            freqs, density = periodogram((estimate - truth)[:length, b, channel])
+            np.testing.assert_allclose(found.spectra[b, :, channel], density, rtol=1e-9)
+            np.testing.assert_allclose(found.freqs_hz, freqs, rtol=1e-12)
+
+
+def test_band_power_adds_what_is_inside_both_ends_included():
+    truth, estimate = episodes((1024, 1024))
+    found = summarise(estimate, truth, np.array([1024, 1024]), DT)
+    low, high = found.freqs_hz[10], found.freqs_hz[20]
+    inside = sum(found.spectra[:, k] for k in range(10, 21)) / (512 * DT)
+    np.testing.assert_allclose(found.band_power((low, high)), inside, rtol=1e-12)
+
+
+def test_short_signals_are_padded_to_the_same_frequencies():
+    freqs, density = error_spectrum(np.random.default_rng(0).normal(size=(100, 3)), DT)
+    assert freqs.shape == (257,)
+    assert density.shape == (257, 3)
+    along, turned = error_spectrum(np.random.default_rng(0).normal(size=(100, 3)).T, DT, axis=1)
+    np.testing.assert_allclose(along, freqs)
+    np.testing.assert_allclose(turned.T, density, rtol=1e-12)

@@ -26,7 +26,8 @@ TIMEOUT_S = 120.0
 FAST = f"{sys.executable} -m pytest -q -x -p no:cacheprovider -m 'not slow'"
 TESTS = {
     "src/kros/synthesis/robust": "tests/oracle/test_synthesis_worst_case.py tests/oracle/test_synthesis_shaping.py",
-    "src/kros/uncertainty/weights": "tests/oracle/test_uncertainty_cover.py tests/oracle/test_uncertainty_certificate.py tests/oracle/test_uncertainty_entrywise.py",
+    "src/kros/uncertainty/weights": "tests/oracle/test_uncertainty_cover.py tests/oracle/test_uncertainty_certificate.py "
+    "tests/oracle/test_uncertainty_entrywise.py",
     "src/kros/observer/relift": "tests/oracle/test_observer_relift.py tests/unit/test_observer_relift_study.py",
     "src/kros/evaluate/errors.py": "tests/oracle/test_evaluate_errors.py tests/oracle/test_evaluate_spectra.py",
 }

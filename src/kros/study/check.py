@@ -14,6 +14,7 @@ from ..data import Population, check_population
 from ..identify import Factor, ModelSet, combine, edmd, lifted_factor
 from ..observer import Observer
 from ..uncertainty import OutlierModel
+from .config import Stage
 from .estimate import check_channels, load_calibration, open_data, training_keys, unit_parameters
 from .executors import Executor, open_executor
 from .pipeline import load_run
@@ -34,6 +35,7 @@ def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]
     folders = sorted(p.parent for p in store.path("outliers").glob("*/outlier_model.json"))
     if not folders:
         raise ConfigError(f"Run {run}: has no outlier scores to compare with; run the study until quantify, with at least three units.")
+    store.verify(Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE)
     population = open_data(config, data)
     check_population(population, allow_single=True)
     deployed = store.path("observers", "deployed.json")

@@ -16,7 +16,7 @@ from ..data.population import EpisodeKey
 from ..evaluate import EpisodeBatch
 from ..identify import PhaseCalibration
 from ..observer import Observer, run_observer
-from .config import StudyConfig, validate_config
+from .config import Stage, StudyConfig, validate_config
 from .pipeline import load_run
 from .stages.calibrate import segments_of
 from .store import Store
@@ -109,6 +109,7 @@ def estimate_recordings(run: Path, data: Path, out: Path) -> int:
         raise ConfigError(f"Run {run}: has no deployed observer; run the study at least until synthesize.")
     if out.exists():
         raise ConfigError(f"Output {out}: exists; name a new file.")
+    store.verify(Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE)
     observer = Observer.load(path)
     population = open_data(config, data)
     check_channels(population, observer)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.artifacts import plain, read_json, write_json
+from ..core.errors import DataError
 from .config import Stage
 
 _BLOCK = 1 << 20
@@ -42,6 +43,21 @@ class Store:
         if record is None or record["key"] != key:
             return False
         return all(self.path(name).exists() and fingerprint(self.path(name)) == digest for name, digest in record["files"].items())
+
+    def verify(self, *stages: Stage) -> None:
+        """Make sure that what finished stages wrote is as they left it; all stages where none is named.
+
+        Raises
+        ------
+        DataError
+            When a file is gone or has changed, by name.
+        """
+        for stage in stages or tuple(Stage):
+            record = self.record(stage)
+            for name, digest in record["files"].items() if record is not None else ():
+                if not self.path(name).is_file() or fingerprint(self.path(name)) != digest:
+                    found = "was changed or damaged since" if self.path(name).is_file() else "is missing"
+                    raise DataError(f"Run {self.folder}: {name}, which {stage.value} wrote, {found}; run the study again.")
 
     def clear(self, stage: Stage) -> None:
         """Forget a stage: its record first, then the files it wrote."""

@@ -37,6 +37,7 @@ def write_figures(folder: Path, out: Path) -> list[str]:
 def _metrics(folder: Path) -> dict[str, Any]:
     from ..pipeline import load_run
 
-    load_run(folder)
+    _, store = load_run(folder)
+    store.verify(*[stage for stage in Stage if stage is not Stage.REPORT])
     metrics: dict[str, Any] = read_json(Path(folder) / "metrics.json")
     return metrics

@@ -66,7 +66,7 @@ def main(verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="Run folder; emptied first when it is an earlier demo.")] = Path("runs/demo"),
+    out: Annotated[Path, typer.Option(help="Run folder: new, empty, or that of an earlier demo.")] = Path("runs/demo"),
     units: Annotated[int, typer.Option(min=2)] = 12,
     episodes: Annotated[int, typer.Option(min=2, max=1000)] = 10,
     seconds: Annotated[float, typer.Option(min=5)] = 20.0,

@@ -91,7 +91,10 @@ def _outdate(context: Context, steps: Sequence[Step]) -> None:
     """Remove what does not follow from the study any more; from here on the run folder is that of the study as it is now."""
     context.store.discard("metrics.json")
     for step in steps:
-        context.store.clear(step.stage)
+        if step.wanted(context.config):
+            context.store.clear(step.stage)
+        else:
+            context.store.erase(step.stage)
     context.store.keep("study.json", context.config.dump())
 
 

@@ -55,10 +55,16 @@ class Store:
         """Return where the running stage writes something; it will be found at `path` once the stage is done."""
         return (self.place or self.folder).joinpath(*parts)
 
-    def nested(self, *parts: str) -> Store:
+    def nested(self, stage: str, name: str) -> Store:
         """Return the run folder of a study that the running stage makes inside this one; it keeps its own records, and is not drafted."""
-        self._runs.append("/".join(parts))
-        return Store(self.path(*parts))
+        self._runs.append(f"{_name(stage)}/{name}")
+        return Store(self.path(_name(stage), name))
+
+    def runs(self, stage: str) -> list[Store]:
+        """Return the runs inside that a stage made, which are in a folder of its name."""
+        folder = self.path(stage)
+        inside = sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else []
+        return [Store(f) for f in inside if f.is_dir() and not f.is_symlink() and ((f / records.FOLDER).is_dir() or (f / PARTIAL).is_dir())]
 
     @contextmanager
     def drafting(self) -> Iterator[Store]:
@@ -152,16 +158,13 @@ class Store:
         self._unlink(records.record_path(self.folder, _name(stage)))
 
     def erase(self, stage: str) -> None:
-        """Forget a stage with the runs inside."""
-        record = self.record(stage)
-        for run in record.runs if record is not None else ():
-            Store(records.place(self.folder, run)).remove()
+        """Forget a stage with the runs inside, finished or not."""
+        for run in self.runs(_name(stage)):
+            run.remove()
         self.clear(stage)
 
     def remove(self) -> None:
         """Remove a run as far as its records know it, and its folder where nothing else is in it."""
-        if self.folder.is_symlink():
-            return
         for record in records.records(self.folder):
             self.erase(record.stage)
         self.tidy()

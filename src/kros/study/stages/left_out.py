@@ -11,7 +11,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from ...core.artifacts import load_artifact, save_artifact
@@ -20,12 +19,11 @@ from ...data.population import OUTLIERS, Population
 from ..config import RequireConfig, Stage, StudyConfig
 from ..context import Context, Progress
 from ..steps import LEARNING, Step, run_steps
-from ..store import Store
 from . import calibrate
 from .evaluate import Outcome, UnitParameters, band_hz, error_rows, estimation, facts_of, outcomes
 
 log = logging.getLogger(__name__)
-FOLDER, KIND, FEWEST = "left_out", "left_out", 2
+FOLDER, KIND, FEWEST = Stage.LEFT_OUT.value, "left_out", 2
 
 
 def wanted(config: StudyConfig) -> bool:
@@ -61,7 +59,9 @@ def run(context: Context) -> None:
     """Make the study once for every fold, and collect what its observers do on the units that it does not know."""
     models = context.models(context.model_names[0])
     folds = parted([u for u in context.facts.pooled if u in models.unit_ids], context.config.evaluate.folds)
-    remove_beyond(context.store.path(FOLDER), len(folds))
+    for surplus in context.store.runs(FOLDER):
+        if surplus.folder.name not in map(str, range(len(folds))):
+            surplus.remove()
     found = [run_fold(context, number, held, len(folds)) for number, held in enumerate(folds)]
     content = {
         "folds": folds,
@@ -70,14 +70,6 @@ def run(context: Context) -> None:
         "observers": facts_of_folds([fold.get("observers", {}) for fold in found]),
     }
     save_artifact(context.store.draft(FOLDER), KIND, content)
-
-
-def remove_beyond(folder: Path, folds: int) -> None:
-    """Remove what an earlier run with more folds left."""
-    if folder.is_dir():
-        for other in folder.iterdir():
-            if other.name.isdecimal() and int(other.name) >= folds:
-                Store(other).remove()
 
 
 def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The command line: a thin face of `kros.study`.
 
-Exit codes: 0 done; 1 failed; 2 wrong usage or bad input, and then nothing was written; 3 done, but a requirement is not met.
+Exit codes: 0 done; 1 failed; 2 wrong usage or bad input, and then nothing was written; 3 done, but a requirement is not met;
+128 and the number of a signal that told it to stop, 143 for SIGTERM.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
 )
-FAILED, BAD_INPUT, NOT_MET = 1, 2, 3
+FAILED, BAD_INPUT, NOT_MET, SIGNALLED = 1, 2, 3, 128
 
 Quiet = Annotated[bool, typer.Option("--json", help="Print metrics.json and nothing else on standard output.")]
 Workers = Annotated[int | None, typer.Option(help="Processes for maps over units; default: one a core.")]
@@ -34,8 +35,14 @@ Seed = Annotated[int, typer.Option(min=0)]
 @contextmanager
 def _exit_codes() -> Iterator[None]:
     """Turn kros's errors into one message on standard error and an exit code."""
+    from .study.stop import Stopped, stoppable
+
     try:
-        yield
+        with stoppable():
+            yield
+    except Stopped as stopped:
+        typer.echo(f"kros: stopped by {stopped}; the same command goes on where this one ended.", err=True)
+        raise typer.Exit(SIGNALLED + stopped.signal) from stopped
     except (ConfigError, DataError, DimensionError, MissingDependencyError) as error:
         _fail(error, BAD_INPUT)
     except KrosError as error:
@@ -66,7 +73,7 @@ def main(verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="Run folder; emptied first when it is an earlier demo.")] = Path("runs/demo"),
+    out: Annotated[Path, typer.Option(help="Run folder: new, empty, or that of an earlier demo.")] = Path("runs/demo"),
     units: Annotated[int, typer.Option(min=2)] = 12,
     episodes: Annotated[int, typer.Option(min=2, max=1000)] = 10,
     seconds: Annotated[float, typer.Option(min=5)] = 20.0,

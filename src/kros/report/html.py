@@ -39,8 +39,8 @@ class Encoded:
 Mapped = Callable[[Callable[[str], Encoded], Iterable[str]], Iterator[Encoded]]
 
 
-def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map) -> Path:
-    """Write `report.html` into a run folder.
+def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map, out: Path | None = None) -> Path:
+    """Write the report of a run folder.
 
     Parameters
     ----------
@@ -50,6 +50,8 @@ def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map) -> Path:
         As in ``metrics.json``; any part but ``study`` may be absent.
     mapped : callable
         Maps the drawing of a figure over their names, in order, for example in several processes.
+    out : Path, optional
+        File to write; default: `report.html` in the run folder.
 
     Returns
     -------
@@ -61,7 +63,7 @@ def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map) -> Path:
     DataError
         When an artifact is broken or of another version.
     """
-    path = Path(run) / "report.html"
+    path = out if out is not None else Path(run) / "report.html"
     write_bytes(path, page(RunFolder(Path(run)), metrics, mapped).encode())
     return path
 

@@ -1,6 +1,7 @@
 """A run folder as the report sees it: every artifact by name, read when first asked for.
 
-What a run does not have raises `NotShownError` with a sentence that the report prints in place of a figure or table.
+Only files that the records of the run list are there; others, such as what an interrupted run left, are not looked at. What a run does not
+have raises `NotShownError` with a sentence that the report prints in place of a figure or table.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import quote, unquote
 
@@ -16,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, read_arrays, read_json
+from ..core.records import recorded_files
 from ..data.population import Channel, EpisodeKey, Population
 from ..identify import ModelSet, PhaseCalibration
 from ..identify.refine import RefinedModels
@@ -63,6 +65,15 @@ class RunFolder:
     folder: Path
 
     @cached_property
+    def files(self) -> frozenset[str]:
+        """Names of all files that belong to the run, relative to its folder."""
+        return recorded_files(self.folder)
+
+    def has(self, name: str) -> bool:
+        """Tell whether a file belongs to the run."""
+        return name in self.files
+
+    @cached_property
     def study(self) -> dict[str, Any]:
         """The resolved study."""
         content: dict[str, Any] = read_json(self.folder / "study.json")
@@ -71,7 +82,7 @@ class RunFolder:
     @cached_property
     def facts(self) -> dict[str, Any]:
         """What the read stage found."""
-        self._require(self.folder / "population" / "facts.json", "the recordings have not been read yet")
+        self._require("population/facts.json", "the recordings have not been read yet")
         return load_artifact(self.folder / "population", "facts")[0]
 
     @property
@@ -86,14 +97,14 @@ class RunFolder:
 
         recordings = Path(self.facts["recordings"])
         folder = recordings if recordings.is_absolute() else self.folder / recordings
-        self._require(folder / "population.json", "the recordings are not in their place any more")
+        if not (folder / "population.json").exists():
+            raise NotShownError("the recordings are not in their place any more")
         return read_parquet(folder)
 
     @cached_property
     def channels(self) -> tuple[Channel, ...]:
         """Channels with their units of measure."""
-        models = self.folder / "models"
-        return next(iter(self.models.values())).channels if models.is_dir() and any(models.iterdir()) else self.population.channels
+        return next(iter(self.models.values())).channels if self._any_models else self.population.channels
 
     @property
     def measured_states(self) -> tuple[str, ...]:
@@ -106,21 +117,22 @@ class RunFolder:
     @property
     def sample_period_s(self) -> float:
         """Sampling period, s."""
-        models = self.folder / "models"
-        return next(iter(self.models.values())).sample_period_s if models.is_dir() else self.population.sample_period_s
+        return next(iter(self.models.values())).sample_period_s if self._any_models else self.population.sample_period_s
+
+    @property
+    def _any_models(self) -> bool:
+        return any(name.startswith("models/") for name in self.files)
 
     @cached_property
     def calibration(self) -> PhaseCalibration:
         """The phase calibration."""
-        self._require(
-            self.folder / "calibration" / "calibration.json", "the lifting of this study has no phase, or it has not been calibrated yet"
-        )
+        self._require("calibration/calibration.json", "the lifting of this study has no phase, or it has not been calibrated yet")
         return PhaseCalibration.load(self.folder / "calibration")
 
     @property
     def calibrated(self) -> bool:
         """Whether the study has a phase calibration, hence a disturbance that is fixed to an angle."""
-        return (self.folder / "calibration" / "calibration.json").exists()
+        return self.has("calibration/calibration.json")
 
     @cached_property
     def models(self) -> dict[str, ModelSet]:
@@ -143,9 +155,9 @@ class RunFolder:
         """Return the models of one kind in a condition."""
         if condition == self.identify_on:
             return self.models[name]
-        folder = self.folder / "models" / f"{name}@{quote(condition, safe='')}"
-        self._require(folder / "model.json", f"no models have been identified in condition {condition!r}")
-        return ModelSet.load(folder)
+        place = f"models/{name}@{quote(condition, safe='')}"
+        self._require(f"{place}/model.json", f"no models have been identified in condition {condition!r}")
+        return ModelSet.load(self.folder / place)
 
     @cached_property
     def uncertain(self) -> dict[str, UncertainModel]:
@@ -206,21 +218,20 @@ class RunFolder:
     @cached_property
     def choice(self) -> dict[str, Any]:
         """Which unit is nominal and which is worst off nominal."""
-        self._require(self.folder / "uncertainty" / "choice.json", "the uncertainty has not been quantified yet")
+        self._require("uncertainty/choice.json", "the uncertainty has not been quantified yet")
         return load_artifact(self.folder / "uncertainty", "choice")[0]
 
     @cached_property
     def outlier_rows(self) -> list[dict[str, Any]]:
         """Scores of all units in all conditions."""
-        self._require(self.folder / "outliers" / "scores.json", "no outlier scores have been computed yet")
+        self._require("outliers/scores.json", "no outlier scores have been computed yet")
         rows: list[dict[str, Any]] = read_json(self.folder / "outliers" / "scores.json")["rows"]
         return rows
 
     @cached_property
     def syntheses(self) -> dict[str, Synthesis]:
         """Syntheses by ``model/method``."""
-        folders = self._folders("synthesis", "*/synthesis.json", "no observer has been synthesized yet")
-        methods = sorted(m for f in folders for m in f.iterdir() if (m / "synthesis.json").exists())
+        methods = self._folders("synthesis/*", "synthesis.json", "no observer has been synthesized yet")
         return {f"{m.parent.name}/{m.name}": Synthesis.load(m) for m in methods}
 
     @cached_property
@@ -231,7 +242,7 @@ class RunFolder:
     @cached_property
     def observers_record(self) -> dict[str, Any]:
         """What the synthesis stage says about its observers."""
-        self._require(self.folder / "observers" / "observers.json", "no observer has been made yet")
+        self._require("observers/observers.json", "no observer has been made yet")
         return load_artifact(self.folder / "observers", "observers")[0]
 
     def observer(self, name: str) -> Observer:
@@ -250,32 +261,31 @@ class RunFolder:
     @cached_property
     def evaluation(self) -> dict[str, Any]:
         """Errors of all observers and models."""
-        self._require(self.folder / "evaluation" / "evaluation.json", "the observers have not been evaluated yet")
+        self._require("evaluation/evaluation.json", "the observers have not been evaluated yet")
         content: dict[str, Any] = read_json(self.folder / "evaluation" / "evaluation.json")
         return content
 
     @cached_property
     def disturbed(self) -> dict[str, Any]:
         """What was found on disturbed measurements and on random members of the set; empty where the study asks for neither."""
-        folder = self.folder / "disturbed"
-        return load_artifact(folder, "disturbed")[0] if (folder / "disturbed.json").exists() else {}
+        return load_artifact(self.folder / "disturbed", "disturbed")[0] if self.has("disturbed/disturbed.json") else {}
 
     @cached_property
     def members(self) -> dict[str, Array]:
         """Norms of the errors over random members of the set, ``members/<observer>`` and ``units/<observer>``."""
-        self._require(self.folder / "disturbed" / "arrays.npz", "no member of an uncertain set was drawn")
+        self._require("disturbed/arrays.npz", "no member of an uncertain set was drawn")
         return dict(read_arrays(self.folder / "disturbed" / "arrays.npz"))
 
     @cached_property
     def left_out(self) -> dict[str, Any]:
         """What observers did on units that took no part in their making."""
-        self._require(self.folder / "left_out" / "left_out.json", "no unit was left out; set evaluate.folds")
+        self._require("left_out/left_out.json", "no unit was left out; set evaluate.folds")
         return load_artifact(self.folder / "left_out", "left_out")[0]
 
     @cached_property
     def arrays(self) -> dict[str, Array]:
         """Trajectories and spectra of the evaluation."""
-        self._require(self.folder / "evaluation" / "arrays.npz", "the observers have not been evaluated yet")
+        self._require("evaluation/arrays.npz", "the observers have not been evaluated yet")
         return dict(read_arrays(self.folder / "evaluation" / "arrays.npz"))
 
     @cached_property
@@ -299,15 +309,19 @@ class RunFolder:
                 return shown
         raise NotShownError(f"there is no held-out episode of unit {unit} ({condition})")
 
-    def _folders(self, name: str, pattern: str, reason: str) -> list[Path]:
-        folder = self.folder / name
-        found = sorted(f for f in folder.iterdir() if f.is_dir() and any(f.glob(pattern))) if folder.is_dir() else []
+    def _folders(self, place: str, file: str, reason: str) -> list[Path]:
+        """Return the folders `place`/* that hold a file; both may be patterns, a star for one part of a name."""
+        pattern = f"{place}/*/{file}"
+        depth, below = pattern.count("/"), file.count("/")
+        found = {
+            PurePosixPath(name).parents[below] for name in self.files if name.count("/") == depth and PurePosixPath(name).match(pattern)
+        }
         if not found:
             raise NotShownError(reason)
-        return found
+        return [self.folder / name for name in sorted(found)]
 
-    def _require(self, path: Path, reason: str) -> None:
-        if not path.exists():
+    def _require(self, name: str, reason: str) -> None:
+        if not self.has(name):
             raise NotShownError(reason)
 
 

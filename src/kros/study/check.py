@@ -14,9 +14,10 @@ from ..data import Population, check_population
 from ..identify import Factor, ModelSet, combine, edmd, lifted_factor
 from ..observer import Observer
 from ..uncertainty import OutlierModel
+from .config import Stage, StudyConfig
 from .estimate import check_channels, load_calibration, open_data, training_keys, unit_parameters
 from .executors import Executor, open_executor
-from .pipeline import load_run
+from .run_folder import open_finished
 from .stages.identify import reduce_episodes
 from .stages.quantify import score_row
 from .store import Store
@@ -30,15 +31,22 @@ def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]
     list of dict
         ``unit, condition, score, threshold, outlier, frequency_hz`` and more, one row a unit and condition that the study knows.
     """
-    config, store = load_run(run)
-    folders = sorted(p.parent for p in store.path("outliers").glob("*/outlier_model.json"))
+    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (config, store):
+        return scored(config, store, data, workers)
+
+
+def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[dict[str, Any]]:
+    """Score the units of some recordings against a run that is open."""
+    kept = [name.split("/") for name in sorted(store.files())]
+    folders = [store.path(*parts[:2]) for parts in kept if len(parts) == 3 and (parts[0], parts[2]) == ("outliers", "outlier_model.json")]
     if not folders:
-        raise ConfigError(f"Run {run}: has no outlier scores to compare with; run the study until quantify, with at least three units.")
+        raise ConfigError(
+            f"Run {store.folder}: has no outlier scores to compare with; run the study until quantify, with at least three units."
+        )
     population = open_data(config, data)
     check_population(population, allow_single=True)
-    deployed = store.path("observers", "deployed.json")
-    if deployed.exists():
-        check_channels(population, Observer.load(deployed))
+    if store.holds("observers", "deployed.json"):
+        check_channels(population, Observer.load(store.path("observers", "deployed.json")))
     rows: list[dict[str, Any]] = []
     with open_executor(workers) as executor:
         for folder in folders:

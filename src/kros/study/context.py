@@ -111,15 +111,15 @@ class Context:
 
     def models(self, name: str, condition: str | None = None) -> ModelSet:
         """Load the models of one kind, in the condition that feeds the synthesis or another."""
-        return ModelSet.load(self.model_folder(name, condition))
+        return ModelSet.load(self.store.path("models", self.model_folder(name, condition)))
 
-    def model_folder(self, name: str, condition: str | None = None) -> Path:
-        """Return where models of a kind and condition are kept."""
+    def model_folder(self, name: str, condition: str | None = None) -> str:
+        """Return the name of the folder of models of a kind and condition."""
         if condition in (None, self.facts.identify_on):
-            return self.store.path("models", name)
+            return name
         from urllib.parse import quote
 
-        return self.store.path("models", f"{name}@{quote(str(condition), safe='')}")
+        return f"{name}@{quote(str(condition), safe='')}"
 
 
 def _call(work: Callable[[], T]) -> T:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import shutil
+import time
 from pathlib import Path
 from typing import Any
 
 from ..core.artifacts import write_json
 from ..core.errors import ConfigError
 from ..data import write_parquet, write_raw
-from .config import validate_config
+from .config import Stage, validate_config
 from .context import Progress
-from .pipeline import RunResult, run_study
+from .pipeline import RunResult, require_usable, run_in
 from .presets import HARMONIC_DRIVE
+from .run_folder import open_run
+from .store import Store, code_key, hash_of
 
 FORMATS = ("parquet", "raw")
-_MARK = "demo.json"
+_STAGE, _RECORDINGS = "simulate", "simulated"
 
 
 def simulate_to(
@@ -60,21 +62,30 @@ def simulate_to(
 def run_demo(out: Path, units: int, episodes: int, seconds: float, seed: int, workers: int, progress: Progress) -> RunResult:
     """Simulate a population with one badly assembled drive and run the study on it, all below one folder.
 
+    An earlier demo there is continued, or changed to what is asked now.
+
     Raises
     ------
     ConfigError
         When the folder holds anything but an earlier demo.
     """
-    out = Path(out).absolute()
-    if out.exists():
-        if not out.is_dir() or (any(out.iterdir()) and not (out / _MARK).exists()):
-            raise ConfigError(f"Output {out}: holds something that is not an earlier demo; name another folder.")
-        shutil.rmtree(out)
-    recordings = out / "simulated"
-    progress.start("simulate", None)
-    out.mkdir(parents=True)
-    write_json(out / _MARK, {"schema": 1, "units": units, "episodes": episodes, "seconds": seconds, "seed": seed})
-    write_json(out / "study.json", {})
-    simulate_to(recordings, "harmonic-drive", units, episodes, seconds, seed, 1.0, "stiff", True, "parquet")
-    config = validate_config({"name": "demo", "data": {"source": str(recordings), "reader": "parquet"}}, out)
-    return run_study(config, out, workers=workers, progress=progress)
+    out = Path(out).resolve()
+    config = validate_config({"name": "demo", "data": {"source": str(out / _RECORDINGS), "reader": "parquet"}}, out)
+    with open_run(out, config) as store:
+        _simulate_in(store, units, episodes, seconds, seed, progress)
+        require_usable(config, Stage.REPORT)
+        return run_in(store, config, Stage.REPORT, workers, progress=progress)
+
+
+def _simulate_in(store: Store, units: int, episodes: int, seconds: float, seed: int, progress: Progress) -> None:
+    """Simulate into a run folder, where the same simulation is not there already."""
+    settings = ("harmonic-drive", units, episodes, seconds, seed, 1.0, "stiff", True, "parquet")
+    key = hash_of([code_key(), settings])
+    if store.is_current(_STAGE, key):
+        return
+    progress.start(_STAGE, None)
+    began = time.perf_counter()
+    with store.drafting() as draft:
+        simulate_to(draft.draft(_RECORDINGS), *settings)
+        store.clear(_STAGE)
+        draft.commit(_STAGE, key, time.perf_counter() - began)

@@ -51,7 +51,7 @@ class _Result(Protocol):
 Work = tuple[Path, Callable[[], _Result]]
 
 
-def diagnose(context: Context, units: list[str], found: Mapping[str, UncertainModel], rows: Sequence[Mapping[str, Any]]) -> list[Path]:
+def diagnose(context: Context, units: list[str], found: Mapping[str, UncertainModel], rows: Sequence[Mapping[str, Any]]) -> None:
     """Compute and save what there is to tell; what cannot be told is logged, with its reason, and left out.
 
     Parameters
@@ -62,13 +62,8 @@ def diagnose(context: Context, units: list[str], found: Mapping[str, UncertainMo
     found : mapping of str to UncertainModel
     rows : sequence of mapping
         Outlier scores of all conditions.
-
-    Returns
-    -------
-    list of Path
-        Files that were written.
     """
-    folder, config = context.store.path("uncertainty"), context.config.uncertainty
+    folder, config = context.store.draft("uncertainty"), context.config.uncertainty
     work: list[Work] = []
     for name, uncertain in found.items():
         work += [(folder / name / "noise", task) for task in _noise(context, name, units, uncertain)]
@@ -77,12 +72,9 @@ def diagnose(context: Context, units: list[str], found: Mapping[str, UncertainMo
         work.append((folder / name / "units", partial(beside_weights, context.models(name), found[name], config)))
     work += _others(context, rows)
     results = context.run("quantify (diagnose)", [partial(_attempt, place.parent.name, task) for place, task in work])
-    files: list[Path] = []
     for (place, _), result in zip(work, results, strict=True):
         if result is not None:
             result.save(place)
-            files += sorted(place.iterdir())
-    return files
 
 
 def _attempt(name: str, task: Callable[[], _Result]) -> _Result | None:
@@ -158,7 +150,7 @@ def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Work]:
     nominal = others[choose_nominals(responses)[Form(context.config.uncertainty.form)].index]
     return [
         (
-            context.store.path("outliers", context.model_folder(models.name, condition).name, "others"),
+            context.store.draft("outliers", context.model_folder(models.name, condition), "others"),
             partial(against_others, models, others, outside, nominal, context.config.uncertainty),
         )
         for models in sets

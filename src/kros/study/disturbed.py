@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -128,16 +127,16 @@ def noise_draws(context: Context, keys: Sequence[EpisodeKey], measured: Sequence
 
 def run_disturbed(
     context: Context, trial: Trial | None, observers: Mapping[str, Observer], baselines: Mapping[str, tuple[Array, Sequence[int] | None]]
-) -> list[Path]:
+) -> None:
     """Run the observers of a trial on disturbed measurements and on random members of their set, and save what comes out.
 
     `baselines` have been run already; beside their errors stand the channels that they estimate.
     """
     if trial is None:
-        return []
+        return
     from .stages.evaluate import alike
 
-    config, folder = context.config.evaluate, context.store.path("disturbed")
+    config, folder = context.config.evaluate, context.store.draft("disturbed")
     chosen = {name: observer for name, observer in observers.items() if name in trial.names}
     groups = alike(chosen.values())
     kinds = list(dict.fromkeys(name.rpartition("/")[0] for name in chosen)) if config.monte_carlo else []
@@ -149,7 +148,6 @@ def run_disturbed(
     members = {name: found for of_kind in done[len(groups) :] for name, found in of_kind.items()}
     arrays = {f"{what}/{name}": values for name, (_, parts) in members.items() for what, values in parts.items()}
     save_artifact(folder, "disturbed", contents(trial, config, errors, [row for row, _ in members.values()]), arrays)
-    return [folder / "disturbed.json", folder / "arrays.npz"]
 
 
 def contents(

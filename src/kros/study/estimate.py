@@ -16,8 +16,8 @@ from ..data.population import EpisodeKey
 from ..evaluate import EpisodeBatch
 from ..identify import PhaseCalibration
 from ..observer import Observer, run_observer
-from .config import StudyConfig, validate_config
-from .pipeline import load_run
+from .config import Stage, StudyConfig, validate_config
+from .run_folder import open_finished
 from .stages.calibrate import segments_of
 from .store import Store
 
@@ -53,8 +53,7 @@ def check_channels(population: Population, observer: Observer) -> None:
 
 def load_calibration(store: Store) -> PhaseCalibration | None:
     """Return the run's calibration, where it has one."""
-    folder = store.path("calibration")
-    return PhaseCalibration.load(folder) if (folder / "calibration.json").exists() else None
+    return PhaseCalibration.load(store.path("calibration")) if store.holds("calibration", "calibration.json") else None
 
 
 def unit_parameters(population: Population, calibration: PhaseCalibration | None, prefer: str) -> dict[str, dict[str, float]]:
@@ -103,18 +102,16 @@ def training_keys(population: Population) -> dict[tuple[str, str], tuple[Episode
 
 def estimate_recordings(run: Path, data: Path, out: Path) -> int:
     """Write ``unit, condition, episode, k, <channel>_hat`` for every sample; return the number of episodes."""
-    config, store = load_run(run)
-    path = store.path("observers", "deployed.json")
-    if not path.exists():
-        raise ConfigError(f"Run {run}: has no deployed observer; run the study at least until synthesize.")
-    if out.exists():
-        raise ConfigError(f"Output {out}: exists; name a new file.")
-    observer = Observer.load(path)
-    population = open_data(config, data)
-    check_channels(population, observer)
-    facts = _identify_on(store)
-    units = unit_parameters(population, load_calibration(store), facts)
-    _write(out, population, observer, units)
+    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
+        if not store.holds("observers", "deployed.json"):
+            raise ConfigError(f"Run {run}: has no deployed observer; run the study at least until synthesize.")
+        if out.exists():
+            raise ConfigError(f"Output {out}: exists; name a new file.")
+        observer = Observer.load(store.path("observers", "deployed.json"))
+        population = open_data(config, data)
+        check_channels(population, observer)
+        units = unit_parameters(population, load_calibration(store), _identify_on(store))
+        _write(out, population, observer, units)
     return len(population.episodes)
 
 

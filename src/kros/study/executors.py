@@ -1,13 +1,16 @@
-"""Where maps over units run: here, in processes on this machine, or on a Dask cluster. The same code, the same bytes."""
+"""Where maps over units run: here, in processes on this machine, or on a Dask cluster. The same code, the same bytes.
+
+Worker processes hold one end of a pipe whose other end is this process's alone: they end when it is closed, by whatever ended this process too.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Protocol, TypeVar
 
-from ..core.errors import ConfigError, MissingDependencyError
+from ..core.errors import ConfigError, KrosError, MissingDependencyError
 
 T = TypeVar("T")
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ARROW_NUM_THREADS")
@@ -36,8 +39,21 @@ class ProcessExecutor:
         self._pool = pool
 
     def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
-        """Yield results in the order of the tasks."""
-        return self._pool.map(function, tasks)
+        """Yield results in the order of the tasks.
+
+        Raises
+        ------
+        KrosError
+            When a worker process was ended from outside.
+        """
+        from concurrent.futures.process import BrokenProcessPool
+
+        try:
+            yield from self._pool.map(function, tasks)
+        except BrokenProcessPool as error:
+            raise KrosError(
+                "A worker process was ended from outside, perhaps because memory ran out; run again, with fewer --workers."
+            ) from error
 
 
 class DaskExecutor:
@@ -76,20 +92,55 @@ def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Ex
     if workers == 1:
         yield SerialExecutor()
         return
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor
+    with _single_threaded(), _pool(workers) as pool:
+        yield ProcessExecutor(pool)
 
+
+@contextmanager
+def _single_threaded() -> Iterator[None]:
+    """Let processes that start now use one thread for linear algebra."""
     saved = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
     try:
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-            yield ProcessExecutor(pool)
+        yield
     finally:
         for name, value in saved.items():
             if value is None:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[Any]:
+    """Give a pool of processes; where it is left early, their work is not waited for."""
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
+    context = multiprocessing.get_context("spawn")
+    theirs, ours = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with, initargs=(theirs,))
+    try:
+        yield pool
+        pool.shutdown()
+    finally:
+        ours.close()
+        pool.shutdown(cancel_futures=True)
+        theirs.close()
+
+
+def _end_with(pipe: Any) -> None:
+    """In a worker: end as soon as the other end of a pipe is closed; an interrupt from the keyboard is the parent's to handle."""
+    import signal
+    from threading import Thread
+
+    def watch() -> None:
+        with suppress(EOFError, OSError):
+            pipe.recv_bytes()
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=watch, name="ends with its parent", daemon=True).start()
 
 
 def available_cores() -> int:

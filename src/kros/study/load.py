@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,10 +47,10 @@ def wanted(config: LoadConfig) -> bool:
     return config.moment is not None
 
 
-def run_load(context: Context, observers: Mapping[str, Observer]) -> list[Path]:
+def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     """Make and judge the estimators of the load and save what was found; nothing where the study declares no load."""
     if not wanted(context.config.load):
-        return []
+        return
     study = LoadStudy(context)
     rows: list[dict[str, Any]] = []
     curves: dict[str, Array] = {}
@@ -64,7 +63,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> list[Path]:
             facts[f"{kind}/load"] = {"status": "failed", "reason": str(error)}
             log.info("%s/load could not be made: %s", kind, error)
             continue
-        observer.save(context.store.path(FOLDER, f"{kind}.json"))
+        observer.save(context.store.draft(FOLDER, f"{kind}.json"))
         estimate = run_observer(observer, study.measured(study.test), study.test.inputs, study.parameters(observer, study.test))
         found = study.level(observer, calibration, estimate)
         facts[f"{kind}/load"] = {"order": len(observer.lifting.states), "episodes_left_out": len(calibration.left_out)}
@@ -83,14 +82,11 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> list[Path]:
     key = study.test.keys[shown]
     arrays = {"truth": study.truth[1][:, shown], **{f"estimate/{name}": values[:, shown] for name, values in curves.items()}}
     save_artifact(
-        context.store.path(FOLDER),
+        context.store.draft(FOLDER),
         KIND,
         content | {"shown": [key.unit, key.condition, key.episode], "estimates": list(curves)},
         {name: values.astype(np.float32) for name, values in arrays.items()},
     )
-    folder = context.store.path(FOLDER)
-    made = [folder / f"{name.partition('/')[0]}.json" for name, found in facts.items() if "order" in found]
-    return [folder / "load.json", folder / "arrays.npz", *made]
 
 
 def load_metrics(context: Context) -> dict[str, Any]:

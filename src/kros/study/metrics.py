@@ -5,7 +5,6 @@ What was not run is absent, what is unknown is null, nothing is invented.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from .config import Stage
 from .context import Context
 from .load import load_metrics
 from .stages import calibrate, left_out
+from .store import Store
 
 
 def collect_metrics(context: Context, until: Stage, total_s: float | None) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
 
 
 def _timing(context: Context, done: list[Stage], total_s: float | None) -> dict[str, float]:
-    timing = {stage.value: record["seconds"] for stage in done if (record := context.store.record(stage)) is not None}
+    timing = {stage.value: record.seconds for stage in done if (record := context.store.record(stage)) is not None}
     return timing | ({"total": total_s} if total_s is not None else {})
 
 
@@ -90,9 +90,9 @@ def _pooled_radius(context: Context, name: str) -> float:
 
 
 def _uncertainty(context: Context) -> dict[str, Any]:
-    folder = context.store.path("uncertainty")
-    found = {name: folder / name for name in context.model_names if (folder / name).exists()}
-    return {name: uncertainty_entry(UncertainModel.load(place)) | diagnostic_entry(place) for name, place in found.items()}
+    store = context.store
+    found = [name for name in context.model_names if store.holds("uncertainty", name)]
+    return {name: uncertainty_entry(UncertainModel.load(store.path("uncertainty", name))) | diagnostic_entry(store, name) for name in found}
 
 
 def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
@@ -113,16 +113,16 @@ def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
     return entry
 
 
-def diagnostic_entry(folder: Path) -> dict[str, Any]:
+def diagnostic_entry(store: Store, name: str) -> dict[str, Any]:
     """Return what was told about one uncertain model beside its weights: share of noise, and overbounds of a scalar magnitude over order."""
     entry: dict[str, Any] = {}
-    if (folder / "noise").exists():
-        noise = VariationAndNoise.load(folder / "noise")
+    if store.holds("uncertainty", name, "noise"):
+        noise = VariationAndNoise.load(store.path("uncertainty", name, "noise"))
         place = int(noise.residual.max(axis=0).argmax())
         shares = {"median": np.median(noise.noise_share), "at_peak": noise.noise_share[place], "peak_hz": noise.freqs_hz[place]}
         entry["noise_share"] = shares
-    if (folder / "order").exists():
-        order = Tightness.load(folder / "order")
+    if store.holds("uncertainty", name, "order"):
+        order = Tightness.load(store.path("uncertainty", name, "order"))
         entry["order_db"] = {"orders": order.orders, "overbound": order.overbound_db, "proven": order.proven_db}
     return entry
 
@@ -136,9 +136,8 @@ def _observers(context: Context) -> dict[str, Any]:
     record = _observers_record(context)
     for name in record["facts"]:
         entry = dict(record["facts"][name])
-        folder = context.store.path("synthesis", name)
-        if folder.exists():
-            synthesis = Synthesis.load(folder)
+        if context.store.holds("synthesis", name):
+            synthesis = Synthesis.load(context.store.path("synthesis", name))
             entry |= {"status": synthesis.status, "solve_s": synthesis.solve_s}
             entry |= {key: getattr(synthesis, key) for key in ("h2_norm", "hinf_norm")}
             if synthesis.worst_case_h2 is not None:  # a Kalman filter's own optimum bounds nothing in the worst case
@@ -166,15 +165,15 @@ def _evaluation_record(context: Context) -> dict[str, Any]:
 
 def _disturbed(context: Context) -> dict[str, Any]:
     """Errors against severity, and over noise and random members of the set; only what the study asks for."""
-    if not context.store.path("disturbed", "disturbed.json").exists():
+    if not context.store.holds("disturbed", "disturbed.json"):
         return {}
     content = load_artifact(context.store.path("disturbed"), "disturbed")[0]
     return {key: content[key] for key in ("robustness", "monte_carlo") if key in content}
 
 
 def _outliers(context: Context) -> list[dict[str, Any]]:
-    path = context.store.path("outliers", "scores.json")
-    rows: list[dict[str, Any]] = read_json(path)["rows"] if path.exists() else []
+    kept = context.store.holds("outliers", "scores.json")
+    rows: list[dict[str, Any]] = read_json(context.store.path("outliers", "scores.json"))["rows"] if kept else []
     return rows
 
 

@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core.artifacts import read_json, write_json
-from ..core.errors import ConfigError, DataError, DimensionError
+from ..core.artifacts import read_json
 from .config import Stage, StudyConfig
 from .context import Context, Progress, Silent
 from .executors import open_executor
 from .metrics import collect_metrics
+from .run_folder import load_run as load_run  # where readers of runs look for it
+from .run_folder import open_run, require_own
 from .stages import evaluate, left_out, read, report
 from .steps import LEARNING, Step, run_steps
-from .store import Store, remove_tree
+from .store import Store
 
 STEPS = (
     *LEARNING,
@@ -65,33 +66,43 @@ def run_study(
     Raises
     ------
     KrosError
-        Bad input leaves no folder behind that was not there before.
+        Bad input leaves no folder behind that was not there before; so does a folder in which another study lives, or another run is at work.
     """
-    began = time.perf_counter()
     out = Path(out)
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"Output {out}: is a file; name a folder.")
-    fresh = not out.exists() or not any(out.iterdir())
-    if not fresh and not (out / "study.json").exists():
-        raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
+    require_own(out, config)
+    require_usable(config, until)
+    with open_run(out, config) as store:
+        return run_in(store, config, until, workers, scheduler, progress)
+
+
+def require_usable(config: StudyConfig, until: Stage) -> None:
+    """Refuse what can be refused from the names of recordings alone."""
     read.check_source(config, single_allowed=list(Stage).index(until) <= list(Stage).index(Stage.IDENTIFY))
     if left_out.wanted(config):
         left_out.check_folds(config, read.open_source(config))
-    store = Store(out)
-    try:
-        with open_executor(workers, scheduler) as executor:
-            context = Context(config, store, executor, progress or Silent())
-            if fresh:
-                write_json(store.path("study.json"), config.dump())
-            run_steps(context, STEPS, until)
-    except (ConfigError, DataError, DimensionError):
-        remove_tree(store.path(read.PARTIAL))
-        if fresh and not store.record(Stage.READ):
-            remove_tree(out)
-        raise
-    metrics = collect_metrics(context, until, time.perf_counter() - began)
-    write_json(store.path("metrics.json"), metrics)
-    return RunResult(out, metrics, violations(config, metrics))
+
+
+def run_in(
+    store: Store, config: StudyConfig, until: Stage, workers: int, scheduler: str | None = None, progress: Progress | None = None
+) -> RunResult:
+    """Run a study in its run folder, which is open."""
+    began = time.perf_counter()
+    with open_executor(workers, scheduler) as executor:
+        context = Context(config, store, executor, progress or Silent())
+        run_steps(context, STEPS, until)
+        metrics = kept_metrics(store, collect_metrics(context, until, time.perf_counter() - began))
+    return RunResult(store.folder, metrics, violations(config, metrics))
+
+
+def kept_metrics(store: Store, metrics: dict[str, Any]) -> dict[str, Any]:
+    """Write the metrics where they are not those of an earlier run, with the time that took; return what is kept."""
+    earlier: dict[str, Any] = read_json(store.path("metrics.json")) if store.is_kept("metrics.json") else {}
+    total = earlier.get("timing_s", {}).get("total")
+    as_earlier = metrics | {"timing_s": metrics["timing_s"] | {"total": total}}
+    if as_earlier == earlier:
+        return earlier
+    store.keep("metrics.json", metrics)
+    return metrics
 
 
 def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:
@@ -105,17 +116,3 @@ def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:
     if config.require.no_outliers and flagged:
         found.append(f"require.no_outliers: flagged are {', '.join(flagged)}")
     return tuple(found)
-
-
-def load_run(folder: Path) -> tuple[StudyConfig, Store]:
-    """Open a finished run folder.
-
-    Raises
-    ------
-    ConfigError
-        When the folder is not a run.
-    """
-    folder = Path(folder)
-    if not (folder / "study.json").exists():
-        raise ConfigError(f"Run {folder}: there is no study.json in it; name the folder that kros run or kros demo wrote.")
-    return StudyConfig.model_validate(read_json(folder / "study.json")), Store(folder)

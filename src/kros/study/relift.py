@@ -153,11 +153,10 @@ def certify(observer: Observer, scales: ReliftScales, task: Task) -> ReliftCerti
     return found
 
 
-def save_running(folder: Path, found: Sequence[Running]) -> list[Path]:
+def save_running(folder: Path, found: Sequence[Running]) -> None:
     """Write certificates and rows below the folder of the observers."""
     rows = {r.name: [row.as_dict() for row in r.rows] for r in found}
     told = {r.name: {"assumptions": r.certificate.assumptions, "method": r.certificate.method} for r in found}
     save_artifact(folder, "relift", {"rows": rows, "certificates": told})
     for running in found:
         running.certificate.save(folder / "relift" / running.name)
-    return [folder / "relift.json"]

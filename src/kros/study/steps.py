@@ -5,10 +5,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
-from ..core.artifacts import write_json
 from .config import Stage, StudyConfig
 from .context import Context
 from .stages import calibrate, identify, quantify, read, synthesize
@@ -27,7 +25,7 @@ class Step:
     """One stage: what it does, which sections of the study it depends on beside the stages before it, and which studies have it."""
 
     stage: Stage
-    run: Callable[[Context], list[Path]]
+    run: Callable[[Context], None]
     sections: tuple[str, ...]
     wanted: Callable[[StudyConfig], bool] = always
 
@@ -43,51 +41,61 @@ LEARNING = (
 
 
 def run_steps(context: Context, steps: Sequence[Step], until: Stage) -> None:
-    """Run steps up to a stage, from the first one that is not current."""
-    key = code_key()
-    for position, step in enumerate(steps):
-        if not step.wanted(context.config):
-            context.store.clear(step.stage)
-        else:
-            key = _run_step(context, steps[position:], key)
-        if step.stage is until:
-            return
+    """Run steps up to a stage, from the first one that is not current; what later ones left goes where it is not current any more."""
+    key, ahead = code_key(), False
+    try:
+        for position, step in enumerate(steps):
+            if not step.wanted(context.config):
+                context.store.erase(step.stage)
+            elif not ahead:
+                key = _run_step(context, steps[position:], key)
+            elif context.store.is_current(step.stage, own := _key(context, step, key)):
+                key = _next_key(context, step.stage, own)
+            else:
+                _outdate(context, steps[position:])
+                break
+            ahead = ahead or step.stage is until
+        context.store.keep("study.json", context.config.dump())
+    finally:
+        context.store.tidy()
 
 
 def _run_step(context: Context, steps: Sequence[Step], upstream: str) -> str:
-    """Run the first of some steps, or find it done; return what the next one depends on."""
-    step = steps[0]
-    key = _key(context, step, upstream)
-    if context.store.is_current(step.stage, key):
-        record = context.store.record(step.stage) or {}
-        context.progress.finish(step.stage.value, record["seconds"], skipped=True)
-    else:
-        began = time.perf_counter()
-        context.progress.start(step.stage.value, None)
-        files = _perform(context, steps)
+    """Run the first of some steps, or find it done; return what the next one depends on.
+
+    Its earlier result, and all that follows from it, stay until the new one is there: a stage that fails or is killed leaves a run as it was.
+    """
+    stage = steps[0].stage
+    key = _key(context, steps[0], upstream)
+    if context.store.is_current(stage, key):
+        record = context.store.record(stage)
+        context.progress.finish(stage.value, record.seconds if record is not None else 0.0, skipped=True)
+        return _next_key(context, stage, key)
+    began = time.perf_counter()
+    context.progress.start(stage.value, None)
+    with context.store.drafting() as draft:
+        steps[0].run(replace(context, store=draft))
         seconds = time.perf_counter() - began
-        context.store.finish(step.stage, key, seconds, files)
-        context.progress.finish(step.stage.value, seconds, skipped=False)
-        log.info("%s: %.2f s", step.stage.value, seconds)
-    if step.stage is Stage.READ:
-        write_json(context.store.path("study.json"), context.config.dump())
-        context.store.path("metrics.json").unlink(missing_ok=True)
-    return hash_of([key, context.store.output_key(step.stage)])
+        _outdate(context, steps)
+        draft.commit(stage, key, seconds)
+    context.progress.finish(stage.value, seconds, skipped=False)
+    log.info("%s: %.2f s", stage.value, seconds)
+    return _next_key(context, stage, key)
 
 
-def _perform(context: Context, steps: Sequence[Step]) -> list[Path]:
-    """Run a stage in place of its earlier result and of all that follow from it."""
-    if steps[0].stage is not Stage.READ:
-        _clear(context, steps)
-        return steps[0].run(context)
-    files = steps[0].run(context)  # before anything is cleared: recordings that turn out bad leave an earlier run as it was
-    _clear(context, steps[1:])
-    return files
+def _next_key(context: Context, stage: Stage, key: str) -> str:
+    return hash_of([key, context.store.output_key(stage)])
 
 
-def _clear(context: Context, steps: Sequence[Step]) -> None:
+def _outdate(context: Context, steps: Sequence[Step]) -> None:
+    """Remove what does not follow from the study any more; from here on the run folder is that of the study as it is now."""
+    context.store.discard("metrics.json")
     for step in steps:
-        context.store.clear(step.stage)
+        if step.wanted(context.config):
+            context.store.clear(step.stage)
+        else:
+            context.store.erase(step.stage)
+    context.store.keep("study.json", context.config.dump())
 
 
 def _key(context: Context, step: Step, upstream: str) -> str:

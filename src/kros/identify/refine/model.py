@@ -77,7 +77,7 @@ class RefinedModels:
     whitening: Array
     spectral_radius: Array
 
-    def save(self, folder: Path) -> list[Path]:
+    def save(self, folder: Path) -> None:
         """Write ``refinement.json`` and ``arrays.npz``; an infinite strength becomes null."""
         content: dict[str, Any] = {
             "unit_ids": self.unit_ids,
@@ -88,7 +88,6 @@ class RefinedModels:
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         arrays |= {f"{which}_{m}": getattr(getattr(self, which), m) for which in ("units", "pooled") for m in "AB"}
         save_artifact(folder, "refinement", content, arrays)
-        return [folder / "refinement.json", folder / "arrays.npz"]
 
     @classmethod
     def load(cls, folder: Path) -> RefinedModels:

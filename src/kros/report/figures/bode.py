@@ -39,7 +39,7 @@ def draw(run: RunFolder) -> Drawing:
 
 
 def _nominal(run: RunFolder) -> str | None:
-    return str(run.choice["nominal"]) if (run.folder / "uncertainty" / "choice.json").exists() else None
+    return str(run.choice["nominal"]) if run.has("uncertainty/choice.json") else None
 
 
 def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:

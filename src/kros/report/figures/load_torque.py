@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...core.artifacts import read_arrays, read_json
+from ...core.records import recorded_files
 from ...evaluate.errors import error_spectrum
 from ..canvas import grid, legend, logarithmic
 from ..names import Look, condition_label
@@ -27,7 +28,7 @@ _WAYS = (("load", "a load of its own"), ("current", "error of the\nrecorded curr
 def draw(run: RunFolder) -> Drawing:
     """Draw estimates over the episode and power spectral densities of their errors, one row for each way to estimate."""
     path = run.folder / "load" / "load.json"
-    if not path.exists():
+    if "load/load.json" not in recorded_files(run.folder):
         raise NotShownError("this study declares no load; set load.moment")
     content, arrays = read_json(path), read_arrays(run.folder / "load" / "arrays.npz")
     ways = [(label, [n for n in content["estimates"] if n.endswith(f"/{way}")]) for way, label in _WAYS]

@@ -28,7 +28,7 @@ _BOUND = (
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     """Return the certificates of the observers as they run; None where there are none."""
     observers = {name: entry for name, entry in metrics.get("observers", {}).items() if entry.get("relift_certified") is not None}
-    if not observers or not (run.folder / "observers" / "relift.json").exists():
+    if not observers or not run.has("observers/relift.json"):
         return None
     record = load_artifact(run.folder / "observers", "relift")[0]
     deployed = metrics["study"].get("deployed")

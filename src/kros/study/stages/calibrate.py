@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 from ...core.errors import IdentificationError
 from ...data.population import EpisodeKey, Population
@@ -33,11 +32,11 @@ def calibration_keys(context: Context, unit: str) -> tuple[EpisodeKey, ...]:
     return facts.keys("train", unit, facts.identify_on) or tuple(k for k in own if k.condition == own[0].condition)
 
 
-def run(context: Context) -> list[Path]:
+def run(context: Context) -> None:
     """Calibrate all units; a unit that cannot be calibrated is left out with its reason."""
     spec, facts = context.phase_spec, context.facts
     if spec is None:
-        return []
+        return
     tasks = [(context.population.select([u]), calibration_keys(context, u), spec) for u in facts.groups]
     units: dict[str, UnitPhase] = {}
     for unit, segments in zip(facts.groups, context.map("calibrate", segments_of, tasks), strict=True):
@@ -51,9 +50,7 @@ def run(context: Context) -> list[Path]:
             f"Calibration: {len(pooled)} of {len(facts.pooled)} units could be calibrated, too few for a population; check [calibrate] against the recordings "
             f"(angle {spec.angle!r}, ratio {spec.ratio:g}, error {spec.reference!r} - {spec.measured!r})."
         )
-    folder = context.store.path("calibration")
-    resolve_branches(units, pooled, spec).save(folder)
-    return [folder / "calibration.json"]
+    resolve_branches(units, pooled, spec).save(context.store.draft("calibration"))
 
 
 def load(context: Context) -> PhaseCalibration | None:

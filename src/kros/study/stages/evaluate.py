@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -123,7 +122,7 @@ def _outcome(estimate: Array, batch: EpisodeBatch, dt: float, shown: tuple[int, 
     return Outcome(summarise(estimate, batch.states, batch.lengths, dt), [estimate[: batch.lengths[i], i] for i in shown])
 
 
-def run(context: Context) -> list[Path]:
+def run(context: Context) -> None:
     """Evaluate and save errors, spectra and the trajectories that are shown."""
     facts, population = context.facts, context.population
     calibration = calibrate.load(context)
@@ -149,7 +148,6 @@ def run(context: Context) -> list[Path]:
     for name, outcome in estimates.items():
         rows += error_rows(name, outcome.summary, keys, roles, population.states, band, outcome.estimated)
     free = {name: free_run_percent(o.summary, on, facts.pooled, population.states) for name, o in free_runs.items()}
-    folder = context.store.path("evaluation")
     content: dict[str, Any] = {
         "rows": rows,
         "free_run": free,
@@ -159,14 +157,11 @@ def run(context: Context) -> list[Path]:
         "baselines": {name: facts_of(name, outcome) for name, outcome in results.items() if name not in observers},
     }
     content |= {"observers": list(estimates), "models": list(models), "states": population.states}
-    save_artifact(folder, "evaluation", content, _arrays(population, keys, on, shown, shown_on, roles, estimates, free_runs))
+    arrays = _arrays(population, keys, on, shown, shown_on, roles, estimates, free_runs)
+    save_artifact(context.store.draft("evaluation"), "evaluation", content, arrays)
     disturbed = {name: (o.disturbed, o.estimated) for name, o in estimates.items() if o.disturbed is not None}
-    return [
-        folder / "evaluation.json",
-        folder / "arrays.npz",
-        *run_disturbed(context, trial, observers, disturbed),
-        *run_load(context, observers),
-    ]
+    run_disturbed(context, trial, observers, disturbed)
+    run_load(context, observers)
 
 
 def estimation(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -49,29 +48,24 @@ def reduce_episodes(task: Task) -> Factor:
     return Factor.stack(factors)
 
 
-def run(context: Context) -> list[Path]:
+def run(context: Context) -> None:
     """Reduce, identify, save."""
     facts, lifting = context.facts, context.lifting
     calibration = calibrate.load(context)
     known = [u for u in facts.groups if calibration is None or u in calibration.units]
-    files: list[Path] = []
     for condition in sorted({k.condition for k in facts.train}, key=lambda c: c != facts.identify_on):
         units = [u for u in known if facts.keys("train", u, condition)]
         tasks = [(context.population.select([u], [condition]), facts.keys("train", u, condition), lifting) for u in units]
         episodes = list(context.map(f"identify ({condition})", reduce_episodes, tasks))
-        files += _save_factors(context, condition, units, episodes)
+        _save_factors(context, condition, units, episodes)
         whole = [combine(f) for f in episodes]
         factor = Factor.stack(whole)
         parameters = {} if calibration is None else {calibration.spec.parameter: np.array([calibration.units[u].phase_rad for u in units])}
         found = identify_models(context, condition, units, factor, parameters)
         if context.config.identify.refine and condition == facts.identify_on:
-            refined, written = refine_models(context, units, factor, parameters, found)
-            found, files = found + refined, files + written
+            found += refine_models(context, units, factor, parameters, found)
         for models in found:
-            folder = context.model_folder(models.name, condition)
-            models.save(folder)
-            files += [folder / "model.json", folder / "arrays.npz"]
-    return files
+            models.save(context.store.draft("models", context.model_folder(models.name, condition)))
 
 
 def identify_models(context: Context, condition: str, units: list[str], factor: Factor, parameters: dict[str, Array]) -> list[ModelSet]:
@@ -99,7 +93,7 @@ def identify_models(context: Context, condition: str, units: list[str], factor: 
 
 def refine_models(
     context: Context, units: list[str], factor: Factor, parameters: dict[str, Array], starts: list[ModelSet]
-) -> tuple[list[ModelSet], list[Path]]:
+) -> list[ModelSet]:
     """Refine every kind of model on free-run error, the population first, then each unit with a prior centred on it.
 
     Beside the models, what the refinement found out (the pooled model, the trade-off, the information matrices) is written.
@@ -123,8 +117,9 @@ def refine_models(
     ]
     refined = context.run("identify (refine)", work)
     models = [with_matrices(start, found.units, factor, context, parameters) for start, found in zip(starts, refined, strict=True)]
-    files = [file for m, found in zip(models, refined, strict=True) for file in found.save(context.store.path("refinement", m.name))]
-    return models, files
+    for start, found in zip(models, refined, strict=True):
+        found.save(context.store.draft("refinement", start.name))
+    return models
 
 
 def refine_options(config: IdentifyConfig) -> RefineOptions:
@@ -193,10 +188,10 @@ def fit(
     )
 
 
-def _save_factors(context: Context, condition: str, units: list[str], episodes: list[Factor]) -> list[Path]:
+def _save_factors(context: Context, condition: str, units: list[str], episodes: list[Factor]) -> None:
     from urllib.parse import quote
 
-    folder = context.store.path("factors", quote(condition, safe=""))
+    folder = context.store.draft("factors", quote(condition, safe=""))
     keys = [[k.unit, k.episode] for u in units for k in context.facts.keys("train", u, condition)]
     arrays = {name: np.concatenate([getattr(f, name) for f in episodes]) for name in ("R", "peak", "n_samples")}
     content = {
@@ -207,4 +202,3 @@ def _save_factors(context: Context, condition: str, units: list[str], episodes: 
         "input_functions": context.lifting.input_functions,
     }
     save_artifact(folder, "factors", {**content, "rows": keys}, arrays)
-    return [folder / "factors.json", folder / "arrays.npz"]

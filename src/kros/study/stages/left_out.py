@@ -11,7 +11,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from ...core.artifacts import load_artifact, save_artifact
@@ -20,12 +19,11 @@ from ...data.population import OUTLIERS, Population
 from ..config import RequireConfig, Stage, StudyConfig
 from ..context import Context, Progress
 from ..steps import LEARNING, Step, run_steps
-from ..store import Store, remove_tree
 from . import calibrate
 from .evaluate import Outcome, UnitParameters, band_hz, error_rows, estimation, facts_of, outcomes
 
 log = logging.getLogger(__name__)
-FOLDER, KIND, FEWEST = "left_out", "left_out", 2
+FOLDER, KIND, FEWEST = Stage.LEFT_OUT.value, "left_out", 2
 
 
 def wanted(config: StudyConfig) -> bool:
@@ -57,11 +55,13 @@ def parted(units: Sequence[str], folds: int) -> list[list[str]]:
     return parts
 
 
-def run(context: Context) -> list[Path]:
+def run(context: Context) -> None:
     """Make the study once for every fold, and collect what its observers do on the units that it does not know."""
     models = context.models(context.model_names[0])
     folds = parted([u for u in context.facts.pooled if u in models.unit_ids], context.config.evaluate.folds)
-    remove_beyond(context.store.path(FOLDER), len(folds))
+    for surplus in context.store.runs(FOLDER):
+        if surplus.folder.name not in map(str, range(len(folds))):
+            surplus.remove()
     found = [run_fold(context, number, held, len(folds)) for number, held in enumerate(folds)]
     content = {
         "folds": folds,
@@ -69,22 +69,13 @@ def run(context: Context) -> list[Path]:
         "rows": [{"fold": number, **row} for number, fold in enumerate(found) for row in fold.get("rows", [])],
         "observers": facts_of_folds([fold.get("observers", {}) for fold in found]),
     }
-    save_artifact(context.store.path(FOLDER), KIND, content)
-    return [context.store.path(FOLDER, f"{KIND}.json")]
-
-
-def remove_beyond(folder: Path, folds: int) -> None:
-    """Remove what an earlier run with more folds left."""
-    if folder.is_dir():
-        for other in folder.iterdir():
-            if other.is_dir() and other.name.isdecimal() and int(other.name) >= folds:
-                remove_tree(other)
+    save_artifact(context.store.draft(FOLDER), KIND, content)
 
 
 def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> dict[str, Any]:
     """Make the study without some units, and run its observers on these; a fold that fails is a result too, with its reason."""
     progress = Fold(whole.progress, f"{number + 1}/{folds} ")
-    context = Context(without(whole, held), Store(whole.store.path(FOLDER, str(number))), whole.executor, progress)
+    context = Context(without(whole, held), whole.store.nested(FOLDER, str(number)), whole.executor, progress)
     steps = (*LEARNING, Step(Stage.EVALUATE, partial(estimate_held, whole, held), ()))
     try:
         run_steps(context, steps, Stage.EVALUATE)
@@ -113,7 +104,7 @@ def absent(whole: Context) -> tuple[str, ...]:
     return tuple(unit for unit in read_parquet(whole.recordings).unit_ids if unit not in whole.facts.groups)
 
 
-def estimate_held(whole: Context, held: Sequence[str], context: Context) -> list[Path]:
+def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None:
     """Run what a fold made on the test episodes of the units it does not know."""
     facts, population = whole.facts, whole.population.select(held)
     units, keys = held_parameters(whole, held, context), tuple(k for k in facts.test if k.unit in held)
@@ -126,8 +117,7 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> list
     others = {name: facts_of(name, outcome) for name, outcome in results.items() if name not in record["facts"]}
     parameters = {unit: values for unit, values in units.items() if values}
     content = {"units": held, "parameters": parameters, "rows": rows, "observers": {**record["facts"], **others}}
-    save_artifact(context.store.path("evaluation"), KIND, content)
-    return [context.store.path("evaluation", f"{KIND}.json")]
+    save_artifact(context.store.draft("evaluation"), KIND, content)
 
 
 def held_parameters(whole: Context, held: Sequence[str], context: Context) -> UnitParameters:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,16 +24,16 @@ _LARGEST_PRODUCT = 0.7  # of |W_R W_L|: an amplification by 3.3
 _LOOSEST = 3.0  # overbound in tolerances at which a diagonal weight is loose
 
 
-def run(context: Context) -> list[Path]:
+def run(context: Context) -> None:
     """Score outliers first, so that flagged units can be dropped where the study asks for it; then quantify."""
-    files, scores = score_units(context)
+    scores = score_units(context)
     dropped = {row["unit"] for row in scores if row["outlier"]} if context.config.uncertainty.drop_outliers else set()
     units = [u for u in context.facts.pooled if u in context.models(context.model_names[0]).unit_ids and u not in dropped]
     if len(units) < 2:
         raise IdentificationError(
             f"Uncertainty: {len(units)} units are left of {len(context.facts.pooled)}, at least two are needed; dropped are {sorted(dropped)}."
         )
-    folder = context.store.path("uncertainty")
+    folder = context.store.draft("uncertainty")
     sets = {name: context.models(name) for name in context.model_names}
     first = next(iter(sets.values()))
     nominal = choose_nominal(first, units, context.config.uncertainty)
@@ -42,11 +41,9 @@ def run(context: Context) -> list[Path]:
     found = context.run("quantify", tasks)
     for name, uncertain in zip(sets, found, strict=True):
         uncertain.save(folder / name)
-        files += sorted((folder / name).iterdir())
     choice = {"nominal": nominal, "worst_off_nominal": worst_off_nominal(first, found[0]), "dropped": sorted(dropped)}
     save_artifact(folder, "choice", choice)
-    files += diagnose(context, units, dict(zip(sets, found, strict=True)), scores)
-    return [*files, folder / "choice.json"]
+    diagnose(context, units, dict(zip(sets, found, strict=True)), scores)
 
 
 def choose_nominal(models: ModelSet, units: list[str], config: UncertaintyConfig) -> str:
@@ -103,14 +100,14 @@ def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:
     return uncertain.unit_ids[int(np.argmax(peaks))]
 
 
-def score_units(context: Context) -> tuple[list[Path], list[dict[str, Any]]]:
-    """Score every unit against the others in every condition, whatever group it is filed under; return files and rows."""
+def score_units(context: Context) -> list[dict[str, Any]]:
+    """Score every unit against the others in every condition, whatever group it is filed under; return a row a score."""
     name = context.edmd_names[0]
-    folder = context.store.path("outliers")
+    folder = context.store.draft("outliers")
     rows: list[dict[str, Any]] = []
-    files: list[Path] = []
     for condition in context.population.conditions:
-        if not (context.model_folder(name, condition) / "model.json").exists():
+        place = context.model_folder(name, condition)
+        if not context.store.holds("models", place, "model.json"):
             continue
         models = context.models(name, condition)
         if len(models.unit_ids) < 3:
@@ -126,12 +123,10 @@ def score_units(context: Context) -> tuple[list[Path], list[dict[str, Any]]]:
             input_scale=models.input_scale,
             false_alarm_rate=context.config.uncertainty.false_alarm_rate,
         )
-        place = context.model_folder(name, condition).name
         outliers.save(folder / place)
-        files += sorted((folder / place).iterdir())
         rows += [score_row(score, condition) for score in outliers.scores]
     write_json(folder / "scores.json", {"schema": 1, "rows": rows})
-    return [*files, folder / "scores.json"], rows
+    return rows
 
 
 def score_row(score: OutlierScore, condition: str) -> dict[str, Any]:

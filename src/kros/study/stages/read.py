@@ -26,10 +26,8 @@ from ...data.writers import GroupRecord
 from ..config import StudyConfig
 from ..context import Context
 from ..presets import resolve_lifting, resolve_phase
-from ..store import remove_tree
 
 PARQUET = "parquet"
-PARTIAL = ".recordings.partial"
 
 
 @dataclass(frozen=True)
@@ -104,32 +102,25 @@ def resolution(signal: npt.NDArray[np.float64]) -> float:
     return float(steps[steps > floor].min()) if np.any(steps > floor) else float(floor)
 
 
-def run(context: Context) -> list[Path]:
+def run(context: Context) -> None:
     """Read everything once."""
     config, population = context.config, open_source(context.config)
     in_place = config.data.reader == PARQUET and not config.data.prepare
-    folder = None if in_place else context.store.path(PARTIAL)
+    folder = None if in_place else context.store.draft("recordings")
     if folder is not None:
-        remove_tree(folder)
         folder.mkdir(parents=True)
     tasks = [GroupTask(population.select([u], [c]), u, c, folder, config.data.on_nan) for u, c, _ in population.groups()]
     found = list(context.map("read", read_group, tasks))
-    files = []
     if folder is not None:
         records = [f.record for f in found if f.record is not None]
         write_index(population, records, folder)
-        final = context.store.path("recordings")
-        remove_tree(final)
-        folder.rename(final)
-        files = [final / "population.json", *(final / r.file for r in records)]
-        kept = read_parquet(final)
+        kept = read_parquet(folder)
     else:
         present = {(f.unit, f.condition, e) for f in found for e in f.episodes}
         kept = population
         if any((k.unit, k.condition, k.episode) not in present for k in population.episodes):
             raise DataError("Dropping episodes needs a copy of the recordings; convert them first with on_nan = 'drop_episode'.")
     save_facts(context, kept, found, population)
-    return [*files, context.store.path("population", "facts.json")]
 
 
 def save_facts(context: Context, kept: Population, found: list[GroupFacts], asked: Population) -> None:
@@ -145,7 +136,7 @@ def save_facts(context: Context, kept: Population, found: list[GroupFacts], aske
         "resolution": steps,
         "dropped": [str(k) for k in asked.episodes if k not in set(kept.episodes)],
     }
-    save_artifact(context.store.path("population"), "facts", content)
+    save_artifact(context.store.draft("population"), "facts", content)
 
 
 def _identify_on(config: StudyConfig, population: Population) -> str:

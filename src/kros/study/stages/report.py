@@ -2,41 +2,44 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from ...core.artifacts import read_json
 from ..config import Stage
 from ..context import Context
+from ..run_folder import open_finished
+
+REPORT = "report.html"
+_SHOWN = [stage for stage in Stage if stage is not Stage.REPORT]
 
 
-def run(context: Context) -> list[Path]:
+def run(context: Context) -> None:
     """Write report.html from the run folder and the metrics so far."""
     from ...report import render
     from ..metrics import collect_metrics
 
-    return [render(context.store.folder, collect_metrics(context, Stage.LEFT_OUT, None), partial(context.map, "report"))]
+    metrics = collect_metrics(context, Stage.LEFT_OUT, None)
+    render(context.store.folder, metrics, partial(context.map, "report"), context.store.draft(REPORT))
 
 
 def render_run(folder: Path) -> Path:
     """Write the report of a finished run again."""
     from ...report import render
 
-    return render(folder, _metrics(folder))
+    began = time.perf_counter()
+    with open_finished(folder, *_SHOWN, alone=True) as (_, store), store.drafting() as draft:
+        render(store.folder, read_json(store.path("metrics.json")), out=draft.draft(REPORT))
+        record = store.record(Stage.REPORT)
+        key, seconds = (record.key, record.seconds) if record is not None else ("", time.perf_counter() - began)
+        draft.commit(Stage.REPORT, key, seconds)
+        return store.path(REPORT)
 
 
 def write_figures(folder: Path, out: Path) -> list[str]:
     """Write the figures of a finished run as PNG and PDF."""
     from ... import report
 
-    _metrics(folder)
-    return report.write_figures(folder, out)
-
-
-def _metrics(folder: Path) -> dict[str, Any]:
-    from ..pipeline import load_run
-
-    load_run(folder)
-    metrics: dict[str, Any] = read_json(Path(folder) / "metrics.json")
-    return metrics
+    with open_finished(folder, *_SHOWN):
+        return report.write_figures(folder, out)

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,11 +33,11 @@ _AS_GOOD = 1.01  # ratio of errors that is no reason to prefer one observer to a
 WORST_CASE = ("worst_case_h2", "worst_case_hinf")
 
 
-def run(context: Context) -> list[Path]:
+def run(context: Context) -> None:
     """Make all observers, certify them, save them."""
     tasks = [task for name in context.model_names for task in tasks_of(context, name)]
     products = produced(context, tasks)
-    files, facts = [], {}
+    facts = {}
     certificates = iter(context.run("certify", certificates_of(tasks, products)))
     for task, product in zip(tasks, products, strict=True):
         facts[task.name] = dict(product.facts)
@@ -47,18 +46,17 @@ def run(context: Context) -> list[Path]:
                 log.warning("%s could not be made: %s", task.name, product.facts["reason"])
         else:
             facts[task.name] |= next(certificates)
-            files += save(context, task, product.synthesis)
+            save(context, task, product.synthesis)
     made = [p.name for p in products if p.synthesis is not None]
-    folder = context.store.path("observers")
+    folder = context.store.draft("observers")
     running = [r for found in context.run("certify as it runs", as_it_runs(tasks, products)) for r in found]
-    files += save_running(folder, running)
+    save_running(folder, running)
     eligible = robust_of(running, facts) if context.config.require.robust else running
     deployed = choose_deployed(context.config.observer.deployed, made, eligible)
     for found in running:
         facts[found.name] |= found.facts()
     save_artifact(folder, "observers", {"names": made, "deployed": deployed, "facts": facts})
     Observer.load(folder / f"{deployed}.json").save(folder / "deployed.json")
-    return [*files, folder / "observers.json", folder / "deployed.json"]
 
 
 def produced(context: Context, tasks: list[Task]) -> list[Product]:
@@ -233,10 +231,7 @@ def of_units(task: Task, synthesis: Synthesis, problem: ObserverProblem) -> dict
     return facts | {"unit_to_bound_max": found.largest_ratio, "unit_to_density_max": float(found.density_ratio.max(initial=0.0))}
 
 
-def save(context: Context, task: Task, synthesis: Synthesis) -> list[Path]:
+def save(context: Context, task: Task, synthesis: Synthesis) -> None:
     """Write the observer and its synthesis."""
-    path = context.store.path("observers", f"{task.name}.json")
-    task.observer(synthesis).save(path)
-    folder = context.store.path("synthesis", task.name)
-    synthesis.save(folder)
-    return [path, folder / "synthesis.json", folder / "arrays.npz"]
+    task.observer(synthesis).save(context.store.draft("observers", f"{task.name}.json"))
+    synthesis.save(context.store.draft("synthesis", task.name))

@@ -1,0 +1,136 @@
+"""Run folders opened: to run a study in, which is that study's alone, or to read what a finished one left."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from ..core.artifacts import read_json
+from ..core.errors import ConfigError, DataError, DimensionError
+from ..core.locks import locked
+from .config import Stage, StudyConfig
+from .store import BOOKKEEPING, Store
+
+STUDY = "study.json"
+
+
+def require_own(out: Path, config: StudyConfig) -> bool:
+    """Refuse a folder that is not this study's: one with the same name and recordings; tell whether it is new or empty.
+
+    Raises
+    ------
+    ConfigError
+        When the folder is a file, holds another study, or something else.
+    """
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"Output {out}: is a file; name a folder.")
+    if not out.exists() or not {p.name for p in out.iterdir()} - BOOKKEEPING:
+        return True
+    if not (out / STUDY).exists():
+        raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
+    found, own = _identity(_read_study(out)), _identity(config.dump())
+    if found != own:
+        raise ConfigError(
+            f"Output {out}: holds the study {found[0]!r} of {found[1]}, and this is {own[0]!r} of {own[1]}; "
+            "name another folder, or remove this one if it is not needed any more."
+        )
+    return False
+
+
+def _identity(study: dict[str, Any]) -> tuple[str, str]:
+    """Return a study's name and where its recordings are: what makes a changed study the same study still."""
+    data = study.get("data")
+    return str(study.get("name")), str(Path(str(data.get("source"))).resolve()) if isinstance(data, dict) else "nowhere"
+
+
+def _read_study(folder: Path) -> dict[str, Any]:
+    try:
+        found = read_json(folder / STUDY)
+    except DataError as error:
+        raise ConfigError(f"Run {folder}: its {STUDY} cannot be read ({error}); name another folder.") from error
+    if not isinstance(found, dict):
+        raise ConfigError(f"Run {folder}: its {STUDY} holds no study; name another folder.")
+    return found
+
+
+@contextmanager
+def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
+    """Open a study's run folder for this process alone; what an interrupted run left half done goes.
+
+    Where bad input ends a run that has read no recordings yet, nothing stays of it.
+
+    Raises
+    ------
+    ConfigError
+        When the folder is not this study's, or another run is at work in it.
+    """
+    above = [p for p in (out, *out.absolute().parents) if not p.exists()]
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        with locked(out):
+            fresh, store = require_own(out, config), Store(out)
+            store.tidy()
+            try:
+                if fresh:
+                    store.keep(STUDY, config.dump())
+                yield store
+            except (ConfigError, DataError, DimensionError):
+                if fresh and store.record(Stage.READ) is None:
+                    store.remove()
+                raise
+            finally:
+                store.tidy()
+    finally:
+        with suppress(OSError):  # it is not empty, as a rule
+            for folder in above:
+                folder.rmdir()
+
+
+@contextmanager
+def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator[tuple[StudyConfig, Store]]:
+    """Open a run for reading while no other process writes there, and make sure that some stages' files are as they left them.
+
+    Parameters
+    ----------
+    folder : Path
+    *stages : Stage
+        Stages that are read.
+    alone : bool
+        Whether to write as well.
+
+    Raises
+    ------
+    ConfigError
+        When the folder is no run, or another process is at work in it.
+    DataError
+        When a file is missing or was changed.
+    """
+    folder = Path(folder)
+    load_run(folder)
+    with locked(folder, shared=not alone):
+        config, store = load_run(folder)
+        store.verify(*stages)
+        yield config, store
+
+
+def load_run(folder: Path) -> tuple[StudyConfig, Store]:
+    """Read the study of a run folder.
+
+    Raises
+    ------
+    ConfigError
+        When the folder is not a run, or one of another version of kros.
+    """
+    folder = Path(folder)
+    if not (folder / STUDY).exists():
+        raise ConfigError(f"Run {folder}: there is no {STUDY} in it; name the folder that kros run or kros demo wrote.")
+    try:
+        return StudyConfig.model_validate(_read_study(folder)), Store(folder)
+    except ValidationError as error:
+        raise ConfigError(
+            f"Run {folder}: its {STUDY} is of another version of kros ({error.errors()[0]['msg']}); run the study again."
+        ) from error

@@ -1,0 +1,358 @@
+"""The run folder: what records list, what a run may remove, who may work in it, and what an interrupted run leaves."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kros.core.locks import NAME as LOCK
+from kros.core.locks import locked
+from kros.study import Stage, load_config, run_study
+
+FAST = (
+    'name = "fast"\n[data]\nsource = "{source}"\nreader = "parquet"\n'
+    "[identify]\nrefine = false\n"
+    '[uncertainty]\nn_freqs = 60\nstructure = "scalar"\nmax_order = 1\n'
+    '[synthesis]\ninput_weight = 3.0\nmethods = ["residual_h2"]\n'
+    '[observer]\nbaselines = ["open_loop", "kalman_white"]\n'
+    "[evaluate]\nrobustness = false\nmonte_carlo = 0\n"
+)
+TIMES = {"seconds", "solve_s", "timing_s"}
+
+
+@pytest.fixture(scope="module")
+def pendulums(kros, tmp_path_factory) -> Path:
+    """Recordings of four pendulums."""
+    folder = tmp_path_factory.mktemp("pendulums") / "recordings"
+    assert kros("simulate", folder, "--plant", "pendulum", "--units", 4, "--episodes", 3, "--seconds", 5).exit_code == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fast(pendulums, tmp_path_factory) -> Path:
+    """A quick study."""
+    path = tmp_path_factory.mktemp("fast") / "fast.toml"
+    path.write_text(FAST.format(source=pendulums))
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(fast) -> Path:
+    """A finished run, which no test changes."""
+    run_study(load_config(fast, ["evaluate.folds=2"]), fast.parent / "finished")
+    return fast.parent / "finished"
+
+
+@pytest.fixture
+def run(finished, tmp_path) -> Path:
+    """A copy of the finished run."""
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+def again(kros: Callable[..., Any], fast: Path, run: Path, *options: Any) -> Any:
+    return kros("run", fast, "--out", run, "--workers", 1, "--set", "evaluate.folds=2", *options)
+
+
+def files(folder: Path) -> set[str]:
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file() or p.is_symlink()}
+
+
+def results(folder: Path) -> dict[str, Any]:
+    """Contents of all files but records; without times, and without the keys that depend on them."""
+    return {
+        name: timeless(json.loads((folder / name).read_text())) if name.endswith(".json") else (folder / name).read_bytes()
+        for name in files(folder)
+        if "stages/" not in name
+    }
+
+
+def timeless(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {k: timeless(v) for k, v in content.items() if k not in TIMES}
+    return [timeless(v) for v in content] if isinstance(content, list) else content
+
+
+def recorded(folder: Path) -> set[str]:
+    return {name for path in (folder / "stages").glob("*.json") for name in json.loads(path.read_text())["files"]}
+
+
+def test_records_list_every_file_of_a_run_and_no_other(finished):
+    own = {name for name in files(finished) if name.startswith("stages/")} | {"study.json", "metrics.json"}
+    assert recorded(finished) == files(finished) - own
+    assert any(name.startswith("observers/relift/") for name in recorded(finished))
+    assert any(name.startswith("left_out/1/observers/relift/") for name in recorded(finished))
+
+
+@pytest.mark.parametrize(
+    "pattern", ["observers/relift/*/*/relift.json", "uncertainty/*/order/tightness.json", "left_out/1/models/*/arrays.npz"]
+)
+def test_any_file_that_was_changed_is_made_again(kros, fast, run, finished, pattern):
+    changed = sorted(run.glob(pattern))[0]
+    name = changed.relative_to(run).as_posix()
+    content = bytearray(changed.read_bytes())
+    content[len(content) // 2] ^= 1
+    changed.write_bytes(content)
+    report = kros("report", run)
+    assert report.exit_code == 2
+    assert name in report.stderr
+    assert again(kros, fast, run, "--until", "left_out").exit_code == 0
+    assert results(run)[name] == results(finished)[name]
+
+
+@pytest.mark.parametrize("settings", [(), ("--set", "uncertainty.n_freqs=61"), ("--set", "uncertainty.false_alarm_rate=0.01")])
+def test_a_stage_may_run_many_times_in_one_folder(kros, fast, run, settings):
+    for _ in range(2):
+        (run / "stages" / "quantify.json").unlink(missing_ok=True)  # as if it had been killed
+        assert again(kros, fast, run, "--until", "quantify", *settings).exit_code == 0
+    own = {name for name in files(run) if name.startswith("stages/")} | {"study.json", "metrics.json"}
+    assert recorded(run) >= {name for name in files(run) - own if name.startswith(("uncertainty/", "outliers/"))}
+
+
+def test_a_stage_that_fails_leaves_the_earlier_run_as_it_was(kros, fast, run, finished):
+    found = again(kros, fast, run, "--set", "uncertainty.nominal=nobody")
+    assert found.exit_code == 1
+    assert results(run) == results(finished)
+    assert kros("figures", run, run.parent / "figures").exit_code == 0
+
+
+def test_what_does_not_follow_from_the_study_any_more_goes(kros, fast, run):
+    assert again(kros, fast, run, "--until", "identify", "--set", "uncertainty.max_order=2").exit_code == 0
+    assert not any(name.startswith(("uncertainty/", "observers/", "evaluation/", "left_out/left_out")) for name in files(run))
+    assert "models" in {name.partition("/")[0] for name in files(run)}
+
+
+def test_another_study_is_refused_and_the_same_one_may_change(kros, fast, run, pendulums, tmp_path):
+    before = results(run)
+    other = tmp_path / "other.toml"
+    other.write_text(FAST.format(source=pendulums).replace('"fast"', '"slow"'))
+    elsewhere = tmp_path / "elsewhere.toml"
+    shutil.copytree(pendulums, tmp_path / "recordings")
+    elsewhere.write_text(FAST.format(source=tmp_path / "recordings"))
+    for study in (other, elsewhere):
+        found = kros("run", study, "--out", run, "--workers", 1)
+        assert found.exit_code == 2
+        assert "holds the study 'fast'" in found.stderr
+        assert results(run) == before
+    assert kros("demo", "--out", run).exit_code == 2
+    assert results(run) == before
+
+
+def test_a_folder_that_looks_like_a_demo_is_left_alone(kros, tmp_path):
+    folder = tmp_path / "mine"
+    (folder / "thesis").mkdir(parents=True)
+    for name in ("demo.json", "thesis/chapter.tex"):
+        (folder / name).write_text('{"schema": 1}')
+    assert kros("demo", "--out", folder, "--units", 2, "--episodes", 2, "--seconds", 5).exit_code == 2
+    assert files(folder) == {"demo.json", "thesis/chapter.tex"}
+
+
+def crafted(run: Path, names: list[str], matching: Path | None = None) -> None:
+    """Let the record of a stage claim other files, with the right digest where one is given."""
+    import hashlib
+
+    path = run / "stages" / "synthesize.json"
+    record = json.loads(path.read_text())
+    digest = hashlib.sha256(matching.read_bytes()).hexdigest() if matching else "0" * 64
+    record["files"] |= dict.fromkeys(names, digest)
+    record["key"] = "changed"
+    path.write_text(json.dumps(record))
+
+
+@pytest.mark.parametrize("way", ["absolute", "above", "link to a folder", "link", "above in the middle"])
+def test_a_record_cannot_reach_out_of_its_folder(kros, fast, run, tmp_path, way):
+    victim = tmp_path / "victim" / "thesis.tex"
+    victim.parent.mkdir()
+    victim.write_text("years of work")
+    (run / "linked").symlink_to(victim.parent)
+    (run / "link").symlink_to(victim)
+    name = {
+        "absolute": str(victim),
+        "above": "../victim/thesis.tex",
+        "link to a folder": "linked/thesis.tex",
+        "link": "link",
+        "above in the middle": "models/../../victim/thesis.tex",
+    }[way]
+    crafted(run, [name], victim)
+    found = again(kros, fast, run, "--until", "synthesize")
+    assert found.exit_code in (0, 2), found.output
+    assert victim.read_text() == "years of work"
+    assert (run / "linked").is_symlink()
+    assert (run / "link").is_symlink()
+
+
+def test_files_of_others_in_a_run_folder_stay(kros, fast, run):
+    for name in ("notes.txt", "observers/notes.txt", "left_out/0/notes.txt"):
+        (run / name).write_text("remember")
+    crafted(run, ["notes.txt"])
+    assert kros("run", fast, "--out", run, "--workers", 1, "--until", "synthesize", "--set", "identify.alpha_factor=5").exit_code == 0
+    assert {"notes.txt", "observers/notes.txt", "left_out/0/notes.txt"} <= files(run)
+    assert not any(name.startswith("left_out/") for name in files(run) - {"left_out/0/notes.txt"})
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"files": 3}', '{"schema": 1, "stage": "identify"}', "null", ""])
+def test_a_damaged_record_is_a_stage_to_be_run_again(kros, fast, run, content):
+    (run / "stages" / "identify.json").write_text(content)
+    assert kros("report", run).exit_code == 2
+    assert again(kros, fast, run, "--until", "identify").exit_code == 0
+    assert json.loads((run / "stages" / "identify.json").read_text())["stage"] == "identify"
+
+
+def test_a_link_in_the_place_of_a_folder_of_results_is_not_followed(kros, fast, run, tmp_path):
+    (tmp_path / "outside").mkdir()
+    shutil.rmtree(run / "uncertainty")
+    (run / "uncertainty").symlink_to(tmp_path / "outside")
+    found = again(kros, fast, run, "--until", "quantify")
+    assert found.exit_code == 2
+    assert "link" in found.stderr
+    assert not list((tmp_path / "outside").iterdir())
+
+
+def test_leftovers_are_not_believed(kros, run, pendulums, fast):
+    known = kros("check", run, pendulums, "--json", "--workers", 1)
+    assert kros("report", run).exit_code == 0
+    page = (run / "report.html").read_bytes()
+    for kind in ("models", "uncertainty", "outliers", "synthesis", "refinement"):
+        for folder in sorted((run / kind).glob("*")) if (run / kind).is_dir() else ():
+            if folder.is_dir():
+                shutil.copytree(folder, run / kind / f"{folder.name}_ghost")
+    shutil.copytree(run / "evaluation", run / "disturbed")
+    (run / "disturbed" / "disturbed.json").write_text("{")
+    assert kros("report", run).exit_code == 0
+    assert (run / "report.html").read_bytes() == page
+    assert kros("check", run, pendulums, "--json", "--workers", 1).stdout == known.stdout
+    found = again(kros, fast, run)
+    assert found.stderr.count("unchanged") >= 8
+
+
+def test_a_second_run_is_refused_while_the_first_lives(kros, fast, run, pendulums, tmp_path):
+    before = results(run)
+    with locked(run):
+        for command in (
+            ("run", fast, "--out", run),
+            ("report", run),
+            ("check", run, pendulums),
+            ("figures", run, tmp_path / "figures"),
+            ("estimate", run, pendulums, tmp_path / "estimate.parquet"),
+        ):
+            found = kros(*command)
+            assert found.exit_code == 2, command
+            assert f"process {os.getpid()}" in found.stderr
+        assert {k: v for k, v in results_of(run).items() if k != LOCK} == before
+    with locked(run, shared=True):
+        assert kros("check", run, pendulums, "--workers", 1).exit_code in (0, 3)
+        assert again(kros, fast, run).exit_code == 2
+    (run / LOCK).write_text("process 1 on moon, since long ago,")  # left by one that was killed
+    assert again(kros, fast, run).exit_code == 0
+    assert results(run) == before
+
+
+def results_of(folder: Path) -> dict[str, Any]:
+    """As `results`, beside a lock that is held."""
+    held = (folder / LOCK).read_text()
+    assert held
+    kept = shutil.copytree(folder, folder.parent / "while_locked", ignore=shutil.ignore_patterns(LOCK))
+    return results(Path(kept))
+
+
+def test_a_run_that_may_only_be_read_is_read(kros, run, pendulums, tmp_path):
+    run.chmod(0o555)
+    try:
+        assert kros("estimate", run, pendulums, tmp_path / "estimate.parquet").exit_code == 0
+    finally:
+        run.chmod(0o755)
+
+
+def test_a_copy_of_a_run_is_as_good(kros, run, pendulums, tmp_path):
+    moved = run.rename(tmp_path / "moved")
+    for path in moved.rglob("*"):
+        os.utime(path)
+    assert kros("estimate", moved, pendulums, tmp_path / "estimate.parquet").exit_code == 0
+
+
+def test_a_deployed_observer_that_was_changed_is_not_run(kros, run, pendulums, tmp_path):
+    path = run / "observers" / "deployed.json"
+    content = json.loads(path.read_text())
+    content["model"]["A"][0][0] = None
+    path.write_text(json.dumps(content))
+    for command in (("estimate", run, pendulums, tmp_path / "estimate.parquet"), ("check", run, pendulums)):
+        found = kros(*command)
+        assert found.exit_code == 2
+        assert "observers/deployed.json" in found.stderr
+    assert not (tmp_path / "estimate.parquet").exists()
+
+
+def start(fast: Path, run: Path, *options: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", "from kros.cli import app; app()", "run", str(fast), "--out", str(run), *options]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for(found: Callable[[], Any], seconds: float = 120.0) -> None:
+    end = time.monotonic() + seconds
+    while not found():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def children(pid: int) -> list[int]:
+    """Descendants of a process."""
+    own = [int(c) for task in Path(f"/proc/{pid}/task").glob("*/children") for c in task.read_text().split()]
+    return own + [c for child in own for c in children(child)]
+
+
+def lives(pid: int) -> bool:
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_run_that_is_stopped_leaves_no_workers_and_resumes(kros, fast, finished, tmp_path, number):
+    run = tmp_path / "run"
+    process = start(fast, run, "--workers", "2", "--until", "synthesize")
+    wait_for(lambda: (run / "stages" / "identify.json").exists() or process.poll() is not None)
+    workers = children(process.pid)
+    assert len(workers) >= 2
+    process.send_signal(number)
+    told = process.communicate(timeout=120)[1]
+    wait_for(lambda: not any(lives(pid) for pid in workers))
+    if number == signal.SIGTERM:
+        assert process.returncode == 143
+        assert "stopped by SIGTERM" in told
+        assert "Traceback" not in told
+        assert not [name for name in files(run) if Path(name).name.startswith(".")]
+    found = kros("run", fast, "--out", run, "--workers", 1, "--until", "synthesize")
+    assert found.exit_code == 0
+    assert "unchanged" in found.stderr
+    whole = {k: v for k, v in results(finished).items() if not k.startswith(("evaluation/", "left_out/", "report", "metrics", "study"))}
+    assert {k: v for k, v in results(run).items() if not k.startswith(("metrics", "study"))} == whole
+
+
+def test_a_run_killed_in_the_middle_of_a_stage_leaves_only_its_draft(kros, fast, finished, tmp_path):
+    run = tmp_path / "run"
+    process = start(fast, run, "--workers", "1", "--until", "quantify")
+    wait_for(lambda: list(run.glob(".*/**/uncertainty/*")) or process.poll() is not None)
+    process.kill()
+    process.communicate()
+    assert not (run / "uncertainty").exists()
+    assert kros("report", run).exit_code == 2  # nothing was finished that could be shown
+    assert kros("run", fast, "--out", run, "--workers", 1, "--until", "quantify").exit_code == 0
+    assert not [name for name in files(run) if Path(name).name.startswith(".") or name.startswith(".")]
+    assert results(run)["uncertainty/choice.json"] == results(finished)["uncertainty/choice.json"]
+
+
+def test_a_script_is_not_told_twice_who_owns_a_folder(fast, run):
+    """From Python as from the command line: strings are paths."""
+    found = run_study(load_config(fast, ["evaluate.folds=2"]), str(run), Stage.REPORT)  # type: ignore[arg-type]
+    assert found.metrics["study"]["units"] == 4

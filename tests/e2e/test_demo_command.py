@@ -13,3 +13,9 @@ def test_the_demo_command_runs_everything_tunes_and_says_where_the_report_is(kro
     assert metrics["study"]["units"] == 3
     observers = {name: o for name, o in metrics["observers"].items() if name.endswith(("worst_case_h2", "kalman_tuned"))}
     assert all("process_noise" in o or "process_noise_level" in o for o in observers.values())
+    (out / "notes.txt").write_text("remember")
+    again = kros("demo", "--out", out, "--units", 3, "--episodes", 2, "--seconds", 6, "--workers", 1)
+    assert again.exit_code == 0, again.output
+    assert again.stderr.count("unchanged") == len(metrics["timing_s"]) - 1
+    assert (out / "notes.txt").read_text() == "remember"
+    assert json.loads((out / "metrics.json").read_text()) == metrics

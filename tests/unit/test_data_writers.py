@@ -14,6 +14,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from kros.core.errors import ConfigError, DataError
+from kros.core.locks import locked
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, read_parquet, write_group, write_index, write_parquet
 from kros.data.writers import group_file
 
@@ -243,3 +244,23 @@ def test_damaged_folders(tmp_path: Path) -> None:
     (out / "b@warm.parquet").unlink()
     with pytest.raises(DataError, match=r"1 files are missing, the first b@warm\.parquet"):
         read_parquet(out)
+
+
+def test_what_a_killed_writer_left_goes_and_what_it_moved_aside_comes_back(tmp_path: Path) -> None:
+    out, left = tmp_path / "population", tmp_path / ".population.kros"
+    for folder in (left / "new", left / "old"):
+        folder.mkdir(parents=True)
+        (folder / "half").write_text("done")
+    with pytest.raises(DataError, match="not empty"):
+        write_parquet(population(), out)
+    assert (out / "half").exists()
+    assert not left.exists()
+    write_parquet(population(), out, overwrite=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["population"]
+
+
+def test_a_folder_that_is_being_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / ".population.kros").mkdir()
+    with locked(tmp_path / ".population.kros"), pytest.raises(ConfigError, match="is at work in it"):
+        write_parquet(population(), tmp_path / "population")
+    write_parquet(population(), tmp_path / "population")

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..core.errors import DataError
+from ..core.locks import locked
 
 
 @contextmanager
 def whole_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
-    """Give a temporary sibling of `out` to fill; it is moved there at the end, or removed when anything fails.
+    """Give a folder beside `out` to fill; it is moved there at the end, or removed when anything fails.
+
+    What a killed process left half done goes when `out` is written again, and what it had moved aside comes back.
 
     Parameters
     ----------
@@ -26,19 +28,37 @@ def whole_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
     ------
     DataError
         `out` exists and is not an empty folder.
+    ConfigError
+        Another process is writing `out`.
     """
-    occupied = out.exists() and not (out.is_dir() and not any(out.iterdir()))
-    if occupied and not (overwrite and out.is_dir()):
-        raise DataError(f"Writing {out}: it exists and is not empty; choose another name or remove it first.")
-    out.absolute().parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=out.absolute().parent, prefix=f".{out.name}."))
+    out = out.absolute()
+    work = out.with_name(f".{out.name}.kros")
+    work.mkdir(parents=True, exist_ok=True)
     try:
-        filled = temporary / "new"
-        filled.mkdir()
-        yield filled
-        _replace(out, filled, temporary / "old")
+        with locked(work):
+            filled, aside = work / "new", work / "old"
+            _tidy(out, filled, aside)
+            occupied = out.exists() and not (out.is_dir() and not any(out.iterdir()))
+            if occupied and not (overwrite and out.is_dir()):
+                raise DataError(f"Writing {out}: it exists and is not empty; choose another name or remove it first.")
+            try:
+                filled.mkdir()
+                yield filled
+                _replace(out, filled, aside)
+            finally:
+                _tidy(out, filled, aside)
     finally:
-        shutil.rmtree(temporary)
+        with suppress(OSError):  # somebody else has begun
+            work.rmdir()
+
+
+def _tidy(out: Path, filled: Path, aside: Path) -> None:
+    """Remove what is half done; what was moved aside comes back where nothing took its place."""
+    if aside.exists() and not out.exists():
+        aside.rename(out)
+    for folder in (filled, aside):
+        if folder.exists():
+            shutil.rmtree(folder)
 
 
 def _replace(out: Path, filled: Path, aside: Path) -> None:

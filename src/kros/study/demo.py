@@ -69,7 +69,7 @@ def run_demo(out: Path, units: int, episodes: int, seconds: float, seed: int, wo
     ConfigError
         When the folder holds anything but an earlier demo.
     """
-    out = Path(out).resolve()
+    out = Path(out).absolute()
     config = validate_config({"name": "demo", "data": {"source": str(out / _RECORDINGS), "reader": "parquet"}}, out)
     with open_run(out, config) as store:
         _simulate_in(store, units, episodes, seconds, seed, progress)

@@ -46,14 +46,19 @@ class ProcessExecutor:
         KrosError
             When a worker process was ended from outside.
         """
-        from concurrent.futures.process import BrokenProcessPool
+        return _results(self._pool.map(function, tasks))
 
-        try:
-            yield from self._pool.map(function, tasks)
-        except BrokenProcessPool as error:
-            raise KrosError(
-                "A worker process was ended from outside, perhaps because memory ran out; run again, with fewer --workers."
-            ) from error
+
+def _results(found: Iterator[T]) -> Iterator[T]:
+    """Yield results of a pool, whose work has begun."""
+    from concurrent.futures.process import BrokenProcessPool
+
+    try:
+        yield from found
+    except BrokenProcessPool as error:
+        raise KrosError(
+            "A worker process was ended from outside, perhaps because memory ran out; run again, with fewer --workers."
+        ) from error
 
 
 class DaskExecutor:

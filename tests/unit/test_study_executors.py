@@ -1,0 +1,43 @@
+"""Worker processes: the same results, and they end when their work is not wanted any more."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+
+import pytest
+
+from kros.core.errors import KrosError
+from kros.study.executors import open_executor
+
+
+def square(x: int) -> int:
+    return x * x
+
+
+def endless(_: int) -> None:
+    time.sleep(1e6)
+
+
+def die(_: int) -> None:
+    os._exit(9)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_come_in_order(workers):
+    with open_executor(workers) as executor:
+        assert list(executor.map(square, range(5))) == [0, 1, 4, 9, 16]
+
+
+def test_work_that_is_abandoned_is_not_waited_for():
+    with pytest.raises(RuntimeError, match="enough"), open_executor(2) as executor:  # noqa: PT012
+        executor.map(endless, range(3))
+        assert len(multiprocessing.active_children()) == 2
+        raise RuntimeError("enough")
+    assert not multiprocessing.active_children()
+
+
+def test_a_worker_that_is_ended_from_outside_is_an_error_with_a_remedy():
+    with pytest.raises(KrosError, match="fewer --workers"), open_executor(2) as executor:
+        list(executor.map(die, range(3)))

@@ -70,9 +70,13 @@ def _stationary(
     families: tuple[list[Signals], list[Signals]] = ([], [])
     values = []
     for family, here, there, change in zip(families, Side.both(p), Side.both(q), (back, T.T), strict=True):
-        eigenvalues, found = Pencil.of(there, level).signals()
-        values.append(eigenvalues)
-        family += [judged for V, M, G in found if (judged := evaluated(here, change @ V, M, G)) is not None]
+        for basis in there.reachable():
+            eigenvalues, found = Pencil.of(there.within(basis), level).signals()
+            values.append(eigenvalues)
+            judged = [(V.shape[1], evaluated(here, change @ basis @ V, M, G)) for V, M, G in found]
+            family += [signals for _, signals in judged if signals is not None]
+            if any(signals is not None and r == basis.shape[1] for r, signals in judged):
+                break
     return families, _candidates(np.concatenate(values), p.dt > 0)
 
 

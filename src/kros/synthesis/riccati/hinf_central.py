@@ -33,6 +33,7 @@ from .hinf_pointwise import direct_bound
 Array = npt.NDArray[Any]
 
 _AXIS = 1e-14
+_ROUNDING = 1e-12
 _NEGATIVE = 1e-7
 _ASYMMETRY = 1e-5
 
@@ -136,7 +137,8 @@ def _stabilising(A: Array, B: Array, C: Array, D: Array, R: Array) -> Array | st
     closed = A - B @ gain[:, :n]
     quadratic, cost = B @ gain[:, n:], C.T @ C - C.T @ D @ gain[:, :n]
     # A change of the units of X levels the blocks: rounding is then relative to both, and slow modes are not lost beside fast ones.
-    unit = np.sqrt(max(float(np.linalg.norm(cost)), 1e-300) / max(float(np.linalg.norm(quadratic)), 1e-300))
+    sizes = [float(np.linalg.norm(x)) for x in (closed, quadratic, cost)]
+    unit = np.sqrt(sizes[2] / sizes[1]) if sizes[1] * sizes[2] > (_ROUNDING * sizes[0]) ** 2 else 1.0
     H = np.block([[closed, -unit * (quadratic + quadratic.T) / 2], [-(cost + cost.T) / (2 * unit), -closed.T]])
     T, Z, stable = schur(H, output="real", sort="lhp")
     # LAPACK's real Schur form has the real parts of all eigenvalues on its diagonal.

@@ -30,6 +30,8 @@ from .hinf_central import normalise
 
 Array = npt.NDArray[Any]
 
+_SWEEPS = 20
+
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
@@ -148,12 +150,25 @@ def _continuous(p: GeneralizedPlant) -> GeneralizedPlant:
 
 
 def scaled(p: GeneralizedPlant) -> GeneralizedPlant:
-    """Scale the states by powers of two, so that A is balanced and B as large as C."""
+    """Scale the states by powers of two, so that A is balanced, every state is driven as much as it is seen, and B is as large as C."""
     if not p.sizes[0]:
         return p
     _, (scale, _) = matrix_balance(p.A, permute=False, separate=True)
-    p = transformed(p, np.diag(1 / scale), np.diag(scale))
-    return _level_out(p)
+    p = _level_out(transformed(p, np.diag(1 / scale), np.diag(scale)))
+    size = np.ones(len(p.A))
+    for _ in range(_SWEEPS):
+        q = transformed(p, np.diag(1 / size), np.diag(size))
+        coupling = np.abs(q.A - np.diag(np.diag(q.A)))
+        unit = max(float(np.linalg.norm(q.A)), 1e-300)
+        B, C = np.hstack([q.B1, q.B2]), np.vstack([q.C1, q.C2])
+        driven = np.hypot(np.linalg.norm(coupling, axis=1), unit * np.linalg.norm(B, axis=1) / max(float(np.linalg.norm(B)), 1e-300))
+        seen = np.hypot(np.linalg.norm(coupling, axis=0), unit * np.linalg.norm(C, axis=0) / max(float(np.linalg.norm(C)), 1e-300))
+        usable = (driven > 0) & (seen > 0)
+        step = np.exp2(np.round(0.5 * np.log2(np.where(usable, driven, 1.0) / np.where(usable, seen, 1.0))))
+        size = size * step
+        if np.all(step == 1):
+            break
+    return _level_out(transformed(p, np.diag(1 / size), np.diag(size)))
 
 
 def balancing(p: GeneralizedPlant) -> tuple[Array, Array] | None:
@@ -190,7 +205,7 @@ def _level_out(p: GeneralizedPlant) -> GeneralizedPlant:
     inputs, outputs = np.linalg.norm(np.hstack([p.B1, p.B2])), np.linalg.norm(np.vstack([p.C1, p.C2]))
     if not (inputs > 0 and outputs > 0):
         return p
-    eye, size = np.eye(p.sizes[0]), float(np.sqrt(outputs / inputs))
+    eye, size = np.eye(p.sizes[0]), float(np.exp2(np.round(np.log2(outputs / inputs) / 2)))
     return transformed(p, eye * size, eye / size)
 
 

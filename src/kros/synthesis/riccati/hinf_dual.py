@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import LinAlgError, ordqz, qr, solve_continuous_lyapunov
+from scipy.linalg import LinAlgError, null_space, ordqz, qr, schur, solve_continuous_lyapunov
 
 from ...core.norms import gramian
 from ..generalized_plant import GeneralizedPlant
@@ -39,6 +39,7 @@ Array = npt.NDArray[Any]
 
 _EPS = float(np.finfo(float).eps)
 _CUTS = (1e-12, 1e-9, 1e-6, 1e-3)  # directions of the state below this share are left out; whatever is left proves a bound
+_REACHED = (1e-7, 1e-10, 1e-13)
 _CONSTRAINTS = 100 * _EPS
 
 
@@ -59,6 +60,36 @@ class Side:
         """Return the side of the disturbances and that of the outputs, which is the same of the transposed plant."""
         past = cls(p.A, p.B1, p.C1, p.D11, p.C2, p.D21, p.dt)
         return past, cls(p.A.T, p.C1.T, p.B1.T, p.D11.T, p.B2.T, p.D12.T, p.dt)
+
+    def kept_zero(self) -> tuple[Array, Array]:
+        """Return (F, N) with ``w = F x + N v``: the signals that keep the constraint, for a full-rank D_y."""
+        if not self.D_y.size:
+            return np.zeros((self.B.shape[1], len(self.A))), np.eye(self.B.shape[1])
+        U, s, Vh = np.linalg.svd(self.D_y)
+        r = int(np.sum(s > 1e-12 * s.max(initial=0.0)))
+        return -Vh[:r].T @ ((U[:, :r].T @ self.C_y) / s[:r, None]), Vh[r:].T
+
+    def within(self, V: Array) -> Side:
+        """Return the side for states ``x = V c``, with orthonormal V."""
+        return Side(V.T @ self.A @ V, V.T @ self.B, self.C @ V, self.D, self.C_y @ V, self.D_y, self.dt)
+
+    def reachable(self) -> list[Array]:
+        """Orthonormal bases of the states without the stable modes that no signal reaches, for several ideas of what is not reached.
+
+        Such modes would grow backwards. The whole space is the last idea.
+        """
+        n = len(self.A)
+        F, N = self.kept_zero()
+        A, B = self.A + self.B @ F, self.B @ N
+        bases: dict[int, Array] = {}
+        for cut in _REACHED:
+            left, k = null_space(_reached(A, B, cut).T), 0
+            if left.shape[1]:
+                _, L, k = schur((left.T @ A @ left).T, output="real", sort="iuc" if self.dt > 0 else "lhp")
+            V = null_space((left @ L[:, :k]).T) if k else np.eye(n)
+            bases.setdefault(V.shape[1], V)
+        bases[n] = np.eye(n)
+        return [bases[r] for r in sorted(bases) if r]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +163,19 @@ class Pencil:
                 back = Wt[:r].T / s[:r]
                 found.append((U[:, :r], s[:r, None] * Wt[:r] @ M @ back, G @ back))
         return values, found
+
+
+def _reached(A: Array, B: Array, cut: float) -> Array:
+    """Orthonormal basis of the states that B reaches through A, step by step; directions below the cut do not count."""
+    found, new = np.zeros((len(A), 0)), B / max(float(np.linalg.norm(B)), 1e-300)
+    size = max(float(np.linalg.norm(A)), 1e-300)
+    while new.size and found.shape[1] < len(A):
+        new = new - found @ (found.T @ new)
+        U, s, _ = np.linalg.svd(new, full_matrices=False)
+        new = U[:, s > cut]
+        new = np.linalg.qr(new - found @ (found.T @ new))[0]
+        found, new = np.hstack([found, new]), A @ new / size
+    return found if found.shape[1] else np.zeros((len(A), 1))
 
 
 def evaluated(s: Side, V: Array, M: Array, G: Array) -> Signals | None:
@@ -209,8 +253,8 @@ def coupled(past: Signals, future: Signals) -> float:
         root = vectors / np.sqrt(values)
         for _ in range(30):
             # The signals that are worst at the level that is proven prove a higher one (a Rayleigh quotient).
-            level = max(best, 1e-300)
-            c = root @ np.linalg.eigh(root.T @ (cross + Z / level) @ root)[1][:, -1]
+            form = cross + Z / best if best > 0 else cross
+            c = root @ np.linalg.eigh(root.T @ form @ root)[1][:, -1]
             c *= np.sign(c @ cross @ c) or 1.0
             inner = c @ cross @ c / 2 - np.abs(c[:r]) @ rounding @ np.abs(c[r:])
             w, z = float(c @ W @ c), float(c @ Z @ c)

@@ -49,15 +49,15 @@ def proven_bound(plant: GeneralizedPlant, attained: float, tolerance: float) -> 
         q = transformed(p, T, back)
         level = attained * (1 - tolerance / 2)
         for _ in range(_LEVELS):
-            found_signals, candidates = _stationary(p, q, T, back, level)
+            families, candidates, complete = _stationary(p, q, T, back, level)
             before = best
             best = max(best, pointwise_bound(p, candidates) if candidates.size else 0.0)
-            best = max([best, *(coupled(a, b) for a in found_signals[0] for b in found_signals[1])])
+            best = max([best, *(coupled(a, b) for a in families[0] for b in families[1])])
             if best >= attained * (1 - tolerance / 2):
                 return best * (1 - _MARGIN)
-            if best <= before * (1 + 1e-9) and all(found_signals):
+            if best <= before * (1 + 1e-9) and complete:
                 break
-            level = best if all(found_signals) else float(np.sqrt(max(best, 1e-3 * attained) * attained))
+            level = best if complete else float(np.sqrt(max(best, 1e-3 * attained) * attained))
             if level >= attained:
                 break
     return best * (1 - _MARGIN)
@@ -65,19 +65,24 @@ def proven_bound(plant: GeneralizedPlant, attained: float, tolerance: float) -> 
 
 def _stationary(
     p: GeneralizedPlant, q: GeneralizedPlant, T: Array, back: Array, level: float
-) -> tuple[tuple[list[Signals], list[Signals]], Array]:
-    """Signals of both sides, computed in the coordinates of q and judged in those of p, and frequencies at which the level may be attained."""
-    families: tuple[list[Signals], list[Signals]] = ([], [])
-    values = []
+) -> tuple[tuple[list[Signals], list[Signals]], Array, bool]:
+    """Signals of both sides, computed in the coordinates of q and judged in those of p, and frequencies at which the level may be attained.
+
+    No signals at all are the first of each family: one side may prove more alone. The last value tells whether all that could be there were found.
+    """
+    families: tuple[list[Signals], list[Signals]] = ([Signals.none(len(p.A))], [Signals.none(len(p.A))])
+    values, complete = [np.zeros(0)], True
     for family, here, there, change in zip(families, Side.both(p), Side.both(q), (back, T.T), strict=True):
-        for basis in there.reachable():
+        bases = there.reachable()
+        for basis in bases:
             eigenvalues, found = Pencil.of(there.within(basis), level).signals()
             values.append(eigenvalues)
             judged = [(V.shape[1], evaluated(here, change @ basis @ V, M, G)) for V, M, G in found]
             family += [signals for _, signals in judged if signals is not None]
             if any(signals is not None and r == basis.shape[1] for r, signals in judged):
                 break
-    return families, _candidates(np.concatenate(values), p.dt > 0)
+        complete &= len(family) > 1 or not bases
+    return families, _candidates(np.concatenate(values), p.dt > 0), complete
 
 
 def _candidates(values: Array, discrete: bool) -> Array:

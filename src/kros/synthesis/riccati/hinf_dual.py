@@ -76,7 +76,7 @@ class Side:
     def reachable(self) -> list[Array]:
         """Orthonormal bases of the states without the stable modes that no signal reaches, for several ideas of what is not reached.
 
-        Such modes would grow backwards. The whole space is the last idea.
+        Such modes would grow backwards. The whole space is the last idea, unless nothing is reached at all.
         """
         n = len(self.A)
         F, N = self.kept_zero()
@@ -88,7 +88,8 @@ class Side:
                 _, L, k = schur((left.T @ A @ left).T, output="real", sort="iuc" if self.dt > 0 else "lhp")
             V = null_space((left @ L[:, :k]).T) if k else np.eye(n)
             bases.setdefault(V.shape[1], V)
-        bases[n] = np.eye(n)
+        if 0 not in bases:
+            bases[n] = np.eye(n)
         return [bases[r] for r in sorted(bases) if r]
 
 
@@ -101,6 +102,11 @@ class Signals:
     Z: Array
     slack_W: Array
     slack_Z: Array
+
+    @classmethod
+    def none(cls, n: int) -> Signals:
+        """Return the family that holds nothing but zero."""
+        return cls(np.zeros((n, 0)), *(np.zeros((0, 0)) for _ in range(4)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,6 +246,8 @@ def _residual(M: Array, F: Array, X: Array, dt: float) -> float:
 def coupled(past: Signals, future: Signals) -> float:
     """Return the largest norm that signals of the two families prove, less its rounding."""
     r = past.V.shape[1]
+    if not r + future.V.shape[1]:
+        return 0.0
     cross = np.zeros((r + future.V.shape[1],) * 2)
     cross[:r, r:] = past.V.T @ future.V
     cross[r:, :r] = cross[:r, r:].T
@@ -253,7 +261,7 @@ def coupled(past: Signals, future: Signals) -> float:
         root = vectors / np.sqrt(values)
         for _ in range(30):
             # The signals that are worst at the level that is proven prove a higher one (a Rayleigh quotient).
-            form = cross + Z / best if best > 0 else cross
+            form = cross + Z / best if best > 0 else cross if cross.any() else Z
             c = root @ np.linalg.eigh(root.T @ form @ root)[1][:, -1]
             c *= np.sign(c @ cross @ c) or 1.0
             inner = c @ cross @ c / 2 - np.abs(c[:r]) @ rounding @ np.abs(c[r:])

@@ -22,6 +22,7 @@ Array = npt.NDArray[Any]
 
 _EPS = float(np.finfo(float).eps)
 _RANK = 1e-9
+_LIGHT = 0.3
 
 
 def direct_bound(p: GeneralizedPlant) -> float:
@@ -37,16 +38,15 @@ def pointwise_bound(p: GeneralizedPlant, rad: Array) -> float:
 
 
 def resonances(A: Array, discrete: bool) -> Array:
-    """Frequencies where a system with the dynamics A may peak: at all poles, within their width, and in between; rad/s or rad per sample."""
-    poles = np.linalg.eigvals(A).astype(complex)
+    """Frequencies where lightly damped poles of A let a system peak, and both sides of them; rad/s or rad per sample."""
+    poles = np.linalg.eigvals(A).astype(complex) if A.size else np.zeros(0, complex)
     if discrete:
         poles = np.log(poles[np.abs(poles) > 0])
-    offsets = np.array([0.0, 0.3, 1.0, 3.0])
-    near = np.abs(poles.imag)[:, None] + np.abs(poles.real)[:, None] * np.concatenate([-offsets, offsets])
+    poles = poles[(poles.imag >= 0) & (np.abs(poles.real) < _LIGHT * np.abs(poles))]
     # A pole a + jb peaks at sqrt(b^2 - a^2) in the transfer function of second order.
     peaks = np.sqrt(np.maximum(poles.imag**2 - poles.real**2, 0.0))
-    found = np.concatenate([near.ravel(), peaks, np.abs(poles)])
-    return np.unique(np.clip(found, 0.0, np.pi if discrete else np.inf))
+    beside = poles.imag[:, None] + np.abs(poles.real)[:, None] * np.array([-3.0, -1.0, 0.0, 1.0, 3.0])
+    return np.unique(np.clip(np.concatenate([beside.ravel(), peaks]), 0.0, np.pi if discrete else np.inf))
 
 
 def _at_infinity(s: Side) -> float:

@@ -13,7 +13,7 @@ import itertools
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any
+from functools import partial
 
 import numpy as np
 from campaign import Tally, main
@@ -172,19 +172,95 @@ def optimum(rng: np.random.Generator, dt: float, family: str) -> Callable[[], tu
     return tried
 
 
+def structured(rng: np.random.Generator, dt: float) -> Callable[[], tuple[str, bool]]:
+    """One case of `mu_bounds`: a lightly damped system, by default or on a coarse grid of the user's."""
+    n = int(rng.integers(2, 9))
+    A = random_dynamics(rng, n, dt, 10 ** rng.uniform(-7, -1))
+    D = rng.standard_normal((4, 4)) * rng.integers(0, 2)
+    system = StateSpace(A, rng.standard_normal((n, 4)), rng.standard_normal((4, n)), D, dt)
+    scalar, full = Block.scalar(), Block.full(2)
+    blocks = [[scalar] * 4, [full, full], [Block.scalar(2), full], [Block.full(4)]][int(rng.integers(4))]
+    freqs = dense(A, dt)
+    given = np.geomspace(freqs[1], freqs[-1], 40) if rng.random() < 0.3 else None
+
+    def tried() -> tuple[str, bool]:
+        found = mu_bounds(system, blocks, given)
+        response = system.frequency_response(freqs)
+        truth, below = mu_upper(response, blocks).max(), mu_lower(response, blocks)[0].max()
+        if found.everywhere is None or below > found.everywhere * (1 + FALSE) or found.peak_lower > found.everywhere * (1 + FALSE):
+            return "false bound", True
+        if given is None and found.peak < truth * 0.99:
+            return "missed peak", True
+        return (
+            f"bounded everywhere within {'2 %' if found.everywhere <= 1.02 * max(found.peak, truth) else 'more than 2 %'} of the peak",
+            False,
+        )
+
+    return tried
+
+
+def constrained(rng: np.random.Generator, dt: float) -> Callable[[], tuple[str, bool]]:
+    """One case of `mixed`: T22 = c + share theta K, theta an all-pass with a zero outside, so that nothing below c is within reach."""
+    c, a, share = rng.uniform(0.3, 3), rng.uniform(1.2, 5), (0.0, 1e-6, 1e-3, 1e-1)[int(rng.integers(4))]
+    feasible = rng.random() < 0.3
+    gamma = c * (rng.uniform(1.05, 2) if feasible else rng.uniform(0.3, 0.98))
+    n = int(rng.integers(1, 4))
+    A = random_dynamics(rng, n, dt, None)
+    A = (
+        A * (0.9 / max(np.abs(np.linalg.eigvals(A)).max(), 0.9))
+        if dt > 0
+        else A - max(np.linalg.eigvals(A).real.max() + 0.1, 0) * np.eye(n)
+    )
+    # (s - a) / (s + a) = 1 - 2a / (s + a), and (z - a) / (1 - a z) = -b - b (b - a) / (z - b) with b = 1 / a
+    b = 1 / a
+    pole, gain, direct = (-a, -2 * a, 1.0) if dt == 0 else (b, -b * (b - a), -b)
+    A = np.block([[A, np.zeros((n, 1))], [np.zeros((1, n)), np.array([[pole]])]])
+    B1 = np.zeros((n + 1, 3))
+    B1[:n, 0] = rng.standard_normal(n)
+    C1 = np.zeros((3, n + 1))
+    C1[0, :n], C1[2, n] = rng.standard_normal(n), share * gain
+    B2, C2 = np.append(rng.standard_normal(n), 1.0)[:, None], np.append(rng.standard_normal(n), 0.0)[None]
+    noise = np.array([[0.0, 0.3, rng.integers(0, 2) * 1.0]])
+    plant = GeneralizedPlant(A, B1, B2, C1, C2, np.diag([0, 0, c]), [[0.0], [0.3], [share * direct]], noise, [[0.0]], dt, 2, 2)
+
+    def tried() -> tuple[str, bool]:
+        try:
+            found = mixed(plant, gamma=gamma, time_limit_s=10)
+        except KrosError as error:
+            shown = "is infeasible, no controller has" in str(error)
+            if feasible:
+                return ("false claim of infeasibility", True) if shown else ("feasible, nothing found", False)
+            return ("infeasible: refused with the least within reach", False) if shown else ("infeasible: not shown", True)
+        closed = closed_loop(plant, found.controller)
+        value = norm(closed[0], closed[1][:, 2:], closed[2][2:], closed[3][2:, 2:], dt)
+        return ("feasible: solved", False) if value < gamma * (1 + FALSE) else ("constraint violated", True)
+
+    return tried
+
+
 def run(count: int, seed: int) -> list[Tally]:
     """Try `count` plants, and a tenth as many of the other kinds."""
-    truth = "controllers by SLICOT sb10fd, sb10dd at 14 levels, norms by ab13dd and a dense grid" if SLYCOT else "other levels, a dense grid"
+    truth = "controllers by SLICOT sb10fd, sb10dd at 9 levels, norms by ab13dd and a dense grid" if SLYCOT else "other levels, a dense grid"
+    kind = {"small": "small penalties and noises", "scaled": "the same in units of many sizes", "full": "every feedthrough"}
     tallies = []
-    families = ("small", "scaled", "lightly damped", "full")
-    for k, (family, dt) in enumerate(itertools.product(families, (0.0, 1.0))):
-        rng = np.random.default_rng([seed, k])
-        kind = {"small": "small penalties and noises", "scaled": "the same in units of many sizes", "full": "every feedthrough"}
-        tally = Tally(f"H-infinity optimum, {kind.get(family, family)}, {'discrete' if dt else 'continuous'}", truth)
-        for _ in range(max(count // 8, 1)):
-            judge(tally, optimum(rng, dt, family))
-        tallies.append(tally)
+    for family, dt in itertools.product(("small", "scaled", "lightly damped", "full"), (0.0, 1.0)):
+        name = f"H-infinity optimum, {kind.get(family, family)}, {'discrete' if dt else 'continuous'}"
+        make = partial(optimum, family=family)
+        tallies.append(_tried(Tally(name, truth), make, dt, count // 8, np.random.default_rng([seed, len(tallies)])))
+    for dt in (0.0, 1.0):
+        time_axis = "discrete" if dt else "continuous"
+        rng = np.random.default_rng([seed, len(tallies)])
+        mu = Tally(f"Structured singular value, lightly damped, {time_axis}", "bounds on dense grids within every pole's width")
+        tallies.append(_tried(mu, structured, dt, count // 20, rng))
+        least = Tally(f"Mixed synthesis, constraint within reach or not, {time_axis}", "the least norm by interpolation at a zero")
+        tallies.append(_tried(least, constrained, dt, count // 20, rng))
     return tallies
+
+
+def _tried(tally: Tally, make: Callable[..., Callable[[], tuple[str, bool]]], dt: float, count: int, rng: np.random.Generator) -> Tally:
+    for _ in range(max(count, 1)):
+        judge(tally, make(rng, dt))
+    return tally
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@ r"""The largest level that is proven to be out of reach of every controller.
 
     level --> pencils of both sides --> signals --------> energies (`hinf_dual`) --> bound --> next level
                       |                                                               ^
-                      +--> eigenvalues near the boundary --> Parrott (`hinf_pointwise`) 
+                      +--> eigenvalues near the boundary --> Parrott (`hinf_pointwise`)
 
 The levels only say where to look. Errors of a level enter the bound squared, so that a few of them suffice.
 """

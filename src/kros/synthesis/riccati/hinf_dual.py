@@ -25,6 +25,7 @@ K. Zhou, J. C. Doyle, K. Glover, *Robust and Optimal Control*, section 16.8 (the
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,13 +96,13 @@ class Side:
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """A family of signals of one side, with energies and the bounds of their rounding errors, all as quadratic forms of c(0)."""
+    """A family of signals of one side: energies W and Z, and bounds `of_w`, `of_z` of their rounding errors, all as quadratic forms of c(0)."""
 
     V: Array
     W: Array
     Z: Array
-    slack_W: Array
-    slack_Z: Array
+    of_w: Array
+    of_z: Array
 
     @classmethod
     def none(cls, n: int) -> Signals:
@@ -134,9 +135,7 @@ class Pencil:
             H = np.vstack([np.hstack([s.A, zero((n, n))]), np.hstack([zero((n, n)), eye]), zero((m, 2 * n)), outer])
             E = np.vstack([np.eye(n, 2 * n), np.hstack([zero((n, n)), s.A.T]), np.hstack([zero((m, n)), -s.B.T]), zero((p + q, 2 * n))])
         else:
-            H = np.vstack(
-                [np.hstack([s.A, zero((n, n))]), np.hstack([zero((n, n)), -s.A.T]), np.hstack([zero((m, n)), s.B.T]), outer]
-            )
+            H = np.vstack([np.hstack([s.A, zero((n, n))]), np.hstack([zero((n, n)), -s.A.T]), np.hstack([zero((m, n)), s.B.T]), outer])
             E = np.vstack([np.eye(2 * n), zero((m + p + q, 2 * n))])
         whole = np.vstack([driven, to_costate, stationary, inner])
         Q = qr(whole)[0][:, m + p + q :].T
@@ -212,7 +211,7 @@ def evaluated(s: Side, V: Array, M: Array, G: Array) -> Signals | None:
         unit = vectors / np.sqrt(np.maximum(values, 1e-14 * values[-1]))
         back = (vectors * np.sqrt(np.maximum(values, 1e-14 * values[-1]))).T
         V, M, G, out = V @ unit, back @ M @ unit, G @ unit, out @ unit
-    return Signals(V @ back, W, Z, energies.slack_W, energies.slack_Z)
+    return Signals(V @ back, W, Z, energies.of_w, energies.of_z)
 
 
 def _energies(M: Array, G: Array, out: Array, dt: float) -> Signals | None:
@@ -221,8 +220,10 @@ def _energies(M: Array, G: Array, out: Array, dt: float) -> Signals | None:
     try:
         if (np.abs(np.linalg.eigvals(M)).max() >= 1) if dt > 0 else (np.linalg.eigvals(M).real.max() >= 0):
             return None
-        unit, W, Z = (_gramian(M, F, dt) for F in (eye, G, out))
-    except LinAlgError:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # overflow, or a Lyapunov equation that was perturbed to be solved
+            unit, W, Z = (_gramian(M, F, dt) for F in (eye, G, out))
+    except (LinAlgError, ValueError, RuntimeWarning):
         return None
     if not all(np.isfinite(X).all() for X in (unit, W, Z)) or np.linalg.eigvalsh(unit)[0] <= 0:
         return None
@@ -252,7 +253,7 @@ def coupled(past: Signals, future: Signals) -> float:
     cross[:r, r:] = past.V.T @ future.V
     cross[r:, :r] = cross[:r, r:].T
     rounding = 10 * len(past.V) * _EPS * np.abs(past.V).T @ np.abs(future.V)
-    W, Z = _diagonal(past.W + past.slack_W, future.W + future.slack_W), _diagonal(past.Z - past.slack_Z, future.Z - future.slack_Z)
+    W, Z = _diagonal(past.W + past.of_w, future.W + future.of_w), _diagonal(past.Z - past.of_z, future.Z - future.of_z)
     best = 0.0
     try:
         values, vectors = np.linalg.eigh(W)

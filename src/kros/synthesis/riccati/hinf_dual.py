@@ -193,12 +193,16 @@ def evaluated(s: Side, V: Array, M: Array, G: Array) -> Signals | None:
         J = np.block([[V, s.B], [np.zeros((len(s.C_y), r)), s.D_y]])
         target = -np.vstack([s.A @ V, s.C_y @ V])
     found = np.vstack([M, G])
-    size = np.linalg.norm(J, axis=1)
-    size = np.where(size > 0, size, 1.0)[:, None]
+    rows = np.linalg.norm(np.block([[s.A, s.B], [s.C_y, s.D_y]]), axis=1)[:, None]
+    size = np.where(rows > 0, rows, 1.0)
     for _ in range(2):
         found = found + np.linalg.lstsq(J / size, (target - J @ found) / size, rcond=None)[0]
-    terms = np.abs(J) @ np.abs(found) + np.abs(target)
-    if not np.isfinite(found).all() or np.any(np.abs(target - J @ found).max(axis=1) > _CONSTRAINTS * len(J) * terms.max(axis=1)):
+    if not np.isfinite(found).all():
+        return None
+    # What is left is that of a plant whose rows differ by rounding.
+    columns = np.linalg.norm(np.vstack([V @ found[:r] if s.dt > 0 else V, found[r:]]), axis=0)
+    moved = np.vstack([np.abs(V) if s.dt > 0 else np.abs(V) @ np.abs(found[:r]), np.zeros((len(s.C_y), r))])
+    if np.any(np.abs(target - J @ found) > _CONSTRAINTS * len(J) * (rows * columns + moved)):
         return None
     M, G = found[:r], found[r:]
     out = s.C @ V @ M + s.D @ G if s.dt > 0 else s.C @ V + s.D @ G

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
+from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, h2, mixed
 from kros.synthesis.low_order.reduction import truncate
 from kros.synthesis.mixed_norms.balance import balance
@@ -304,3 +304,32 @@ def test_continuous_plants_are_mapped_exactly(seed, speed):
     assert h2_norm(part(plant, closed, 1)) == pytest.approx(found.h2_norm, rel=1e-9)
     assert free.h2_norm * (1 - 1e-9) <= found.lower_bound <= found.h2_norm
     assert found.gap_percent < 2
+
+
+def fixed_at(c, share, dt):
+    """T22 = c + share theta K with theta an all-pass with a zero outside the stable region: no controller brings it below c."""
+    b = 0.5
+    pole, out, direct = (b, -b * (b - 1 / b), -b) if dt > 0 else (-b, -2 * b, 1.0)
+    A = np.diag([0.9 if dt > 0 else -0.1, pole])
+    B1, C1 = np.zeros((2, 3)), np.zeros((3, 2))
+    B1[0, 0] = C1[0, 0] = 1.0
+    C1[2, 1] = share * out
+    D12, D21 = [[0.0], [0.3], [share * direct]], [[0.0, 0.3, 1.0]]
+    return GeneralizedPlant(A, B1, [[1.0], [1.0]], C1, [[1.0, 0.0]], np.diag([0.0, 0.0, c]), D12, D21, [[0.0]], dt, 2, 2)
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+@pytest.mark.parametrize("share", [0.0, 1e-6, 1e-2, 1.0])
+def test_a_constraint_out_of_reach_is_refused_with_what_is_within(share, dt):
+    with pytest.raises(SynthesisError, match=r"gamma = 0\.5 is infeasible, no controller has \|\|T22\|\| below 0\.(8|79999)"):
+        mixed(fixed_at(0.8, share, dt), gamma=0.5, time_limit_s=1e4)
+    assert mixed(fixed_at(0.8, share, dt), gamma=0.9).hinf_norm < 0.9
+
+
+def test_an_observer_whose_constraint_cannot_be_met_is_told_so():
+    # K does not enter T22 = W_R W_L
+    case = drive_problem(0, Injection.INPUT, 1)
+    least = hinf_norm(case.W_R @ case.W_L)
+    with pytest.raises(SynthesisError, match="is infeasible, no controller has") as caught:
+        mixed(case, gamma=0.6 * least, time_limit_s=1e4)
+    assert float(re.search(r"below ([0-9.e+-]+);", str(caught.value)).group(1)) == pytest.approx(least, rel=1e-4)

@@ -126,6 +126,41 @@ def test_a_peak_between_the_points_is_found():
     assert found.peak_lower == pytest.approx(found.peak)
 
 
+def lightly_damped(rng, damping, dt):
+    """Two resonances between the points of any grid, four signals."""
+    angles = rng.uniform(0.1, 2.5, 2)
+    poles = -damping * angles + 1j * angles
+    A = np.zeros((4, 4))
+    for k, s in enumerate(np.exp(poles) if dt > 0 else poles):
+        A[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = [[s.real, s.imag], [-s.imag, s.real]]
+    return StateSpace(A, rng.standard_normal((4, 4)), rng.standard_normal((4, 4)), 0.1 * np.eye(4), dt), angles
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.01])
+@pytest.mark.parametrize("damping", [1e-2, 1e-4, 1e-7])
+def test_peaks_of_lightly_damped_poles_are_found_and_bounded(damping, dt):
+    rng = np.random.default_rng(20)
+    for blocks in ([SCALAR] * 4, [Block.full(2), Block.scalar(2)]):
+        system, angles = lightly_damped(rng, damping, dt)
+        found = mu_bounds(system, blocks)
+        near = (angles[:, None] * (1 + damping * np.linspace(-5, 5, 41))).ravel() / (2 * np.pi * (dt or 1.0))
+        everywhere = np.concatenate([near, np.geomspace(near.min() / 100, 0.5 / dt if dt > 0 else 10 * near.max(), 60)])
+        truth = mu_upper(system.frequency_response(everywhere), blocks).max()
+        assert found.peak >= truth * (1 - 1e-3)
+        assert truth * (1 - 1e-9) <= found.everywhere <= 1.02 * found.peak
+        assert found.peak_lower <= found.everywhere
+
+
+def test_a_peak_beside_a_given_grid_is_found():
+    # the grid ends below the resonance, so that only the bound between and beyond its points can tell of it
+    system, angles = lightly_damped(np.random.default_rng(21), 1e-5, 0.0)
+    blocks = [Block.full(2), Block.full(2)]
+    found = mu_bounds(system, blocks, np.geomspace(1e-3, 0.5, 20) * angles.min() / (2 * np.pi))
+    truth = mu_upper(system.frequency_response(angles / (2 * np.pi)), blocks).max()
+    assert found.peak >= 0.99 * truth
+    assert truth <= found.everywhere <= 1.1 * truth
+
+
 def test_what_does_not_fit_is_refused():
     with pytest.raises(DimensionError, match="need a matrix of"):
         mu_upper(np.eye(3), [SCALAR, SCALAR])

@@ -232,7 +232,7 @@ def test_mixed_says_why_nothing_survives(one_state):
         n_w1=2,
         n_z1=2,
     )
-    with pytest.raises(SynthesisError, match=r"gamma = 1 is infeasible, no controller has .* below 1.99.*raise gamma"):
+    with pytest.raises(SynthesisError, match=r"gamma = 1 is infeasible, no controller has .* below 2; raise gamma"):
         mixed(impossible, time_limit_s=5)
 
 

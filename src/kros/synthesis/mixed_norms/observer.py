@@ -25,6 +25,7 @@ from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
 from ..robust.certificate import certify
+from .attainable import require_reachable
 from .candidates import by_inequalities
 from .channels import Verified
 
@@ -58,6 +59,7 @@ def for_observer(
     for floor, states, rungs in [*rows, (noise_floor, max_states, solvers)]:
         noisy = replace(problem, noise=np.maximum(problem.noise, floor * (np.abs(problem.C) @ problem.output_scale)))
         plant = noisy.mixed_plant(noise_floor=0.0, penalty_floor=penalty_floor)
+        require_reachable(plant, gamma)  # K does not enter T22, so that this is all there is to say about the constraint
         for tried in canonical_scalings(plant) if scalings is None else [tuple(scalings)]:
             told: list[str] = []
             notes: list[str] = []

@@ -3,6 +3,9 @@ r"""Mixed H2/H-infinity synthesis (7)-(8): ``min ||T11||_2`` subject to ``||T22|
     H2 optimum without the constraint --(constraint met)--> optimal
         |
         v
+    is gamma within reach of any controller? --(no)--> error with the least norm of T22
+        |
+        v
     matrix inequalities: common and extended, several scalings of channel 2  -->  candidates
     H-infinity controllers of both channels together                         -->  candidates
         |
@@ -22,18 +25,20 @@ from dataclasses import replace
 from typing import Any
 
 from ...core.errors import ConfigError, SynthesisError
+from ...core.norms import hinf_norm
 from ..assumptions import require, require_plant
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
 from ..riccati.h2_optimal import h2
+from .attainable import require_attainable, require_reachable
 from .balance import reached
 from .candidates import by_hinf, by_inequalities
-from .channels import Verified, verify
+from .channels import Verified, part, verify
 from .continuous import continuous_controller, discrete_twin, speed
 from .improvement import polish
 from .singular import is_degenerate, is_singular, on_the_plant, regularised
-from .youla import hinf_lower_bound, mixed_lower_bound
+from .youla import mixed_lower_bound
 
 _SCALINGS = (1.0, 4.0, 16.0)
 _LAST_SCALINGS = (64.0, 256.0)
@@ -90,7 +95,8 @@ def mixed(
     ConfigError
         When an option is out of range.
     SynthesisError
-        When the plant is not regular, or no controller survives verification (each reason is given).
+        When the plant is not regular, when gamma is shown to be out of reach (with the least that is not), or when no controller survives
+        verification (each reason is given).
 
     Examples
     --------
@@ -136,13 +142,13 @@ def mixed(
     if isinstance(unconstrained, Verified):
         note = "The H2 optimum meets the constraint: it is the optimum of the mixed problem."
         return _synthesis(unconstrained, free.lower_bound, Status.OPTIMAL, [note], start)
+    require_attainable(plant, gamma, hinf_norm(part(plant, plant.close(free.controller), 2)), time_limit_s / 10)
     notes: list[str] = []
     reasons: list[str] = []
     quick = ("BARRIER",) if solvers is None else solvers
     found = by_inequalities(plant, gamma, tried, max_states, end, reasons, notes, quick, extended=True)
     found += by_hinf(plant, gamma, end, reasons)
     if not found:
-        require_attainable(plant, gamma)
         easier = reached(plant)
         if easier is not plant:  # the inequalities have not been tried yet
             found = on_the_plant(
@@ -176,6 +182,7 @@ def _singular(
     solvers: Sequence[str] | None,
 ) -> Synthesis:
     """Solve a plant without penalty or noise in channel 1; there is no lower bound but for a degenerate one."""
+    require_reachable(plant, gamma)
     regular, degenerate = regularised(plant), is_degenerate(plant)
     notes: list[str] = []
     reasons: list[str] = []
@@ -187,7 +194,7 @@ def _singular(
     if not degenerate or not found:
         found += on_the_plant(plant, by_hinf(regular, gamma, end, reasons), gamma)
     if not found:
-        require_attainable(regular, gamma)
+        require_attainable(regular, gamma, 2 * gamma, max(end - time.perf_counter(), 1.0))
         told = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
         raise SynthesisError(
             f"Mixed synthesis of a singular plant: no controller survived; {told}. Add penalty and noise to channel 1, or raise gamma."
@@ -210,6 +217,7 @@ def _singular(
 def _continuous(plant: GeneralizedPlant, gamma: float, **options: Any) -> Synthesis:
     """Solve the discrete twin of a continuous plant, and verify on the plant itself."""
     require(performance(plant), "Mixed synthesis in continuous time")
+    require_reachable(plant, gamma)
     a = speed(plant)
     found = mixed(discrete_twin(plant, a), gamma=gamma, **options)
     verdict = verify(plant, continuous_controller(found.controller, a), gamma, "the controller of the discrete twin", found.solver)
@@ -247,16 +255,6 @@ def _improved(plant: GeneralizedPlant, found: list[Verified], gamma: float, end:
         if isinstance(verdict, Verified):
             better.append(verdict)
     return better
-
-
-def require_attainable(plant: GeneralizedPlant, gamma: float) -> None:
-    """Raise a `SynthesisError` when a bound shows that no controller attains the level."""
-    least = hinf_lower_bound(plant)
-    if least >= gamma:
-        raise SynthesisError(
-            f"Mixed synthesis: gamma = {gamma:g} is infeasible, no controller has ||T22|| below {least:.6g}; raise gamma, or make the weights of "
-            "channel 2 smaller."
-        )
 
 
 def _synthesis(best: Verified, lower: float | None, status: Status, notes: list[str], start: float) -> Synthesis:

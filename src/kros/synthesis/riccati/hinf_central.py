@@ -28,16 +28,18 @@ from scipy.linalg import LinAlgError, schur
 
 from ...core.lti import StateSpace
 from ..generalized_plant import GeneralizedPlant
+from .hinf_pointwise import direct_bound
 
 Array = npt.NDArray[Any]
 
-_AXIS = 1e-9
+_AXIS = 1e-14
+_ROUNDING = 1e-12
 _NEGATIVE = 1e-7
 _ASYMMETRY = 1e-5
 
 
 class Obstacle(str, Enum):
-    """Why a level is not attained. All but the last show that no controller attains it."""
+    """What stands against a level in floating point. None of them proves that no controller attains it: `hinf_bound` does."""
 
     DIRECT = "the direct gain from w to z cannot be brought below it"
     CONTROL_AXIS = "the control Hamiltonian has eigenvalues on the stability boundary"
@@ -81,12 +83,6 @@ def normalise(p: GeneralizedPlant) -> Normalised:
         left,
         right,
     )
-
-
-def direct_bound(p: GeneralizedPlant) -> float:
-    """Return the smallest norm of ``D11 + D12 K D21`` over all gains K (Parrott), for a normalised plant."""
-    free_z, free_w = p.sizes[3] - p.sizes[2], p.sizes[1] - p.sizes[4]
-    return max(_size(p.D11[:free_z]), _size(p.D11[:, :free_w]))
 
 
 def central(p: GeneralizedPlant, gamma: float) -> StateSpace | Obstacle:
@@ -133,14 +129,17 @@ def _assemble(p: GeneralizedPlant, gamma: float, F: Array, L: Array, E: Array) -
 
 
 def _stabilising(A: Array, B: Array, C: Array, D: Array, R: Array) -> Array | str | None:
-    """Stabilising X of the indefinite Riccati equation; "axis" or "sign" when the level is shown not to be attainable, None in doubt."""
+    """Stabilising X of the indefinite Riccati equation; "axis" or "sign" when there is none that is semidefinite, None in doubt."""
     n = len(A)
     if not n:
         return np.zeros((0, 0))
     gain = np.linalg.solve(R, np.hstack([D.T @ C, B.T]))
     closed = A - B @ gain[:, :n]
     quadratic, cost = B @ gain[:, n:], C.T @ C - C.T @ D @ gain[:, :n]
-    H = np.block([[closed, -(quadratic + quadratic.T) / 2], [-(cost + cost.T) / 2, -closed.T]])
+    # A change of the units of X levels the blocks: rounding is then relative to both, and slow modes are not lost beside fast ones.
+    sizes = [float(np.linalg.norm(x)) for x in (closed, quadratic, cost)]
+    unit = np.sqrt(sizes[2] / sizes[1]) if sizes[1] * sizes[2] > (_ROUNDING * sizes[0]) ** 2 else 1.0
+    H = np.block([[closed, -unit * (quadratic + quadratic.T) / 2], [-(cost + cost.T) / (2 * unit), -closed.T]])
     T, Z, stable = schur(H, output="real", sort="lhp")
     # LAPACK's real Schur form has the real parts of all eigenvalues on its diagonal.
     if stable != n or np.abs(np.diag(T)).min() <= _AXIS * np.linalg.norm(H):
@@ -150,10 +149,6 @@ def _stabilising(A: Array, B: Array, C: Array, D: Array, R: Array) -> Array | st
     if np.abs(product - product.T).max() > _ASYMMETRY * max(np.abs(product).max(), 1e-3):
         return None
     X: Array = np.linalg.solve(X1.T, X2.T).T
-    X = (X + X.T) / 2
+    X = unit * (X + X.T) / 2
     values = np.linalg.eigvalsh(X)
     return "sign" if values[0] < -_NEGATIVE * max(values[-1], -values[0], 1e-300) and values[0] < -1e-10 else X
-
-
-def _size(matrix: Array) -> float:
-    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0

@@ -30,6 +30,8 @@ from .hinf_central import normalise
 
 Array = npt.NDArray[Any]
 
+_SWEEPS = 20
+
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
@@ -73,12 +75,12 @@ class Balance(str, Enum):
 def coordinates(plant: GeneralizedPlant, balance: Balance = Balance.LOOP) -> Coordinates:
     """Map, balance and normalise a regular plant."""
     strict = replace(plant, D22=np.zeros_like(plant.D22))
-    scaled = _balance_plant(strict) if balance is Balance.PLANT else _scale(strict)
-    if balance is Balance.LOOP:
-        scaled = _balance(scaled)
-    constant, mirrored, mapped = np.zeros(plant.D22.T.shape), False, scaled
+    better = _balance_plant(strict) if balance is Balance.PLANT else scaled(strict)
+    if balance is Balance.LOOP and (found := balancing(better)) is not None:
+        better = _level_out(transformed(better, *found))
+    constant, mirrored, mapped = np.zeros(plant.D22.T.shape), False, better
     if plant.dt > 0:
-        constant, mirrored, mapped = _best_map(scaled)
+        constant, mirrored, mapped = _best_map(better)
     normal = normalise(mapped)
     return Coordinates(normal.plant, normal.left, normal.right, mapped.D22, constant, mirrored, plant)
 
@@ -147,34 +149,46 @@ def _continuous(p: GeneralizedPlant) -> GeneralizedPlant:
     return GeneralizedPlant(s.A, B[:, :n_w], B[:, n_w:], C[:n_z], C[n_z:], D[:n_z, :n_w], D[:n_z, n_w:], D[n_z:, :n_w], D[n_z:, n_w:], 0.0)
 
 
-def _scale(p: GeneralizedPlant) -> GeneralizedPlant:
-    """Scale the states by powers of two, so that A is balanced and B as large as C."""
+def scaled(p: GeneralizedPlant) -> GeneralizedPlant:
+    """Scale the states by powers of two, so that A is balanced, every state is driven as much as it is seen, and B is as large as C."""
     if not p.sizes[0]:
         return p
     _, (scale, _) = matrix_balance(p.A, permute=False, separate=True)
-    p = _transform(p, np.diag(1 / scale), np.diag(scale))
-    return _level_out(p)
+    p = _level_out(transformed(p, np.diag(1 / scale), np.diag(scale)))
+    size = np.ones(len(p.A))
+    for _ in range(_SWEEPS):
+        q = transformed(p, np.diag(1 / size), np.diag(size))
+        coupling = np.abs(q.A - np.diag(np.diag(q.A)))
+        unit = max(float(np.linalg.norm(q.A)), 1e-300)
+        B, C = np.hstack([q.B1, q.B2]), np.vstack([q.C1, q.C2])
+        driven = np.hypot(np.linalg.norm(coupling, axis=1), unit * np.linalg.norm(B, axis=1) / max(float(np.linalg.norm(B)), 1e-300))
+        seen = np.hypot(np.linalg.norm(coupling, axis=0), unit * np.linalg.norm(C, axis=0) / max(float(np.linalg.norm(C)), 1e-300))
+        usable = (driven > 0) & (seen > 0)
+        step = np.exp2(np.round(0.5 * np.log2(np.where(usable, driven, 1.0) / np.where(usable, seen, 1.0))))
+        size = size * step
+        if np.all(step == 1):
+            break
+    return _level_out(transformed(p, np.diag(1 / size), np.diag(size)))
 
 
-def _balance(p: GeneralizedPlant) -> GeneralizedPlant:
-    """Balance the H2 Riccati solutions, where these can be computed and do not vanish."""
+def balancing(p: GeneralizedPlant) -> tuple[Array, Array] | None:
+    """Change of the states, and its inverse, that balances the H2 Riccati solutions; None where these cannot be computed."""
     if not p.sizes[0]:
-        return p
+        return None
     purpose = "H-infinity synthesis, balancing"
     try:
         X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, p.D12.T @ p.D12, p.C1.T @ p.D12, p.dt, purpose)
         Y = solve_riccati(p.A.T, p.C2.T, p.B1 @ p.B1.T, p.D21 @ p.D21.T, p.B1 @ p.D21.T, p.dt, purpose)
         square = [_root(X, p.A, p.C1), _root(Y, p.A, p.B1)]
+        U, s, Vh = np.linalg.svd(square[0].T @ square[1])
     except (SynthesisError, LinAlgError):
-        return p
-    U, s, Vh = np.linalg.svd(square[0].T @ square[1])
-    T, back = (U / np.sqrt(s)).T @ square[0].T, square[1] @ Vh.T / np.sqrt(s)
-    return _level_out(_transform(p, T, back))
+        return None
+    return (U / np.sqrt(s)).T @ square[0].T, square[1] @ Vh.T / np.sqrt(s)
 
 
 def _balance_plant(p: GeneralizedPlant) -> GeneralizedPlant:
     """Balance the Gramians of the plant, where these exist and can be computed; states without effect are dropped."""
-    p = _scale(p)
+    p = scaled(p)
     system = p.open_loop()
     if not p.sizes[0] or not system.is_stable():
         return p
@@ -183,7 +197,7 @@ def _balance_plant(p: GeneralizedPlant) -> GeneralizedPlant:
     if not all(np.isfinite(root).all() for root in roots):
         return p  # so close to the boundary that rounding in A decides
     balancing = Balancing.of(*roots)
-    return _level_out(_transform(p, balancing.left, balancing.right))
+    return _level_out(transformed(p, balancing.left, balancing.right))
 
 
 def _level_out(p: GeneralizedPlant) -> GeneralizedPlant:
@@ -191,8 +205,8 @@ def _level_out(p: GeneralizedPlant) -> GeneralizedPlant:
     inputs, outputs = np.linalg.norm(np.hstack([p.B1, p.B2])), np.linalg.norm(np.vstack([p.C1, p.C2]))
     if not (inputs > 0 and outputs > 0):
         return p
-    eye, size = np.eye(p.sizes[0]), float(np.sqrt(outputs / inputs))
-    return _transform(p, eye * size, eye / size)
+    eye, size = np.eye(p.sizes[0]), float(np.exp2(np.round(np.log2(outputs / inputs) / 2)))
+    return transformed(p, eye * size, eye / size)
 
 
 def _root(M: Array, A: Array, source: Array) -> Array:
@@ -204,7 +218,8 @@ def _root(M: Array, A: Array, source: Array) -> Array:
     return vectors * np.sqrt(np.maximum(values, floor))
 
 
-def _transform(p: GeneralizedPlant, T: Array, back: Array) -> GeneralizedPlant:
+def transformed(p: GeneralizedPlant, T: Array, back: Array) -> GeneralizedPlant:
+    """Return the plant in the states ``T x``."""
     return replace(p, A=T @ p.A @ back, B1=T @ p.B1, B2=T @ p.B2, C1=p.C1 @ back, C2=p.C2 @ back)
 
 

@@ -1,18 +1,17 @@
-r"""H-infinity synthesis: bisection on the level gamma, each level decided by two Riccati equations (`hinf_central`).
+r"""H-infinity synthesis: controllers of levels by two Riccati equations (`hinf_central`), and a proof of what is out of reach (`hinf_bound`).
 
-    plant --> coordinates --> bracket --> bisection --> central controller --> closed loop, norm recomputed
+    plant --> coordinates --> first controllers --> proven bound --> levels above it --> central controllers --> closed loop, norm recomputed
 
-The upper end of the bracket is always a norm that was computed from a closed loop, the lower end a level that was shown to be out of reach: by
-Parrott's bound at some frequency, or by a condition of the Riccati equations.
+What is attained is always a norm that was computed from a closed loop, what is out of reach is proven by signals on which no controller has an
+influence. A level for which the equations give no controller proves nothing.
 
 Symbols
 -------
-gamma : level;  K : controller;  P11, P12, P21 : frequency responses of the plant
+gamma : level;  K : controller
 """
 
 from __future__ import annotations
 
-import contextlib
 import time
 import warnings
 from dataclasses import dataclass, replace
@@ -28,17 +27,18 @@ from ..assumptions import require
 from ..generalized_plant import GeneralizedPlant
 from ..result import Injection, Status, Synthesis
 from .h2_optimal import h2, stability_margin
-from .hinf_central import Obstacle, central, direct_bound
+from .hinf_bound import proven_bound
+from .hinf_central import Obstacle, central
 from .hinf_coordinates import Balance, Coordinates, coordinates
+from .hinf_pointwise import direct_bound
 
 Array = npt.NDArray[Any]
 
-_MAX_STEPS = 100
+_MAX_STEPS = 60
 _MAX_RAISES = 40
 _NEGLIGIBLE = 1e-9
-_SURELY = 1e3  # a level so far above an attained one is attained by any account
-_AGREEMENT = 1e-6
-_RELAXATIONS = (0.0, *np.geomspace(1e-6, 0.1, 16))
+_ROUNDING = 1e-5
+_RELAXATIONS = np.geomspace(1e-6, 1.0, 13)
 
 
 def hinf(
@@ -55,15 +55,16 @@ def hinf(
     gamma : float, optional
         Ask for this level instead of the optimum. A level well above the optimum gives a calmer controller.
     tolerance : float
-        Relative width of the bracket around the optimum at which the search ends.
+        Distance of the norm from the proven bound, as a fraction of it, at which the search ends.
     injection : Injection
         Recorded in the result, for plants of observers.
 
     Returns
     -------
     Synthesis
-        ``hinf_norm`` is recomputed from the closed loop; ``lower_bound`` is the largest level that was shown to be out of reach of every
-        controller, and ``gap_percent`` the distance. The status is OPTIMAL when they agree within the tolerance, otherwise CERTIFIED.
+        ``hinf_norm`` is recomputed from the closed loop; ``lower_bound`` is the largest level that was proven to be out of reach of every
+        controller, by a proof that tolerates rounding, and ``gap_percent`` the distance. The status is OPTIMAL when they agree within the tolerance,
+        otherwise CERTIFIED: a better controller may exist.
 
     Raises
     ------
@@ -88,7 +89,7 @@ def hinf(
     start = time.perf_counter()
     if 0 in plant.sizes[2::2]:
         return _without_control(plant, injection, gamma)
-    search = _Search.begin(plant)
+    search = _Search.begin(plant, tolerance)
     search = search.at(gamma) if gamma is not None else search.bisect(tolerance)
     elapsed = time.perf_counter() - start
     return _result(search, injection, elapsed, tolerance if gamma is None else None)
@@ -96,7 +97,7 @@ def hinf(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The best controller so far with its recomputed norm, and the bracket; later frames are for levels where earlier ones fail."""
+    """The best controller so far with its recomputed norm, and the proven bound; later frames are for levels where earlier ones fail."""
 
     plant: GeneralizedPlant
     frames: tuple[Coordinates, ...]
@@ -104,27 +105,23 @@ class _Search:
     norm: float
     lower: float
     scale: float
-    known: float = 0.0  # the part of `lower` that no frame has a say in
 
     @classmethod
-    def begin(cls, plant: GeneralizedPlant) -> _Search:
-        """Bracket the optimum: Parrott's bound from below, controllers that are at hand from above."""
+    def begin(cls, plant: GeneralizedPlant, tolerance: float) -> _Search:
+        """Bracket the optimum: controllers that are at hand from above, what is proven from below."""
         frames = tuple(coordinates(plant, balance) for balance in Balance)
-        mapped = frames[-1].plant
-        bound = max(_frequency_bound(mapped), direct_bound(mapped)) * (1 - 1e-9)
-        search = cls(plant, frames, None, float("inf"), bound, 0.0, bound)
+        search = cls(plant, frames, None, float("inf"), 0.0, 0.0)
         _, _, n_u, _, n_y = plant.sizes
         search = search.consider(gain(np.zeros((n_u, n_y)), plant.dt))
         search = search.consider(_h2_controller(plant))
         for frame in frames:
             if search.K is None and (K := _h2_controller(frame.plant)) is not None:
                 search = search.consider(frame.controller(K))
-        return search._open()._seeing()
+        return search._open().proven(tolerance)
 
-    def _seeing(self) -> _Search:
-        """Keep the frames that do not deny a level far above one that is attained: with poles next to the boundary, rounding may blind a frame."""
-        seeing = tuple(f for f in self.frames if not _denied(f, _SURELY * self.norm))
-        return replace(self, frames=seeing) if seeing else self
+    def proven(self, tolerance: float) -> _Search:
+        """Raise the bound, looking from the best norm downwards."""
+        return replace(self, lower=max(self.lower, proven_bound(self.plant, self.norm, tolerance)))
 
     def uncancelled(self) -> float:
         """Size that the closed loop would have if nothing in it cancelled: a norm far below it is rounding."""
@@ -149,72 +146,84 @@ class _Search:
             return self
         return replace(self, K=K, norm=norm) if norm < self.norm else self
 
-    def level(self, gamma: float, verify: bool = True) -> tuple[_Search, Obstacle | None]:
-        """Decide one level; what the controller is worth is the norm of its closed loop, whatever the equations promise."""
-        search, verdict = self, [Obstacle.NUMERICAL]
+    def level(self, gamma: float) -> tuple[_Search, Obstacle | None]:
+        """Try one level; what the controller is worth is the norm of its closed loop, whatever the equations promise."""
+        search, verdict = self, None
         for frame in self.frames:
             found = central(frame.plant, gamma)
             if isinstance(found, Obstacle):
-                if found is not Obstacle.NUMERICAL and gamma < self.norm:
-                    return replace(search, lower=max(search.lower, gamma)), found
+                verdict = verdict or found
                 continue
-            verdict = []
-            if not verify:
-                break
             try:
                 search = search.consider(frame.controller(found))
             except SynthesisError:
                 continue
             if search.norm <= gamma * (1 + 1e-6):
-                break
-        return search, verdict[0] if verdict else None
+                return search, None
+        return search, verdict
+
+    def alone(self, gamma: float) -> _Search:
+        """Controllers of one level without those that are at hand, which may be better but less calm."""
+        return replace(self, K=None, norm=float("inf")).level(gamma)[0]
 
     def at(self, gamma: float) -> _Search:
         """Controller for a level that was asked for."""
-        blank = replace(self, K=None, norm=float("inf"))
-        search, obstacle = blank.level(gamma)
-        for margin in (1e-7, 1e-6, 1e-5):
-            if obstacle is not None or search.norm <= gamma:
-                break
-            closer, _ = search.level(gamma * (1 - margin))
-            search = closer if closer.norm < search.norm else search
-        if search.norm <= gamma * (1 + 1e-6):
-            return replace(search, lower=self.lower)
+        for margin in (0.0, 1e-7, 1e-6, 1e-5):
+            search = self.alone(gamma * (1 - margin))
+            if search.norm <= gamma * (1 + 1e-6 * (margin > 0)):
+                return search
         best = self.bisect(1e-3)
-        reached = f"the best that was reached is {best.norm:.6g}, and no controller is below {best.lower:.6g}"
-        why = obstacle.value if obstacle is not None else f"the closed loop has norm {search.norm:.6g}"
         if best.norm <= gamma:
             return best
-        raise SynthesisError(f"H-infinity synthesis: the level gamma = {gamma:.6g} is out of reach ({why}); {reached}. Raise gamma.")
+        told = f"the best that was reached is {best.norm:.6g}, and no controller is below {best.lower:.6g}"
+        if best.lower >= gamma:
+            _, why = self.level(gamma)
+            reason = f" ({why.value})" if why is not None else ""
+            raise SynthesisError(f"H-infinity synthesis: the level gamma = {gamma:.6g} is out of reach{reason}; {told}. Raise gamma.")
+        raise SynthesisError(
+            f"H-infinity synthesis: the level gamma = {gamma:.6g} was not reached, which does not prove that it cannot be; {told}. Raise gamma, or scale "
+            "states, inputs and outputs to similar size."
+        )
 
     def bisect(self, tolerance: float) -> _Search:
-        """Narrow the bracket to the tolerance."""
-        search, low, high = self, self.lower, self.norm
+        """Close the gap to the proven bound, or come as low as the equations lead."""
+        search = self
+        for _ in range(2):
+            calm = search.alone(search.lower * (1 + 0.9 * tolerance))
+            if calm.norm <= search.lower * (1 + tolerance):
+                return calm
+            search = search._narrow(tolerance)
+            if search._closed(tolerance):
+                break
+            search = search.proven(tolerance)
+        return search
+
+    def _closed(self, tolerance: float) -> bool:
+        return self.norm <= max(self.lower * (1 + tolerance), _NEGLIGIBLE * self.scale)
+
+    def _narrow(self, tolerance: float) -> _Search:
+        """Bisect between the bound and the best norm. A level that fails only leads the search elsewhere; nothing is concluded from it."""
+        search, low = self, self.lower
         floor = _NEGLIGIBLE * search.scale
         for _ in range(_MAX_STEPS):
-            if high <= max(low * (1 + tolerance / 4), floor):
+            high = search.norm
+            if high <= max(low * (1 + tolerance / 4), floor) or search._closed(tolerance):
                 break
             bottom = max(low, floor)
             middle = float(np.sqrt(bottom * high)) if high > 2 * bottom else (bottom + high) / 2
-            search, obstacle = search.level(middle, verify=False)
-            low, high = (low, middle) if obstacle is None else (middle, high)
-        return search._contested(tolerance) or search._settle(high, tolerance)
-
-    def _contested(self, tolerance: float) -> _Search | None:
-        """Search again without the frames that deny a level which another one attains; None where all agree."""
-        found = self
-        for frame in self.frames:
-            K = central(frame.plant, self.lower)
-            with contextlib.suppress(SynthesisError):
-                found = found.consider(None if isinstance(K, Obstacle) else frame.controller(K))
-        if found.norm >= self.lower * (1 - _AGREEMENT):
-            return None
-        right = tuple(f for f in self.frames if not _denied(f, self.lower))
-        return replace(found, frames=right, lower=self.known).bisect(tolerance) if len(right) < len(self.frames) else None
+            search, _ = search.level(middle)
+            if search.norm > middle * (1 + 1e-6):
+                low = middle
+        for relaxation in _RELAXATIONS:
+            trial = max(search.lower, floor) * (1 + relaxation)
+            if search._closed(tolerance) or trial >= search.norm:
+                break
+            search, _ = search.level(trial)
+        return search
 
     def _open(self) -> _Search:
         """Find any controller when none is at hand, by raising the level."""
-        search, gamma = self, 2 * max(self.lower, float(np.linalg.norm(self.plant.D11)), 1e-3)
+        search, gamma, obstacle = self, 2 * max(direct_bound(self.plant), float(np.linalg.norm(self.plant.D11)), 1e-3), None
         for _ in range(_MAX_RAISES):
             if np.isfinite(search.norm):
                 return replace(search, scale=search.uncancelled())
@@ -222,22 +231,9 @@ class _Search:
             gamma *= 4
         reason = obstacle.value if obstacle is not None else "no closed loop was stable"
         raise SynthesisError(
-            f"H-infinity synthesis: no level up to {gamma:.3g} is attained ({reason}); scale states, inputs and outputs to similar size, "
+            f"H-infinity synthesis: no level up to {gamma:.3g} was attained ({reason}); scale states, inputs and outputs to similar size, "
             "or raise noise and penalty."
         )
-
-    def _settle(self, gamma: float, tolerance: float) -> _Search:
-        """Take the calmest controller within the tolerance, or relax the level where none survives verification so close to the optimum."""
-        allowed = self.lower * (1 + tolerance)
-        calm, _ = replace(self, K=None, norm=float("inf")).level(self.lower * (1 + 0.9 * tolerance))
-        if calm.norm <= allowed:
-            return calm
-        search = self
-        for relaxation in _RELAXATIONS:
-            if search.norm <= max(allowed, _NEGLIGIBLE * search.scale, gamma * (1 + relaxation)):
-                break
-            search, _ = search.level(gamma * (1 + relaxation))
-        return search
 
 
 def _result(search: _Search, injection: Injection, elapsed: float, tolerance: float | None) -> Synthesis:
@@ -251,6 +247,10 @@ def _result(search: _Search, injection: Injection, elapsed: float, tolerance: fl
         if idle.norm <= lower * (1 + tolerance):
             K, norm = gain(np.zeros((n_u, n_y)), plant.dt), idle.norm
     vanishes = norm <= 10 * _NEGLIGIBLE * search.scale
+    if not vanishes and lower > norm * (1 + _ROUNDING):
+        raise SynthesisError(
+            f"H-infinity synthesis: internal error, the bound {lower:.9g} lies above the norm {norm:.9g} that is attained; please report the plant."
+        )
     optimal = tolerance is not None and (vanishes or norm <= lower * (1 + tolerance) * (1 + 2e-6))
     closed = plant.close(K)
     return Synthesis(
@@ -266,11 +266,6 @@ def _result(search: _Search, injection: Injection, elapsed: float, tolerance: fl
         solve_s=elapsed,
         solver="riccati",
     )
-
-
-def _denied(frame: Coordinates, gamma: float) -> bool:
-    found = central(frame.plant, gamma)
-    return isinstance(found, Obstacle) and found is not Obstacle.NUMERICAL
 
 
 def _without_control(plant: GeneralizedPlant, injection: Injection, gamma: float | None) -> Synthesis:
@@ -313,24 +308,3 @@ def _h2_norm(closed: StateSpace) -> float | None:
             return h2_norm(closed)
         except RuntimeWarning:
             return None
-
-
-def _frequency_bound(p: GeneralizedPlant) -> float:
-    """Largest Parrott bound over a grid of frequencies; it holds for every controller."""
-    n, n_w, n_u, n_z, n_y = p.sizes
-    sizes = np.abs(np.linalg.eigvals(p.A)) if n else np.ones(1)
-    typical = float(np.median(sizes)) or 1.0
-    # The odd factor keeps the grid off poles on the boundary.
-    freqs_hz = 1.0137 * typical * np.geomspace(1e-4, 1e4, 200) / (2 * np.pi)
-    try:
-        P = p.open_loop().frequency_response(freqs_hz)
-        P11, P12, P21 = P[:, :n_z, :n_w], P[:, :n_z, n_w:], P[:, n_z:, :n_w]
-        outside_z = np.linalg.svd(P12)[0][:, :, n_u:].conj().transpose(0, 2, 1) @ P11
-        outside_w = P11 @ np.linalg.svd(P21)[2][:, n_y:].conj().transpose(0, 2, 1)
-    except np.linalg.LinAlgError:
-        return 0.0
-    return max(_largest(outside_z), _largest(outside_w))
-
-
-def _largest(matrices: Array) -> float:
-    return float(np.linalg.norm(matrices, 2, axis=(-2, -1)).max()) if matrices.size else 0.0

@@ -29,6 +29,8 @@ from ...core.errors import DimensionError, SynthesisError
 from ...core.frequency import log_grid
 from ...core.lti import StateSpace
 from ...core.norms import as_state_space
+from ..riccati.hinf_pointwise import resonances
+from .between import everywhere
 from .blocks import Block, Structure
 from .power import power_iteration
 from .scalings import scalings
@@ -51,13 +53,16 @@ class MuBounds:
         The grid asked for and the points that were added around the peaks.
     upper, lower : ndarray, shape (f,)
     peak : float
-        Largest upper bound; perturbations smaller than ``1 / peak`` in norm cannot make the loop singular at these frequencies.
+        Largest upper bound on the grid; perturbations smaller than ``1 / peak`` in norm cannot make the loop singular at these frequencies.
     peak_lower : float
         Largest lower bound: some perturbation of norm ``1 / peak_lower`` does.
     peak_hz : float, Hz
         Where the upper bound peaks.
     perturbation : ndarray, shape (w, z), complex
         Of norm one, at the frequency of `peak_lower`: ``det(I - M Delta / peak_lower e^{j phi}) = 0`` for some phi.
+    everywhere : float or None
+        Upper bound at every frequency, between the points too (`kros.synthesis.structured.between`): perturbations smaller than ``1 / everywhere``
+        cannot make the loop singular at all. Usually one percent above `peak`. None where it was not asked for.
     """
 
     freqs_hz: Array
@@ -67,6 +72,7 @@ class MuBounds:
     peak_lower: float
     peak_hz: float
     perturbation: Array
+    everywhere: float | None = None
 
 
 def mu_upper(M: npt.ArrayLike, blocks: Sequence[Block]) -> Array:
@@ -118,7 +124,7 @@ def mu_lower(M: npt.ArrayLike, blocks: Sequence[Block]) -> tuple[Array, Array]:
     return value.reshape(matrices.shape[:-2]), Delta.reshape(*matrices.shape[:-2], *Delta.shape[-2:])
 
 
-def mu_bounds(system: StateSpace, blocks: Sequence[Block], freqs_hz: npt.ArrayLike | None = None) -> MuBounds:
+def mu_bounds(system: StateSpace, blocks: Sequence[Block], freqs_hz: npt.ArrayLike | None = None, *, prove: bool = True) -> MuBounds:
     """Return bounds of the structured singular value of a stable system over frequency.
 
     Parameters
@@ -127,8 +133,10 @@ def mu_bounds(system: StateSpace, blocks: Sequence[Block], freqs_hz: npt.ArrayLi
         From w to z, stable.
     blocks : sequence of Block
     freqs_hz : array_like, shape (f,), Hz, optional
-        Grid to start from, at least three points; around its highest peaks points are added until the peak is located. By default 200 logarithmic points
-        over six decades below Nyquist, or around the poles in continuous time.
+        Grid to start from, at least three points; the frequencies of lightly damped poles between them join it, and around the highest peaks points
+        are added until the peak is located. By default 200 logarithmic points over six decades below Nyquist, or around the poles in continuous time.
+    prove : bool
+        Bound mu between the points as well. It costs an eigenvalue problem of twice the order for every range of frequencies that shares its scalings.
 
     Returns
     -------
@@ -148,18 +156,39 @@ def mu_bounds(system: StateSpace, blocks: Sequence[Block], freqs_hz: npt.ArrayLi
     freqs = _default_grid(system) if freqs_hz is None else np.unique(np.asarray(freqs_hz, dtype=float))
     if freqs.size < 3:
         raise DimensionError(f"Structured singular value: needs at least three frequencies, found {freqs.size}.")
-    upper = scalings(system.frequency_response(freqs), structure).upper
+    freqs = np.union1d(freqs, _peaks(system, freqs[0], freqs[-1]))
+    freqs, upper = _located(system, structure, freqs, scalings(system.frequency_response(freqs), structure).upper)
+    bound = None
+    if prove:
+        found = everywhere(system, structure, freqs, upper)
+        bound = found.bound
+        if found.upper.max(initial=0.0) > upper.max() * (1 + _FLAT):
+            freqs, upper = _located(system, structure, *_merged(freqs, upper, found.freqs_hz, found.upper))
+            bound = max(bound, float(upper.max()))
+    lower, Delta = power_iteration(system.frequency_response(freqs), structure)
+    top, low = int(np.argmax(upper)), int(np.argmax(lower))
+    return MuBounds(freqs, upper, lower, float(upper[top]), float(lower[low]), float(freqs[top]), Delta[low], bound)
+
+
+def _located(system: StateSpace, structure: Structure, freqs: Array, upper: Array) -> tuple[Array, Array]:
+    """Add points around the highest peaks until these are located."""
     for _ in range(_REFINEMENTS):
         extra = _between(freqs, upper)
         if not extra.size:
             break
-        found = scalings(system.frequency_response(extra), structure).upper
-        freqs, upper = np.concatenate([freqs, extra]), np.concatenate([upper, found])
-        order = np.argsort(freqs)
-        freqs, upper = freqs[order], upper[order]
-    lower, Delta = power_iteration(system.frequency_response(freqs), structure)
-    top, low = int(np.argmax(upper)), int(np.argmax(lower))
-    return MuBounds(freqs, upper, lower, float(upper[top]), float(lower[low]), float(freqs[top]), Delta[low])
+        freqs, upper = _merged(freqs, upper, extra, scalings(system.frequency_response(extra), structure).upper)
+    return freqs, upper
+
+
+def _merged(freqs: Array, upper: Array, more: Array, their: Array) -> tuple[Array, Array]:
+    joined, first = np.unique(np.concatenate([freqs, more]), return_index=True)
+    return joined, np.concatenate([upper, their])[first]
+
+
+def _peaks(system: StateSpace, low_hz: float, high_hz: float) -> Array:
+    """Frequencies of lightly damped poles within the grid, Hz."""
+    found = resonances(system.A, system.dt > 0) / (2 * np.pi * (system.dt or 1.0))
+    return found[(found > low_hz) & (found < high_hz)]
 
 
 def _between(freqs: Array, upper: Array) -> Array:
@@ -173,7 +202,7 @@ def _between(freqs: Array, upper: Array) -> Array:
     left, right = peaks[peaks > 0], peaks[peaks < len(freqs) - 1]
     gaps = np.concatenate([np.stack([freqs[left - 1], freqs[left]]), np.stack([freqs[right], freqs[right + 1]])], axis=1)
     inner = gaps[0] + (gaps[1] - gaps[0]) * np.array([[1 / 3], [2 / 3]])
-    return np.unique(inner[:, gaps[1] - gaps[0] > 1e-6 * gaps[1]])
+    return np.unique(inner[:, gaps[1] - gaps[0] > 1e-13 * gaps[1]])
 
 
 def _default_grid(system: StateSpace) -> Array:

@@ -54,7 +54,7 @@ class _Round:
     def of(cls, plant: GeneralizedPlant, structure: Structure, controller: StateSpace, freqs_hz: Array) -> _Round:
         """Close the loop and judge it."""
         closed = plant.close(controller)
-        return cls(controller, closed, mu_bounds(closed, structure.blocks, freqs_hz), freqs_hz)
+        return cls(controller, closed, mu_bounds(closed, structure.blocks, freqs_hz, prove=False), freqs_hz)
 
     def fitted(self, structure: Structure, max_order: int) -> tuple[StateSpace, StateSpace]:
         """Return scalings of z and of w for this closed loop."""

@@ -44,6 +44,8 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
         "identify_on": facts.identify_on,
         "sample_period_s": context.population.sample_period_s,
     }
+    if facts.alerts:
+        study["alerts"] = facts.alerts
     if Stage.IDENTIFY in done:
         study["alpha"] = context.models(context.edmd_names[0]).alpha
     if Stage.SYNTHESIZE in done:

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..core.artifacts import read_json, write_json
 from ..core.errors import ConfigError, DataError, DimensionError
-from .config import Stage, StudyConfig
+from .config import Stage, StudyConfig, stored_config
 from .context import Context, Progress, Silent
 from .executors import open_executor
 from .metrics import collect_metrics
@@ -118,4 +118,4 @@ def load_run(folder: Path) -> tuple[StudyConfig, Store]:
     folder = Path(folder)
     if not (folder / "study.json").exists():
         raise ConfigError(f"Run {folder}: there is no study.json in it; name the folder that kros run or kros demo wrote.")
-    return StudyConfig.model_validate(read_json(folder / "study.json")), Store(folder)
+    return stored_config(read_json(folder / "study.json"), folder / "study.json"), Store(folder)

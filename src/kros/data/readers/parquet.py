@@ -43,12 +43,13 @@ class ParquetRecordings:
             values = np.empty((table.num_rows, len(self.columns)))
             for column, channel in enumerate(self.columns):
                 fill(values[:, column], table.column(channel))
+            table.select(KEYS).validate(full=True)
+            for label, expected in zip(KEYS, (key.unit, key.condition, key.episode), strict=True):
+                _check_label(table.column(label), label, expected, path)
         except DataError:
             raise
         except (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError, MemoryError) as error:  # and Arrow's own
             raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; convert the recordings again.") from error
-        for name, expected in zip(KEYS, (key.unit, key.condition, key.episode), strict=True):
-            _check_label(table.column(name), name, expected, path)
         return Recording(key, values)
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> ParquetRecordings:

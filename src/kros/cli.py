@@ -1,7 +1,7 @@
 """The command line: a thin face of `kros.study`.
 
 Exit codes: 0 done; 1 failed; 2 wrong usage or bad input, and then nothing was written; 3 done, but a requirement is not met;
-128 and the number of a signal that told it to stop, 143 for SIGTERM.
+128 and the number of a signal that told it to stop, 143 for SIGTERM. Errors become messages in `kros.edge`.
 """
 
 from __future__ import annotations
@@ -9,49 +9,26 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from .core.errors import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
+from .core.errors import ConfigError
+from .edge import NOT_MET, EdgeGroup
 
 app = typer.Typer(
     name="kros",
+    cls=EdgeGroup,
     help="From recordings of a batch of machines to one robust observer for all of them.",
     no_args_is_help=True,
     add_completion=False,
 )
-FAILED, BAD_INPUT, NOT_MET, SIGNALLED = 1, 2, 3, 128
 
 Quiet = Annotated[bool, typer.Option("--json", help="Print metrics.json and nothing else on standard output.")]
 Workers = Annotated[int | None, typer.Option(help="Processes for maps over units; default: one a core.")]
 Scheduler = Annotated[str | None, typer.Option(help="Address of a Dask scheduler to use instead of processes.")]
 Seed = Annotated[int, typer.Option(min=0)]
-
-
-@contextmanager
-def _exit_codes() -> Iterator[None]:
-    """Turn kros's errors into one message on standard error and an exit code."""
-    from .study.stop import Stopped, stoppable
-
-    try:
-        with stoppable():
-            yield
-    except Stopped as stopped:
-        typer.echo(f"kros: stopped by {stopped}; the same command goes on where this one ended.", err=True)
-        raise typer.Exit(SIGNALLED + stopped.signal) from stopped
-    except (ConfigError, DataError, DimensionError, MissingDependencyError) as error:
-        _fail(error, BAD_INPUT)
-    except KrosError as error:
-        _fail(error, FAILED)
-
-
-def _fail(error: KrosError, code: int) -> None:
-    typer.echo(f"kros: {error}", err=True)
-    raise typer.Exit(code)
 
 
 def _count(workers: int | None) -> int:
@@ -66,7 +43,10 @@ def _say(text: str, quiet: bool = False) -> None:
 
 
 @app.callback()
-def main(verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens to standard error.")] = False) -> None:
+def main(
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens to standard error.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error in place of a message.")] = False,
+) -> None:
     """Set up logging."""
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
 
@@ -85,7 +65,7 @@ def demo(
     from .study.demo import run_demo
     from .study.progress import make_progress
 
-    with _exit_codes(), make_progress(quiet) as progress:
+    with make_progress(quiet) as progress:
         result = run_demo(out, units, episodes, seconds, seed, _count(workers), progress)
     _finish(result, quiet)
 
@@ -106,8 +86,7 @@ def simulate(
     """Simulate a population with known truth."""
     from .study.demo import simulate_to
 
-    with _exit_codes():
-        simulate_to(out, plant, units, episodes, seconds, seed, spread, loop, outlier, format_)
+    simulate_to(out, plant, units, episodes, seconds, seed, spread, loop, outlier, format_)
     _say(f"recordings in {out}")
 
 
@@ -123,7 +102,7 @@ def convert(
     from .study.convert import convert_recordings
     from .study.progress import make_progress
 
-    with _exit_codes(), make_progress(False) as progress:
+    with make_progress(False) as progress:
         population = convert_recordings(source, out, reader, mapping, _count(workers), progress)
     _say(f"{len(population.episodes)} episodes of {len(population.units)} units in {out}")
 
@@ -144,7 +123,7 @@ def run(
     from .study import Stage, load_config, run_study
     from .study.progress import make_progress
 
-    with _exit_codes(), make_progress(quiet) as progress:
+    with make_progress(quiet) as progress:
         if until not in [s.value for s in Stage]:
             raise ConfigError(f"--until {until!r}: stages are {', '.join(s.value for s in Stage)}.")
         config = load_config(study, set_ or ())
@@ -177,8 +156,7 @@ def check(
     """Score new units against a finished study; exit code 3 when one is flagged."""
     from .study.check import check_units
 
-    with _exit_codes():
-        scores = check_units(run_folder, data, _count(workers))
+    scores = check_units(run_folder, data, _count(workers))
     if quiet:
         typer.echo(json.dumps(scores, indent=1, ensure_ascii=False))
     else:
@@ -199,8 +177,7 @@ def estimate(
     """Write the deployed observer's estimates on recordings."""
     from .study.estimate import estimate_recordings
 
-    with _exit_codes():
-        count = estimate_recordings(run_folder, data, out)
+    count = estimate_recordings(run_folder, data, out)
     _say(f"estimates of {count} episodes in {out}")
 
 
@@ -209,8 +186,7 @@ def report(run_folder: Annotated[Path, typer.Argument(metavar="RUN")]) -> None:
     """Write the report of a run again, from the run folder only."""
     from .study.stages.report import render_run
 
-    with _exit_codes():
-        path = render_run(run_folder)
+    path = render_run(run_folder)
     _say(f"report: {path}")
 
 
@@ -219,8 +195,7 @@ def figures(run_folder: Annotated[Path, typer.Argument(metavar="RUN")], out: Pat
     """Write the report's figures as PNG and PDF."""
     from .study.stages.report import write_figures
 
-    with _exit_codes():
-        names = write_figures(run_folder, out)
+    names = write_figures(run_folder, out)
     _say(f"{len(names)} figures in {out}")
 
 

@@ -68,7 +68,7 @@ def test_arrays_that_do_not_fit(episode: Any, message: str) -> None:
 
 
 def test_period_above_zero_and_unknown_key() -> None:
-    with pytest.raises(DataError, match="sampling period above zero, found 0"):
+    with pytest.raises(DataError, match="sampling period should be a number of seconds above zero, found 0"):
         from_arrays({"a": [values(0)]}, CHANNELS, 0)
     with pytest.raises(DataError, match=r"Asked for episode 9 of unit a \(default\)"):
         from_arrays({"a": [values(0)]}, CHANNELS, 0.1).read(EpisodeKey("a", "default", "9"))
@@ -107,7 +107,7 @@ def test_frame_refuses() -> None:
         from_frame(frame(), CHANNELS)
     with pytest.raises(DataError, match=r"column 'unit' should hold text or whole numbers, found 1\.5"):
         from_frame(frame(unit=1.5), CHANNELS, time="t")
-    with pytest.raises(DataError, match=r"columns \['x', 'v', 'u'\] should hold numbers"):
+    with pytest.raises(DataError, match=r"column 'x' should hold numbers"):
         from_frame(frame(x="wide"), CHANNELS, time="t")
     with pytest.raises(DataError, match=r"rows of episode 0 of unit a \(hot\) are not together"):
         from_frame(frame(episode=0, unit=["a"] * 6 + ["b"] * 6 + ["a"] * 24), CHANNELS, time="t")

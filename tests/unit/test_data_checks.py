@@ -52,10 +52,24 @@ def test_infinities_of_both_signs_and_huge_values() -> None:
     check_episode(np.sign(values()) * 1e308, KEY, CHANNELS)
 
 
-def test_states_and_inputs_may_rest_in_an_episode() -> None:
-    rest = values()
-    rest[:, 1:] = 2.5, 0.0
+def test_an_input_may_be_held_and_a_machine_may_rest() -> None:
+    held, rest = values(), values()
+    held[:, 2] = 0.0
+    check_episode(held, KEY, CHANNELS)
+    rest[:] = 1.0, 2.5, 0.0
     check_episode(rest, KEY, CHANNELS)
+
+
+@pytest.mark.parametrize("level", [0.0, 2.5, -1e9, 0.1])
+@pytest.mark.parametrize("column", [0, 1])
+def test_a_stuck_sensor_is_named(column: int, level: float) -> None:
+    stuck = values()
+    stuck[:, column] = level
+    match = rf"^Episode 7 of unit 001011 \(load\): state '{'xv'[column]}' stays at .* in all 20 samples .*stuck"
+    with pytest.raises(DataError, match=match):
+        check_episode(stuck, KEY, CHANNELS)
+    stuck[7, column] += 1e-3 * max(1.0, abs(level))
+    check_episode(stuck, KEY, CHANNELS)
 
 
 def test_short_and_misshapen() -> None:
@@ -108,20 +122,11 @@ def test_scan_refuses_an_input_that_never_moves() -> None:
         scan_population(population({"a": resting[:2], "b": resting[2:]}))
 
 
-def test_scan_takes_a_state_that_rests_in_one_episode_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    resting = [values(i) for i in range(2)]
-    resting[0][:, 1] = 2.5
-    with caplog.at_level(logging.INFO):
-        assert len(scan_population(population({"a": resting})).episodes) == 2
-    assert [r.message for r in caplog.records] == ["Episode 0 of unit a (default): state 'v' rests at 2.5 in all 20 samples."]
-
-
 @pytest.mark.parametrize("later", [2.5, -1.0], ids=["same level", "another level"])
 def test_scan_refuses_a_state_that_rests_in_every_episode(later: float) -> None:
-    stuck = [values(i) for i in range(2)]
-    stuck[0][:, 1], stuck[1][:, 1] = 2.5, later
+    stuck = [np.tile([0.0, 2.5, 1.0], (20, 1)), np.tile([1.0, later, 1.0], (30, 1))]
     with pytest.raises(
-        DataError, match=r"Unit a \(default\): state 'v' stays where it is in each of 2 episodes, in the first at 2\.5; check the sensor"
+        DataError, match=r"Unit a \(default\): state 'x' stays where it is in each of 2 episodes, in the first at 0; check the sensor"
     ):
         scan_population(population({"a": stuck}))
 

@@ -223,7 +223,7 @@ def test_another_rate(folder: Path) -> None:
         ({"sample_period_s": 0.1}, "one of time and sample_period_s"),
         ({"time": 0}, "numbered from 1, found 0"),
         ({"header": False}, "leaves columns without names, found 't'"),
-        ({"delimiter": "::"}, "two different characters, found delimiter = '::'"),
+        ({"delimiter": "::"}, "two different characters .* found delimiter = '::'"),
         ({"decimal": ","}, "two different characters"),
         ({"skip": -1}, "skip should be zero or more lines, found -1"),
         ({"unit": [{"suffix": "1", "columns": {"z": "pos"}}]}, r"gives a column for 'z'; the channels are \['u', 'x'\]"),
@@ -236,10 +236,10 @@ def test_mapping_refuses(folder: Path, changes: dict[str, Any], message: str) ->
 
 
 def test_mapping_file_refuses(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with pytest.raises(ConfigError, match="there is no such file"):
         read_csv_folder(tmp_path, tmp_path / "mapping.toml")
     (tmp_path / "mapping.toml").write_text("files = ")
-    with pytest.raises(ConfigError, match="not valid TOML"):
+    with pytest.raises(ConfigError, match="not a TOML file"):
         read_csv_folder(tmp_path, tmp_path / "mapping.toml")
 
 
@@ -251,10 +251,10 @@ def test_states_alone_without_a_role_state_are_refused(folder: Path) -> None:
 def test_files_that_cannot_be_read(folder: Path) -> None:
     population = read_csv_folder(folder, MAPPING)
     (folder / "b" / "cold_1.csv").unlink()
-    with pytest.raises(DataError, match=r"b/cold_1\.csv: .*check that the file exists"):
+    with pytest.raises(DataError, match=r"b/cold_1\.csv: .*there is no such file"):
         population.read(EpisodeKey("b", "cold", "1"))
     (folder / "b" / "cold_1.csv").write_bytes("t,pos,Größe\n".encode("latin-1"))
-    with pytest.raises(DataError, match=r"b/cold_1\.csv: cannot read its first line"):
+    with pytest.raises(DataError, match=r"b/cold_1\.csv: its first line is not UTF-8"):
         read_csv_folder(folder, MAPPING)
 
 

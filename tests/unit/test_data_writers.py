@@ -80,7 +80,6 @@ def test_any_id_works(tmp_path: Path) -> None:
         "a%40b",
         "Größe 5 / links",
         "x.parquet",
-        "",
         "a b",
         "x" * 300,
         "x" * 299 + "y",
@@ -232,10 +231,14 @@ def test_damaged_folders(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="schema and kind should be"):
         read_parquet(out)
     index.write_text(good.replace('"role": "input"', '"role": "output"'))
+    with pytest.raises(DataError, match="does not fit its checksum"):
+        read_parquet(out)
+    edited = good.replace('"checksum"', '"note"')  # as by somebody who edits the file on purpose
+    index.write_text(edited.replace('"role": "input"', '"role": "output"'))
     with pytest.raises(DataError, match="not as kros writes it"):
         read_parquet(out)
-    index.write_text(good.replace("   20,", "   25,"))
-    with pytest.raises(DataError, match="25 samples are expected, found 20"):
+    index.write_text(edited.replace("   20,", "   25,"))
+    with pytest.raises(DataError, match="25 samples are expected in row group 0, found 20"):
         read_parquet(out).read(EpisodeKey("a", "cold", "0"))
     index.write_text(good)
     (out / "b@warm.parquet").write_bytes((out / "b@warm.parquet").read_bytes()[:200])

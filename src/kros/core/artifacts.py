@@ -1,28 +1,46 @@
 """The one reader and writer behind every `save` and `load`.
 
-An artifact is a folder with `arrays.npz` (no pickle) and `<kind>.json` (readable, with a schema version).
-Files appear whole or not at all: they are written beside their place and moved there.
+An artifact is a folder with `arrays.npz` (no pickle) and `<kind>.json` (readable, with a schema version and a checksum of both).
+Files appear whole or not at all: they are written beside their place and moved there. What was changed since is not read: a file that
+was edited on purpose is accepted once its key ``checksum`` is removed, with what its reader checks of the content.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import enum
-import io
+import hashlib
 import json
 import math
 import os
 import tempfile
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from . import limits
+from .archive import pack_arrays, unpack_arrays
 from .errors import DataError
+from .files import read_bytes, shortened
 
 SCHEMA = 1
+CHECKSUM = "checksum"
+
+
+class Record(dict[Any, Any]):
+    """A JSON object or a set of arrays as read from a file; asking for a key that is not there says so, with the file."""
+
+    def __init__(self, content: Mapping[Any, Any], path: Path) -> None:
+        super().__init__(content)
+        self.path = path
+
+    def __missing__(self, key: Any) -> Any:
+        raise DataError(
+            f"Reading {self.path}: key {key!r} is missing, found {shortened(str(list(self)))}; write it again with this version."
+        )
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -57,6 +75,8 @@ def plain(value: Any) -> Any:
         return None
     if isinstance(value, Path):
         return str(value)
+    if isinstance(value, (datetime.date, datetime.time)):  # of TOML
+        return value.isoformat()
     return value
 
 
@@ -66,53 +86,110 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file, or say which file is missing or broken."""
+    """Read a JSON file, or say which file is missing or broken; its objects are `Record`."""
+    path = Path(path)
+    if not path.exists():
+        raise DataError(f"Reading {path.name}: there is no file {path}; is this the folder that an earlier step wrote?")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DataError(f"Reading {path.name}: there is no file {path}; is this the folder that an earlier step wrote?") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"Reading {path}: not valid JSON ({error}); write it again with the step that made it.") from error
+        text = read_bytes(path, limits.MAX_JSON_BYTES).decode("utf-8")
+        return json.loads(text, object_hook=lambda found: Record(found, path), parse_constant=_refuse, parse_float=_finite)
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"Reading {path}: not valid JSON ({shortened(str(error))}); write it again with the step that made it.") from error
+
+
+def _refuse(constant: str) -> Any:
+    raise ValueError(f"{constant} is not a number of JSON")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is too large")
+    return value
+
+
+def checksum_of(content: Mapping[str, Any]) -> str:
+    """Return the checksum of an artifact's JSON content, whatever its layout, without the key that holds it."""
+    kept = {key: value for key, value in plain(content).items() if key != CHECKSUM}
+    return "sha256:" + hashlib.sha256(json.dumps(kept, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def with_checksum(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content with its checksum as the last key."""
+    return {**content, CHECKSUM: checksum_of(content)}
+
+
+def check_checksum(content: Mapping[str, Any], path: Path) -> bool:
+    """Refuse content that is not what its checksum says; False where it has none.
+
+    Raises
+    ------
+    DataError
+    """
+    if CHECKSUM not in content:
+        return False
+    if content[CHECKSUM] != checksum_of(content):
+        raise DataError(
+            f"Reading {path}: the content does not fit its checksum, so it was changed or damaged since it was written; write it again, or "
+            f'remove the key "{CHECKSUM}" where it was edited on purpose.'
+        )
+    return True
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write arrays to an .npz whose bytes depend on the content alone."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in arrays.items():
-            content = io.BytesIO()
-            np.lib.format.write_array(content, np.ascontiguousarray(array), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0)), content.getvalue())
-    write_bytes(path, buffer.getvalue())
+    write_bytes(path, pack_arrays(arrays))
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read all arrays of an .npz; pickled objects are refused."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError as error:
-        raise DataError(f"Reading {path.name}: there is no file {path}; is this the folder that an earlier step wrote?") from error
-    except (ValueError, zipfile.BadZipFile) as error:
-        raise DataError(f"Reading {path}: not a valid archive of arrays ({error}); write it again with the step that made it.") from error
+    """Read all arrays of an .npz; pickled objects and packed archives are refused."""
+    path = Path(path)
+    return Record(unpack_arrays(_read_archive(path), path), path)
+
+
+def _read_archive(path: Path) -> bytes:
+    if not path.exists():
+        raise DataError(f"Reading {path.name}: there is no file {path}; is this the folder that an earlier step wrote?")
+    return read_bytes(path, limits.MAX_ARRAYS_BYTES)
 
 
 def save_artifact(folder: Path, kind: str, content: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None) -> None:
-    """Write `<kind>.json` (with the schema version) and, where there are arrays, `arrays.npz`."""
+    """Write `<kind>.json` (with schema version and checksum) and, where there are arrays, `arrays.npz`."""
     folder = Path(folder)
+    whole = {"schema": SCHEMA, "kind": kind, **content}
     if arrays is not None:
-        write_arrays(folder / "arrays.npz", arrays)
-    write_json(folder / f"{kind}.json", {"schema": SCHEMA, "kind": kind, **content})
+        packed = pack_arrays(arrays)
+        write_bytes(folder / "arrays.npz", packed)
+        whole["arrays"] = hashlib.sha256(packed).hexdigest()
+    write_json(folder / f"{kind}.json", with_checksum(whole))
 
 
 def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read what `save_artifact` wrote and check kind and schema version."""
+    """Read what `save_artifact` wrote and check kind, schema version and checksum.
+
+    Raises
+    ------
+    DataError
+        A file that is missing, of another version, or not as it was written.
+    """
     folder = Path(folder)
-    content = read_json(folder / f"{kind}.json")
+    path, archive = folder / f"{kind}.json", folder / "arrays.npz"
+    content = read_json(path)
     found = (content.get("schema"), content.get("kind")) if isinstance(content, dict) else None
     if found != (SCHEMA, kind):
         raise DataError(
             f"Loading {kind} from {folder}: schema and kind should be {(SCHEMA, kind)}, found {found}; write it again with this version of kros."
         )
-    arrays = read_arrays(folder / "arrays.npz") if (folder / "arrays.npz").exists() else {}
-    return content, arrays
+    check_checksum(content, path)
+    content.pop(CHECKSUM, None)
+    digest = content.pop("arrays", None)
+    if digest is None and not archive.exists():
+        return content, Record({}, archive)
+    packed = _read_archive(archive)
+    if digest is not None and hashlib.sha256(packed).hexdigest() != digest:
+        raise DataError(
+            f"Reading {archive}: it is not the file that {path.name} was written with; write both again with the step that made them."
+        )
+    return content, Record(unpack_arrays(packed, archive), archive)

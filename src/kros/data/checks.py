@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import logging
+import math
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from enum import Enum
+from numbers import Real
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError
+from .copies import Print, print_of, refuse_copies
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 from .recording import title
 
 logger = logging.getLogger(__name__)
 
 MIN_SAMPLES = 3  # two consecutive states and one more
+_ROUNDING = 1e-12  # of the largest value: what filters and scales make of a constant
 
 
 class OnNan(str, Enum):
@@ -55,7 +61,8 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
     NonFiniteError
         NaN or infinity.
     DataError
-        Wrong number of columns, or too short. (A state or an input may rest in one episode, not in all of them; see `RestWatch`.)
+        Wrong number of columns, too short, or a state that stands still while other channels move: a sensor that is stuck. (Where nothing moves
+        the machine rests, and an input may be held; neither may in all episodes, see `RestWatch`.)
     """
     if values.ndim != 2 or values.shape[1] != len(channels):
         raise DataError(
@@ -68,11 +75,27 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
         )
     if not np.isfinite(values).all():
         check_finite(values, key, channels)
+    _check_moving(values, key, channels)
+
+
+def _check_moving(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel]) -> None:
+    """Refuse a state that stands still for the whole episode while anything else moves."""
+    still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
+    if not still:
+        return
+    moving = [c.name for i, c in enumerate(channels) if i not in still and not is_constant(values[:, i])]
+    if moving:
+        raise DataError(
+            f"{title(key)}: state {channels[still[0]].name!r} stays at {values[0, still[0]]:g} in all {len(values)} samples while "
+            f"{', '.join(repr(name) for name in moving)} move, so its sensor is stuck or the column is wrong; leave the episode out, or the channel."
+        )
 
 
 def is_constant(column: npt.NDArray[np.float64]) -> bool:
-    """Tell whether a signal never changes; a changing one is recognised early."""
-    return bool(column[0] == column[len(column) // 2] and np.all(column == column[0]))
+    """Tell whether a signal never changes, but for rounding; a changing one is recognised early."""
+    room = _ROUNDING * abs(column[0])
+    lower, upper = column[0] - room, column[0] + room
+    return bool(lower <= column[len(column) // 2] <= upper and np.all((column >= lower) & (column <= upper)))
 
 
 def check_finite(
@@ -142,8 +165,43 @@ class RestWatch:
             )
 
 
+def check_names(kind: str, names: Iterable[Any]) -> None:
+    """Refuse names that are empty, no text, or hold characters that no file and no table can show.
+
+    Parameters
+    ----------
+    kind : str
+        What they name, for example ``channel``.
+    names : iterable
+
+    Raises
+    ------
+    DataError
+    """
+    for name in names:
+        if not isinstance(name, str) or not name.strip():
+            raise DataError(f"The name of every {kind} should be text that is not empty, found {name!r}; name it.")
+        if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
+            raise DataError(f"The name of a {kind} should hold printable characters in UTF-8 only, found {name!r}; rename it.")
+
+
+def check_period(period_s: Any, what: str) -> float:
+    """Return a sampling period that is a number of seconds above zero.
+
+    Raises
+    ------
+    DataError
+    """
+    if isinstance(period_s, bool) or not isinstance(period_s, Real) or not 0 < float(period_s) < math.inf:
+        raise DataError(f"{what}: the sampling period should be a number of seconds above zero, found {period_s!r}; give it in seconds.")
+    return float(period_s)
+
+
 def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey]) -> None:
-    """Check names: at least one state, no channel and no episode twice."""
+    """Check names: none empty, at least one state, no channel and no episode twice."""
+    check_names("channel", [c.name for c in channels])
+    for kind in ("unit", "condition", "episode"):
+        check_names(kind, dict.fromkeys(getattr(key, kind) for key in episodes))
     twice = [name for name, count in Counter(c.name for c in channels).items() if count > 1]
     if twice:
         raise DataError(f"Channel names should differ, found {twice} more than once in {[c.name for c in channels]}; rename them.")
@@ -210,8 +268,17 @@ def scan_population(population: Population, min_samples: int = MIN_SAMPLES, on_n
     ------
     DataError
     """
+    kept = [key for key, _ in scan_prints(population, min_samples, on_nan)]
+    left = {key.unit for key in kept}
+    return replace(population, episodes=tuple(kept), units=tuple(u for u in population.units if u.id in left))
+
+
+def scan_prints(
+    population: Population, min_samples: int = MIN_SAMPLES, on_nan: OnNan | str = OnNan.ERROR
+) -> list[tuple[EpisodeKey, Print]]:
+    """Do the same, and return the episodes that are left with what they are recognised by."""
     policy = parse_on_nan(on_nan)
-    kept: list[EpisodeKey] = []
+    kept: list[tuple[EpisodeKey, Print]] = []
     for unit, condition, keys in population.groups():
         watch = RestWatch(population.channels)
         for key in keys:
@@ -219,14 +286,14 @@ def scan_population(population: Population, min_samples: int = MIN_SAMPLES, on_n
             if values is not None:
                 check_episode(values, key, population.channels, min_samples)
                 watch.add(values)
-                kept.append(key)
+                kept.append((key, print_of(values, population.channels)))
         watch.check(unit, condition)
-    left = {key.unit for key in kept}
-    return replace(population, episodes=tuple(kept), units=tuple(u for u in population.units if u.id in left))
+    refuse_copies(kept)
+    return kept
 
 
 def read_or_drop(population: Population, key: EpisodeKey, on_nan: OnNan) -> npt.NDArray[np.float64] | None:
-    """Read and check for NaN; None where the episode is to be dropped, which is logged, as are states that rest in it."""
+    """Read and check for NaN; None where the episode is to be dropped, which is logged."""
     try:
         values = population.read(key)
         check_episode(values, key, population.channels)
@@ -235,7 +302,4 @@ def read_or_drop(population: Population, key: EpisodeKey, on_nan: OnNan) -> npt.
             raise
         logger.warning("Dropped, as data.on_nan asks: %s", error)
         return None
-    for column, channel in enumerate(population.channels):
-        if channel.role is Role.STATE and is_constant(values[:, column]):
-            logger.info("%s: state %r rests at %g in all %d samples.", title(key), channel.name, values[0, column], len(values))
     return values

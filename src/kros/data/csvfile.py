@@ -1,19 +1,26 @@
-"""Numbers from one delimited text file, fast, with errors that name the file and the column."""
+"""Numbers from one delimited text file, fast, in bounded memory, with errors that name the file and the column."""
 
 from __future__ import annotations
 
 import csv
 import gzip
 import re
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ..core import limits
 from ..core.errors import DataError
+from ..core.files import require_regular, shortened
 from .arrow import fill
+
+BLOCK = 1 << 22  # bytes that Arrow parses at once; a line has to fit into two
 
 
 @dataclass(frozen=True)
@@ -29,19 +36,80 @@ class Dialect:
 COMMA = Dialect()
 
 
-def first_fields(path: Path, dialect: Dialect = COMMA) -> list[str]:
-    """Return the fields of the first line after those skipped, without surrounding space and quotes."""
-    opener = gzip.open if path.suffix == ".gz" else open
+class Bounded:
+    """An open file that refuses to give more than is ever read; text that was packed too tightly to be recordings is refused early."""
+
+    def __init__(self, file: IO[bytes], path: Path) -> None:
+        self._file, self._path = file, path
+        self._given, self._size = 0, path.stat().st_size
+        self.closed = False
+
+    def read(self, size: int = -1) -> bytes:
+        """Return the next bytes."""
+        return self._counted(self._file.read(BLOCK if size is None or size < 0 else size))
+
+    def readline(self) -> bytes:
+        """Return the next line with its end, or refuse one that is longer than any header."""
+        line = self._counted(self._file.readline(limits.MAX_LINE_BYTES + 1))
+        if len(line) > limits.MAX_LINE_BYTES:
+            raise DataError(
+                f"Reading {self._path}: a line at the start is longer than {limits.MAX_LINE_BYTES} bytes, so this is no table of text; check "
+                "the file and its line ends."
+            )
+        if b"\r" in line.removesuffix(b"\r\n").removesuffix(b"\r"):
+            raise DataError(f"Reading {self._path}: lines end with CR alone, as on old systems; convert the line ends to LF or CR LF.")
+        if b"\0" in line:
+            raise DataError(f"Reading {self._path}: holds NUL bytes, so it is binary or UTF-16; convert it to text in UTF-8.")
+        return line
+
+    def close(self) -> None:
+        """Say that nothing more is read."""
+        self.closed = True
+
+    def _counted(self, content: bytes) -> bytes:
+        self._given += len(content)
+        if self._given > limits.MAX_TEXT_BYTES:
+            raise DataError(
+                f"Reading {self._path}: unpacks to more than {limits.MAX_TEXT_BYTES} bytes; split it, or raise MAX_TEXT_BYTES in kros.core.limits."
+            )
+        if self._given > max(limits.RATIO_FROM_BYTES, limits.MAX_RATIO * self._size):
+            raise DataError(
+                f"Reading {self._path}: unpacks to more than {limits.MAX_RATIO} times its {self._size} bytes, which recordings never do; unpack it "
+                "yourself if it is one, or raise MAX_RATIO in kros.core.limits."
+            )
+        return content
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Bounded]:
+    """Open a regular text file, unpacked where it ends in ``.gz``.
+
+    Raises
+    ------
+    DataError
+        No regular file, too large, unreadable, or not a valid gzip file.
+    """
+    require_regular(path, limits.MAX_TEXT_BYTES)
+    opener: Any = gzip.open if path.suffix == ".gz" else open
     try:
         with opener(path, "rb") as file:
-            for _ in range(dialect.skip):
-                file.readline()
-            line = file.readline().decode("utf-8-sig").rstrip("\r\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"Reading {path}: cannot read its first line ({error}); check the file.") from error
+            yield Bounded(file, path)
+    except (OSError, EOFError, zlib.error) as error:
+        raise DataError(f"Reading {path}: cannot be read ({error}); check the file, or restore it.") from error
+
+
+def first_fields(path: Path, dialect: Dialect = COMMA) -> list[str]:
+    """Return the fields of the first line after those skipped, without surrounding space and quotes."""
+    with opened(path) as file:
+        _skip(file, dialect.skip, path)
+        line = _text(file.readline(), path)
     if not line.strip():
         raise DataError(f"Reading {path}: the file is empty or starts with an empty line; remove it or restore it.")
-    return [part.strip() for part in next(csv.reader([line], delimiter=dialect.delimiter, skipinitialspace=True))]
+    try:
+        fields = next(csv.reader([line], delimiter=dialect.delimiter, skipinitialspace=True))
+    except csv.Error as error:
+        raise DataError(f"Reading {path}: its first line is no list of columns ({error}); correct the file.") from error
+    return [part.strip() for part in fields]
 
 
 def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect = COMMA) -> npt.NDArray[np.float64]:
@@ -64,29 +132,46 @@ def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialec
     Raises
     ------
     DataError
-        A missing file, a row with more or fewer columns, or a cell that is not a number.
+        A missing file, a row with more or fewer columns, a cell that is not a number, or more text than is ever read.
     """
     import pyarrow as pa
     from pyarrow import csv as arrow
 
-    read = arrow.ReadOptions(use_threads=False, skip_rows=dialect.skip + dialect.header, column_names=list(names), block_size=1 << 22)
+    read = arrow.ReadOptions(use_threads=False, column_names=list(names), block_size=BLOCK)
     parse = arrow.ParseOptions(delimiter=dialect.delimiter)
     numbers = {name: pa.float64() for name in wanted}
     convert = arrow.ConvertOptions(column_types=numbers, include_columns=list(numbers), decimal_point=dialect.decimal)
-    try:
-        table = arrow.read_csv(path, read, parse, convert)
-    except (pa.ArrowInvalid, pa.ArrowKeyError) as error:
-        if "Empty CSV" in str(error):
-            return np.zeros((len(wanted), 0))
-        raise DataError(f"Reading {path}: {_explain(str(error), names)}; correct the file.") from error
-    except OSError as error:
-        raise DataError(f"Reading {path}: {error}; check that the file exists and can be read.") from error
+    with opened(path) as file:
+        _skip(file, dialect.skip + dialect.header, path)  # here, so that both readings count lines alike
+        try:
+            table = arrow.read_csv(pa.PythonFile(file, mode="r"), read, parse, convert)
+        except DataError:
+            raise
+        except (pa.ArrowException, ValueError, MemoryError) as error:
+            if "Empty CSV" in str(error):
+                return np.zeros((len(wanted), 0))
+            raise DataError(f"Reading {path}: {_explain(str(error), names)}; correct the file.") from error
     values = np.empty((len(wanted), table.num_rows))
     for row, name in enumerate(wanted):
         fill(values[row], table.column(name))
     return values
 
 
+def _skip(file: Bounded, lines: int, path: Path) -> None:
+    for line in range(lines):
+        if not file.readline():
+            raise DataError(f"Reading {path}: {lines} lines stand before the numbers by the mapping, found {line} in all; correct skip.")
+
+
+def _text(line: bytes, path: Path) -> str:
+    try:
+        return line.decode("utf-8-sig").rstrip("\r\n")
+    except UnicodeDecodeError as error:
+        raise DataError(f"Reading {path}: its first line is not UTF-8 ({error}); convert the file.") from error
+
+
 def _explain(message: str, names: Sequence[str]) -> str:
     """Return Arrow's message, with the number of a column (from zero, in the file) replaced by its name."""
-    return re.sub(r"In CSV column #(\d+):", lambda match: f"in column {names[int(match[1])]!r}:", message)
+    if "straddling" in message:
+        return f"a line, or a text in quotes, is longer than {BLOCK} bytes"
+    return shortened(re.sub(r"In CSV column #(\d+):", lambda match: f"in column {names[int(match[1])]!r}:", message))

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
-from .checks import check_episode, check_structure
+from .checks import check_episode, check_period, check_structure
 from .population import Channel, EpisodeKey, EpisodeSource, Population, Role, Unit, natural_key, restrict
 from .recording import TIME_TOLERANCE, Recording, RecordingSource, check_even, estimate_period
 from .steps import Resample, Step
@@ -112,6 +112,7 @@ def assemble(recorded: Recorded, steps: Iterable[Step] = ()) -> Population:
     units = tuple(sorted((u for u in recorded.units if u.id in with_episodes), key=lambda u: (natural_key(u.id), u.id)))
     first = episodes[0]
     period = recorded.sample_period_s if recorded.sample_period_s is not None else estimate_period(recorded.recordings(first))
+    period = check_period(period, "Population")
     source = PreparedSource(recorded.recordings, recorded.channels, period, first, tolerance=recorded.tolerance)
     return prepare(Population(recorded.channels, period, units, episodes, source, recorded.metadata), steps)
 
@@ -148,6 +149,7 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     channels, period = population.channels, population.sample_period_s
     for step in added:
         channels, period = step.channels_after(channels), step.period_after(period)
+    check_structure(channels, population.episodes)
     source = population.source
     if isinstance(source, PreparedSource):
         source = replace(source, steps=source.steps + added)

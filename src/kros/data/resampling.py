@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
+from ..core import limits
 from ..core.errors import ConfigError, DataError
 from .filters import lowpass, resample_even
 from .population import Channel, Role
@@ -29,8 +31,12 @@ class Resample(Step):
 
     def period_after(self, period_s: float) -> float:
         """Return the new sampling period, s."""
-        if not self.period_s > 0:
+        if not 0 < self.period_s < math.inf:
             raise ConfigError(f"Step 'resample' needs period_s > 0, found {self.period_s}; give the period in seconds.")
+        if self.max_gap_s is not None and not self.max_gap_s > 0:
+            raise ConfigError(
+                f"Step 'resample' needs max_gap_s > 0, found {self.max_gap_s}; give the longest gap in seconds, or leave it out."
+            )
         return self.period_s
 
     def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
@@ -45,6 +51,11 @@ class Resample(Step):
             raise DataError(
                 f"{title(recording.key)}: resampling would bridge a gap of {longest:g} s after sample {gap} (allowed: {limit:g} s); "
                 "cut the episode there, or raise max_gap_s."
+            )
+        count = (time[-1] - time[0]) / min(self.period_s, median)
+        if count > limits.MAX_SAMPLES:
+            raise DataError(
+                f"{title(recording.key)}: resampling to period_s = {self.period_s:g} would make {count:g} samples of {len(time)}; correct the period."
             )
         return replace(recording, values=resample_even(time, recording.values, median, self.period_s), time_s=None)
 
@@ -70,6 +81,15 @@ class Differentiate(Step):
             raise ConfigError(f"Step 'differentiate' would add {self.name!r}, which is there already; choose another name.")
         at = self._position(channels)
         return (*channels[:at], Channel(self.name, Role.STATE, self.unit), *channels[at:])
+
+    def period_after(self, period_s: float) -> float:
+        """Return the sampling period, unchanged; the cut-off has to lie below half its inverse."""
+        if not 0 < self.cutoff_hz < 0.5 / period_s:
+            raise ConfigError(
+                f"Step 'differentiate' needs a cutoff_hz above zero and below the Nyquist frequency of {0.5 / period_s:g} Hz, found {self.cutoff_hz}; "
+                "correct it."
+            )
+        return period_s
 
     def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
         """Return the recording with one more column."""

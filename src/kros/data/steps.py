@@ -7,6 +7,7 @@ In TOML a step is a table with its name under `step`: ``[[data.prepare]] step = 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -35,6 +36,8 @@ class Scale(Step):
 
     def channels_after(self, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
         """Return the channels with their new unit of measure."""
+        if not math.isfinite(self.factor) or self.factor == 0:
+            raise ConfigError(f"Step 'scale' needs a finite factor other than zero, found {self.factor}; correct it.")
         self.columns(self.channels, channels)
         return channels if self.unit is None else tuple(replace(c, unit=self.unit) if c.name in self.channels else c for c in channels)
 
@@ -161,6 +164,6 @@ def parse_steps(tables: Iterable[Step | Mapping[str, Any]], where: str = "data.p
 
 def _parse_step(table: Mapping[str, Any], where: str) -> Step:
     name = table.get("step") if isinstance(table, Mapping) else None
-    if name not in STEPS:
+    if not isinstance(name, str) or name not in STEPS:
         raise ConfigError(f"{where}: step should be one of {list(STEPS)}, found {name!r}; correct it.")
     return build(STEPS[name], {key: value for key, value in table.items() if key != "step"}, f"{where} (step {name!r})")

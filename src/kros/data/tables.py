@@ -58,8 +58,15 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
     if isinstance(hint, type) and issubclass(hint, Enum):
         return _convert_enum(value, hint, where)
     if hint is Any or (isinstance(hint, type) and _fits(value, hint)):
-        return float(value) if hint is float else value
+        return _float(value, where) if hint is float else value
     raise ConfigError(f"{where}: should be {_word(hint)}, found {value!r}; correct it.")
+
+
+def _float(value: float, where: str) -> float:
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise ConfigError(f"{where}: should be a number that fits 64 bits, found one of {value.bit_length()} bits; correct it.") from error  # type: ignore[attr-defined]
 
 
 def _convert_union(value: Any, arguments: tuple[Any, ...], where: str) -> Any:

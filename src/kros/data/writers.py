@@ -25,14 +25,15 @@ from ..core.artifacts import save_artifact
 from ..core.errors import DataError
 from .arrow import from_numpy, repeated
 from .checks import OnNan, RestWatch, check_structure, parse_on_nan, read_or_drop
+from .copies import Print, print_of, refuse_copies
 from .folders import whole_folder
 from .population import EpisodeKey, Population
-from .readers.parquet import INDEX
+from .readers.parquet import INDEX, KEYS
 
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
-KEYS = ("unit", "condition", "episode")
+_INDEXED = ("unit", "condition", "file", "episodes", "samples")
 LONGEST_NAME = 200  # file systems allow 255 bytes, and a temporary name is longer
 # Signals of sensors as bytes of equal weight side by side, then LZ4: 57 % of the size for 0.03 s more per 91 MB; zstd: 55 % for 0.08 s.
 COMPRESSION, SIGNALS, COUNTER = "lz4", "BYTE_STREAM_SPLIT", "DELTA_BINARY_PACKED"
@@ -49,6 +50,8 @@ class GroupRecord:
         In the order of the row groups.
     samples : tuple of int
         Length of each episode.
+    prints : tuple of Print
+        What each episode is recognised by.
     """
 
     unit: str
@@ -56,6 +59,13 @@ class GroupRecord:
     file: str
     episodes: tuple[str, ...]
     samples: tuple[int, ...]
+    prints: tuple[Print, ...] = ()
+
+    @property
+    def recognised(self) -> list[tuple[EpisodeKey, Print]]:
+        """Episodes with their prints."""
+        keys = [EpisodeKey(self.unit, self.condition, episode) for episode in self.episodes]
+        return list(zip(keys, self.prints, strict=True)) if self.prints else []
 
 
 def group_file(unit: str, condition: str) -> str:
@@ -102,7 +112,8 @@ def write_group(population: Population, unit: str, condition: str, folder: Path 
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-    return GroupRecord(unit, condition, path.name, tuple(e for e, _ in written), tuple(n for _, n in written))
+    episodes, samples, prints = zip(*written, strict=True)
+    return GroupRecord(unit, condition, path.name, episodes, samples, prints)
 
 
 def write_index(population: Population, records: Iterable[GroupRecord], folder: Path | str) -> None:
@@ -114,16 +125,22 @@ def write_index(population: Population, records: Iterable[GroupRecord], folder: 
         Whose channels, units and metadata are stored; units without a record are left out.
     records : iterable of GroupRecord
     folder : Path
+
+    Raises
+    ------
+    DataError
+        An episode that is a copy of another one.
     """
     groups = [g for g in records if g.episodes]
     written = {g.unit for g in groups}
     check_structure(population.channels, [EpisodeKey(g.unit, g.condition, e) for g in groups for e in g.episodes])
+    refuse_copies(pair for g in groups for pair in g.recognised)
     content = {
         "sample_period_s": population.sample_period_s,
         "channels": population.channels,
         "units": [u for u in population.units if u.id in written],
         "metadata": population.metadata,
-        "groups": groups,
+        "groups": [{name: getattr(g, name) for name in _INDEXED} for g in groups],
     }
     save_artifact(Path(folder), INDEX, content)
 
@@ -173,20 +190,25 @@ def write_parquet(
 
 def _write_episodes(
     population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: OnNan, watch: RestWatch
-) -> Iterable[tuple[str, int]]:
+) -> Iterable[tuple[str, int, Print]]:
     from pyarrow import parquet
 
     names = [c.name for c in population.channels]
     schema = _schema(names)
     encoding = {"k": COUNTER, **dict.fromkeys(names, SIGNALS)}
-    options: dict[str, Any] = {"compression": COMPRESSION, "use_dictionary": list(KEYS), "write_statistics": False}
+    options: dict[str, Any] = {
+        "compression": COMPRESSION,
+        "use_dictionary": list(KEYS),
+        "write_statistics": False,
+        "write_page_checksum": True,
+    }
     with parquet.ParquetWriter(path, schema, column_encoding=encoding, **options) as writer:
         for key in keys:
             values = read_or_drop(population, key, on_nan)
             if values is not None:
                 watch.add(values)
                 writer.write_table(_table(key, values, schema), row_group_size=len(values))
-                yield key.episode, len(values)
+                yield key.episode, len(values), print_of(values, population.channels)
 
 
 def _schema(names: Sequence[str]) -> Any:

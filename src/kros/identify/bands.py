@@ -21,6 +21,7 @@ import numpy.typing as npt
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.errors import ConfigError, DimensionError
 from ..core.frequency import check_grid
+from ..core.loading import check_shapes, loader
 from ..core.lti import StateSpace
 from .bootstrap import ModelSamples
 from .edmd import KoopmanMatrices
@@ -64,9 +65,12 @@ class Bands:
         save_artifact(folder, "bands", {"unit_ids": self.unit_ids, "level": self.level}, arrays)
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> Bands:
         """Read what `save` wrote."""
         content, arrays = load_artifact(folder, "bands")
+        axes = {"freqs_hz": "f", "response": "ufnm", "entry": "ufnm", "spectral": "uf", "output_scale": "n", "input_scale": "m"}
+        check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         return cls(unit_ids=tuple(content["unit_ids"]), level=content["level"], **{name: arrays[name] for name in _ARRAYS})
 
 

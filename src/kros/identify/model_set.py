@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
+from ..core.loading import check_shapes, loader
 from ..core.lti import StateSpace
 from ..data.population import Channel, Role
 from ..lifting import Lifting
@@ -129,9 +130,13 @@ class ModelSet:
         save_artifact(folder, "model", content, arrays)
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> ModelSet:
         """Read what `save` wrote."""
         content, arrays = load_artifact(folder, "model")
+        n, m = len(content["states"]) + len(content["lifting"]), len(content["inputs"]) + len(content.get("input_functions", ()))
+        axes = {"A": "unn", "B": "unm", "residual_covariance": "unn", "output_scale": "n", "input_scale": "m"}
+        check_shapes(arrays, axes, {"u": len(content["unit_ids"]), "n": n, "m": m}, Path(folder))
         parameters = {k: np.array([v[u] for u in content["unit_ids"]], dtype=float) for k, v in content["parameters"].items()}
         return cls(
             name=content["name"],

@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.errors import IdentificationError
+from ..core.loading import loader
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -94,6 +95,7 @@ class PhaseCalibration:
         save_artifact(folder, "calibration", {"spec": self.spec, "lag_rad": self.lag_rad, "units": self.units})
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> PhaseCalibration:
         """Read what `save` wrote."""
         content, _ = load_artifact(folder, "calibration")

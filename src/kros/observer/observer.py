@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import plain, read_json, write_json
-from ..core.errors import DataError, DimensionError
+from ..core.errors import DimensionError
 from ..core.lti import StateSpace, gain
 from ..lifting import Lifting
 from ..synthesis.result import Injection
@@ -169,53 +168,22 @@ class Observer:
         """Estimate a batch of episodes; see `run_observer`."""
         return run_observer(self, y, u, parameters)
 
-    def save(self, path: Path) -> None:
-        """Write the observer as one JSON file that a person can read."""
-        content = {
-            "schema": 1,
-            "kind": "observer",
-            "name": self.name,
-            "states": self.lifting.states,
-            "lifting": self.lifting.functions,
-            **self.lifting.extension(),
-            "parameters": {k: self.parameters.get(k) for k in self.lifting.parameters},
-            "inputs": self.inputs,
-            "measured": self.measured,
-            "injection": self.injection,
-            "sample_period_s": self.sample_period_s,
-            "model": {"A": self.A, "B": self.B},
-            "controller": {key: getattr(self.controller, key) for key in "ABCD"},
-            **self.runtime.content(),
-        }
-        write_json(path, plain(content))
+    def save(self, path: Path | str) -> None:
+        """Write the observer as one JSON file that a person can read, with a checksum."""
+        from .file import write_observer
+
+        write_observer(self, Path(path))
 
     @classmethod
-    def load(cls, path: Path) -> Observer:
-        """Read what `save` wrote."""
-        content = read_json(path)
-        if not isinstance(content, dict) or (content.get("schema"), content.get("kind")) != (1, "observer"):
-            raise DataError(f"Loading an observer from {path}: not an observer file of schema 1; write it again with this version of kros.")
-        lifting = Lifting.from_content(content)
-        n, m, q = lifting.n_lifted, len(content["inputs"]) + len(lifting.input_functions), len(content["measured"])
-        injection, dt = Injection(content["injection"]), content["sample_period_s"]
-        width = m if injection is Injection.INPUT else n
-        raw = {key: np.asarray(value, dtype=float) for key, value in content["controller"].items()}
-        order = raw["A"].shape[0]
-        controller = StateSpace(
-            raw["A"].reshape(order, order), raw["B"].reshape(order, q), raw["C"].reshape(width, order), raw["D"].reshape(width, q), dt
-        )
-        model = {key: np.asarray(value, dtype=float) for key, value in content["model"].items()}
-        defaults = {k: v for k, v in content["parameters"].items() if v is not None}
-        return cls(
-            content["name"],
-            lifting,
-            model["A"],
-            model["B"],
-            tuple(content["measured"]),
-            tuple(content["inputs"]),
-            controller,
-            injection,
-            dt,
-            defaults,
-            Runtime.from_content(content),
-        )
+    def load(cls, path: Path | str) -> Observer:
+        """Read what `save` wrote, or what was written by hand in the same form.
+
+        Raises
+        ------
+        DataError
+            The content does not fit its checksum; a key is missing, unknown or of the wrong kind; a matrix has another shape, or an entry that is
+            not a finite number; names repeat; an index or the period is out of range.
+        """
+        from .file import read_observer
+
+        return read_observer(Path(path))

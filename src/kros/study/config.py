@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from ..core.errors import ConfigError
+from ..core.files import parse_toml, read_toml, shortened
 from ..lifting import check_family
 
 FORMS = Literal[
@@ -39,7 +40,7 @@ class Stage(str, Enum):
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class DataConfig(_Section):
@@ -52,6 +53,13 @@ class DataConfig(_Section):
     on_nan: Literal["error", "drop_episode"] = "error"
     prepare: tuple[dict[str, Any], ...] = ()
     csv: dict[str, Any] | None = None
+
+    @field_validator("source")
+    @classmethod
+    def _nameable(cls, value: Path) -> Path:
+        if "\0" in str(value):
+            raise ValueError("data.source should be a path, without NUL")
+        return value
 
 
 class SplitConfig(_Section):
@@ -240,7 +248,7 @@ class StudyConfig(_Section):
         return self.model_dump(mode="json")
 
 
-def load_config(path: Path, overrides: Sequence[str] = ()) -> StudyConfig:
+def load_config(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
     """Read a study file and apply ``KEY=VALUE`` overrides such as ``identify.alpha=90``.
 
     Raises
@@ -248,12 +256,8 @@ def load_config(path: Path, overrides: Sequence[str] = ()) -> StudyConfig:
     ConfigError
         When the file is missing, not TOML, or holds unknown keys or values out of range.
     """
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"Study: there is no file {path}; write one with [data] source and reader.") from error
-    except (IsADirectoryError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"Study {path}: not a TOML file ({error}); see the smallest study in the README.") from error
+    path = Path(path)
+    raw = read_toml(path, "Study")
     for override in overrides:
         _apply(raw, override)
     raw.setdefault("name", path.stem)
@@ -262,20 +266,43 @@ def load_config(path: Path, overrides: Sequence[str] = ()) -> StudyConfig:
 
 def validate_config(raw: dict[str, Any], base: Path, origin: str = "study") -> StudyConfig:
     """Validate a study given as nested tables; a relative source is relative to `base`."""
-    try:
-        config = StudyConfig.model_validate(raw)
-    except ValidationError as error:
-        problems = "; ".join(f"{'.'.join(str(p) for p in e['loc'])}: {_explain(e)}" for e in error.errors())
-        raise ConfigError(f"Study {origin}: {problems}.") from error
+    config = _validated(raw, f"Study {origin}")
     source = (base / config.data.source).resolve()
     return config.model_copy(update={"data": config.data.model_copy(update={"source": source})})
+
+
+def stored_config(raw: Any, path: Path) -> StudyConfig:
+    """Return the resolved study of a run folder.
+
+    Raises
+    ------
+    ConfigError
+        Damaged, or of another version of kros.
+    """
+    try:
+        return _validated(raw, f"Run {path.parent}: {path.name}")
+    except ConfigError as error:
+        raise ConfigError(f"{error} It is damaged, or of another version of kros; run the study again.") from error
+
+
+def _validated(raw: Any, origin: str) -> StudyConfig:
+    """Validate, with every problem in one message."""
+    try:
+        return StudyConfig.model_validate(raw)
+    except ValidationError as error:
+        problems = "; ".join(f"{'.'.join(str(p) for p in e['loc'])}: {_explain(e)}" for e in error.errors())
+        raise ConfigError(f"{origin}: {shortened(problems, 2000)}.") from error
+    except (TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, RecursionError) as error:  # of a family's arguments
+        raise ConfigError(
+            f"{origin}: {type(error).__name__}: {shortened(str(error))}; check the values of [[lifting.families]]."
+        ) from error
 
 
 def _explain(error: Any) -> str:
     if error["type"] == "extra_forbidden":
         return "unknown key; check the spelling against the documentation"
     found = error.get("input")
-    return f"{error['msg'].lower()}, found {found!r}" if not isinstance(found, dict) else error["msg"].lower()
+    return f"{error['msg'].lower()}, found {shortened(repr(found))}" if not isinstance(found, dict) else error["msg"].lower()
 
 
 def _apply(raw: dict[str, Any], override: str) -> None:
@@ -283,9 +310,11 @@ def _apply(raw: dict[str, Any], override: str) -> None:
     if not separator or not key.strip():
         raise ConfigError(f"--set {override!r}: should look like KEY=VALUE, for example identify.alpha=90.")
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
+        value = parse_toml(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"--set {shortened(override)!r}: {shortened(str(error))}; correct the value.") from error
     *tables, last = key.strip().split(".")
     table = raw
     for name in tables:

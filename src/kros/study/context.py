@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from ..core.artifacts import load_artifact
-from ..core.errors import DataError
+from ..core.loading import loader
 from ..data.population import OUTLIERS, EpisodeKey, Population
 from ..identify import ModelSet, PhaseSpec
 from ..lifting import Lifting
@@ -141,6 +141,8 @@ class Facts:
         Quantisation step found in every measured channel.
     dropped : tuple of str
         Episodes that were left out, with the reason.
+    alerts : tuple of str
+        What looks wrong in the recordings without making them unusable.
     """
 
     recordings: Path
@@ -150,6 +152,7 @@ class Facts:
     test: tuple[EpisodeKey, ...]
     resolution: dict[str, float]
     dropped: tuple[str, ...] = ()
+    alerts: tuple[str, ...] = ()
 
     @property
     def pooled(self) -> tuple[str, ...]:
@@ -161,6 +164,7 @@ class Facts:
         return tuple(k for k in getattr(self, part) if unit in (None, k.unit) and condition in (None, k.condition))
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> Facts:
         """Read what the read stage wrote."""
         content, _ = load_artifact(folder, "facts")
@@ -168,15 +172,13 @@ class Facts:
         def keys(rows: list[list[str]]) -> tuple[EpisodeKey, ...]:
             return tuple(EpisodeKey(*row) for row in rows)
 
-        try:
-            return cls(
-                Path(content["recordings"]),
-                content["identify_on"],
-                content["groups"],
-                keys(content["train"]),
-                keys(content["test"]),
-                content["resolution"],
-                tuple(content["dropped"]),
-            )
-        except KeyError as error:
-            raise DataError(f"Loading the facts of {folder}: {error} is missing; run the study again.") from error
+        return cls(
+            Path(content["recordings"]),
+            content["identify_on"],
+            content["groups"],
+            keys(content["train"]),
+            keys(content["test"]),
+            content["resolution"],
+            tuple(content["dropped"]),
+            tuple(content.get("alerts", ())),
+        )

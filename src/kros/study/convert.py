@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import ConfigError
+from ..core.files import read_toml
 from ..data import Population, check_population, open_population, read_parquet, write_group, write_index
 from ..data.folders import whole_folder
 from ..data.readers import detect_reader
@@ -19,10 +18,7 @@ Task = tuple[Population, str, str, Path]
 
 def read_mapping(path: Path) -> dict[str, Any]:
     """Read a CSV mapping from TOML."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"--mapping {path}: not a readable TOML file ({error}); see the documentation of CSV mappings.") from error
+    return read_toml(path, "--mapping")
 
 
 def write_one(task: Task) -> GroupRecord:

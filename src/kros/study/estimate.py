@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import ConfigError, DataError, IdentificationError
+from ..core.files import read_toml
 from ..data import Population, open_population, split_episodes
 from ..data.population import EpisodeKey
 from ..evaluate import EpisodeBatch
@@ -30,10 +30,7 @@ def open_data(config: StudyConfig, data: Path) -> Population:
     data = Path(data)
     section = config.data
     if data.is_file():
-        try:
-            raw = tomllib.loads(data.read_text(encoding="utf-8"))
-        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise ConfigError(f"DATA {data}: neither a folder of recordings nor a TOML file ({error}).") from error
+        raw = read_toml(data, "DATA is no folder of recordings, and")
         section = validate_config({"data": raw.get("data", {})}, data.parent, str(data)).data
     else:
         section = section.model_copy(update={"source": data})
@@ -131,7 +128,7 @@ def _write(out: Path, population: Population, observer: Observer, units: dict[st
     out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.partial")
     try:
-        with parquet.ParquetWriter(temporary, schema) as writer:
+        with parquet.ParquetWriter(temporary, schema, write_page_checksum=True) as writer:
             for start in range(0, len(population.episodes), _BATCH):
                 keys = population.episodes[start : start + _BATCH]
                 batch = EpisodeBatch.read(population, keys)

@@ -45,6 +45,8 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
         "sample_period_s": context.population.sample_period_s,
         "channels": {c.name: c.unit for c in context.population.channels},
     }
+    if facts.alerts:
+        study["alerts"] = facts.alerts
     if Stage.IDENTIFY in done:
         study["alpha"] = context.models(context.edmd_names[0]).alpha
     if Stage.SYNTHESIZE in done:

@@ -7,12 +7,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from ..core.artifacts import read_json
 from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.locks import locked
-from .config import Stage, StudyConfig
+from .config import Stage, StudyConfig, stored_config
 from .store import BOOKKEEPING, Store
 
 STUDY = "study.json"
@@ -128,9 +126,4 @@ def load_run(folder: Path) -> tuple[StudyConfig, Store]:
     folder = Path(folder)
     if not (folder / STUDY).exists():
         raise ConfigError(f"Run {folder}: there is no {STUDY} in it; name the folder that kros run or kros demo wrote.")
-    try:
-        return StudyConfig.model_validate(_read_study(folder)), Store(folder)
-    except ValidationError as error:
-        raise ConfigError(
-            f"Run {folder}: its {STUDY} is of another version of kros ({error.errors()[0]['msg']}); run the study again."
-        ) from error
+    return stored_config(_read_study(folder), folder / STUDY), Store(folder)

@@ -10,6 +10,7 @@ def summary_lines(result: RunResult) -> list[str]:
     metrics = result.metrics
     study = metrics["study"]
     lines = [f"{study['units']} units, conditions {', '.join(study['conditions'])}, {metrics['timing_s']['total']:.1f} s in all"]
+    lines += [f"look at: {alert}" for alert in study.get("alerts", ())]
     lines += observer_lines(result)
     flagged = sorted({f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]})
     if "outliers" in metrics:

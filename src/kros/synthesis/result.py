@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.artifacts import load_artifact, save_artifact
+from ..core.loading import loader
 from ..core.lti import StateSpace
 
 
@@ -105,6 +106,7 @@ class Synthesis:
         save_artifact(Path(folder), "synthesis", {**content, "dt": self.controller.dt}, arrays)
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> Synthesis:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "synthesis")

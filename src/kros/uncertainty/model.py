@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
+from ..core.loading import check_shapes, loader
 from ..core.lti import StateSpace
 from .forms import Form
 from .quantified import Quantified
@@ -82,9 +83,12 @@ class UncertainModel(Quantified):
         save_artifact(Path(folder), "uncertain_model", content, arrays)
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> UncertainModel:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "uncertain_model")
+        axes = {"freqs_hz": "f", "nominal_C": "pN", "nominal_D": "pm", "output_scale": "p", "input_scale": "m"}
+        check_shapes(arrays, axes, {}, Path(folder))
         dt = content["sample_period_s"]
         weight, cover = _unpack_weight("weight", content["weight"], arrays, dt)
         remainder, remainder_cover = (

@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError
+from ...core.files import shortened
+from ..checks import check_period
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit
 from ..prepare import Recorded, assemble
 from ..recording import Recording, look_up, title
@@ -79,8 +81,7 @@ def from_arrays(
     >>> from_arrays({"a": [np.eye(4, 2)], "b": [np.eye(4, 2)]}, channels, 0.01).unit_ids
     ('a', 'b')
     """
-    if not sample_period_s > 0:
-        raise DataError(f"A population needs a sampling period above zero, found {sample_period_s} s; give it in seconds.")
+    check_period(sample_period_s, "from_arrays")
     order = sorted(range(len(channels)), key=lambda i: channels[i].role is Role.INPUT)
     pairs = list(_episodes(data))
     values = {key: np.ascontiguousarray(_samples(key, episode, channels)[:, order]) for key, episode in pairs}
@@ -91,8 +92,28 @@ def from_arrays(
     return assemble(Recorded(ordered, found, [key for key, _ in pairs], ArrayRecordings(values), sample_period_s, dict(metadata or {})))
 
 
+def as_numbers(values: Any) -> npt.NDArray[np.float64]:
+    """Return an array of doubles; text, complex numbers and dates are refused rather than converted.
+
+    Raises
+    ------
+    TypeError, ValueError, OverflowError
+        With the reason.
+    """
+    found = np.asarray(values)
+    kind = found.dtype.kind
+    if kind not in "biufO" or (kind == "O" and any(isinstance(v, (str, bytes, complex)) for v in found.ravel().tolist())):
+        raise TypeError(f"{'text or complex numbers' if kind == 'O' else found.dtype} cannot be used as real numbers")
+    return np.asarray(found, dtype=float)
+
+
 def _named(items: Any) -> Iterator[tuple[Any, Any]]:
-    yield from items.items() if isinstance(items, Mapping) else ((str(i), item) for i, item in enumerate(items))
+    if isinstance(items, Mapping):
+        yield from items.items()
+    elif isinstance(items, Iterable) and not isinstance(items, str | bytes) and getattr(items, "shape", True):
+        yield from ((str(i), item) for i, item in enumerate(items))
+    else:
+        raise DataError(f"from_arrays needs mappings or lists of episodes, found {shortened(repr(items))}; see its documentation.")
 
 
 def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
@@ -108,9 +129,9 @@ def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
 
 def _samples(key: EpisodeKey, episode: Any, channels: Sequence[Channel]) -> npt.NDArray[np.float64]:
     try:
-        parts = [np.asarray(part, dtype=float) for part in (episode if isinstance(episode, tuple) else (episode,))]
+        parts = [as_numbers(part) for part in (episode if isinstance(episode, tuple) else (episode,))]
         values = parts[0] if len(parts) == 1 else np.column_stack(parts)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(
             f"{title(key)}: needs numbers of shape (n_samples, {len(channels)}), found something else ({error}); correct the array."
         ) from error

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import DataError
+from ..checks import check_names
 from ..csvfile import Dialect, first_fields, read_columns
 from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Unit
 from ..prepare import Recorded, assemble
@@ -94,6 +95,7 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
                 raise DataError(
                     f"Duplicate episodes: {key} is in {places[key].path} and in {path}; name more groups in files, or exclude one."
                 )
+            check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
             places[key] = _place(path, fields, chosen, unit)
             group = found.get("group") or ""
             if groups.setdefault(key.unit, group) != group:

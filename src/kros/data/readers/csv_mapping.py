@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import ConfigError
+from ...core.files import read_toml
 from ..population import Channel, Role
 from ..recording import TIME_TOLERANCE
 from ..steps import Scale, Step, parse_steps
@@ -117,9 +118,11 @@ class CsvMapping:
                 f"CSV mapping: give one of time and sample_period_s, found time = {self.time!r}, sample_period_s = "
                 f"{self.sample_period_s!r}."
             )
-        if len(self.delimiter) != 1 or len(self.decimal) != 1 or self.delimiter == self.decimal:
+        self._check_numbers()
+        if not (_is_mark(self.delimiter) and _is_mark(self.decimal)) or self.delimiter == self.decimal:
             found = f"delimiter = {self.delimiter!r}, decimal = {self.decimal!r}"
-            raise ConfigError(f"CSV mapping: delimiter and decimal should be two different characters, found {found}; correct them.")
+            wanted = "two different characters of ASCII that stand in no number otherwise"
+            raise ConfigError(f"CSV mapping: delimiter and decimal should be {wanted}, found {found}; correct them.")
         if self.skip < 0:
             raise ConfigError(f"CSV mapping: skip should be zero or more lines, found {self.skip}; correct it.")
         if not self.channel:
@@ -128,10 +131,22 @@ class CsvMapping:
         self._check_pattern("exclude")
         self._check_columns()
 
+    def _check_numbers(self) -> None:
+        """Refuse what no time and no scale can be."""
+        periods = {} if self.sample_period_s is None else {"sample_period_s": self.sample_period_s}
+        for name, value in {**periods, "time_scale": self.time_scale, "time_tolerance": self.time_tolerance}.items():
+            if not 0 < value < math.inf:
+                raise ConfigError(f"CSV mapping: {name} should be a number above zero, found {value}; correct it.")
+        for channel in self.channel:
+            if not math.isfinite(channel.scale) or channel.scale == 0:
+                raise ConfigError(
+                    f"CSV mapping: the scale of channel {channel.name!r} should be finite and not zero, found {channel.scale}."
+                )
+
     def _check_pattern(self, name: str) -> None:
         try:
             found = re.compile(getattr(self, name) or "").groupindex
-        except re.error as error:
+        except (re.error, RecursionError, OverflowError) as error:
             raise ConfigError(
                 f"CSV mapping: {name} = {getattr(self, name)!r} is not a regular expression ({error}); correct it."
             ) from error
@@ -184,6 +199,10 @@ class CsvMapping:
         return unit.columns.get(channel.name, channel.column)
 
 
+def _is_mark(text: str) -> bool:
+    return len(text) == 1 and text.isascii() and not text.isalnum() and text not in '"+-\r\n\0'
+
+
 def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMapping:
     """Return a mapping from a TOML file or a table with the same keys.
 
@@ -195,12 +214,7 @@ def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMap
         return mapping
     if isinstance(mapping, Mapping):
         return build(CsvMapping, _with_columns(mapping), "CSV mapping")
-    try:
-        return build(CsvMapping, _with_columns(tomllib.loads(Path(mapping).read_text(encoding="utf-8"))), f"CSV mapping {mapping}")
-    except OSError as error:
-        raise ConfigError(f"CSV mapping {mapping}: cannot be read ({error}); give the path of a TOML file.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"CSV mapping {mapping}: not valid TOML ({error}); correct it.") from error
+    return build(CsvMapping, _with_columns(read_toml(Path(mapping), "CSV mapping")), f"CSV mapping {mapping}")
 
 
 def _with_columns(table: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -208,11 +222,12 @@ def _with_columns(table: Mapping[str, Any]) -> Mapping[str, Any]:
     channels, units = table.get("channel"), table.get("unit")
     if not isinstance(channels, (list, tuple)) or not isinstance(units, (list, tuple)):
         return table
-    names = {c.get("name") for c in channels if isinstance(c, Mapping)}
+    names = {c["name"] for c in channels if isinstance(c, Mapping) and isinstance(c.get("name"), str)}
     return {**table, "unit": [_unit_table(u, names - {"suffix", "columns"}) if isinstance(u, Mapping) else u for u in units]}
 
 
 def _unit_table(unit: Mapping[str, Any], names: set[Any]) -> dict[str, Any]:
     beside = {key: value for key, value in unit.items() if key in names}
     rest = {key: value for key, value in unit.items() if key not in names}
-    return rest if not beside else {**rest, "columns": {**rest.get("columns", {}), **beside}}
+    columns = rest.get("columns", {})
+    return rest if not beside or not isinstance(columns, Mapping) else {**rest, "columns": {**columns, **beside}}

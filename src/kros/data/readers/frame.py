@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ...core.errors import DataError, MissingDependencyError
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit
 from ..prepare import Recorded, assemble
-from .arrays import ArrayRecordings
+from .arrays import ArrayRecordings, as_numbers
 
 
 def from_frame(
@@ -60,11 +60,15 @@ def from_frame(
         raise DataError(f"from_frame needs one of time and sample_period_s, found time = {time!r}, sample_period_s = {sample_period_s!r}.")
     ordered = tuple(sorted(channels, key=lambda c: c.role is Role.INPUT))
     required = [unit, *([] if time is None else [time]), *(c.name for c in ordered)]
-    missing = [name for name in required if name not in frame.columns]
+    columns = list(frame.columns)
+    missing = [name for name in required if name not in columns]
     if missing:
         raise DataError(
             f"from_frame: column {missing[0]!r} is missing, found {list(frame.columns)}; rename a column or correct the channels."
         )
+    twice = [name for name in (*required, condition, episode) if name is not None and columns.count(name) > 1]
+    if twice:
+        raise DataError(f"from_frame: column {twice[0]!r} occurs {columns.count(twice[0])} times in {columns}; rename or drop the others.")
     n = len(frame)
     ids = (
         np.column_stack([_ids(frame, unit, ""), _ids(frame, condition, DEFAULT_CONDITION), _ids(frame, episode, "0")])
@@ -114,10 +118,20 @@ def _ids(frame: Any, column: str | None, default: str) -> npt.NDArray[np.object_
 
 
 def _numbers(frame: Any, names: list[str]) -> npt.NDArray[np.float64]:
+    if not names:
+        return np.empty((len(frame), 0))
+    return np.column_stack([_column(frame[name], name) for name in names])
+
+
+def _column(column: Any, name: str) -> npt.NDArray[np.float64]:
     try:
-        return np.ascontiguousarray(frame[names].to_numpy(dtype=float))
-    except (TypeError, ValueError) as error:
-        raise DataError(f"from_frame: columns {names} should hold numbers ({error}); convert them.") from error
+        if column.dtype.kind in "OMmSU":
+            return as_numbers(column.to_numpy())
+        if column.dtype.kind not in "biuf":
+            raise TypeError(f"{column.dtype} cannot be used as real numbers")
+        return np.asarray(column.to_numpy(dtype=float, na_value=np.nan))
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DataError(f"from_frame: column {name!r} should hold numbers ({error}); convert it.") from error
 
 
 def _runs(ids: npt.NDArray[np.object_]) -> Iterator[tuple[EpisodeKey, slice]]:

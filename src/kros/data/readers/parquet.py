@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,15 +10,19 @@ from typing import Any
 
 import numpy as np
 
+from ...core import limits
 from ...core.artifacts import load_artifact
 from ...core.errors import DataError
+from ...core.files import require_regular, shortened
 from ..arrow import fill
+from ..checks import check_period
 from ..population import Channel, EpisodeKey, Population, Role, Unit
 from ..prepare import Recorded, assemble
 from ..recording import Recording, look_up
 from ..steps import Step
 
 INDEX = "population"  # kind of the artifact, hence population.json
+KEYS = ("unit", "condition", "episode")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,28 +35,57 @@ class ParquetRecordings:
 
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode."""
-        import pyarrow as pa
-        from pyarrow import parquet
-
         name, group, samples = look_up(self.places, key)
         path = Path(self.folder) / name
+        require_regular(path, sys.maxsize)
         try:
-            with parquet.ParquetFile(path, memory_map=True) as file:
-                table = file.read_row_group(group, columns=list(self.columns), use_threads=False)
+            table = _read_group(path, group, samples, [*KEYS, *self.columns])
             values = np.empty((table.num_rows, len(self.columns)))
             for column, channel in enumerate(self.columns):
                 fill(values[:, column], table.column(channel))
-        except (OSError, pa.ArrowInvalid, KeyError, IndexError) as error:
-            raise DataError(f"Reading {key} from {path}: {error}; convert the recordings again.") from error
-        if len(values) != samples:
-            raise DataError(
-                f"Reading {key} from {path}: {samples} samples are expected, found {len(values)}; convert the recordings again."
-            )
+            table.select(KEYS).validate(full=True)
+            for label, expected in zip(KEYS, (key.unit, key.condition, key.episode), strict=True):
+                _check_label(table.column(label), label, expected, path)
+        except DataError:
+            raise
+        except (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError, MemoryError) as error:  # and Arrow's own
+            raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; convert the recordings again.") from error
         return Recording(key, values)
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> ParquetRecordings:
         """Return the same for fewer episodes, cheaper to send to another process."""
         return replace(self, places={key: self.places[key] for key in keys})
+
+
+def _read_group(path: Path, group: int, samples: int, columns: list[str]) -> Any:
+    """Read one row group after its length and the types of its columns, pages against their checksums."""
+    from pyarrow import parquet
+
+    with parquet.ParquetFile(path, memory_map=True, page_checksum_verification=True) as file:
+        found = file.metadata.row_group(group).num_rows
+        if found != samples:
+            raise DataError(
+                f"Reading {path}: {samples} samples are expected in row group {group}, found {found}; convert the recordings again."
+            )
+        if samples > limits.MAX_SAMPLES:
+            raise DataError(f"Reading {path}: an episode has {samples} samples; cut it, or raise MAX_SAMPLES in kros.core.limits.")
+        schema = file.schema_arrow
+        for name in columns:
+            kind = str(schema.field(name).type)
+            if (name in KEYS and "string" not in kind) or (name not in KEYS and kind != "double"):
+                wanted = "text" if name in KEYS else "numbers of type double"
+                raise DataError(f"Reading {path}: column {name!r} should hold {wanted}, found {kind}; convert the recordings again.")
+        return file.read_row_group(group, columns=columns, use_threads=False)
+
+
+def _check_label(column: Any, name: str, expected: str, path: Path) -> None:
+    """Refuse samples that say they belong to something else than the index says."""
+    found = column.unique().to_pylist()
+    if found != [expected]:
+        raise DataError(
+            f"Reading {path}: the index says {name} {expected!r}, the samples say {shortened(repr(found))}; files were renamed or exchanged, convert "
+            "the recordings again."
+        )
 
 
 def read_parquet(folder: Path | str, prepare: Iterable[Step] = ()) -> Population:
@@ -75,11 +109,16 @@ def read_parquet(folder: Path | str, prepare: Iterable[Step] = ()) -> Population
     """
     content, _ = load_artifact(Path(folder), INDEX)
     try:
-        channels = tuple(Channel(c["name"], Role(c["role"]), c["unit"], c["measured"]) for c in content["channels"])
-        units = [Unit(u["id"], u["group"], u["metadata"]) for u in content["units"]]
+        channels = tuple(Channel(c["name"], Role(c["role"]), _text(c["unit"]), c["measured"] is True) for c in content["channels"])
+        units = [Unit(_text(u["id"]), _text(u["group"]), dict(u["metadata"])) for u in content["units"]]
         places = _places(content["groups"])
-        period, metadata = float(content["sample_period_s"]), content["metadata"]
-    except (KeyError, TypeError, ValueError) as error:
+        period, metadata = (
+            check_period(content["sample_period_s"], f"Reading {Path(folder) / 'population.json'}"),
+            dict(content["metadata"]),
+        )
+    except DataError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise DataError(
             f"Reading {Path(folder) / 'population.json'}: not as kros writes it ({error!r}); convert the recordings again."
         ) from error
@@ -91,8 +130,22 @@ def read_parquet(folder: Path | str, prepare: Iterable[Step] = ()) -> Population
 
 
 def _places(groups: Iterable[Mapping[str, Any]]) -> dict[EpisodeKey, tuple[str, int, int]]:
-    return {
-        EpisodeKey(g["unit"], g["condition"], episode): (g["file"], row_group, samples)
-        for g in groups
-        for row_group, (episode, samples) in enumerate(zip(g["episodes"], g["samples"], strict=True))
-    }
+    places: dict[EpisodeKey, tuple[str, int, int]] = {}
+    for g in groups:
+        unit, condition, name = _text(g["unit"]), _text(g["condition"]), _text(g["file"])
+        if name in ("", ".", "..") or Path(name).name != name:
+            raise ValueError(f"the file {name!r} is not beside the index")
+        for row_group, (episode, samples) in enumerate(zip(g["episodes"], g["samples"], strict=True)):
+            key = EpisodeKey(unit, condition, _text(episode))
+            if key in places:
+                raise ValueError(f"{key} occurs twice")
+            if type(samples) is not int or samples < 0:
+                raise TypeError(f"{samples!r} is no number of samples")
+            places[key] = name, row_group, samples
+    return places
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} should be text")
+    return value

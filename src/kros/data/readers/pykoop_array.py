@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit
-from .arrays import from_arrays
+from .arrays import as_numbers, from_arrays
 
 log = logging.getLogger(__name__)
 _EXACT = 2.0**53
@@ -56,7 +56,12 @@ def from_pykoop(
     DataError
         Wrong sizes, or episodes that are not whole numbers.
     """
-    arrays = {str(u): np.asarray(x) for u, x in X.items()} if isinstance(X, Mapping) else {"0": np.asarray(X)}
+    try:
+        arrays = {str(u): np.asarray(x) for u, x in X.items()} if isinstance(X, Mapping) else {"0": np.asarray(X)}
+    except (TypeError, ValueError, RecursionError) as error:
+        raise DataError(
+            f"from_pykoop: needs an array (n_samples, n_columns) a unit, found something else ({error}); correct it."
+        ) from error
     if not arrays:
         raise DataError("from_pykoop: the mapping is empty; give one array per unit.")
     widths = sorted({x.shape[-1] if x.ndim == 2 else -1 for x in arrays.values()})
@@ -142,6 +147,6 @@ def _episodes(unit: str, column: npt.NDArray[Any]) -> list[str]:
 
 def _numbers(unit: str, x: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     try:
-        return np.asarray(x, dtype=float)
-    except (TypeError, ValueError) as error:
+        return as_numbers(x)
+    except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"from_pykoop: states and inputs of unit {unit} should be numbers ({error}); convert them.") from error

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
+from ...core.loading import check_shapes, loader
 from ..edmd import KoopmanMatrices
 
 Array = npt.NDArray[np.float64]
@@ -90,9 +91,20 @@ class RefinedModels:
         save_artifact(folder, "refinement", content, arrays)
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> RefinedModels:
         """Read what `save` wrote."""
         content, arrays = load_artifact(folder, "refinement")
+        axes = {
+            "units_A": "unn",
+            "units_B": "unm",
+            "pooled_A": "nn",
+            "pooled_B": "nm",
+            "strengths": "u",
+            "information": "uPP",
+            "spectral_radius": "u",
+        }
+        check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         return cls(
             unit_ids=tuple(content["unit_ids"]),
             units=KoopmanMatrices(arrays["units_A"], arrays["units_B"]),

@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
+from ...core.loading import loader
 from ..observer import Observer
 from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, without_measurement
 from .ladder import MOST_CORNERS, frozen_gain, mismatch_gain, prove
@@ -113,6 +114,7 @@ class ReliftCertificate:
         save_artifact(Path(folder), "relift", content, arrays)
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> ReliftCertificate:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "relift")

@@ -24,7 +24,8 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section:
         text += f"Filed as outliers and kept out of everything pooled: {', '.join(filed)}. "
     if facts.get("dropped"):
         text += f"Left out for bad samples: {', '.join(facts['dropped'])}."
-    return Section("recordings", "Recordings", [text], [t for t in [_channels(run)] if t], ["signals", "tracking_spectrum"])
+    alerts = [f"Look at this first: {alert}" for alert in facts.get("alerts", ())]
+    return Section("recordings", "Recordings", [*alerts, text], [t for t in [_channels(run)] if t], ["signals", "tracking_spectrum"])
 
 
 def _where(condition: str) -> str:

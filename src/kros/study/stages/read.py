@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,17 +17,20 @@ from ...data import (
     check_population,
     open_population,
     read_parquet,
-    scan_population,
     split_episodes,
     write_group,
     write_index,
 )
+from ...data.alerts import period_alerts
+from ...data.checks import scan_prints
+from ...data.copies import Print, refuse_copies
 from ...data.population import DEFAULT_CONDITION
 from ...data.writers import GroupRecord
 from ..config import StudyConfig
 from ..context import Context
 from ..presets import resolve_lifting, resolve_phase
 
+log = logging.getLogger(__name__)
 PARQUET = "parquet"
 
 
@@ -50,6 +54,8 @@ class GroupFacts:
     record: GroupRecord | None
     episodes: tuple[str, ...]
     resolution: dict[str, float]
+    prints: list[tuple[EpisodeKey, Print]]
+    alerts: tuple[str, ...]
 
 
 def open_source(config: StudyConfig) -> Population:
@@ -82,17 +88,19 @@ def check_source(config: StudyConfig, single_allowed: bool) -> None:
 def read_group(task: GroupTask) -> GroupFacts:
     """Read, check and, where asked, write one unit and condition."""
     if task.folder is None:
-        population = scan_population(task.population.select([task.unit], [task.condition]), on_nan=task.on_nan)
-        episodes = tuple(k.episode for k in population.keys(task.unit, task.condition))
+        prints = scan_prints(task.population.select([task.unit], [task.condition]), on_nan=task.on_nan)
         record = None
     else:
         record = write_group(task.population, task.unit, task.condition, task.folder, task.on_nan)
-        episodes, population = record.episodes, task.population
+        prints = record.recognised
+    population, episodes = task.population, tuple(key.episode for key, _ in prints)
     if not episodes:
         raise DataError(f"Unit {task.unit} ({task.condition}): every episode was dropped; fix the source or leave the unit out.")
     first = population.read(EpisodeKey(task.unit, task.condition, episodes[0]))
     names = population.states + population.inputs
-    return GroupFacts(task.unit, task.condition, record, episodes, {m: resolution(first[:, names.index(m)]) for m in population.measured})
+    steps = {m: resolution(first[:, names.index(m)]) for m in population.measured}
+    alerts = period_alerts(first, population.channels, population.sample_period_s)
+    return GroupFacts(task.unit, task.condition, record, episodes, steps, prints, alerts)
 
 
 def resolution(signal: npt.NDArray[np.float64]) -> float:
@@ -116,6 +124,7 @@ def run(context: Context) -> None:
         write_index(population, records, folder)
         kept = read_parquet(folder)
     else:
+        refuse_copies(pair for f in found for pair in f.prints)
         present = {(f.unit, f.condition, e) for f in found for e in f.episodes}
         kept = population
         if any((k.unit, k.condition, k.episode) not in present for k in population.episodes):
@@ -127,6 +136,9 @@ def save_facts(context: Context, kept: Population, found: list[GroupFacts], aske
     """Write what all later stages need to know about the recordings."""
     splits = split_episodes(kept, context.config.split.test)
     steps = {m: min(f.resolution[m] for f in found) for m in kept.measured}
+    alerts = list(dict.fromkeys(alert for f in found for alert in f.alerts))
+    for alert in alerts:
+        log.warning("%s", alert)
     content = {
         "recordings": "recordings" if kept is not asked else context.config.data.source,
         "identify_on": _identify_on(context.config, kept),
@@ -134,6 +146,7 @@ def save_facts(context: Context, kept: Population, found: list[GroupFacts], aske
         "train": [[k.unit, k.condition, k.episode] for s in splits.values() for k in s.train],
         "test": [[k.unit, k.condition, k.episode] for s in splits.values() for k in s.test],
         "resolution": steps,
+        "alerts": alerts,
         "dropped": [str(k) for k in asked.episodes if k not in set(kept.episodes)],
     }
     save_artifact(context.store.draft("population"), "facts", content)

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
+from ...core.loading import loader
 from ..weights.cover import Structure
 from ..weights.weight import Residuals, fit_weight
 from .magnitude import _FLOOR, FittedMagnitude, Side, _Problem, fit_magnitude
@@ -43,6 +44,7 @@ class Tightness:
         save_artifact(Path(folder), "tightness", vars(self))
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> Tightness:
         """Read what `save` wrote."""
         content, _ = load_artifact(Path(folder), "tightness")

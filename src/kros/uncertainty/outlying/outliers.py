@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, DataError, DimensionError
+from ...core.loading import check_shapes, loader
 from ..forms import Form, as_form
 from ..residuals import check_responses
 from .distances import Distances, balance, distances, largest_entries
@@ -162,9 +163,12 @@ class OutlierModel:
         save_artifact(Path(folder), "outlier_model", content, {name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> OutlierModel:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "outlier_model")
+        axes = {"freqs_hz": "f", "responses": "ufpm", "output_scale": "p", "input_scale": "m", "by_nominal_db": "sn"}
+        check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         threshold = float("inf") if content["threshold_db"] is None else content["threshold_db"]
         scores = tuple(OutlierScore(**{**s, "threshold_db": threshold, "entry": tuple(s["entry"])}) for s in content["scores"])
         return cls(

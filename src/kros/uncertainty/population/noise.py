@@ -25,6 +25,7 @@ import numpy.typing as npt
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.frequency import check_grid
+from ...core.loading import check_shapes, loader
 from ...core.lti import StateSpace
 from ...identify import KoopmanMatrices, ModelSamples
 from ..forms import Form, as_form, residual
@@ -90,9 +91,12 @@ class VariationAndNoise:
         save_artifact(Path(folder), "variation_and_noise", content, {name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> VariationAndNoise:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "variation_and_noise")
+        axes = {"freqs_hz": "f", "residual": "uf", "band": "uf", "total": "f", "noise": "f"}
+        check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         return cls(
             form=Form(content["form"]),
             unit_ids=tuple(content["unit_ids"]),

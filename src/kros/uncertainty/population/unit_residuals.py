@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import DimensionError
+from ...core.loading import check_shapes, loader
 from ..fits.magnitude import fit_magnitude
 from ..forms import Form, residual
 from ..residuals import sigma_max
@@ -81,9 +82,12 @@ class UnitResiduals:
         save_artifact(Path(folder), "unit_residuals", content, {name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
+    @loader
     def load(cls, folder: Path) -> UnitResiduals:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "unit_residuals")
+        axes = {"freqs_hz": "f", "entries": "ufpm", "ratio": "uf", "largest": "fpm", "entry_weights": "fpm", "entry_orders": "pm"}
+        check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         return cls(
             form=Form(content["form"]),
             nominal_id=content["nominal_id"],

@@ -1,0 +1,106 @@
+"""Files that others wrote: opened only when they are regular files, read up to a limit, parsed with one kind of error."""
+
+from __future__ import annotations
+
+import re
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from . import limits
+from .errors import ConfigError, DataError, KrosError
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+_NAME = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+
+
+def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) -> None:
+    """Refuse what is not a regular file, or a larger one than is ever read.
+
+    Parameters
+    ----------
+    path : Path
+    limit : int
+        Bytes; one of `kros.core.limits`.
+    error : type of KrosError
+        Raised with the reason.
+    """
+    try:
+        status = path.stat()
+    except FileNotFoundError as found:
+        raise error(f"Reading {path}: there is no such file; check the path.") from found
+    except (OSError, ValueError) as found:
+        raise error(f"Reading {path}: {found}; check the path and the permissions.") from found
+    if not stat.S_ISREG(status.st_mode):
+        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "not a regular file")
+        raise error(f"Reading {path}: a regular file is needed, found {kind}; copy its content to a file first.")
+    if status.st_size > limit:
+        raise error(
+            f"Reading {path}: files of up to {limit} bytes are read, found {status.st_size}; split it, or raise the limit in kros.core.limits."
+        )
+
+
+def read_bytes(path: Path, limit: int, error: type[KrosError] = DataError) -> bytes:
+    """Return the content of a regular file of at most `limit` bytes."""
+    require_regular(path, limit, error)
+    try:
+        with path.open("rb") as file:
+            return file.read(limit)
+    except (OSError, MemoryError) as found:
+        raise error(f"Reading {path}: {found or 'not enough memory'}; check the file and its permissions.") from found
+
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What messages call the file, for example ``Study``.
+
+    Raises
+    ------
+    ConfigError
+        Not a regular file, not UTF-8, not TOML, or tables nested deeper than anything that is read here.
+    """
+    content = read_bytes(path, limits.MAX_TOML_BYTES, ConfigError)
+    try:
+        return parse_toml(content.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:  # of decoding, of TOML, of numbers with thousands of digits
+        raise ConfigError(f"{what} {path}: not a TOML file that can be used ({_said(error)}); correct it.") from error
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Parse TOML; tables within tables are refused below `limits.MAX_TOML_DEPTH`, since everything that walks them recurses.
+
+    Raises
+    ------
+    ValueError or RecursionError
+    """
+    dots = rf"(?<![\w-]){_NAME}(?:[ \t]*\.[ \t]*{_NAME}){{{limits.MAX_TOML_DEPTH}}}"
+    if re.search(dots, text):  # before parsing, whose time grows with the square of their number
+        raise ValueError(f"a key of more than {limits.MAX_TOML_DEPTH} names")
+    found = tomllib.loads(text)
+    level: list[Any] = [found]
+    for _ in range(limits.MAX_TOML_DEPTH):
+        level = [v for item in level for v in (item.values() if isinstance(item, dict) else item) if isinstance(v, (dict, list))]
+    if level:
+        raise ValueError(f"tables or lists are nested more than {limits.MAX_TOML_DEPTH} deep")
+    return found
+
+
+def _said(error: BaseException) -> str:
+    return "nested too deeply" if isinstance(error, RecursionError) else shortened(str(error))
+
+
+def shortened(text: str, longest: int = 300) -> str:
+    """Return a text for a message, without the middle of a very long one."""
+    return text if len(text) <= longest else f"{text[: longest // 2]} ... {text[-longest // 4 :]}"

@@ -1,0 +1,108 @@
+"""Episodes that were recorded once and are there twice: they put test episodes into training, and one machine's data into another.
+
+Every episode leaves a print when it is read: a digest of all its samples, and the smallest hashes of its stretches of samples (a bottom-k
+sketch, A. Broder, On the resemblance and containment of documents, 1997). Episodes that share samples share these hashes, in the ratio of
+what they share, wherever the common part lies in either. A print takes half a kilobyte however long the episode is.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError
+from .population import Channel, EpisodeKey, Role
+from .recording import title
+
+STRETCH = 16  # samples that two episodes have to share bit by bit, one behind the other, to have something in common
+KEPT = 64  # hashes an episode
+SHARED = 0.25  # of the hashes from which on an episode counts as a copy in part
+_LOOKED_AT = 8 * KEPT  # smallest hashes among which those of moving machines are sought
+_PRIME, _MIX = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9)
+
+
+@dataclass(frozen=True)
+class Print:
+    """What one episode is recognised by.
+
+    Parameters
+    ----------
+    digest : bytes
+        Of all samples.
+    hashes : tuple of int
+        The smallest hashes of its stretches.
+    """
+
+    digest: bytes
+    hashes: tuple[int, ...]
+
+
+def print_of(values: npt.NDArray[np.float64], channels: Sequence[Channel]) -> Print:
+    """Return the print of an episode.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n_samples, n_channels)
+    channels : sequence of Channel
+        Stretches in which a state stands still are left out: a machine at rest looks like any other one.
+    """
+    values = np.ascontiguousarray(values) + 0.0  # one zero
+    digest = sha256(repr(values.shape).encode() + values.tobytes()).digest()
+    states = [i for i, c in enumerate(channels) if c.role is Role.STATE]
+    if len(values) <= STRETCH:
+        return Print(digest, ())
+    hashes = _stretches(values)
+    smallest = np.argpartition(hashes, min(_LOOKED_AT, len(hashes)) - 1)[:_LOOKED_AT]
+    stretches = values[smallest[:, None] + np.arange(STRETCH)][..., states]
+    moving = (np.diff(stretches, axis=1) != 0).sum(axis=1).min(axis=1) >= STRETCH // 2
+    return Print(digest, tuple(np.unique(hashes[smallest[moving]])[:KEPT].tolist()))
+
+
+def refuse_copies(prints: Iterable[tuple[EpisodeKey, Print]]) -> None:
+    """Refuse episodes that are copies of others, whole or in a good part.
+
+    Raises
+    ------
+    DataError
+        Names both.
+    """
+    whole: dict[bytes, EpisodeKey] = {}
+    holders: dict[int, EpisodeKey] = {}
+    for key, found in prints:
+        if found.digest in whole:
+            raise DataError(
+                f"{title(key)} is a copy of {whole[found.digest]}, sample by sample; a copy leaks test episodes into training and makes units look "
+                "alike, so remove one of them."
+            )
+        common = Counter(holders[h] for h in found.hashes if h in holders).most_common(1)
+        if common and common[0][1] >= SHARED * KEPT:
+            raise DataError(
+                f"{title(key)} and {common[0][0]} share about {100 * common[0][1] / len(found.hashes):.0f} % of their samples in all channels; "
+                "recordings never repeat bit by bit, so remove one of them, or cut the common part."
+            )
+        whole[found.digest] = key
+        for h in found.hashes:
+            holders.setdefault(h, key)
+
+
+def _stretches(values: npt.NDArray[np.float64]) -> npt.NDArray[np.uint64]:
+    """One hash a stretch of samples, shape (n_samples - STRETCH + 1,)."""
+    with np.errstate(over="ignore"):
+        rows = np.zeros(len(values), np.uint64)
+        for column in values.view(np.uint64).T:
+            rows = _mixed(rows * _PRIME + column)
+        length = 1
+        while length < STRETCH:  # twice as long every time
+            rows = _mixed(rows[:-length] * _PRIME + rows[length:])
+            length *= 2
+        return rows
+
+
+def _mixed(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    x = (x ^ (x >> np.uint64(30))) * _MIX
+    return x ^ (x >> np.uint64(27))

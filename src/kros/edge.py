@@ -1,0 +1,91 @@
+"""The edge of the command line: whatever goes wrong below becomes one message on standard error and an exit code.
+
+In the library exceptions stay exceptions. Here each class of them gets its words; what is not expected at all is a defect of kros and says so,
+with the way to its traceback (``kros --debug``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from .core.errors import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
+
+FAILED, BAD_INPUT, NOT_MET, SIGNALLED = 1, 2, 3, 128
+_USAGE = [kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"]  # typer may carry its own click
+_PASSED: tuple[type[BaseException], ...] = (typer.Exit, typer.Abort, *_USAGE)
+_BAD_INPUT = (ConfigError, DataError, DimensionError, MissingDependencyError)
+
+
+class EdgeGroup(TyperGroup):
+    """Commands whose errors end as messages."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command."""
+        if ctx.params.get("debug"):
+            return super().invoke(ctx)
+        with edge():
+            return super().invoke(ctx)
+
+
+@contextlib.contextmanager
+def edge() -> Iterator[None]:
+    """Turn any exception into one message on standard error and an exit code."""
+    from .study.stop import Stopped, stoppable
+
+    try:
+        with stoppable():
+            yield
+    except Stopped as stopped:
+        typer.echo(f"kros: stopped by {stopped}; the same command goes on where this one ended.", err=True)
+        raise typer.Exit(SIGNALLED + stopped.signal) from stopped
+    except _PASSED:
+        raise
+    except BrokenPipeError:
+        _silence()
+        raise typer.Exit(FAILED) from None
+    except Exception as error:
+        _silence_if_broken()
+        typer.echo(f"kros: {message(error)}".encode(errors="backslashreplace").decode(), err=True)
+        raise typer.Exit(BAD_INPUT if isinstance(error, _BAD_INPUT) else FAILED) from error
+
+
+def message(error: Exception) -> str:
+    """Return what the command line says about an exception."""
+    if isinstance(error, KrosError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return f"Memory: there is not enough of it ({error or 'no details'}); use fewer --workers, shorter episodes or fewer units."
+    if isinstance(error, BrokenProcessPool):
+        return "Workers: a worker process died, mostly because memory ran out; use fewer --workers, or look into the system's log."
+    if isinstance(error, OSError):
+        place = " -> ".join(
+            repr(os.fspath(name)) for name in (error.filename, error.filename2) if name is not None and not isinstance(name, int)
+        )
+        return (
+            f"Files: {error.strerror or error}{f': {place}' if place else ''}; check the path, its permissions and the space that is left."
+        )
+    kind = type(error).__name__
+    return f"Internal error, a defect of kros: {kind}: {error}; run the command again as kros --debug ... for its traceback, and report it."
+
+
+def _silence_if_broken() -> None:
+    """Where standard output cannot be written any more, say nothing more on it: Python would fail once more when it ends."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        _silence()
+
+
+def _silence() -> None:
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)

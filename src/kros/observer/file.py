@@ -1,0 +1,224 @@
+"""The file of an observer: JSON that a person can read and write, and that is believed in nothing.
+
+A file that kros wrote carries a checksum of its content. One without, from an earlier version or edited by hand, is read all the same, with a
+warning: everything below is checked either way.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.artifacts import CHECKSUM, check_checksum, plain, read_json, with_checksum, write_json
+from ..core.errors import DataError, KrosError
+from ..core.files import shortened
+from ..core.loading import as_written
+from ..core.lti import StateSpace
+from ..lifting import Lifting
+from ..synthesis.result import Injection
+from .observer import Observer
+from .runtime import Runtime
+
+Array = npt.NDArray[np.float64]
+log = logging.getLogger(__name__)
+SCHEMA, KIND = 1, "observer"
+
+
+def observer_content(observer: Observer) -> dict[str, Any]:
+    """Return what the file of an observer holds, without its checksum."""
+    lifting = observer.lifting
+    content = {
+        "schema": SCHEMA,
+        "kind": KIND,
+        "name": observer.name,
+        "states": lifting.states,
+        "lifting": lifting.functions,
+        **lifting.extension(),
+        "parameters": {k: observer.parameters.get(k) for k in lifting.parameters},
+        "inputs": observer.inputs,
+        "measured": observer.measured,
+        "injection": observer.injection,
+        "sample_period_s": observer.sample_period_s,
+        "model": {"A": observer.A, "B": observer.B},
+        "controller": {key: getattr(observer.controller, key) for key in "ABCD"},
+        **observer.runtime.content(),
+    }
+    found: dict[str, Any] = plain(content)
+    return found
+
+
+def write_observer(observer: Observer, path: Path) -> None:
+    """Write an observer; one that could not be read again is refused."""
+    content = observer_content(observer)
+    observer_from(content, f"Writing observer {observer.name} to {path}")
+    write_json(path, with_checksum(content))
+
+
+def read_observer(path: Path) -> Observer:
+    """Read an observer's file.
+
+    Raises
+    ------
+    DataError
+        See `Observer.load`.
+    """
+    content = read_json(path)
+    if not isinstance(content, dict) or (content.get("schema"), content.get("kind")) != (SCHEMA, KIND):
+        raise DataError(f"Loading an observer from {path}: not an observer file of schema 1; write it again with this version of kros.")
+    if not check_checksum(content, path):
+        log.warning("The observer of %s carries no checksum: it was edited, or written by an earlier version of kros.", path)
+    try:
+        with as_written("Observer", path):
+            return observer_from(content, f"Loading an observer from {path}")
+    except DataError:
+        raise
+    except KrosError as error:
+        raise DataError(f"Loading an observer from {path}: {error}") from error
+
+
+def observer_from(content: Mapping[str, Any], where: str) -> Observer:
+    """Make an observer from the content of a file.
+
+    Parameters
+    ----------
+    content : mapping
+    where : str
+        What messages begin with.
+
+    Raises
+    ------
+    DataError
+    """
+    _text(content["name"], f"{where}: name")
+    for key in ("states", "inputs", "lifting", "lifting_inputs", "input_functions"):
+        _names(content.get(key, []) if key.endswith(("lifting_inputs", "functions")) else content[key], f"{where}: {key}")
+    parameters = _parameters(content["parameters"], where)
+    _distinct([*content["states"], *content["inputs"], *content["parameters"]], where)
+    lifting = Lifting.from_content(content)
+    n, m = lifting.n_lifted, len(content["inputs"]) + len(lifting.input_functions)
+    measured = _indices(content["measured"], lifting.n_states, where)
+    injection, q = Injection(content["injection"]), len(measured)
+    period = content["sample_period_s"]
+    if not _is_number(period) or not 0 < period < math.inf:
+        raise DataError(
+            f"{where}: sample_period_s should be a number of seconds above zero, found {shortened(repr(period))}; correct the file."
+        )
+    width = m if injection is Injection.INPUT else n
+    controller, order = content["controller"], len(content["controller"]["A"])
+    shapes = {"A": (order, order), "B": (order, q), "C": (width, order), "D": (width, q)}
+    _known(controller, shapes, f"{where}: controller")
+    _known(content["model"], "AB", f"{where}: model")
+    A, B, C, D = (matrix(controller[key], shapes[key], f"{where}: controller.{key}") for key in "ABCD")
+    observer = Observer(
+        content["name"],
+        lifting,
+        matrix(content["model"]["A"], (n, n), f"{where}: model.A"),
+        matrix(content["model"]["B"], (n, m), f"{where}: model.B"),
+        measured,
+        tuple(content["inputs"]),
+        StateSpace(A, B, C, D, float(period)),
+        injection,
+        float(period),
+        parameters,
+        _runtime(content, where),
+    )
+    _known(content, [*observer_content(observer), "runtime", "lifting_inputs", "input_functions", CHECKSUM], where)
+    return observer
+
+
+def matrix(rows: Any, shape: tuple[int, int], where: str) -> Array:
+    """Return a matrix from lists of lists.
+
+    Raises
+    ------
+    DataError
+        Another shape, or an entry that is not a finite number, with its place.
+    """
+    if not isinstance(rows, list) or len(rows) != shape[0]:
+        found = f"{len(rows)} rows" if isinstance(rows, list) else shortened(repr(rows), 60)
+        raise DataError(f"{where} should have {shape[0]} rows of {shape[1]} numbers, found {found}; correct the file.")
+    for i, row in enumerate(rows):
+        if not isinstance(row, list) or len(row) != shape[1]:
+            found = f"{len(row)} entries" if isinstance(row, list) else shortened(repr(row), 60)
+            raise DataError(f"{where}[{i}] should have {shape[1]} numbers, found {found}; correct the file.")
+        for j, value in enumerate(row):
+            if not _is_number(value) or not math.isfinite(value):
+                raise DataError(f"{where}[{i}][{j}] should be a finite number, found {shortened(repr(value), 60)}; correct the file.")
+    return np.array(rows, dtype=float).reshape(shape)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number that a double can hold."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return isinstance(value, float) or value.bit_length() < 1024
+
+
+def _text(value: Any, where: str) -> None:
+    if not isinstance(value, str) or not value.strip():
+        raise DataError(f"{where} should be text that is not empty, found {shortened(repr(value), 60)}; correct the file.")
+
+
+def _names(values: Any, where: str) -> None:
+    if not isinstance(values, list):
+        raise DataError(f"{where} should be a list of names, found {shortened(repr(values), 60)}; correct the file.")
+    for i, value in enumerate(values):
+        _text(value, f"{where}[{i}]")
+
+
+def _distinct(names: Sequence[str], where: str) -> None:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise DataError(
+            f"{where}: the names of states, inputs and parameters should differ, found {', '.join(twice)} more than once; correct the file."
+        )
+
+
+def _parameters(values: Any, where: str) -> dict[str, float]:
+    """Return the values that are known; null stands for one that every unit has of its own."""
+    if not isinstance(values, dict):
+        raise DataError(f"{where}: parameters should name values, found {shortened(repr(values), 60)}; correct the file.")
+    for name, value in values.items():
+        if value is not None and (not _is_number(value) or not math.isfinite(value)):
+            raise DataError(
+                f"{where}: parameters.{name} should be a finite number or null, found {shortened(repr(value), 60)}; correct the file."
+            )
+    return {name: float(value) for name, value in values.items() if value is not None}
+
+
+def _indices(values: Any, count: int, where: str) -> tuple[int, ...]:
+    good = isinstance(values, list) and all(type(i) is int and 0 <= i < count for i in values) and len(set(values)) == len(values)
+    if not good:
+        raise DataError(
+            f"{where}: measured should list different states by number, 0 to {count - 1}, found {shortened(repr(values), 60)}; correct the file."
+        )
+    return tuple(values)
+
+
+def _runtime(content: Mapping[str, Any], where: str) -> Runtime:
+    found = content.get("runtime", {})
+    if not isinstance(found, dict):
+        raise DataError(f"{where}: runtime should be an object, found {shortened(repr(found), 60)}; correct the file.")
+    _known(found, Runtime.__dataclass_fields__, f"{where}: runtime")
+    for key, value in found.items():
+        entries = [value]
+        while any(isinstance(entry, list) for entry in entries):
+            entries = [e for entry in entries for e in (entry if isinstance(entry, list) else [entry])]
+        bad = [e for e in entries if not (_is_number(e) and math.isfinite(e)) and (e is not None or key in ("delay", "filter_gain"))]
+        if bad:
+            raise DataError(f"{where}: runtime.{key} should hold finite numbers, found {shortened(repr(bad[0]), 60)}; correct the file.")
+    return Runtime.from_content(content)
+
+
+def _known(found: Any, known: Sequence[str] | Mapping[str, Any] | str, where: str) -> None:
+    if not isinstance(found, dict):
+        raise DataError(f"{where} should be an object, found {shortened(repr(found), 60)}; correct the file.")
+    unknown = [key for key in found if key not in known]
+    if unknown:
+        raise DataError(f"{where}: unknown key {unknown[0]!r}; known are {', '.join(known)}; correct the file.")

@@ -1,0 +1,132 @@
+"""The file of an observer: what is wrong with it is said, and nothing wrong is run."""
+
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kros.core.errors import DataError
+from kros.core.lti import StateSpace
+from kros.lifting import Lifting
+from kros.observer import Observer, Runtime
+from kros.synthesis.result import Injection
+
+
+def observer(**changes: Any) -> Observer:
+    lifting = Lifting(("position", "velocity"), ("sin(3*position + phase)",), ("phase",))
+    K = StateSpace(np.eye(2) / 2, np.ones((2, 1)), np.ones((3, 2)), np.ones((3, 1)), 0.01)
+    runtime = Runtime(delay=1, lower=np.array([-1.0, -np.inf]))
+    parts: dict[str, Any] = {"A": np.diag([0.9, 0.8, 0.1]), "B": np.ones((3, 1)), "measured": (0,), "parameters": {"phase": 0.3}, **changes}
+    return Observer(
+        "o", lifting, inputs=("torque",), controller=K, injection=Injection.STATE, sample_period_s=0.01, runtime=runtime, **parts
+    )
+
+
+def changed(path: Path, change: Callable[[dict[str, Any]], Any], checksum: bool = False) -> Path:
+    """Change a file as a person would who removes the checksum, or as a fault would that does not."""
+    observer().save(path)
+    content = json.loads(path.read_text())
+    if not checksum:
+        del content["checksum"]
+    change(content)
+    path.write_text(json.dumps(content))
+    return path
+
+
+def put(*place: Any) -> Callable[[dict[str, Any]], None]:
+    """Put the last argument where the others lead; nothing behind them removes it."""
+    *keys, last, value = place
+
+    def change(content: Any) -> None:
+        for key in keys:
+            content = content[key]
+        if value is DEL:
+            del content[last]
+        else:
+            content[last] = value
+
+    return change
+
+
+DEL = object()
+
+
+def test_what_was_saved_is_what_runs(tmp_path: Path) -> None:
+    observer().save(str(tmp_path / "o.json"))
+    again, y, u = Observer.load(str(tmp_path / "o.json")), np.random.default_rng(0).normal(size=(50, 1, 1)), np.ones((50, 1, 1))
+    np.testing.assert_array_equal(again.run(y, u), observer().run(y, u))
+
+
+def test_a_file_without_checksum_is_validated_and_said_to_have_none(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        Observer.load(changed(tmp_path / "o.json", put("model", "A", 0, 0, 0.5)))
+    assert "no checksum" in caplog.text
+
+
+@pytest.mark.parametrize("change", [put("model", "A", 0, 0, 0.5), put("name", "p"), put("sample_period_s", 0.02), put("runtime", DEL)])
+def test_a_changed_file_does_not_fit_its_checksum(tmp_path: Path, change: Callable[[Any], None]) -> None:
+    with pytest.raises(DataError, match=r"o\.json: the content does not fit its checksum"):
+        Observer.load(changed(tmp_path / "o.json", change, checksum=True))
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (put("model", "A", 0, 0, None), r"model\.A\[0\]\[0\] should be a finite number, found None"),
+        (put("model", "A", 1, 2, "1.5"), r"model\.A\[1\]\[2\] should be a finite number, found '1\.5'"),
+        (put("model", "A", 1, 2, True), r"model\.A\[1\]\[2\] should be a finite number, found True"),
+        (put("model", "A", 1, 2, 10**400), r"model\.A\[1\]\[2\] should be a finite number"),
+        (put("model", "B", 2, 0, []), r"model\.B\[2\]\[0\]"),
+        (put("model", "A", 1, [1.0, 2.0]), r"model\.A\[1\] should have 3 numbers, found 2"),
+        (put("model", "A", 1, 0.5), r"model\.A\[1\] should have 3 numbers"),
+        (put("model", "A", [[0.5]]), r"model\.A should have 3 rows"),
+        (put("model", "E", [[0.5]]), "unknown key 'E'"),
+        (put("model", DEL), "key 'model' is missing"),
+        (put("model", []), "model should be an object"),
+        (put("controller", "D", 0, 0, None), r"controller\.D\[0\]\[0\]"),
+        (put("controller", "A", 0, DEL), r"controller\.A"),
+        (put("controller", "C", DEL), "key 'C' is missing"),
+        (put("measured", [2]), "measured should list different states by number, 0 to 1"),
+        (put("measured", [-1]), "measured"),
+        (put("measured", [0.0]), "measured"),
+        (put("measured", [0, 0]), "measured"),
+        (put("measured", "0"), "measured"),
+        (put("sample_period_s", 0), "sample_period_s should be a number of seconds above zero"),
+        (put("sample_period_s", -0.01), "sample_period_s"),
+        (put("sample_period_s", "0.01"), "sample_period_s"),
+        (put("sample_period_s", None), "sample_period_s"),
+        (put("inputs", ["position"]), "the names of states, inputs and parameters should differ, found position"),
+        (put("states", ["position", "position"]), "position"),
+        (put("inputs", "torque"), "inputs should be a list of names"),
+        (put("inputs", [""]), r"inputs\[0\] should be text that is not empty"),
+        (put("states", 0, None), r"states\[0\]"),
+        (put("lifting", ["sin(load)"]), "load"),
+        (put("lifting", ["exp("]), "exp"),
+        (put("parameters", "phase", "x"), r"parameters\.phase should be a finite number or null"),
+        (put("parameters", ["phase"]), "parameters should name values"),
+        (put("injection", "both"), "both"),
+        (put("runtime", "delay", -1), "delay"),
+        (put("runtime", "delay", "1"), r"runtime\.delay"),
+        (put("runtime", "lower", [0.0]), "lower"),
+        (put("runtime", "lower", ["0", None]), r"runtime\.lower"),
+        (put("runtime", "delai", 1), "unknown key 'delai'"),
+        (put("runtime", 5), "runtime should be an object"),
+        (put("runtim", {}), "unknown key 'runtim'"),
+        (put("name", ""), "name should be text"),
+        (put("kind", "model"), "not an observer file"),
+        (put("schema", 2), "not an observer file"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, change: Callable[[Any], None], found: str) -> None:
+    with pytest.raises(DataError, match=found):
+        Observer.load(changed(tmp_path / "o.json", change))
+
+
+def test_an_observer_that_nobody_could_read_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"model\.A\[0\]\[0\] should be a finite number"):
+        observer(A=np.diag([np.nan, 0.8, 0.1])).save(tmp_path / "o.json")
+    assert not (tmp_path / "o.json").exists()

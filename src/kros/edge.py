@@ -10,7 +10,6 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator
-from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 import typer
@@ -63,8 +62,6 @@ def message(error: Exception) -> str:
         return str(error)
     if isinstance(error, MemoryError):
         return f"Memory: there is not enough of it ({error or 'no details'}); use fewer --workers, shorter episodes or fewer units."
-    if isinstance(error, BrokenProcessPool):
-        return "Workers: a worker process died, mostly because memory ran out; use fewer --workers, or look into the system's log."
     if isinstance(error, OSError):
         place = " -> ".join(
             repr(os.fspath(name)) for name in (error.filename, error.filename2) if name is not None and not isinstance(name, int)

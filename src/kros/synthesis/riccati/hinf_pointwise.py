@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..generalized_plant import GeneralizedPlant
-from .hinf_dual import Side
+from .hinf_pencil import Side
 
 Array = npt.NDArray[Any]
 

@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from ..generalized_plant import GeneralizedPlant
 from .hinf_coordinates import balancing, scaled, transformed
-from .hinf_dual import Pencil, Side, Signals, coupled, evaluated
+from .hinf_dual import Signals, coupled, evaluated
+from .hinf_pencil import Pencil, Side
 from .hinf_pointwise import direct_bound, pointwise_bound, resonances
 
 Array = npt.NDArray[Any]

@@ -16,13 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ..generalized_plant import GeneralizedPlant
-from .hinf_dual import Side
+from .hinf_pencil import Side
 
 Array = npt.NDArray[Any]
 
 _EPS = float(np.finfo(float).eps)
 _RANK = 1e-9
 _LIGHT = 0.3
+_ROUNDS, _POINTS = 5, 9
 
 
 def direct_bound(p: GeneralizedPlant) -> float:
@@ -31,10 +32,20 @@ def direct_bound(p: GeneralizedPlant) -> float:
 
 
 def pointwise_bound(p: GeneralizedPlant, rad: Array) -> float:
-    """Return the largest Parrott bound over frequencies, shape (f,), rad/s, in discrete time rad per sample."""
+    """Return the largest Parrott bound over frequencies, shape (f,), rad/s, in discrete time rad per sample, and around the best of them."""
     if not len(p.A):
         return direct_bound(p)
-    return max((float(_at(s, rad).max(initial=0.0)) for s in Side.both(p)), default=0.0)
+    best = 0.0
+    for s in Side.both(p):
+        points = np.unique(rad)
+        for _ in range(_ROUNDS):
+            found = _at(s, points)
+            k = int(np.argmax(found))
+            best = max(best, float(found[k]))
+            points = np.linspace(points[max(k - 1, 0)], points[min(k + 1, len(points) - 1)], _POINTS)
+            if points[0] == points[-1] or found[k] == 0:
+                break
+    return best
 
 
 def resonances(A: Array, discrete: bool) -> Array:
@@ -57,7 +68,7 @@ def _at_infinity(s: Side) -> float:
 
 def _at(s: Side, rad: Array) -> Array:
     n, m, q = len(s.A), s.B.shape[1], len(s.C_y)
-    if m <= q or not len(s.C):
+    if not m or not len(s.C):
         return np.zeros(len(rad))
     # zeta = z - 1 keeps the digits at low frequency, where z and A are both close to one.
     point = np.expm1(1j * rad) if s.dt > 0 else 1j * rad
@@ -66,7 +77,11 @@ def _at(s: Side, rad: Array) -> Array:
     system[:, :n, :n] = point[:, None, None] * np.eye(n) - shifted
     system[:, :n, n:], system[:, n:, :n], system[:, n:, n:] = -s.B, s.C_y, s.D_y
     size = np.linalg.norm(system, axis=2, keepdims=True)
-    kernel = np.conj(np.swapaxes(np.linalg.svd(system / np.where(size > 0, size, 1.0))[2][:, n + q :], 1, 2))
+    _, values, Vh = np.linalg.svd(system / np.where(size > 0, size, 1.0))
+    # Constraints that only rounding tells from others are none: where K has no effect on z the kernel is larger than sizes say.
+    free = np.ones((len(rad), n + m), bool)
+    free[:, : values.shape[1]] = values <= 10 * (n + m) * _EPS * values[:, :1]
+    kernel = np.conj(np.swapaxes(Vh, 1, 2)) * free[:, None, :]
     # Combinations of the kernel with w = 0 prove nothing; those with next to none only as much as rounding leaves.
     _, values, Vh = np.linalg.svd(kernel[:, n:])
     kept = values > _RANK

@@ -35,11 +35,10 @@ from ..riccati.hinf_optimal import hinf
 from .ball import below
 from .certificate import certify
 from .disturbance import Channels, Fit, Shaping, Spectrum, default_fit, design_grid
+from .everywhere import Everywhere
 from .robust_gain import RobustGain, robust_gain
 
 Array = npt.NDArray[Any]
-
-_DENSER = 10
 
 
 def worst_case_hinf(
@@ -173,15 +172,14 @@ def dominating(channels: Channels, loop: StateSpace) -> Spectrum:
 
 
 def _lower_bound(channels: Channels, fit: Fit, options: dict[str, Any], tolerance: float) -> float | None:
-    """Fit from below, lowered on a grid ten times denser."""
-    freqs = channels.freqs_hz
-    dense = Channels(channels.problem, np.geomspace(freqs[0], freqs[-1], _DENSER * len(freqs)))
-    low, check = (Spectrum(c.shaped(below(c.symmetric_part())), None) for c in (channels, dense))
-    return lower_bound(channels.problem, dense.lowered(channels.shaping(low, fit, "below", options), check), tolerance)
+    """Fit from below, lowered until it is below at every frequency."""
+    low = Spectrum(channels.shaped(below(channels.ball.symmetric_part())), None)
+    shaping = channels.shaping(low, fit, "below", options)
+    return lower_bound(channels.problem, Everywhere(channels).lowered_to_symmetric_part(shaping), tolerance)
 
 
 def lower_bound(problem: ObserverProblem, shaping: Shaping, tolerance: float) -> float | None:
-    """Return a level that no observer of either injection reaches, for filters that lie below the spectrum on the grid; None where none is shown.
+    """Return a level that no observer of either injection reaches, for filters that lie below the spectrum; None where none is shown.
 
     Estimates of ``W_p x`` one step ahead, free of any structure, are what is searched: the disturbance is delayed by one sample, which changes no
     norm, so that the output to be estimated is that of the next sample.

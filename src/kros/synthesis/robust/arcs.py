@@ -72,7 +72,7 @@ def _even_coordinates(system: StateSpace) -> Array:
     return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0) + _CORRELATED))
 
 
-def least_ratio(ratio: Ratio, edges: Array, rtol: float = 1e-2, max_arcs: int = 20000) -> Array:
+def least_ratio(ratio: Ratio, edges: Array, rtol: float = 3e-3, max_arcs: int = 20000) -> Array:
     """Return what a ratio of responses nowhere falls below, for every channel.
 
     Parameters

@@ -141,19 +141,25 @@ class Channels:
     ----------
     problem : ObserverProblem
     freqs_hz : ndarray, shape (f,), Hz
+    apart : bool
+        Keep W_L behind the filters: more states, for bounds that are never run.
     """
 
-    def __init__(self, problem: ObserverProblem, freqs_hz: Array) -> None:
+    def __init__(self, problem: ObserverProblem, freqs_hz: Array, apart: bool = False) -> None:
         self.problem, self.freqs_hz = problem, freqs_hz
         self.ball = uncertain_ball(problem, freqs_hz)
         self.left = problem.W_L.frequency_response(freqs_hz)
-        self.contained = is_diagonal(problem.W_L)
+        self.contained = not apart and is_diagonal(problem.W_L)
         self.behind = None if self.contained else problem.W_L
         self._fits: dict[Any, StateSpace] = {}
 
     def shaped(self, power: Array) -> Array:
         """Power of the channels for the power of w2."""
         return np.sum(np.abs(self.left) ** 2, axis=-1) * power if self.contained else power
+
+    def mixture(self, spectrum: Spectrum) -> Spectrum:
+        """Return the spectrum of the same contractions for the channels as they are shaped here."""
+        return replace(spectrum, phi=self.shaped(spectrum.power(self.ball, np.arange(len(self.freqs_hz)))))
 
     def average(self) -> Spectrum:
         """Average over the set; every causal observer costs at least its share of it."""

@@ -36,11 +36,12 @@ _MARGIN = 1e-6  # relative, for rounding
 
 
 class Everywhere:
-    """Proofs for the channels of one problem.
+    """Proofs for the components of w2 and of the remainder of one problem.
 
     Parameters
     ----------
     channels : Channels
+        With W_L behind the filters.
     """
 
     def __init__(self, channels: Channels) -> None:
@@ -50,7 +51,6 @@ class Everywhere:
         self.edges = np.unique(np.concatenate([[0.0], inside[inside < np.pi * (1 - 1e-9)], [np.pi]]))
         self.chain = Enclosure(problem.chain)
         self.loop = None if problem.loop is None else Enclosure(problem.loop)
-        self.left = Enclosure(problem.W_L) if channels.contained else None
         self.remainder: tuple[Enclosure, Enclosure] | None = None
         if problem.remainder_left is not None and problem.remainder_right is not None:
             self.remainder = Enclosure(problem.remainder_left), Enclosure(problem.remainder_right @ problem.input_weight)
@@ -79,7 +79,7 @@ class Everywhere:
         return StateSpace(filters.A, filters.B, filters.C * scale[:, None], filters.D * scale[:, None], filters.dt)
 
     def disturbance(self, spectrum: Spectrum, theta: Array, half: Array) -> tuple[Array, Array]:
-        """Magnitude of every shaped channel: what is proven on the arcs and what is seen in the middle, (k, channels)."""
+        """Magnitude of every component of w2: what is proven on the arcs and what is seen in the middle, (k, b)."""
         M, reach_M = self.chain(theta, half)
         size_M, distance = np.linalg.norm(M, axis=(-2, -1)), np.linalg.norm(reach_M, axis=-1)
         N = None
@@ -95,10 +95,10 @@ class Everywhere:
             proven = np.maximum(root - distance[:, None], 0.0)
         else:  # the whole matrix counts, not its diagonal alone
             proven = root * _kept(root, distance)
-        return self._shaped(proven, root, theta, half)
+        return proven, root
 
     def symmetric_part(self, theta: Array, half: Array) -> tuple[Array, Array]:
-        """Magnitude of every shaped channel for filters below ``||R_r M|| R_l``, (k, channels).
+        """Magnitude of every component of w2 for filters below ``||R_r M|| R_l``, (k, b).
 
         ``I - N^H N`` grows by at most ``eta = epsilon_N (2 nu + epsilon_N)`` on the arc, so its inverse keeps ``1 / (1 + eta / (1 - nu^2))``.
         """
@@ -112,15 +112,7 @@ class Everywhere:
         with np.errstate(divide="ignore", invalid="ignore"):
             lost = np.linalg.norm(reach_M, axis=-1) / (np.sqrt(slack) * q)
             kept = np.where(lost < 1, (1 - lost) / (1 + far * (2 * nu + far) / slack), 0.0)
-        return self._shaped(root * kept[:, None], root, theta, half)
-
-    def _shaped(self, proven: Array, seen: Array, theta: Array, half: Array) -> tuple[Array, Array]:
-        """Multiply by the magnitude of the left weight where the filters contain it."""
-        if self.left is None:
-            return proven, seen
-        W, reach = self.left(theta, half)
-        size = np.linalg.norm(W, axis=-1)
-        return np.maximum(size - reach, 0.0) * proven, size * seen
+        return root * kept[:, None], root
 
     def remaining(self, theta: Array, half: Array) -> tuple[Array, Array]:
         """Magnitude of every channel of the remainder, (k, n)."""

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, gain
 from ..problem.observer_problem import ObserverProblem
 from .certificate import certify
-from .disturbance import Channels, Fit, Shaping, Spectrum
+from .disturbance import Channels, Fit, Spectrum
 from .everywhere import Everywhere
 from .shaped_filter import design, lower_bound
 
-Array = npt.NDArray[Any]
 Options = dict[str, Any]
 log = logging.getLogger(__name__)
+
+_BOUND_ORDERS = (1, 2)  # of filters in lower bounds: W_L is behind them as it is, and what is left is smooth
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,86 +32,81 @@ class Certified:
     controller: StateSpace
 
 
-@dataclass(eq=False)
 class Search:
-    """What was found so far.
+    """The best certified filter so far; it starts from no correction at all.
 
     Parameters
     ----------
     channels : Channels
     fit : callable
+    options : dict
+        ``order``, ``max_order`` and ``tolerance_db`` of the fit.
     rtol : float
         Of the certificate's quadrature.
     """
 
-    channels: Channels
-    fit: Fit
-    rtol: float
-    best: Certified | None = None
-    latest: StateSpace | None = None
-    lower: float | None = None
-    options: Options = field(default_factory=dict)
-    tried: list[Options] = field(default_factory=list)
-    designed: int = 0
-    elapsed: float = 0.0
-    reasons: list[str] = field(default_factory=list)
+    def __init__(self, channels: Channels, fit: Fit, options: Options, rtol: float) -> None:
+        self.channels, self.fit, self.asked, self.rtol = channels, fit, options, rtol
+        self.options = options  # of the kind that did best
+        self.best = self._certified(self._nothing())
+        self.designs, self.elapsed = 0, 0.0
+        self.reasons: list[str] = []
 
     @property
     def problem(self) -> ObserverProblem:
         """What the filters are for."""
         return self.channels.problem
 
-    def first(self, spectrum: Spectrum, options: Options) -> None:
-        """Design for the first spectrum: with filters as asked, of order one, and no correction at all; where the first is not the best, of every order.
+    def _nothing(self) -> StateSpace:
+        return gain(np.zeros((self.problem.correction_size, len(self.problem.C))), self.problem.nominal.dt)
 
-        Filters of a high order may have peaks between the frequencies that they are fitted at, and a design for what is not there.
+    def _certified(self, controller: StateSpace) -> Certified:
+        return Certified(*certify(self.problem, controller, self.rtol), controller)
+
+    def first(self, spectrum: Spectrum) -> None:
+        """Design with shaping filters as asked and of order one; where the former are not the best, with those of every order.
+
+        Filters of a high order may have peaks between the frequencies that they are fitted at: a design for what is not there.
+
+        Raises
+        ------
+        SynthesisError
+            When no design survives.
         """
-        self._certify(gain(np.zeros((self.problem.correction_size, len(self.problem.C))), self.problem.nominal.dt))
-        self.options = options
-        as_asked = self.design(spectrum, options)
-        if options["order"] is None:
-            orders = [1] if options["max_order"] > 1 else []
-            for order in orders:
-                other = self.design(spectrum, {**options, "order": order})
-            if orders and min(other, self.best_value) < as_asked:
-                for order in range(2, options["max_order"]):
-                    self.design(spectrum, {**options, "order": order})
-        if not self.designed:
+        as_asked = self.design(spectrum, self.asked)
+        highest = self.asked["max_order"]
+        if self.asked["order"] is None and highest > 1:
+            self.design(spectrum, {**self.asked, "order": 1})
+            if self.best.value < as_asked:
+                for order in range(2, highest):
+                    self.design(spectrum, {**self.asked, "order": order})
+        if not self.designs:
             raise SynthesisError(f"Worst-case H2 synthesis: no design survived verification ({'; '.join(dict.fromkeys(self.reasons))}).")
-
-    @property
-    def best_value(self) -> float:
-        """Smallest certified norm."""
-        return np.inf if self.best is None else self.best.value
 
     def design(self, spectrum: Spectrum, options: Options) -> float:
         """Design for a spectrum and certify; infinite where that fails."""
-        self.tried += [options] if options not in self.tried else []
+        shaping = self.channels.shaping(spectrum, self.fit, "above", options)
         start = time.perf_counter()
         try:
-            controller = design(self.problem, self.channels.shaping(spectrum, self.fit, "above", options))
-            value = self._certify(controller)
+            controller = design(self.problem, shaping)
+            self.elapsed += time.perf_counter() - start
+            found = self._certified(controller)
         except SynthesisError as error:
             log.info("Shaping filters %s: %s", options, error)
             self.reasons.append(str(error))
-            return np.inf
-        finally:
-            self.elapsed += time.perf_counter() - start
-        self.designed += 1
-        if value <= self.best_value or self.latest is None:
-            self.latest, self.options = controller, options
-        return value
+            return float("inf")
+        self.designs += 1
+        if found.value < self.best.value:
+            self.best, self.options = found, options
+        return found.value
 
-    def _certify(self, controller: StateSpace) -> float:
-        value, error = certify(self.problem, controller, self.rtol)
-        if value < self.best_value:
-            self.best = Certified(value, error, controller)
-        return value
-
-    def bound(self, proofs: Everywhere, spectrum: Spectrum) -> None:
-        """Raise the lower bound by filters below a spectrum, of every kind that was designed with."""
-        for options in self.tried:
-            shaping: Shaping = proofs.lowered(self.channels.shaping(spectrum, self.fit, "below", options), spectrum)
-            found = lower_bound(self.problem, shaping)
-            if found is not None:
-                self.lower = max(found, self.lower or 0.0)
+    def bound(self, spectrum: Spectrum) -> float | None:
+        """Return the best lower bound of filters below a spectrum; None where none could be proven."""
+        channels = Channels(self.problem, self.channels.freqs_hz, apart=True)
+        spectrum, proofs = channels.mixture(spectrum), Everywhere(channels)
+        highest = self.asked["max_order"] if self.asked["order"] is None else self.asked["order"]
+        found = []
+        for order in sorted({min(order, highest) for order in _BOUND_ORDERS}):
+            shaping = channels.shaping(spectrum, self.fit, "below", {**self.asked, "order": order})
+            found.append(lower_bound(self.problem, proofs.lowered(shaping, spectrum)))
+        return max((bound for bound in found if bound is not None), default=None)

@@ -76,18 +76,16 @@ def worst_case_h2(
     spectrum = channels.average()
     if not bounded:
         return _design_alone(problem, channels.shaping(spectrum, fit, "above", options))
-    search = Search(channels, fit, rtol)
-    search.first(spectrum, options)
-    proofs = Everywhere(channels)
-    if not sharp:
-        search.bound(proofs, channels.below_average())
-    for round_ in range(refinements + 1):
-        if round_ and search.latest is not None:
-            spectrum = spectrum.mixed_with(*channels.worst(search.latest), 1 / round_)
-            search.design(spectrum, search.options)
-        if sharp:
-            search.bound(proofs, spectrum)
-    return _result(problem, search, causal)
+    search = Search(channels, fit, options, rtol)
+    search.first(spectrum)
+    for round_ in range(1, refinements + 1):
+        spectrum = spectrum.mixed_with(*channels.worst(search.best.controller), 1 / round_)
+        search.design(spectrum, search.options)
+    if sharp:
+        final = spectrum.mixed_with(*channels.worst(search.best.controller), 1 / (refinements + 1))
+    else:
+        final = channels.below_average()
+    return _result(problem, search, search.bound(final), causal)
 
 
 def _design_alone(problem: ObserverProblem, shaping: Shaping) -> Synthesis:
@@ -103,11 +101,10 @@ def _design_alone(problem: ObserverProblem, shaping: Shaping) -> Synthesis:
     )
 
 
-def _result(problem: ObserverProblem, search: Search, causal: bool) -> Synthesis:
-    assert search.best is not None
+def _result(problem: ObserverProblem, search: Search, lower: float | None, causal: bool) -> Synthesis:
     best, loop = search.best, problem.error_system(search.best.controller)
     n_d = problem.nominal.n_inputs + problem.nominal.n_states
-    lower, gap, notes = enclosed(best.value, search.lower)
+    lower, gap, notes = enclosed(best.value, lower)
     return Synthesis(
         method="worst_case_h2",
         controller=best.controller,
@@ -120,7 +117,7 @@ def _result(problem: ObserverProblem, search: Search, causal: bool) -> Synthesis
         gap_percent=gap,
         quadrature_error=best.error,
         spectral_radius=float(loop.spectral_radius()),
-        solve_s=search.elapsed / max(search.designed, 1),
+        solve_s=search.elapsed / search.designs,
         solver="riccati",
         notes=("The spectral radius is that of the nominal loop; it says nothing about robustness. The certificate is worst_case_h2.", *notes),
     )

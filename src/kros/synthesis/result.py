@@ -129,10 +129,10 @@ def enclosed(value: float, lower: float | None) -> tuple[float | None, float | N
 
     A bound above what is attained is false whatever its proof, and not handed on; a distance that rounding explains is none.
     """
-    if lower is None:
-        return None, None, ("No lower bound could be proven.",)
     if value == 0 or lower == 0:
         return 0.0, None, ()
+    if lower is None:
+        return None, None, ("No lower bound could be proven.",)
     if lower > value * (1 + _ROUNDING):
         log.error("Lower bound %.9g above the attained value %.9g: it is dropped.", lower, value)
         return None, None, (f"Internal error: a lower bound of {lower:.9g} above the attained {value:.9g} was dropped; please report this problem.",)

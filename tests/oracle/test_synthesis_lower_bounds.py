@@ -106,7 +106,7 @@ def test_a_notch_of_the_set_lowers_the_filter():
     notch = StateSpace(chain.A - chain.B @ chain.C / 0.3, chain.B / 0.3, -chain.C / 0.3, [[1 / 0.3]], DT)  # its inverse
     if not notch.is_stable():
         pytest.skip("the inverse of this resonance is not stable")
-    case = small_problem(W_R=notch)
+    case = small_problem(W_R=notch, W_L=gain([[0.03]], DT))
     channels = Channels(case, design_grid(case), apart=True)
     theta = 2.0 + np.linspace(-2e-3, 2e-3, 8001)
     bottom = np.abs(notch.frequency_response(theta / (2 * np.pi))).min()
@@ -221,7 +221,7 @@ def test_no_bound_without_states_or_performance():
         {"form": "input_multiplicative", "W_R": resonance(0.995, 0.7, 2.0, 0.2)},
         {"form": "additive", "W_L": block_diagonal([resonance(0.99, 1.0, 0.3, 0.1), gain([[0.2]], DT)]), "W_R": gain([[1.0], [0.5]], DT)},
         {"form": "inverse_output_multiplicative", "W_L": StateSpace([[0.6]], [[1.0, 0.3]], [[0.1], [0.05]], [[0.2, 0.1], [0.0, 0.2]], DT), "W_R": gain(np.eye(2), DT)},
-        {"remainder_left": gain([[0.1, 0.099], [0.1, 0.1]], DT), "remainder_right": gain([[1.0]], DT), "W_L": gain([[0.01]], DT)},
+        {"remainder_left": gain([[0.1, 0.05], [0.0, 0.1]], DT), "remainder_right": gain([[1.0]], DT), "W_L": gain([[0.01]], DT)},
     ],
     ids=["plain", "input", "resonant", "resonant chain", "additive", "full weight", "correlated remainder"],
 )  # fmt: skip

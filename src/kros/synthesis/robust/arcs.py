@@ -57,10 +57,10 @@ class Enclosure:
         size_R = np.sqrt(np.linalg.norm(R, 1, axis=(-2, -1)) * np.linalg.norm(R, np.inf, axis=(-2, -1)))
         CR, RB = self._C @ R, R @ self._B
         slope, twice = np.linalg.norm(CR @ RB, axis=-1), np.linalg.norm(CR @ R, axis=-1)
-        room = 1 - half * size_R
-        tail = twice * (np.linalg.norm(RB, axis=(-2, -1)) / np.maximum(room, 1e-300))[:, None]
+        reach = half * size_R
+        tail = twice * (np.linalg.norm(RB, axis=(-2, -1)) / np.where(reach < 1, 1 - reach, 1.0))[:, None]
         distance = half[:, None] * slope + half[:, None] ** 2 * tail + _ROUNDING * size
-        return response, np.where((room > 0)[:, None], distance, np.inf)
+        return response, np.where((reach < 1)[:, None], distance, np.inf)
 
 
 def _even_coordinates(system: StateSpace) -> Array:

@@ -194,8 +194,8 @@ class Channels:
         energy = np.sum(np.abs(right) ** 2, axis=(-2, -1)) / max(left.shape[-1], right.shape[-2])
         return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
 
-    def shaping(self, spectrum: Spectrum, fit: Fit, side: str, options: dict[str, Any]) -> Shaping:
-        """Fit one rational factor a channel.
+    def shaping(self, spectrum: Spectrum, fit: Fit, side: str, options: dict[str, Any], remainder: StateSpace | None = None) -> Shaping:
+        """Fit one rational factor a channel; those of the remainder unless they are given.
 
         The best from below is the best from above but for its size, and channels whose spectra differ in size alone share a fit.
         """
@@ -210,7 +210,9 @@ class Channels:
                 systems.append(_touching(self._fitted(magnitude, fit, options), self.freqs_hz, magnitude, side))
             return block_diagonal(systems)
 
-        return Shaping(factor(spectrum.phi), self.behind, None if spectrum.psi is None else factor(spectrum.psi))
+        if remainder is None and spectrum.psi is not None:
+            remainder = factor(spectrum.psi)
+        return Shaping(factor(spectrum.phi), self.behind, remainder)
 
     def _fitted(self, magnitude: Array, fit: Fit, options: dict[str, Any]) -> StateSpace:
         """Fit of a magnitude, whatever its size, once."""

@@ -13,7 +13,7 @@ from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, gain
 from ..problem.observer_problem import ObserverProblem
 from .certificate import certify
-from .disturbance import Channels, Fit, Spectrum
+from .disturbance import Channels, Fit, Shaping, Spectrum
 from .everywhere import Everywhere
 from .shaped_filter import design, lower_bound
 
@@ -73,19 +73,27 @@ class Search:
         SynthesisError
             When no design survives.
         """
-        as_asked = self.design(spectrum, self.asked)
+        as_asked = self.design(self._shaping(spectrum, self.asked), self.asked)
         highest = self.asked["max_order"]
         if self.asked["order"] is None and highest > 1:
-            self.design(spectrum, {**self.asked, "order": 1})
+            simple = self._shaping(spectrum, {**self.asked, "max_order": 1})
+            self.design(simple, {**self.asked, "max_order": 1})
             if self.best.value < as_asked:
                 for order in range(2, highest):
-                    self.design(spectrum, {**self.asked, "order": order})
+                    options = {**self.asked, "max_order": order}
+                    self.design(self._shaping(spectrum, options, simple.remainder), options)
         if not self.designs:
             raise SynthesisError(f"Worst-case H2 synthesis: no design survived verification ({'; '.join(dict.fromkeys(self.reasons))}).")
 
-    def design(self, spectrum: Spectrum, options: Options) -> float:
-        """Design for a spectrum and certify; infinite where that fails."""
-        shaping = self.channels.shaping(spectrum, self.fit, "above", options)
+    def again(self, spectrum: Spectrum) -> None:
+        """Design for another spectrum with filters of the kind that did best."""
+        self.design(self._shaping(spectrum, self.options), self.options)
+
+    def _shaping(self, spectrum: Spectrum, options: Options, remainder: StateSpace | None = None) -> Shaping:
+        return self.channels.shaping(spectrum, self.fit, "above", options, remainder)
+
+    def design(self, shaping: Shaping, options: Options) -> float:
+        """Design for shaped disturbances and certify; infinite where that fails."""
         start = time.perf_counter()
         try:
             controller = design(self.problem, shaping)
@@ -105,8 +113,9 @@ class Search:
         channels = Channels(self.problem, self.channels.freqs_hz, apart=True)
         spectrum, proofs = channels.mixture(spectrum), Everywhere(channels)
         highest = self.asked["max_order"] if self.asked["order"] is None else self.asked["order"]
-        found = []
+        found, remainder = [], None
         for order in sorted({min(order, highest) for order in _BOUND_ORDERS}):
-            shaping = channels.shaping(spectrum, self.fit, "below", {**self.asked, "order": order})
+            shaping = channels.shaping(spectrum, self.fit, "below", {**self.asked, "order": order}, remainder)
+            remainder = shaping.remainder
             found.append(lower_bound(self.problem, proofs.lowered(shaping, spectrum)))
         return max((bound for bound in found if bound is not None), default=None)

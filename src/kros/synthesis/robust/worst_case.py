@@ -80,7 +80,7 @@ def worst_case_h2(
     search.first(spectrum)
     for round_ in range(1, refinements + 1):
         spectrum = spectrum.mixed_with(*channels.worst(search.best.controller), 1 / round_)
-        search.design(spectrum, search.options)
+        search.again(spectrum)
     if sharp:
         final = spectrum.mixed_with(*channels.worst(search.best.controller), 1 / (refinements + 1))
     else:

@@ -31,7 +31,7 @@ def drive_problem(injection, remainder=False):
     rest = {}
     if remainder:
         rest = {
-            "remainder_left": block_diagonal([lag(0.02, 0.002, 5.0 * (i + 1)) for i in range(4)]),
+            "remainder_left": block_diagonal([lag(0.004, 0.0004, 5.0 * (i + 1)) for i in range(4)]),
             "remainder_right": gain(np.eye(2), DT),
         }
     return ObserverProblem(

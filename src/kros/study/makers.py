@@ -141,10 +141,7 @@ def make_worst_case_h2(task: Task) -> Made:
     _, synthesis = best_design(
         task, [partial(rough, assumed, max_order=order) for order in (1, 2)]
     )  # order 2 in the search takes twice as long
-    accurate = worst_case_h2(assumed, max_order=task.max_order, refinements=0, causal=False)  # of higher order: for its lower bound
-    lower = max((b for b in (synthesis.lower_bound, accurate.lower_bound) if b is not None), default=None)
-    gap = None if lower is None or synthesis.worst_case_h2 is None else 100 * (synthesis.worst_case_h2 / lower - 1)
-    synthesis = replace(synthesis, lower_bound=lower, gap_percent=gap, causal_h2=causal_h2(assumed, synthesis.controller))
+    synthesis = replace(synthesis, causal_h2=causal_h2(assumed, synthesis.controller))
     return of_few_states(task, assumed, synthesis), surroundings.facts(), assumed
 
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from ..core.artifacts import load_artifact, save_artifact
+from ..core.errors import SynthesisError
 from ..core.loading import loader
 from ..core.lti import StateSpace
+
+log = logging.getLogger(__name__)
 
 
 class Injection(str, Enum):
@@ -99,6 +103,13 @@ class Synthesis:
     solver: str = ""
     notes: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        if self.gap_percent is not None and not self.gap_percent >= 0:
+            raise SynthesisError(
+                f"Synthesis {self.method}: a lower bound of {self.lower_bound} lies above what is attained ({self.gap_percent:.6g} %); "
+                "no result claims that. Please report the problem that led here."
+            )
+
     def save(self, folder: Path) -> None:
         """Write `synthesis.json` and `arrays.npz`."""
         content = {name: getattr(self, name) for name in _PLAIN}
@@ -115,4 +126,21 @@ class Synthesis:
         return cls(controller=StateSpace(arrays["A"], arrays["B"], arrays["C"], arrays["D"], content["dt"]), **values)
 
 
+def enclosed(value: float, lower: float | None) -> tuple[float | None, float | None, tuple[str, ...]]:
+    """Return the lower bound of an attained value, their distance in percent, and notes.
+
+    A bound above what is attained is false whatever its proof, and not handed on; a distance that rounding explains is none.
+    """
+    if value == 0 or lower == 0:
+        return 0.0, None, ()
+    if lower is None:
+        return None, None, ("No lower bound could be proven.",)
+    if lower > value * (1 + _ROUNDING):
+        log.error("Lower bound %.9g above the attained value %.9g: it is dropped.", lower, value)
+        return None, None, (f"Internal error: a lower bound of {lower:.9g} above the attained {value:.9g} was dropped; please report this problem.",)
+    lower = min(lower, value)
+    return lower, 100 * (value / lower - 1), ()
+
+
+_ROUNDING = 1e-6
 _PLAIN = tuple(name for name in Synthesis.__dataclass_fields__ if name != "controller")

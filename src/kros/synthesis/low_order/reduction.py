@@ -72,6 +72,8 @@ def reduce_controller(
     allowed = aim.value(full) * (1 + largest_loss_percent / 100)
     if not np.isfinite(allowed):
         raise SynthesisError("Order reduction: the controller to be reduced does not stabilise; start from one that does.")
+    if not full.n_states:
+        return synthesis
     balancing = aim.balanced(full)
     for k in range(full.n_states) if order is None else [min(order, full.n_states)]:
         for value, how, K in _candidates(balancing, full, k, aim):

@@ -19,7 +19,7 @@ from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm
 from ..assumptions import unreachable_modes
-from ..result import Injection, Status, Synthesis
+from ..result import Injection, Status, Synthesis, enclosed
 from .equations import discrete_gain, solve_riccati
 
 Array = npt.NDArray[Any]
@@ -88,18 +88,19 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     values, vectors = np.linalg.eigh((Q + Q.T) / 2)
     noise = np.hstack([vectors * np.sqrt(np.maximum(values, 0)), -L @ np.linalg.cholesky(R)])
     norm = h2_norm(StateSpace(closed, noise, np.eye(n), np.zeros((n, n + q)), dt))
-    promised = float(np.sqrt(max(np.trace(P), 0.0)))
+    lower, gap, told = enclosed(norm, float(np.sqrt(max(np.trace(P), 0.0))))
     return Synthesis(
         method="kalman",
         controller=gain(L, dt),
         status=Status.OPTIMAL,
         injection=Injection.STATE,
         h2_norm=norm,
-        lower_bound=promised,
-        gap_percent=100 * (norm / promised - 1) if promised > 0 else 0.0,
+        lower_bound=lower,
+        gap_percent=gap,
         spectral_radius=radius,
         solve_s=elapsed,
         solver="riccati",
+        notes=told,
     )
 
 

@@ -91,8 +91,17 @@ class Ball:
         energy = np.sum(np.abs(self.right) ** 2, axis=(-2, -1)) / max(self.right.shape[-2], self.left.shape[-1])
         return self.center @ _hermitian(self.center) + energy[..., None, None] * (self.left @ _hermitian(self.left))
 
-    def worst_spectrum(self, T: Array, iterations: int = 15) -> Array:
-        """Diagonal of the spectrum of an element that is (locally) worst for T, shape (f, b).
+    def symmetric_part(self) -> Array:
+        """``q^2 R_l R_l^H`` with ``q = ||R_r M||``: what the ball holds on both sides of its centre, shape (f, b, b)."""
+        q = np.linalg.norm(self.right, 2, axis=(-2, -1))
+        return q[:, None, None] ** 2 * (self.left @ _hermitian(self.left))
+
+    def spectrum(self, theta: Array) -> Array:
+        """Diagonal of the spectrum of the element of a contraction (f, b, a), shape (f, b)."""
+        return np.sum(np.abs(self.center + self.left @ theta @ self.right) ** 2, axis=-1)
+
+    def worst(self, T: Array, iterations: int = 15) -> Array:
+        """Contraction of an element that is (locally) worst for T, shape (f, b, a).
 
         The squared error is convex in Theta, so its linearisation is a minorant, and moving to the maximiser of the linearisation, the
         polar factor of the gradient, never decreases it. Where T hardly tells elements apart the first start wins, which fits smoothly.
@@ -106,17 +115,16 @@ class Ball:
             _polar(_hermitian(P) @ (T @ self.center) @ _hermitian(self.right)),  # aligned with the centre, as T sees it
             _hermitian(Vh_p)[..., :k] @ _hermitian(U_q)[..., :k, :],  # worst without the centre
         )
-        best, best_value = np.zeros_like(self.center), np.full(T.shape[:-2], -1.0)
+        best, best_value = starts[0], np.full(T.shape[:-2], -1.0)
         for theta in starts:
             for k in range(iterations + 1):
-                element = self.center + self.left @ theta @ self.right
-                error = T @ element
+                error = T @ (self.center + self.left @ theta @ self.right)
                 if k in (0, iterations):
                     value = np.linalg.norm(error, axis=(-2, -1))
                     better = value > best_value * (1 + 1e-6)
-                    best, best_value = np.where(better[..., None, None], element, best), np.where(better, value, best_value)
+                    best, best_value = np.where(better[..., None, None], theta, best), np.where(better, value, best_value)
                 theta = _polar(_hermitian(P) @ error @ _hermitian(self.right))
-        return np.sum(np.abs(best) ** 2, axis=-1)
+        return best
 
 
 def spread(P: Array, Q: Array) -> Array:

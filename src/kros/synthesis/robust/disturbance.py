@@ -32,14 +32,35 @@ _ALIKE = 9  # decimals, in nepers, to which spectra of one shape agree
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Power of the shaped channels on the design grid: disturbance phi (f, channels) and remainder psi (f, n) or None."""
+    """Power of the shaped channels on the design grid: disturbance phi (f, channels) and remainder psi (f, n) or None.
+
+    Parameters
+    ----------
+    phi, psi : ndarray
+    thetas : tuple of (float, ndarray (f, b, a))
+        What the spectrum is made of beside the average over the ball: elements of it, given by their contractions, and their shares.
+    sharp : bool
+        The diagonal of an element's spectrum is an average over the set; otherwise phi lies below the whole matrix.
+    """
 
     phi: Array
     psi: Array | None
+    thetas: tuple[tuple[float, Array], ...] = ()
+    sharp: bool = True
 
-    def mixed_with(self, phi: Array, weight: float) -> Spectrum:
-        """Return the average of two spectra of the disturbance."""
-        return replace(self, phi=(1 - weight) * self.phi + weight * phi)
+    def mixed_with(self, phi: Array, theta: Array, weight: float) -> Spectrum:
+        """Return the average of this spectrum and of that of an element."""
+        shares = tuple((share * (1 - weight), other) for share, other in self.thetas)
+        return replace(self, phi=(1 - weight) * self.phi + weight * phi, thetas=(*shares, (weight, theta)))
+
+    def power(self, ball: Ball, index: Array) -> Array:
+        """Power of w2 at other frequencies, shape (k, b): the same contractions, those of the given points of the design grid, in another ball."""
+        if not self.sharp:
+            return below(ball.average())
+        power = (1 - sum(share for share, _ in self.thetas)) * np.real(np.einsum("fii->fi", ball.average()))
+        for share, theta in self.thetas:
+            power = power + share * ball.spectrum(theta[index])
+        return np.asarray(power)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +141,15 @@ class Channels:
     ----------
     problem : ObserverProblem
     freqs_hz : ndarray, shape (f,), Hz
+    apart : bool
+        Keep W_L behind the filters: more states, for bounds that are never run.
     """
 
-    def __init__(self, problem: ObserverProblem, freqs_hz: Array) -> None:
+    def __init__(self, problem: ObserverProblem, freqs_hz: Array, apart: bool = False) -> None:
         self.problem, self.freqs_hz = problem, freqs_hz
         self.ball = uncertain_ball(problem, freqs_hz)
         self.left = problem.W_L.frequency_response(freqs_hz)
-        self.contained = is_diagonal(problem.W_L)
+        self.contained = not apart and is_diagonal(problem.W_L)
         self.behind = None if self.contained else problem.W_L
         self._fits: dict[Any, StateSpace] = {}
 
@@ -134,23 +157,32 @@ class Channels:
         """Power of the channels for the power of w2."""
         return np.sum(np.abs(self.left) ** 2, axis=-1) * power if self.contained else power
 
+    def mixture(self, spectrum: Spectrum) -> Spectrum:
+        """Return the spectrum of the same contractions for the channels as they are shaped here."""
+        return replace(spectrum, phi=self.shaped(spectrum.power(self.ball, np.arange(len(self.freqs_hz)))))
+
     def average(self) -> Spectrum:
         """Average over the set; every causal observer costs at least its share of it."""
         return Spectrum(self.shaped(np.real(np.einsum("fii->fi", self.ball.average()))), self._remainder())
 
     def below_average(self) -> Spectrum:
         """Largest diagonal spectrum below the average, where its channels are correlated."""
-        return Spectrum(self.shaped(below(self.ball.average())), self._remainder())
+        return Spectrum(self.shaped(below(self.ball.average())), self._remainder(), sharp=False)
 
-    def symmetric_part(self) -> Array:
-        """``q^2 R_l R_l^H`` with ``q = ||R_r M||``: what the ball holds on both sides of its centre, shape (f, b, b)."""
-        q = np.linalg.norm(self.ball.right, 2, axis=(-2, -1))
-        return q[:, None, None] ** 2 * (self.ball.left @ np.conj(np.swapaxes(self.ball.left, -1, -2)))
-
-    def worst(self, controller: StateSpace) -> Array:
-        """Spectrum of the element of the set that is (locally) worst for a given observer."""
+    def worst(self, controller: StateSpace) -> tuple[Array, Array]:
+        """Spectrum of the element of the set that is (locally) worst for a given observer, and its contraction."""
         T = self.problem.error_system(controller).frequency_response(self.freqs_hz)[..., self.problem.port] @ self.left
-        return self.shaped(self.ball.worst_spectrum(T))
+        theta = self.ball.worst(T)
+        return self.shaped(self.ball.spectrum(theta)), theta
+
+    def ball_of(self, N: Array | None, M: Array) -> Ball:
+        """Return the ball for a loop and a chain at other frequencies."""
+        return Ball.without_loop(M, self.problem.W_L.n_inputs) if N is None else Ball.of(N, M)
+
+    def nearest(self, theta: Array) -> Array:
+        """Return the nearest points of the grid to angles."""
+        grid = 2 * np.pi * self.problem.nominal.dt * self.freqs_hz
+        return np.searchsorted((grid[1:] + grid[:-1]) / 2, theta)
 
     def _remainder(self) -> Array | None:
         """Average spectrum of the remainder, shape (f, n)."""
@@ -162,8 +194,8 @@ class Channels:
         energy = np.sum(np.abs(right) ** 2, axis=(-2, -1)) / max(left.shape[-1], right.shape[-2])
         return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
 
-    def shaping(self, spectrum: Spectrum, fit: Fit, side: str, options: dict[str, Any]) -> Shaping:
-        """Fit one rational factor a channel.
+    def shaping(self, spectrum: Spectrum, fit: Fit, side: str, options: dict[str, Any], remainder: StateSpace | None = None) -> Shaping:
+        """Fit one rational factor a channel; those of the remainder unless they are given.
 
         The best from below is the best from above but for its size, and channels whose spectra differ in size alone share a fit.
         """
@@ -178,7 +210,9 @@ class Channels:
                 systems.append(_touching(self._fitted(magnitude, fit, options), self.freqs_hz, magnitude, side))
             return block_diagonal(systems)
 
-        return Shaping(factor(spectrum.phi), self.behind, None if spectrum.psi is None else factor(spectrum.psi))
+        if remainder is None and spectrum.psi is not None:
+            remainder = factor(spectrum.psi)
+        return Shaping(factor(spectrum.phi), self.behind, remainder)
 
     def _fitted(self, magnitude: Array, fit: Fit, options: dict[str, Any]) -> StateSpace:
         """Fit of a magnitude, whatever its size, once."""
@@ -188,26 +222,9 @@ class Channels:
             self._fits[key] = fit(self.freqs_hz, np.exp(shape), self.problem.nominal.dt, side="above", **options).system
         return self._fits[key]
 
-    def lowered(self, shaping: Shaping, spectrum: Spectrum) -> Shaping:
-        """Scale every filter so that its power nowhere on the grid exceeds the spectrum."""
-        remainder = shaping.remainder
-        if remainder is not None and spectrum.psi is not None:
-            remainder = _lowered(remainder, self.freqs_hz, spectrum.psi)
-        return Shaping(_lowered(shaping.filters, self.freqs_hz, spectrum.phi), shaping.behind, remainder)
-
 
 def _touching(system: StateSpace, freqs_hz: Array, magnitude: Array, side: str) -> StateSpace:
     """Scale a fit until it touches the magnitude from above or from below."""
     ratio = magnitude / np.abs(system.frequency_response(freqs_hz)[:, 0, 0])
     scale = float(ratio.max() if side == "above" else ratio.min())
     return StateSpace(system.A, system.B, system.C * scale, system.D * scale, system.dt)
-
-
-def _lowered(system: StateSpace, freqs_hz: Array, power: Array) -> StateSpace:
-    """Scale each channel of a diagonal filter so that its power nowhere exceeds `power`, shape (f, channels)."""
-    found = np.abs(np.diagonal(system.frequency_response(freqs_hz), axis1=-2, axis2=-1)) ** 2
-    if not np.isfinite(found).all():
-        raise SynthesisError("Worst-case synthesis: a shaping filter has an infinite response; ask for a lower order.")
-    ratio = np.min(power / np.maximum(found, 1e-300), axis=0)
-    scale = np.sqrt(np.minimum(ratio, 1.0))
-    return StateSpace(system.A, system.B, system.C * scale[:, None], system.D * scale[:, None], system.dt)

@@ -30,16 +30,15 @@ from ...core.norms import hinf_norm
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_plants import shape_inputs
 from ..problem.observer_problem import ObserverProblem
-from ..result import Status, Synthesis
+from ..result import Status, Synthesis, enclosed
 from ..riccati.hinf_optimal import hinf
 from .ball import below
 from .certificate import certify
 from .disturbance import Channels, Fit, Shaping, Spectrum, default_fit, design_grid
+from .everywhere import Everywhere
 from .robust_gain import RobustGain, robust_gain
 
 Array = npt.NDArray[Any]
-
-_DENSER = 10
 
 
 def worst_case_hinf(
@@ -110,13 +109,13 @@ def worst_case_hinf(
         loop = problem.error_system(controller)
     if reasons and best[1] is nothing:
         raise SynthesisError(f"Worst-case H-infinity synthesis: no design survived verification ({'; '.join(reasons)}).")
-    lower = _lower_bound(channels, fit, options, tolerance) if bounded else None
+    lower = _lower_bound(problem, fit, options, tolerance) if bounded else None
     return _result(problem, *best, lower, elapsed / (refinements + 1))
 
 
 def _result(problem: ObserverProblem, value: RobustGain, controller: StateSpace, lower: float | None, elapsed: float) -> Synthesis:
     loop = problem.error_system(controller)
-    lower = None if lower is None else min(lower, value.attained)
+    lower, _, notes = enclosed(value.attained, lower)
     n_d = problem.nominal.n_inputs + problem.nominal.n_states
     in_h2, error = certify(problem, controller)
     return Synthesis(
@@ -135,6 +134,7 @@ def _result(problem: ObserverProblem, value: RobustGain, controller: StateSpace,
         solver="riccati",
         notes=(
             f"The gain is attained at {value.freq_hz:.4g} Hz. The spectral radius is that of the nominal loop; it says nothing about robustness.",
+            *notes,
         ),
     )
 
@@ -172,16 +172,15 @@ def dominating(channels: Channels, loop: StateSpace) -> Spectrum:
     return Spectrum(phi, np.sum(np.abs(left) ** 2, axis=-1) * (_norm(Q[1]) ** 2 / share[1])[:, None])
 
 
-def _lower_bound(channels: Channels, fit: Fit, options: dict[str, Any], tolerance: float) -> float | None:
-    """Fit from below, lowered on a grid ten times denser."""
-    freqs = channels.freqs_hz
-    dense = Channels(channels.problem, np.geomspace(freqs[0], freqs[-1], _DENSER * len(freqs)))
-    low, check = (Spectrum(c.shaped(below(c.symmetric_part())), None) for c in (channels, dense))
-    return lower_bound(channels.problem, dense.lowered(channels.shaping(low, fit, "below", options), check), tolerance)
+def _lower_bound(problem: ObserverProblem, fit: Fit, options: dict[str, Any], tolerance: float) -> float | None:
+    """Fit from below, lowered until it is below at every frequency."""
+    channels = Channels(problem, design_grid(problem), apart=True)
+    shaping = channels.shaping(Spectrum(below(channels.ball.symmetric_part()), None), fit, "below", options)
+    return lower_bound(problem, Everywhere(channels).lowered_to_symmetric_part(shaping), tolerance)
 
 
 def lower_bound(problem: ObserverProblem, shaping: Shaping, tolerance: float) -> float | None:
-    """Return a level that no observer of either injection reaches, for filters that lie below the spectrum on the grid; None where none is shown.
+    """Return a level that no observer of either injection reaches, for filters that lie below the spectrum; None where none is shown.
 
     Estimates of ``W_p x`` one step ahead, free of any structure, are what is searched: the disturbance is delayed by one sample, which changes no
     norm, so that the output to be estimated is that of the next sample.

@@ -1,0 +1,106 @@
+r"""What a rational system can do between frequencies: enclosures on arcs of the unit circle, and a ratio proven on all of them.
+
+Around the middle ``z_0`` of an arc, with ``R_0 = (z_0 I - A)^{-1}`` and ``h >= |z - z_0|``, the Neumann series of the resolvent gives for every row
+
+.. math:: \|c_i^T (R - R_0) B\| \le h \|c_i^T R_0^2 B\| + h^2 \frac{\|c_i^T R_0^2\| \|R_0 B\|}{1 - h \|R_0\|},
+          \qquad h \|R_0\| < 1.
+
+It holds in all coordinates of the state; those in which white noise gives every state the same size and no correlation keep ``R_0`` small.
+Arcs on which the enclosure is not good enough are halved: no frequency is left out, and no decision is made at a point.
+
+Symbols
+-------
+theta, half : middle and half width of the arcs, rad, shape (k,)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.lti import StateSpace
+from ...core.norms import gramian
+
+Array = npt.NDArray[Any]
+Ratio = Callable[[Array, Array], tuple[Array, Array]]
+
+_CORRELATED = 1e-10  # regularises the coordinates, in which everything holds whatever they are
+_ROUNDING = 1e-7  # of responses, relative to the terms they are summed from
+_ROUNDS = 60
+
+
+class Enclosure:
+    """Response of a stable discrete system on arcs.
+
+    Parameters
+    ----------
+    system : StateSpace
+    """
+
+    def __init__(self, system: StateSpace) -> None:
+        self.system = system
+        T = _even_coordinates(system)
+        self._A = np.linalg.solve(T, system.A @ T) - np.eye(system.n_states)  # of z - 1, for the sake of low frequencies
+        self._B, self._C = np.linalg.solve(T, system.B), system.C @ T
+
+    def __call__(self, theta: Array, half: Array) -> tuple[Array, Array]:
+        """Return the response in the middle, (k, p, m), and the distance of every row from it on the arc, (k, p); infinite where the series ends."""
+        response = self.system.frequency_response(theta / (2 * np.pi * self.system.dt))
+        size = np.linalg.norm(response, axis=-1)
+        n = self.system.n_states
+        if not n:
+            return response, _ROUNDING * size
+        R = np.linalg.inv(np.expm1(1j * theta)[:, None, None] * np.eye(n) - self._A)
+        size_R = np.sqrt(np.linalg.norm(R, 1, axis=(-2, -1)) * np.linalg.norm(R, np.inf, axis=(-2, -1)))
+        CR, RB = self._C @ R, R @ self._B
+        slope, twice = np.linalg.norm(CR @ RB, axis=-1), np.linalg.norm(CR @ R, axis=-1)
+        reach = half * size_R
+        tail = twice * (np.linalg.norm(RB, axis=(-2, -1)) / np.where(reach < 1, 1 - reach, 1.0))[:, None]
+        distance = half[:, None] * slope + half[:, None] ** 2 * tail + _ROUNDING * size
+        return response, np.where((reach < 1)[:, None], distance, np.inf)
+
+
+def _even_coordinates(system: StateSpace) -> Array:
+    """States of equal size and without correlation under white noise, as far as they are reached."""
+    P = gramian(system.A, system.B, system.dt)
+    size = np.sqrt(np.maximum(np.diag(P), 0.0))
+    size = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(P / size / size[:, None])
+    return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0) + _CORRELATED))
+
+
+def least_ratio(ratio: Ratio, edges: Array, rtol: float = 3e-3, max_arcs: int = 20000) -> Array:
+    """Return what a ratio of responses nowhere falls below, for every channel.
+
+    Parameters
+    ----------
+    ratio : callable
+        Takes middles and half widths of k arcs; returns the least ratio on each, proven, and the ratio in the middle, both (k, channels).
+    edges : ndarray, rad
+        First arcs, from 0 to pi.
+    rtol : float
+        How far what is proven may be from the least ratio that was seen.
+    max_arcs : int
+        Work limit; what is proven until then is returned.
+    """
+    theta, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
+    proven, seen = ratio(theta, half)
+    least = seen.min(axis=0)
+    done = np.full_like(least, np.inf)
+    tried = len(theta)
+    for _ in range(_ROUNDS):
+        least = np.minimum(least, seen.min(axis=0, initial=np.inf))
+        loose = (proven < (1 - rtol) * least).any(axis=1)
+        done = np.minimum(done, proven[~loose].min(axis=0, initial=np.inf))
+        tried += 2 * int(loose.sum())
+        if not loose.any() or tried > max_arcs:
+            break
+        quarter = half[loose] / 2
+        theta, half = np.concatenate([theta[loose] - quarter, theta[loose] + quarter]), np.concatenate([quarter, quarter])
+        proven, seen = ratio(theta, half)
+    else:
+        loose = np.full(len(theta), True)
+    return np.minimum(done, proven[loose].min(axis=0, initial=np.inf))

@@ -1,0 +1,282 @@
+"""Lower bounds of worst-case designs against observers that are there: none may lie above what somebody attains."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+
+from kros.core import StateSpace, SynthesisError, block_diagonal, gain
+from kros.synthesis import Injection, ObserverProblem, Status, Synthesis, reduce_controller, worst_case_h2, worst_case_hinf
+from kros.synthesis.result import enclosed
+from kros.synthesis.riccati.filter_bound import predictor_bound
+from kros.synthesis.robust.arcs import Enclosure, least_ratio
+from kros.synthesis.robust.certificate import certify
+from kros.synthesis.robust.disturbance import Channels, Shaping, design_grid
+from kros.synthesis.robust.everywhere import Everywhere
+from kros.synthesis.robust.robust_gain import robust_gain
+
+DT = 1.0
+
+
+def stored(name):
+    """A problem from its matrices."""
+    parts = json.loads((Path(__file__).parent / "data" / f"{name}.json").read_text())
+    for key, value in parts.items():
+        if isinstance(value, dict):
+            parts[key] = StateSpace(*(value[k] for k in "ABCD"), value["dt"])
+    return ObserverProblem(**{**parts, "injection": Injection(parts["injection"])})
+
+
+def resonance(radius, angle, size=1.0, feed=0.0):
+    """One lightly damped mode with a peak of about `size` above `feed`."""
+    A = radius * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    return StateSpace(A, [[1.0], [0.0]], [[0.0, 2 * size * (1 - radius)]], [[feed]], DT)
+
+
+def small_problem(**changes):
+    parts = {
+        "nominal": StateSpace([[0.9, 0.1], [0.0, 0.7]], [[0.0], [0.5]], np.eye(2), np.zeros((2, 1)), DT),
+        "C": [[1.0, 0.0]],
+        "W_L": gain([[0.3]], DT),
+        "W_R": gain([[1.0]], DT),
+        "input_scale": [1.0],
+        "output_scale": [1.0, 1.0],
+        "noise": [0.1],
+    }
+    return ObserverProblem(**{**parts, **changes})
+
+
+def others(problem, found, rng, count=6):
+    """Observers that are not the one found: perturbed, and none."""
+    K = found.controller
+    yield gain(np.zeros_like(K.D), K.dt)
+    for size in np.geomspace(0.01, 0.5, count):
+        other = StateSpace(
+            K.A, K.B * (1 + size * rng.standard_normal(K.B.shape)), K.C, K.D + size * np.abs(K.D).max() * rng.standard_normal(K.D.shape), K.dt
+        )
+        if problem.error_system(other).is_stable():
+            yield other
+
+
+# --- the population whose bound was above what is attained
+
+
+def test_a_lightly_damped_population():
+    """An open-loop observer guarantees 24.81, whatever the order of the shaping filters; the bound lies below, and is worth something."""
+    case = stored("lightly_damped_population")
+    nothing = certify(case, gain(np.zeros((4, 1)), case.nominal.dt))[0]
+    assert nothing == pytest.approx(24.81, abs=0.005)
+    found = worst_case_h2(case, refinements=0, causal=False)
+    assert found.worst_case_h2 <= nothing
+    assert 0.7 * nothing < found.lower_bound < found.worst_case_h2
+    assert found.gap_percent == pytest.approx(100 * (found.worst_case_h2 / found.lower_bound - 1))
+
+
+def test_the_best_over_orders_is_kept_and_a_bound_belongs_to_all():
+    case = stored("lightly_damped_population")
+    found = [worst_case_h2(case, refinements=0, causal=False, order=order) for order in (1, 4)]
+    lowest = max(f.lower_bound for f in found)
+    assert all(lowest < f.worst_case_h2 <= 24.82 for f in found)
+
+
+# --- filters below a spectrum between the points of any grid
+
+
+@pytest.mark.parametrize("angle", [0.4, 1.9, 3.0])
+def test_a_peak_between_the_points_of_the_grid_lowers_the_filter(angle):
+    """The filter exceeds the spectrum (a constant) at its resonance alone, which is a hundredth of the grid's step wide."""
+    case = small_problem()
+    channels = Channels(case, design_grid(case), apart=True)
+    peak = resonance(1 - 1e-5, angle, size=5.0, feed=0.5)
+    grid = np.abs(peak.frequency_response(channels.freqs_hz)).max()
+    fine = np.abs(peak.frequency_response((angle + np.linspace(-3e-5, 3e-5, 2001)) / (2 * np.pi))).max()
+    assert fine > 3 * grid
+    spectrum = channels.average()
+    lowered = Everywhere(channels).lowered(Shaping(peak, channels.behind, None), spectrum).filters
+    scale = lowered.D[0, 0] / 0.5
+    assert scale == pytest.approx(min(1.0, np.sqrt(spectrum.phi[0, 0]) / fine), rel=5e-3)
+    assert scale * fine <= np.sqrt(spectrum.phi[0, 0])
+
+
+def test_a_notch_of_the_set_lowers_the_filter():
+    """The set's spectrum has a narrow notch between the points of the grid; a constant filter has to go below its bottom."""
+    chain = resonance(0.9999, 2.0, size=1.0, feed=0.3) @ gain([[1.0]], DT)
+    notch = StateSpace(chain.A - chain.B @ chain.C / 0.3, chain.B / 0.3, -chain.C / 0.3, [[1 / 0.3]], DT)  # its inverse
+    if not notch.is_stable():
+        pytest.skip("the inverse of this resonance is not stable")
+    case = small_problem(W_R=notch, W_L=gain([[0.03]], DT))
+    channels = Channels(case, design_grid(case), apart=True)
+    theta = 2.0 + np.linspace(-2e-3, 2e-3, 8001)
+    bottom = np.abs(notch.frequency_response(theta / (2 * np.pi))).min()
+    assert bottom < 0.5 * np.abs(notch.frequency_response(channels.freqs_hz)).min()
+    lowered = Everywhere(channels).lowered(Shaping(gain([[10.0]], DT), channels.behind, None), channels.average())
+    assert lowered.filters.D[0, 0] == pytest.approx(bottom, rel=5e-3)
+    assert lowered.filters.D[0, 0] <= bottom
+
+
+def test_a_response_stays_within_its_enclosure():
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        A = rng.standard_normal((5, 5))
+        A *= rng.uniform(0.5, 0.999) / np.abs(np.linalg.eigvals(A)).max()
+        T = np.diag(10.0 ** rng.uniform(-4, 4, 5))
+        system = StateSpace(T @ A @ np.linalg.inv(T), T @ rng.standard_normal((5, 2)), rng.standard_normal((3, 5)) @ np.linalg.inv(T), rng.standard_normal((3, 2)), DT)
+        theta = rng.uniform(0, np.pi, 40)
+        half = 10.0 ** rng.uniform(-4, -1, 40)
+        middle, distance = Enclosure(system)(theta, half)
+        assert np.isfinite(distance).sum() >= 10
+        for share in np.linspace(-1, 1, 9):
+            there = system.frequency_response((theta + share * half) / (2 * np.pi))
+            assert np.all(np.linalg.norm(there - middle, axis=-1) <= distance)
+        small = Enclosure(system)(theta, half * 1e-3)[1]
+        moved = system.frequency_response((theta + half * 1e-3) / (2 * np.pi)) - middle
+        assert np.median(small / np.linalg.norm(moved, axis=-1)) < 1.5, "tight on short arcs"
+
+
+def test_a_gain_has_no_distance_but_rounding():
+    response, distance = Enclosure(gain([[3.0, 4.0]], DT))(np.array([0.5]), np.array([0.5]))
+    assert response[0] == pytest.approx(np.array([[3.0, 4.0]]))
+    assert 0 < distance[0, 0] < 1e-5
+
+
+def test_the_least_ratio_is_found_and_proven():
+    """``2 + cos(k theta)`` with its Lipschitz constant k: the least value is one."""
+    k = np.array([3.0, 40.0])
+
+    def ratio(theta, half):
+        seen = 2 + np.cos(theta[:, None] * k)
+        return np.maximum(seen - k * half[:, None], 0.0), seen
+
+    found = least_ratio(ratio, np.linspace(0, np.pi, 5), rtol=1e-3)
+    assert np.all(found <= 1)
+    assert np.all(found >= 1 - 1e-3)
+    assert np.all(least_ratio(ratio, np.linspace(0, np.pi, 5), rtol=1e-3, max_arcs=1) == 0), "nothing is proven without work"
+
+
+# --- the inequality of the optimal filter
+
+
+def random_model(rng, n=5, k=4, q=2, spread=0.0):
+    A = rng.standard_normal((n, n))
+    A *= rng.uniform(0.3, 0.99) / np.abs(np.linalg.eigvals(A)).max()
+    T = np.diag(10.0 ** rng.uniform(-spread, spread, n))
+    B, C = rng.standard_normal((n, k)), rng.standard_normal((q, n))
+    D = np.hstack([rng.standard_normal((q, k - q)) * 0.3, np.eye(q)])
+    Z = rng.standard_normal((3, n))
+    return T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T), D, Z @ np.linalg.inv(T)
+
+
+@pytest.mark.parametrize("spread", [0.0, 5.0])
+def test_the_proven_error_is_below_the_optimum_and_close(spread):
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        plain = random_model(rng)
+        A, B, C, D, Z = plain
+        P = solve_discrete_are(A.T, C.T, B @ B.T, D @ D.T, s=B @ D.T)
+        optimum = np.trace(Z @ P @ Z.T)
+        T = np.diag(10.0 ** rng.uniform(-spread, spread, len(A)))
+        proven = predictor_bound(T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T), D, Z @ np.linalg.inv(T))
+        assert optimum * (1 - 1e-6) <= proven <= optimum * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("factor", [1.5, 1 + 1e-6])
+def test_a_wrong_riccati_solution_proves_nothing_false(monkeypatch, factor):
+    """Whatever the solver hands over, too large or no solution at all, the bound stays below the optimum."""
+    from kros.synthesis.riccati import filter_bound
+
+    A, B, C, D, Z = random_model(np.random.default_rng(2))
+    P = solve_discrete_are(A.T, C.T, B @ B.T, D @ D.T, s=B @ D.T)
+    L = np.linalg.solve(D @ D.T + C @ P @ C.T, (A @ P @ C.T + B @ D.T).T).T
+    monkeypatch.setattr(filter_bound, "predictor", lambda *_: (L, factor * P))
+    found = predictor_bound(A, B, C, D, Z)
+    assert found is None or found <= np.trace(Z @ P @ Z.T)
+    monkeypatch.setattr(filter_bound, "predictor", lambda *_: (L, P + np.diag(np.arange(5.0))))
+    found = predictor_bound(A, B, C, D, Z)
+    assert found is None or found <= np.trace(Z @ P @ Z.T)
+
+
+def test_where_nothing_is_seen_the_open_loop_is_the_optimum():
+    A, B, Z = np.diag([0.9, 0.99999]), np.diag([1.0, 2.0]), np.eye(2)
+    found = predictor_bound(A, np.hstack([B, np.zeros((2, 1))]), np.zeros((1, 2)), np.array([[0.0, 0.0, 1.0]]), Z)
+    assert found == pytest.approx(1 / (1 - 0.81) + 4 / (1 - 0.99999**2), rel=1e-6)
+
+
+def test_no_bound_without_states_or_performance():
+    assert predictor_bound(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1)), np.zeros((1, 0))) is None
+    A, B, C, D, Z = random_model(np.random.default_rng(3))
+    assert predictor_bound(A, B, C, D, 0 * Z) is None
+
+
+# --- whole designs
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"injection": Injection.INPUT},
+        {"W_L": resonance(0.999, 1.3, 0.4, 0.1)},
+        {"form": "input_multiplicative", "W_R": resonance(0.995, 0.7, 2.0, 0.2)},
+        {"form": "additive", "W_L": block_diagonal([resonance(0.99, 1.0, 0.3, 0.1), gain([[0.2]], DT)]), "W_R": gain([[1.0], [0.5]], DT)},
+        {"form": "inverse_output_multiplicative", "W_L": StateSpace([[0.6]], [[1.0, 0.3]], [[0.1], [0.05]], [[0.2, 0.1], [0.0, 0.2]], DT), "W_R": gain(np.eye(2), DT)},
+        {"remainder_left": gain([[0.1, 0.05], [0.0, 0.1]], DT), "remainder_right": gain([[1.0]], DT), "W_L": gain([[0.01]], DT)},
+    ],
+    ids=["plain", "input", "resonant", "resonant chain", "additive", "full weight", "correlated remainder"],
+)  # fmt: skip
+def test_no_observer_is_below_the_bound(changes):
+    case = small_problem(**changes)
+    found = worst_case_h2(case, refinements=0, causal=False, max_order=2)
+    assert 0.4 * found.worst_case_h2 < found.lower_bound <= found.worst_case_h2
+    rng = np.random.default_rng(0)
+    for injection in (Injection.STATE, Injection.INPUT):
+        same = small_problem(**{**changes, "injection": injection})
+        mine = worst_case_h2(same, refinements=0, causal=False, max_order=1)
+        assert mine.lower_bound <= found.worst_case_h2
+        for K in others(same, mine, rng):
+            assert certify(same, K)[0] >= max(found.lower_bound, mine.lower_bound)
+
+
+def test_bound_of_a_white_set_is_the_kalman_optimum():
+    """Scalar constants: the worst spectrum is white of size ``(w / (1 - w))^2``, nothing is lost anywhere."""
+    case = small_problem()
+    A, B, C, W_p = case.scaled
+    P = solve_discrete_are(A.T, C.T, (0.3 / 0.7) ** 2 * B @ B.T, np.eye(1))
+    found = worst_case_h2(case, refinements=0, causal=False)
+    assert found.lower_bound == pytest.approx(np.sqrt(np.trace(W_p @ P @ W_p.T)), rel=1e-2)
+    assert found.lower_bound <= np.sqrt(np.trace(W_p @ P @ W_p.T)) <= found.worst_case_h2
+
+
+def test_bound_in_the_other_norm():
+    case = small_problem(W_L=resonance(0.99, 1.3, 0.4, 0.1))
+    found = worst_case_hinf(case, max_order=2, refinements=0)
+    assert found.lower_bound is not None
+    for K in others(case, found, np.random.default_rng(1)):
+        assert robust_gain(case, K).value >= found.lower_bound
+
+
+# --- what is handed on
+
+
+def test_a_bound_above_what_is_attained_is_never_a_result():
+    lower, gap, notes = enclosed(2.0, 2.1)
+    assert lower is None
+    assert gap is None
+    assert "2.1 above the attained 2" in notes[0]
+    assert enclosed(2.0, None)[:2] == (None, None)
+    assert enclosed(2.0, 1.0) == (1.0, 100.0, ())
+    assert enclosed(0.0, None) == (0.0, None, ())
+    assert enclosed(1.0, 1.0 + 1e-9) == (1.0, 0.0, ())
+    with pytest.raises(SynthesisError, match="lies above what is attained"):
+        Synthesis("any", gain([[0.0]], DT), Status.CERTIFIED, lower_bound=2.0, gap_percent=-1.0)
+
+
+def test_no_correction_is_kept_where_nothing_is_better():
+    """Measurements far worse than the disturbance: what is handed over is not worse than no correction, and reducing it changes nothing."""
+    case = small_problem(noise=[1e6], W_L=resonance(0.999, 1.3, 0.4, 0.1))
+    found = worst_case_h2(case, refinements=0, causal=False, max_order=2)
+    nothing = certify(case, gain(np.zeros((2, 1)), DT))[0]
+    assert found.worst_case_h2 <= nothing
+    bare = Synthesis("worst_case_h2", gain(np.zeros((2, 1)), DT), Status.CERTIFIED, Injection.STATE, worst_case_h2=nothing)
+    assert reduce_controller(case, bare) is bare

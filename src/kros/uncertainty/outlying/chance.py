@@ -8,6 +8,9 @@ bound comes from the others, estimated as badly as it was:
 with dG a draw of the unit's own estimation error, var its variance and var_i that of unit i, which has some of it already. Each such estimate is
 scored against the cover of the others as they are. Location and scale are measured on these scores, averaged over draws, and the bound is that
 of the tail model at the same rate (`tail`). With equal variances nothing is added and the bound is the usual one.
+
+The unit itself is in the cover of the others, as everywhere, but only with what is left of its distance without a level of noise that few draws exceed:
+a unit that is far off for its noise alone would lower the scores that it is judged by.
 """
 
 from __future__ import annotations
@@ -19,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..forms import Form
-from .distances import Distances, distances, median_levels
-from .groups import covers, excess
+from .distances import Distances, distances, median_levels, scaled_levels
+from .groups import covers
 from .tail import LEAST_SCORES, gumbel, prediction_bound, prediction_factor
 
 Array = npt.NDArray[Any]
@@ -30,6 +33,8 @@ _MOST_UNITS = 24  # that are estimated badly, and that are nominals for them
 _SCORES = 200  # over all draws
 _BISECTIONS = 5
 _SEED = 0
+_TINY = 1e-30
+_LARGE = 0.95  # quantile of the noise that is taken off a unit's distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +66,13 @@ class Others:
         """Measure the distances of the units among themselves."""
         return cls(form, responses, noise, freqs_hz, rate, distances(form, responses, freqs_hz))
 
-    def bounds(self, deviations: Array) -> tuple[float, float] | None:
+    def bounds(self, response: Array, deviations: Array) -> tuple[float, float] | None:
         """Return the bound of a unit that is known as well as these, and of one with such estimation errors.
 
         Parameters
         ----------
+        response : ndarray, shape (frequency, p, m), complex
+            Of the unit.
         deviations : ndarray, shape (draw, frequency, p, m), complex
 
         Returns
@@ -76,34 +83,38 @@ class Others:
         variance = spread(deviations)
         if len(self.responses) <= LEAST_SCORES or times_noisier(variance, self.noise) <= AS_GOOD:
             return None
-        usual = float(prediction_bound(excess(self.found.levels)[0], self.rate))
-        return usual, max(usual, self._bound(deviations, variance))
+        rows = np.unique(np.linspace(0, len(self.responses) - 1, min(len(self.responses), _MOST_UNITS)).round().astype(int))
+        worse = np.stack([self._worse(rows, deviations, variance, draw) for draw in range(-(-_SCORES // len(rows)))])
+        noise = np.quantile(scaled_levels(self.form, self.responses[rows], worse, self.found, self.freqs_hz), _LARGE, axis=(0, 1))
+        cover = covers(np.concatenate([self.found.levels, self._beyond(response, rows, noise)[None]]))[:-1]
+        usual = float(prediction_bound((self.found.levels - cover).max(axis=1), self.rate))
+        own = np.eye(len(rows), dtype=bool)
+        levels = [median_levels(self.form, self.responses[rows], w, self.found, self.freqs_hz, own) for w in worse]
+        location, scale = gumbel((np.stack(levels) - cover[rows]).max(axis=2))
+        noisy = float(location.mean() + prediction_factor(len(self.responses), self.rate) * scale.mean())
+        return usual, max(usual, noisy)
 
-    def more_data(self, deviations: Array, rise_db: float) -> float:
+    def more_data(self, response: Array, deviations: Array, rise_db: float) -> float:
         """Return by how much longer recordings would bring the rise of the bound down to a size, variances falling as recordings grow."""
         low, high = 0.0, float(np.log(max(times_noisier(spread(deviations), self.noise), 1.0)))
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
-            bounds = self.bounds(deviations * np.exp(-middle / 2))
+            bounds = self.bounds(response, deviations * np.exp(-middle / 2))
             low, high = (low, middle) if bounds is None or bounds[1] - bounds[0] <= rise_db else (middle, high)
         return float(np.exp(high))
 
-    def _bound(self, deviations: Array, variance: Array) -> float:
-        """Bound of the others' scores when each is estimated as badly as the unit."""
-        n, rng = len(self.responses), np.random.default_rng(_SEED)
-        share = np.sqrt(np.clip(1 - np.divide(self.noise, variance, out=np.ones_like(self.noise), where=variance > 0), 0.0, 1.0))
-        cover = covers(self.found.levels)
-        rows = np.unique(np.linspace(0, n - 1, min(n, _MOST_UNITS)).round().astype(int))
-        nominals = self.responses[rows]
-        location, scale = [], []
-        for _ in range(-(-_SCORES // len(rows))):
-            drawn = deviations[rng.choice(len(deviations), len(rows), replace=len(deviations) < len(rows))]
-            worse = self.responses[rows] + share[rows] * drawn
-            levels = median_levels(self.form, nominals, worse, self.found, self.freqs_hz, np.eye(len(rows), dtype=bool))
-            a, b = gumbel((levels - cover[rows]).max(axis=1))
-            location.append(a)
-            scale.append(b)
-        return float(np.mean(location) + prediction_factor(n, self.rate) * np.mean(scale))
+    def _worse(self, rows: Array, deviations: Array, variance: Array, draw: int) -> Array:
+        """Some units, estimated as badly as a unit with such errors."""
+        share = np.sqrt(np.clip(1 - np.divide(self.noise[rows], variance, out=np.ones(self.noise[rows].shape), where=variance > 0), 0.0, 1.0))
+        chosen = np.random.default_rng([_SEED, draw]).choice(len(deviations), len(rows), replace=len(deviations) < len(rows))
+        return self.responses[rows] + share * deviations[chosen]
+
+    def _beyond(self, response: Array, rows: Array, noise: Array) -> Array:
+        """Level of a unit without a level of noise, shape (frequency,), dB."""
+        none = np.zeros((len(rows), 1), dtype=bool)
+        level = median_levels(self.form, self.responses[rows], response[None], self.found, self.freqs_hz, none)[0]
+        rest = 10 ** (level / 10) - 10 ** (noise / 10)
+        return np.where(rest > 0, 10 * np.log10(np.maximum(rest, _TINY)), self.found.levels.min())
 
 
 def spread(deviations: Array) -> Array:

@@ -137,7 +137,7 @@ class OutlierModel:
             return score
         draws = _deviations(unit, deviations, G.shape) / self.output_scale[:, None] * self.input_scale
         others = Others.of(self.form, self.responses[rows], self.noise[rows], self.freqs_hz, self.false_alarm_rate)
-        return _with_noise(score, others, draws)
+        return _with_noise(score, everyone[-1], others, draws)
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``outlier_model.json``."""
@@ -288,9 +288,9 @@ def _with_deviations(model: OutlierModel, G: Array, ids: tuple[str, ...], draws:
     return replace(model, scores=tuple(scores[u] for u in ids), by_nominal_db=by_nominal)
 
 
-def _with_noise(score: OutlierScore, others: Others, draws: Array) -> OutlierScore:
+def _with_noise(score: OutlierScore, G: Array, others: Others, draws: Array) -> OutlierScore:
     """Take off a score what the noise of its own estimate adds to its bound, and say whether that hides too much."""
-    bounds = others.bounds(draws)
+    bounds = others.bounds(G, draws)
     if bounds is None:
         return score
     usual, noisy = bounds
@@ -307,7 +307,7 @@ def _with_noise(score: OutlierScore, others: Others, draws: Array) -> OutlierSco
         status=Status.OUTLIER if outlier else status,
         detectable_db=score.detectable_db + lift,
         detectable_percent=score.detectable_percent * 10 ** (lift / 20),
-        more_data=1.0 if enough else others.more_data(draws, allowed),
+        more_data=1.0 if enough else others.more_data(G, draws, allowed),
     )
 
 

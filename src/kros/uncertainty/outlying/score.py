@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-LARGEST_DB = 20.0  # beyond the cover of the others: ten times as far away as any of them is
+LARGEST_DB = 26.0  # beyond the cover of the others: twenty times as far away as any of them is
 LARGEST_PERCENT = 50.0  # change of gain
 LARGEST_RISE_DB = 6.0  # of the bound, by the unit's own noise: a defect would have to be twice as large to be seen
 

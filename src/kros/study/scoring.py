@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact
 from ..identify import Factor, KoopmanMatrices, ModelSet, combine, edmd, lifted_factor
+from ..uncertainty import OutlierScore, Status
 from .store import Store
 
 Array = npt.NDArray[Any]
@@ -100,6 +101,11 @@ class Recorded:
         """Samples of the middle unit."""
         return float(np.median([e.n_samples for e in self.units.values()]))
 
+    @cached_property
+    def shortest(self) -> int:
+        """Samples of the shortest episode."""
+        return min(int(e.factor.n_samples.min()) for e in self.units.values())
+
     def response(self, evidence: Sequence[Evidence]) -> Array:
         """Return responses of estimates, shape (estimate, frequency, n, m), each regularised as if it had the usual number of samples."""
         joined = [combine(Factor(e.lifted, e.factor.peak, e.factor.n_samples)).R * np.sqrt(self.usual / e.n_samples) for e in evidence]
@@ -125,6 +131,14 @@ class Recorded:
         ratio = float(np.median(jackknife[known] / usual[known])) if known.any() else 1.0
         clearly = ratio > chi2.ppf(_UNLIKELY, own - 1) / (own - 1)
         return draws * np.sqrt(ratio) if clearly else draws
+
+    def judged(self, score: OutlierScore, evidence: Evidence) -> OutlierScore:
+        """Return what can be said about a unit; nothing where it was recorded for less than any episode of the study, of which none can be drawn."""
+        if evidence.n_samples >= self.shortest:
+            return score
+        more = max(score.more_data, self.shortest / evidence.n_samples)
+        score_db = min(score.score_db, score.threshold_db)
+        return replace(score, score_db=score_db, outlier=False, status=Status.NOT_ENOUGH_DATA, more_data=more)
 
     def same_recordings(self, factor: Factor) -> set[str]:
         """Return units of the study that have an episode in common with some, by their factors."""

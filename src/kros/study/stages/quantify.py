@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,8 @@ def score_units(context: Context) -> tuple[list[Path], list[dict[str, Any]]]:
             false_alarm_rate=context.config.uncertainty.false_alarm_rate,
             deviations=[recorded.deviations(e) for e in evidence],
         )
+        judged = tuple(recorded.judged(*pair) for pair in zip(outliers.scores, evidence, strict=True))
+        outliers = replace(outliers, scores=judged)
         place = context.model_folder(name, condition).name
         outliers.save(folder / place)
         files += sorted((folder / place).iterdir())

@@ -382,7 +382,7 @@ def _scores(
         others = inliers & (np.arange(len(G)) != k)
         percent, at, place = smallest_change(change, held(found.levels[others].max(axis=0)), bound)
         status = Status.OUTLIER if beyond else Status.OK if room_db(bound, percent) >= 0 else Status.CANNOT_TELL
-        seen = status, bound, percent, float(freqs[at]) if known else float("nan"), place
+        seen = status, bound, percent, float(freqs[at]) if known else None, place
         scores.append(OutlierScore(unit, referred, threshold, beyond, float(freqs[row]), entry, float(value[k]), *summary.summary(k), *seen))
     return tuple(scores)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 LARGEST_DB = 26.0  # beyond the cover of the others: twenty times as far away as any of them is
-LARGEST_PERCENT = 50.0  # change of gain
+LARGEST_PERCENT = 200.0  # change of gain: three times as large
 LARGEST_RISE_DB = 6.0  # of the bound, by the unit's own noise: a defect would have to be twice as large to be seen
 
 
@@ -59,8 +59,8 @@ class OutlierScore:
         What the excess would have to be for the unit to be flagged; infinite where nothing could be.
     detectable_percent : float
         Smallest change of gain of one entry of the response that is an excess of that size somewhere, to first order.
-    detectable_hz : float, Hz
-        Where that is; NaN where `detectable_percent` is infinite.
+    detectable_hz : float, Hz, or None
+        Where that is; None where `detectable_percent` is infinite.
     detectable_entry : tuple of int
         Output and input of the entry.
     more_data : float
@@ -80,7 +80,7 @@ class OutlierScore:
     status: Status
     detectable_db: float
     detectable_percent: float
-    detectable_hz: float
+    detectable_hz: float | None
     detectable_entry: tuple[int, int]
     more_data: float = 1.0
 
@@ -89,8 +89,7 @@ class OutlierScore:
         """Return a score as it was before it became JSON, which knows neither infinity nor tuples."""
         values = {f.name: content[f.name] for f in fields(cls)} | {"threshold_db": threshold_db, "status": Status(content["status"])}
         values |= {name: tuple(content[name]) for name in ("entry", "detectable_entry")}
-        unknown = {"detectable_hz": np.nan}
-        return cls(**{name: unknown.get(name, np.inf) if value is None else value for name, value in values.items()})
+        return cls(**{name: float("inf") if value is None and name != "detectable_hz" else value for name, value in values.items()})
 
 
 def room_db(detectable_db: float, detectable_percent: float) -> float:

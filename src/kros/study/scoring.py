@@ -134,7 +134,7 @@ class Recorded:
 
     def judged(self, score: OutlierScore, evidence: Evidence) -> OutlierScore:
         """Return what can be said about a unit; nothing where it was recorded for less than any episode of the study, of which none can be drawn."""
-        if evidence.n_samples >= self.shortest:
+        if _STEP * evidence.n_samples >= self.shortest:
             return score
         more = max(score.more_data, self.shortest / evidence.n_samples)
         score_db = min(score.score_db, score.threshold_db)

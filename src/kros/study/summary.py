@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ..report.caveats import confounded_text
 from .pipeline import RunResult
 
 
@@ -13,7 +14,7 @@ def summary_lines(result: RunResult) -> list[str]:
     metrics = result.metrics
     study = metrics["study"]
     lines = [f"{study['units']} units, conditions {', '.join(study['conditions'])}, {metrics['timing_s']['total']:.1f} s in all"]
-    lines += observer_lines(result)
+    lines += [*confounded_text(metrics), *observer_lines(result)]
     flagged = sorted({f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]})
     if "outliers" in metrics:
         lines.append(f"flagged as outliers: {', '.join(flagged) if flagged else 'none'}{_silent(metrics['outliers'])}")

@@ -154,16 +154,14 @@ def check(
     quiet: Annotated[bool, typer.Option("--json", help="Print scores as JSON and nothing else.")] = False,
 ) -> None:
     """Score new units against a finished study; exit code 3 when one is flagged."""
-    from .study.check import check_units
+    from .study.check import check_line, check_units
 
     scores = check_units(run_folder, data, _count(workers))
     if quiet:
         typer.echo(json.dumps(scores, indent=1, ensure_ascii=False))
     else:
         for row in scores:
-            threshold = "none, too few units" if row["threshold"] is None else f"{row['threshold']:.2f} dB"
-            verdict = "OUTLIER" if row["outlier"] else "ok"
-            typer.echo(f"{row['unit']}  {row['condition']}  score {row['score']:.2f} dB (threshold {threshold})  {verdict}")
+            typer.echo(check_line(row))
     if any(row["outlier"] for row in scores):
         raise typer.Exit(NOT_MET)
 

@@ -54,7 +54,11 @@ def others(problem, found, rng, count=6):
     yield gain(np.zeros_like(K.D), K.dt)
     for size in np.geomspace(0.01, 0.5, count):
         other = StateSpace(
-            K.A, K.B * (1 + size * rng.standard_normal(K.B.shape)), K.C, K.D + size * np.abs(K.D).max() * rng.standard_normal(K.D.shape), K.dt
+            K.A,
+            K.B * (1 + size * rng.standard_normal(K.B.shape)),
+            K.C,
+            K.D + size * np.abs(K.D).max() * rng.standard_normal(K.D.shape),
+            K.dt,
         )
         if problem.error_system(other).is_stable():
             yield other
@@ -122,7 +126,13 @@ def test_a_response_stays_within_its_enclosure():
         A = rng.standard_normal((5, 5))
         A *= rng.uniform(0.5, 0.999) / np.abs(np.linalg.eigvals(A)).max()
         T = np.diag(10.0 ** rng.uniform(-4, 4, 5))
-        system = StateSpace(T @ A @ np.linalg.inv(T), T @ rng.standard_normal((5, 2)), rng.standard_normal((3, 5)) @ np.linalg.inv(T), rng.standard_normal((3, 2)), DT)
+        system = StateSpace(
+            T @ A @ np.linalg.inv(T),
+            T @ rng.standard_normal((5, 2)),
+            rng.standard_normal((3, 5)) @ np.linalg.inv(T),
+            rng.standard_normal((3, 2)),
+            DT,
+        )
         theta = rng.uniform(0, np.pi, 40)
         half = 10.0 ** rng.uniform(-4, -1, 40)
         middle, distance = Enclosure(system)(theta, half)

@@ -38,6 +38,18 @@ def test_static_shares(form: Form, variation: float, noise: float) -> None:
     np.testing.assert_allclose(found.noise_share + found.variation_share, 1.0)
 
 
+@pytest.mark.parametrize("units", [2, 3, 5])
+def test_total_and_noise_are_means_over_pairs(units: int) -> None:
+    """Few units, additive, all pairs by hand: a mean over all ordered pairs of different units, and of different draws of the same unit."""
+    models = static(0.5, 0.1, units=units, draws=4)
+    found = variation_and_noise(models, FREQS, DT)
+    B, drawn = models.estimate.B, models.samples.B
+    pairs = [np.sum((B[i] - B[k]) ** 2) for i in range(units) for k in range(units) if i != k]
+    np.testing.assert_allclose(found.total, np.mean(pairs), rtol=1e-12)
+    within = [np.sum((drawn[i, d] - drawn[i, d - 1]) ** 2) for i in range(units) for d in range(4)]
+    np.testing.assert_allclose(found.noise, np.mean(within), rtol=1e-12)
+
+
 def test_band_is_the_quantile_of_the_draws() -> None:
     """A scalar B with Gaussian noise: 95 percent of the draws are within 1.96 standard deviations."""
     rng = np.random.default_rng(1)

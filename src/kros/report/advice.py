@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from .caveats import confounded_text, small_set_text
 from .error_table import ErrorTable, error_table
 from .names import condition_label, model_label, number, observer_label, split_observer
 
@@ -23,23 +24,42 @@ def advice(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[s
     """
     if metrics["study"].get("deployed") is None:
         return []
-    return [*_outliers(metrics), *_observer(metrics, measured), *_recordings(metrics)]
+    model = split_observer(metrics["study"]["deployed"])[0]
+    caveats = [*confounded_text(metrics), *small_set_text(metrics, (model,))]
+    return [*caveats, *_outliers(metrics), *_observer(metrics, measured), *_recordings(metrics)]
 
 
 def _outliers(metrics: Mapping[str, Any]) -> list[str]:
-    """Look at flagged units, the highest score first."""
+    """Look at flagged units, the highest score first, and at those about which nothing can be told."""
     flagged = sorted((r for r in metrics.get("outliers", []) if r["outlier"]), key=lambda r: -float(r["score"]))
     first: dict[str, Mapping[str, Any]] = {}
     for row in flagged:
         first.setdefault(row["unit"], row)
     units = [f"{u} ({_where(r)})" for u, r in first.items()]
     if not units:
-        return []
+        return _silent(metrics)
     filed = {row["unit"] for row in metrics.get("units", []) if row["group"] == "outliers"}
     text = f"Inspect {', '.join(units[:5])}{' and others' if len(units) > 5 else ''} before shipping."
     if any(u not in filed for u in first):
         text += " Flagged units still count in the design; set uncertainty.drop_outliers = true to leave them out."
-    return [text]
+    return [text, *_silent(metrics)]
+
+
+def _silent(metrics: Mapping[str, Any]) -> list[str]:
+    """Say what it would take for a score to mean something."""
+    rows = metrics.get("outliers", [])
+    short = [r for r in rows if r.get("status") == "not enough data"]
+    texts = []
+    if short:
+        most = max(short, key=lambda r: float(r["needed_s"]))
+        units = list(dict.fromkeys(r["unit"] for r in short))
+        texts.append(
+            f"Record {', '.join(units[:5])}{' and others' if len(units) > 5 else ''} for longer before trusting their scores: {most['unit']} "
+            f"({condition_label(most['condition'])}) needs about {number(most['needed_s'])} s and has {number(most['recorded_s'])} s."
+        )
+    if any(r.get("status") == "cannot tell" for r in rows):
+        texts.append("Score against more units: with these, only defects far beyond their differences would have been flagged.")
+    return texts
 
 
 def _where(row: Mapping[str, Any]) -> str:
@@ -95,4 +115,6 @@ def _recordings(metrics: Mapping[str, Any]) -> list[str]:
     differ = f"of how much {model_label(model)} models differ, where they do most ({where} Hz),"
     if share >= _MANY:
         return [f"Record longer or more episodes: {100 * share:.0f} % {differ} comes from the recordings' length."]
-    return [f"Longer recordings of these units would change little: {100 * (1 - share):.0f} % {differ} is manufacturing."]
+    return [
+        f"Longer recordings of these units would change little: {100 * (1 - share):.0f} % {differ} is there whatever is drawn from the episodes."
+    ]

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..data.population import DEFAULT_CONDITION
+from .caveats import conditions_apart, confounded_text
 from .error_table import ErrorTable, error_table
 from .left_out_table import left_out_tables
 from .names import BASELINES, channel_units, condition_label, form_label, minus, number, observer_label, split_observer
-from .sections.outliers import flagged_text
+from .sections.outliers import flagged_text, silence_text
 
 
 def verdict(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[str]:
@@ -39,7 +40,8 @@ def _recorded(metrics: Mapping[str, Any]) -> list[str]:
     study = metrics["study"]
     conditions = " and ".join(condition_label(c) for c in study["conditions"] if c != DEFAULT_CONDITION)
     units = f"{study['units']} unit" + ("s" if study["units"] != 1 else "")
-    return [f"{units} of one batch were recorded" + (f" ({conditions})." if conditions else ".")]
+    batch = "" if conditions_apart(metrics) else " of one batch"
+    return [f"{units}{batch} were recorded" + (f" ({conditions})." if conditions else "."), *confounded_text(metrics)]
 
 
 def _handed_over(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str]:
@@ -58,7 +60,7 @@ def _handed_over(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[
         return [*sentences, "Its estimates diverge on held-out episodes: do not use it."]
     units = channel_units(metrics)
     parts = [_channel(table, name, c, units.get(c, "")) for c in known]
-    sentences.append(f"{source} estimates {_join(parts)} on held-out episodes of the other units, in the mean.")
+    sentences.append(f"{source} estimates {_join(parts)} on held-out episodes of units that are not the nominal one, in the mean.")
     for method, label in (("open_loop", "Open loop, the nominal model alone,"), ("kalman_tuned", "The tuned Kalman filter")):
         sentences += _comparison(table, name, method, label, known)
     return sentences + _better(table, name, known)
@@ -133,7 +135,11 @@ def _covered(metrics: Mapping[str, Any]) -> list[str]:
     if entry is None or entry["peak_db"].get(entry["form"]) is None:
         return []
     peak, cover = minus(f"{entry['peak_db'][entry['form']]:.1f}"), entry["weight"]["cover_max"]
-    held = "its weights cover every unit that counts" if cover is not None and cover <= 1 else "its weights do not cover every unit"
+    held = (
+        "its weights cover the units that it was made from"
+        if cover is not None and cover <= 1
+        else "its weights do not cover all units that it was made from"
+    )
     return [
         f"The set of machines it is designed for ({form_label(entry['form'])}) has residuals of at most {peak} dB around unit {entry['nominal']}; {held}."
     ]
@@ -147,7 +153,7 @@ def _certificate(metrics: Mapping[str, Any]) -> list[str]:
     if entry.get("worst_case_h2") is not None:
         gap = entry.get("gap_percent")
         near = f", at most {number(gap)} % above what any correction of this kind can reach" if gap is not None else ""
-        sentences.append(f"Its error is certified for every unit inside the uncertain set{near}.")
+        sentences.append(f"Its error is certified for all plants inside the uncertain set{near}.")
     if entry.get("relift_certified") is not None:
         which = "A second certificate" if entry.get("worst_case_h2") is not None else "A certificate"
         sentences.append(
@@ -162,9 +168,10 @@ def _flagged(metrics: Mapping[str, Any]) -> list[str]:
     if "outliers" not in metrics:
         return []
     flagged = [r for r in metrics["outliers"] if r["outlier"]]
-    if not flagged:
-        return ["No unit is flagged as an outlier."] if metrics["outliers"] else ["There are too few units to look for outliers."]
-    return [f"Flagged as not belonging to the batch: {flagged_text(flagged)}."]
+    if not flagged and not metrics["outliers"]:
+        return ["There are too few units to look for outliers."]
+    told = f"Flagged as not belonging to the batch: {flagged_text(flagged)}." if flagged else "No unit is flagged as an outlier."
+    return [told, *silence_text(metrics["outliers"])]
 
 
 def _join(parts: list[str]) -> str:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ..core.artifacts import plain
 from ..core.errors import ConfigError, DataError
 from ..data import Population, check_population
-from ..identify import Factor, ModelSet, combine, edmd, lifted_factor
+from ..identify import ModelSet
 from ..observer import Observer
-from ..uncertainty import OutlierModel
+from ..uncertainty import OutlierModel, Status
 from .config import Stage, StudyConfig
 from .estimate import check_channels, load_calibration, open_data, training_keys, unit_parameters
 from .executors import Executor, open_executor
 from .run_folder import open_finished
+from .scoring import Evidence, Recorded
 from .stages.identify import reduce_episodes
 from .stages.quantify import score_row
 from .store import Store
@@ -26,10 +24,13 @@ from .store import Store
 def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]:
     """Identify the units of some recordings as the study did, and score each against the study's population.
 
+    A unit that took part in the study, by its name or by its recordings, is left out of what it is compared with.
+
     Returns
     -------
     list of dict
-        ``unit, condition, score, threshold, outlier, frequency_hz`` and more, one row a unit and condition that the study knows.
+        One row a unit and condition that the study knows: ``unit, condition, score, threshold, outlier, status, detectable, freq_hz`` and more
+        (see `kros.study.stages.quantify.score_row`), and ``left_out``, units of the study that it was not compared with.
     """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (config, store):
         return scored(config, store, data, workers)
@@ -64,22 +65,44 @@ def score_condition(
     store: Store, population: Population, models: ModelSet, outliers: OutlierModel, executor: Executor
 ) -> list[dict[str, Any]]:
     """Score all units that were recorded in one condition."""
-    keys = training_keys(population)
-    units = [u for u in population.unit_ids if keys.get((u, models.condition))]
+    training, everything = training_keys(population), {(u, c): keys for u, c, keys in population.groups()}
+    units = [u for u in population.unit_ids if training.get((u, models.condition))]
     parameters = (
         unit_parameters(population.select(units), load_calibration(store), _identify_on(store))
         if models.lifting.parameters
         else {u: {} for u in units}
     )
-    lifting = models.lifting
-    tasks = [(population.select([u], [models.condition]), keys[u, models.condition], lifting) for u in units]
-    reduced = [combine(f) for f in executor.map(reduce_episodes, tasks)]
-    factor = Factor(*(np.stack([getattr(f, name) for f in reduced]) for name in ("R", "peak", "n_samples")))
-    values = {name: np.array([parameters[u][name] for u in units]) for name in lifting.parameters}
-    matrices = edmd(lifted_factor(factor, lifting, values, lifting).R, lifting.n_lifted, models.alpha or 0.0)
-    fresh = replace(models, unit_ids=tuple(units), A=matrices.A, B=matrices.B, parameters=values, status=("ok",) * len(units))
-    responses = fresh.systems().frequency_response(outliers.freqs_hz)
-    return [score_row(outliers.score(unit, response), models.condition) for unit, response in zip(units, responses, strict=True)]
+    tasks = [(population.select([u], [models.condition]), everything[u, models.condition], models.lifting) for u in units]
+    recorded, rows = Recorded.load(store, models, outliers.freqs_hz), []
+    for unit, factor in zip(units, executor.map(reduce_episodes, tasks), strict=True):
+        keys, used = everything[unit, models.condition], training[unit, models.condition]
+        evidence = Evidence.of(factor, models, parameters[unit]).part([keys.index(k) for k in used])
+        known = recorded.same_recordings(factor) | ({unit} & set(recorded.units))
+        (response,), deviations = recorded.response([evidence]), recorded.deviations(evidence)
+        score = recorded.judged(outliers.score(unit, response, deviations, known), evidence)
+        seconds = float(factor.n_samples.sum()) * models.sample_period_s
+        rows.append(score_row(score, models.condition, len(keys), seconds) | {"left_out": sorted(known)})
+    return rows
+
+
+def check_line(row: dict[str, Any]) -> str:
+    """Return a row of `check_units` for people at a terminal."""
+    threshold = "none, too few units" if row["threshold"] is None else f"{row['threshold']:.2f} dB"
+    line = f"{row['unit']}  {row['condition']}  score {row['score']:.2f} dB (threshold {threshold})"
+    line += f"  {row['status'].upper() if row['outlier'] else row['status']}"
+    if row["outlier"]:
+        return line
+    seen = (
+        "no change would have been seen"
+        if row["detectable"] is None
+        else f"a change of gain by {row['detectable']:.2g} % would have been seen"
+    )
+    if row["status"] == Status.NOT_ENOUGH_DATA:
+        return f"{line}: about {row['needed_s']:.3g} s of recordings are needed, found {row['recorded_s']:.3g} s"
+    if row["detectable"] is None:
+        return f"{line}: {seen}, there are too few units to compare with"
+    where = f"at {row['detectable_hz']:.3g} Hz"
+    return f"{line}: {seen}, {where}, {row['detectable_db']:.1f} dB beyond the other units"
 
 
 def _identify_on(store: Store) -> str:

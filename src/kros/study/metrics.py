@@ -65,7 +65,8 @@ def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
     models = context.models(context.model_names[0]) if Stage.IDENTIFY in done else None
     rows = []
     for unit, group in facts.groups.items():
-        row: dict[str, Any] = {"unit": unit, "group": group}
+        keys = [*facts.keys("train", unit), *facts.keys("test", unit)]
+        row: dict[str, Any] = {"unit": unit, "group": group, "conditions": list(dict.fromkeys(k.condition for k in keys))}
         status = "ok"
         if calibration is not None:
             phase = calibration.units.get(unit)
@@ -73,6 +74,8 @@ def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
             status = status if phase else "not calibrated"
         if models is not None and unit in models.unit_ids:
             status = models.status[models.index(unit)]
+        elif models is not None and status == "ok":
+            status = f"not identified, no recordings in {facts.identify_on}"
         rows.append(row | {"status": status})
     return rows
 

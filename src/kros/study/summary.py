@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..report.caveats import confounded_text
 from .pipeline import RunResult
 
 
@@ -11,13 +15,19 @@ def summary_lines(result: RunResult) -> list[str]:
     study = metrics["study"]
     lines = [f"{study['units']} units, conditions {', '.join(study['conditions'])}, {metrics['timing_s']['total']:.1f} s in all"]
     lines += [f"look at: {alert}" for alert in study.get("alerts", ())]
-    lines += observer_lines(result)
+    lines += [*confounded_text(metrics), *observer_lines(result)]
     flagged = sorted({f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]})
     if "outliers" in metrics:
-        lines.append(f"flagged as outliers: {', '.join(flagged) if flagged else 'none'}")
+        lines.append(f"flagged as outliers: {', '.join(flagged) if flagged else 'none'}{_silent(metrics['outliers'])}")
     report = result.folder / "report.html"
     lines.append(f"report: {report}" if report.exists() else f"results: {result.folder}")
     return lines
+
+
+def _silent(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return how many scores say nothing about their unit."""
+    silent = sum(row.get("status") in ("not enough data", "cannot tell") for row in rows)
+    return f"; {silent} of {len(rows)} scores say nothing about their unit" if silent else ""
 
 
 def observer_lines(result: RunResult) -> list[str]:

@@ -4,7 +4,8 @@ from .fits.magnitude import FittedMagnitude, Side, fit_magnitude, invert
 from .fits.tightness import Tightness, magnitude_tightness, weight_tightness
 from .forms import Form, existence, rebuild, residual, residual_shape
 from .model import UncertainModel, scale_system
-from .outlying.outliers import OutlierModel, OutlierScore, score_outliers
+from .outlying.outliers import OutlierModel, score_outliers
+from .outlying.score import OutlierScore, Status
 from .population.noise import VariationAndNoise, variation_and_noise
 from .population.nominal import Criterion, NominalChoice, choose_nominal, choose_nominals
 from .quantified import Quantified
@@ -33,6 +34,7 @@ __all__ = [
     "ResidualSystems",
     "ResponseUncertainty",
     "Side",
+    "Status",
     "Structure",
     "Tightness",
     "UncertainModel",

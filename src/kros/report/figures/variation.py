@@ -1,4 +1,4 @@
-"""How much of the uncertainty is manufacturing and how much the finite recording, over frequency.
+"""How much of the uncertainty is the units and how much the finite recording, over frequency.
 
 Needs: variation and noise.
 """
@@ -34,7 +34,7 @@ def draw(run: RunFolder) -> Drawing:
         f"Above, blue: {form_label(first.form.value)} residuals of {len(first.unit_ids) - 1} units against the nominal one, "
         f"{first.unit_ids[first.nominal]}. Gold: what the residual of a unit against itself would stay below in {100 * first.level:.0f} % of cases, had other "
         "episodes been recorded; median unit, and from the smallest to the largest. Below: shares of the squared residual. "
-        f"{largest_text(found)} A bias that all episodes of a unit share counts as manufacturing."
+        f"{largest_text(found)} A bias that all episodes of a unit share counts as a difference between units."
     )
     return Drawing(variation_figure(found), text)
 
@@ -94,7 +94,7 @@ def _shares(axes: Axes, found: VariationAndNoise) -> None:
     axes.plot(freqs, share, color=Tone.GOLD.light, lw=1.2)
     middle = float(np.mean(share))
     if middle < 70:
-        axes.annotate("manufacturing", (0.04, 0.93), xycoords="axes fraction", va="top", size=7.5, color=Tone.INK.light)
+        axes.annotate("units differ", (0.04, 0.93), xycoords="axes fraction", va="top", size=7.5, color=Tone.INK.light)
     if middle > 20:
         axes.annotate("recordings", (0.04, 0.07), xycoords="axes fraction", va="bottom", size=7.5, color=Tone.INK.light)
     axes.set_ylim(0, 100)

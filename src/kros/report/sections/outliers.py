@@ -10,6 +10,10 @@ from ..figures.entries import entry_names, short
 from ..names import condition_label, number
 from ..run_folder import NotShownError, RunFolder
 
+_MEANING = (
+    "Beside every score stands the smallest change that would have been flagged: what the unit would have to exceed the others by, and the smallest change of "
+    "gain in one response that does so somewhere. A unit that is “ok” may have any defect that changes its responses by less."
+)
 _MOST = 5  # flagged units that are described in words
 
 
@@ -24,9 +28,19 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "Scores look at the recordings only, never at serial or group. Some unit always sticks out most, so there is a threshold; above it a unit is flagged."
     )
     verdict = f"Flagged: {flagged_text(flagged)}." if flagged else "No unit is flagged."
-    paragraphs = [text, verdict, *(conspicuous_text(r, _names(run, r)) for r in flagged[:_MOST])]
+    paragraphs = [text, verdict, *silence_text(rows), _MEANING, *(conspicuous_text(r, _names(run, r)) for r in flagged[:_MOST])]
     more = [("As in the paper, entry by entry", ["outlier_residuals"])]
     return Section("outliers", "Outliers", paragraphs, [_scores(run, rows)], ["outlier_scores", "outlier_ratio"], more=more)
+
+
+def silence_text(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say about which units the scores say nothing, and why; nothing where there are none."""
+    texts = []
+    for status, why in (("not enough data", "too little was recorded of it"), ("cannot tell", "the others are too few, or too unlike")):
+        silent = [r for r in rows if r.get("status") == status]
+        if silent:
+            texts.append(f"{len(silent)} of {len(rows)} scores say nothing about their unit, as {why}: {flagged_text(silent)}.")
+    return texts
 
 
 def conspicuous_text(row: Mapping[str, Any], names: tuple[Sequence[str], Sequence[str]] | None) -> str:
@@ -66,9 +80,12 @@ def _scores(run: RunFolder, rows: Sequence[Mapping[str, Any]]) -> Table:
     names = {c: _names(run, {"condition": c}) for c in conditions}
     order = sorted(dict.fromkeys(r["unit"] for r in rows), key=lambda u: -max((_score(found, u, c) for c in conditions), default=0.0))
     cells = [[Cell(u), *(cell for c in conditions for cell in _cells(found.get((u, c)), names[c]))] for u in order]
-    head = ["unit", *(["score (dB)", "over nominals (dB)", "at (Hz)", "entry"] * len(conditions))]
-    caption = "Outlier scores, highest first; with their range over all nominals, frequency and entry of the residual"
-    return Table(head, cells, caption, [("", 1), *((condition_label(c), 4) for c in conditions)], folded=True)
+    head = [
+        "unit",
+        *(["score (dB)", "over nominals (dB)", "at (Hz)", "entry", "status", "flagged from (dB)", "gain (%)"] * len(conditions)),
+    ]
+    caption = "Outlier scores, highest first; with their range over all nominals, frequency and entry of the residual, and what would have been flagged"
+    return Table(head, cells, caption, [("", 1), *((condition_label(c), 7) for c in conditions)], folded=True)
 
 
 def flagged_text(flagged: list[Mapping[str, Any]]) -> str:
@@ -86,7 +103,7 @@ def _score(found: Mapping[tuple[str, str], Mapping[str, Any]], unit: str, condit
 
 def _cells(row: Mapping[str, Any] | None, names: tuple[Sequence[str], Sequence[str]] | None) -> list[Cell]:
     if row is None:
-        return [Cell("–")] * 4
+        return [Cell("–")] * 7
     known = row.get("lowest_db") is not None
     shift = row["score"] - row["excess_db"] if known else 0.0  # as the score itself is referred to the threshold
     span = f"{number(row['lowest_db'] + shift)} to {number(row['highest_db'] + shift)}" if known else "–"
@@ -95,4 +112,7 @@ def _cells(row: Mapping[str, Any] | None, names: tuple[Sequence[str], Sequence[s
         Cell(span),
         Cell(number(row.get("freq_hz"))),
         Cell(_entry(row, names, "{1} → {0}") or "–"),
+        Cell(row.get("status", "–"), strong=row.get("status", "ok") != "ok"),
+        Cell(number(row.get("detectable_db"))),
+        Cell(number(row.get("detectable"), 2)),
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ..caveats import confounded_text, small_set_text
 from ..content import Cell, Section, Table
 from ..names import form_label, minus, model_label, number
 from ..run_folder import RunFolder
@@ -40,7 +41,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     tall = any(len(m.output_scale) > len(m.input_scale) for m in run.uncertain.values())
     high = [n for n, e in entries.items() if (e["peak_db"].get(e["form"]) or 0) >= 0]
     paragraphs = [text, *([_PAPER] if tall else []), *([_HIGH.format(names=", ".join(model_label(n) for n in high))] if high else [])]
-    paragraphs += noise_text(entries)
+    paragraphs += [*confounded_text(metrics), *small_set_text(metrics), *noise_text(entries)]
     tables = [t for t in [_peaks(entries), _noise(entries), _weights(entries)] if t]
     more = [("As in the paper, entry by entry", ["forms_entrywise", "weights_entrywise"])]
     return Section("uncertainty", "Uncertainty", paragraphs, tables, ["forms", "variation", "weights", "weight_orders"], more=more)
@@ -60,9 +61,7 @@ def noise_text(entries: Mapping[str, Any]) -> list[str]:
     if low:
         text += f"Where the units differ most, they really differ ({', '.join(low)}): more recordings of the same units would not shrink the set. "
     if high:
-        text += (
-            f"For {', '.join(high)} most of it is the recordings' length: record longer, or more episodes, before calling it manufacturing."
-        )
+        text += f"For {', '.join(high)} most of it is the recordings' length: record longer, or more episodes, before calling it a difference between machines."
     return [text.strip()]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,6 +19,7 @@ from ..config import UncertaintyConfig
 from ..context import Context
 from ..diagnostics import diagnose
 from ..responses import scaled_responses
+from ..scoring import Recorded
 
 log = logging.getLogger(__name__)
 _LARGEST_PRODUCT = 0.7  # of |W_R W_L|: an amplification by 3.3
@@ -114,22 +116,50 @@ def score_units(context: Context) -> list[dict[str, Any]]:
             log.info("%s: outlier scores need at least three units, found %d", condition, len(models.unit_ids))
             continue
         freqs = log_grid(models.sample_period_s, context.config.uncertainty.n_freqs)
+        recorded = Recorded.load(context.store, models, freqs)
+        evidence = list(recorded.units.values())
         outliers = score_outliers(
-            models.systems().frequency_response(freqs),
+            recorded.response(evidence),
             freqs,
             context.config.uncertainty.outlier_form,
             unit_ids=models.unit_ids,
             output_scale=models.output_scale,
             input_scale=models.input_scale,
             false_alarm_rate=context.config.uncertainty.false_alarm_rate,
+            deviations=[recorded.deviations(e) for e in evidence],
         )
+        judged = tuple(recorded.judged(*pair) for pair in zip(outliers.scores, evidence, strict=True))
+        outliers = replace(outliers, scores=judged)
         outliers.save(folder / place)
-        rows += [score_row(score, condition) for score in outliers.scores]
+        for score, found in zip(outliers.scores, evidence, strict=True):
+            keys, used = (context.facts.keys(part, score.unit, condition) for part in ("test", "train"))
+            seconds = found.n_samples * models.sample_period_s * (1 + len(keys) / len(used))  # episodes that are held out, like the others
+            rows.append(score_row(score, condition, len(keys) + len(used), seconds))
     write_json(folder / "scores.json", {"schema": 1, "rows": rows})
     return rows
 
 
-def score_row(score: OutlierScore, condition: str) -> dict[str, Any]:
-    """Return a score as a row of metrics, with where it comes from."""
+def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:
+    """Return a score as a row of metrics.
+
+    Parameters
+    ----------
+    score : OutlierScore
+    condition : str
+    episodes : int
+        Recorded, those that are held out among them.
+    recorded_s : float, s
+
+    Returns
+    -------
+    dict
+        ``unit, condition, score, threshold`` (dB), ``outlier``; ``status``; where the score comes from; ``detectable``, the smallest change of gain
+        that would have been flagged in percent, with ``detectable_db``, ``detectable_hz`` and ``detectable_entry`` (output, input); ``episodes`` and
+        ``recorded_s``, and what would be needed of both.
+    """
     row = {"unit": score.unit, "condition": condition, "score": score.score_db, "threshold": score.threshold_db, "outlier": score.outlier}
-    return row | {key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db", "agreement")}
+    row |= {key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db", "agreement")}
+    row |= {"status": score.status, "detectable": score.detectable_percent}
+    row |= {key: getattr(score, key) for key in ("detectable_db", "detectable_hz", "detectable_entry")}
+    needed = {"needed_episodes": int(np.ceil(episodes * score.more_data)), "needed_s": recorded_s * score.more_data}
+    return row | {"episodes": episodes, "recorded_s": recorded_s} | needed

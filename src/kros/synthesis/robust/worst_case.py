@@ -119,5 +119,8 @@ def _result(problem: ObserverProblem, search: Search, lower: float | None, causa
         spectral_radius=float(loop.spectral_radius()),
         solve_s=search.elapsed / search.designs,
         solver="riccati",
-        notes=("The spectral radius is that of the nominal loop; it says nothing about robustness. The certificate is worst_case_h2.", *notes),
+        notes=(
+            "The spectral radius is that of the nominal loop; it says nothing about robustness. The certificate is worst_case_h2.",
+            *notes,
+        ),
     )

@@ -71,6 +71,27 @@ def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
     return Distances(nominals, level, _median(level, own), np.concatenate(left), np.concatenate(right))
 
 
+def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances, freqs_hz: Array) -> Array:
+    """Return smoothed levels of residuals in the scales of a population, shape (..., frequency), dB.
+
+    Parameters
+    ----------
+    form : Form
+    nominal, perturbed : ndarray, shape (..., frequency, p, m), complex
+        They broadcast against each other.
+    found : Distances
+        Of the population.
+    freqs_hz : ndarray, shape (frequency,), Hz
+    """
+    E = residual(form, nominal, perturbed) / found.left[:, :, None] / found.right[:, None, :]
+    return _smooth(20 * np.log10(np.maximum(sigma_max_first(entries_first(E)), _LEAST)), freqs_hz)
+
+
+def median_levels(form: Form, nominals: Array, perturbed: Array, found: Distances, freqs_hz: Array, own: npt.NDArray[np.bool_]) -> Array:
+    """Return the median of levels over nominals, shape (unit, frequency), dB; `own`, shape (nominal, unit), tells which pairs do not count."""
+    return _median(scaled_levels(form, nominals[:, None], perturbed, found, freqs_hz), own)
+
+
 def largest_entries(form: Form, responses: Array, found: Distances, units: Array, rows: Array) -> list[tuple[int, int]]:
     """Return the entries of units' residuals that are largest for their typical size, each at its own frequency."""
     nominal, perturbed = responses[found.nominals[:, None], rows], responses[units, rows]

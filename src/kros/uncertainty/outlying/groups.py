@@ -53,13 +53,22 @@ def excess(levels: Array, size: int = 1) -> tuple[Array, Array]:
         The largest excess over frequency in dB, and the index of its frequency. Where the reference is more than 40 dB below its peak, it
         is held there: an excess over next to nothing is noise.
     """
+    over = levels - covers(levels, size)
+    where = over.argmax(axis=1)
+    return over[np.arange(len(levels)), where], where
+
+
+def covers(levels: Array, size: int = 1) -> Array:
+    """Return what every unit is held against, shape (unit, frequency): the `size`-th largest of the others, at most 40 dB below its peak."""
     n = len(levels)
     ordered = np.partition(levels, (n - size - 1, n - size), axis=0)
     reference = np.where(levels >= ordered[n - size], ordered[n - size - 1], ordered[n - size])
-    reference = np.maximum(reference, reference.max(axis=1, keepdims=True) - _FLOOR_DB)
-    over = levels - reference
-    where = over.argmax(axis=1)
-    return over[np.arange(n), where], where
+    return held(reference)
+
+
+def held(reference: Array) -> Array:
+    """Return a cover, shape (..., frequency), held at 40 dB below its peak where it is lower: an excess over next to nothing is noise."""
+    return np.maximum(reference, reference.max(axis=-1, keepdims=True) - _FLOOR_DB)
 
 
 def separate(levels: Array, rate: float) -> Separation:

@@ -13,12 +13,15 @@ Some unit always exceeds the others, and without a model no threshold can hold a
 generalised extreme value model of the others' scores at the stated rate (`tail`): an extrapolation, and labelled as such. Units are taken
 out one at a time while they are beyond; where none is, groups that hide one another are looked for (`groups`), up to a third of the units
 and eight at once. With three units nothing can be flagged: two scores make no model. Two units are refused.
+
+All this compares estimates that are equally good. A unit whose estimate is known to scatter more than the others' takes no part in their cover
+and has a bound of its own, from the others estimated as badly (`chance`). What a score would have shown stands beside it (`detectable`, `score`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,50 +33,19 @@ from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.loading import check_shapes, loader
 from ..forms import Form, as_form
 from ..residuals import check_responses
+from .chance import AS_GOOD, Others, spread, times_noisier
+from .detectable import change_levels, smallest_change
 from .distances import Distances, balance, distances, largest_entries
-from .groups import excess, separate
+from .groups import excess, held, separate
+from .score import LARGEST_RISE_DB, OutlierScore, Status, room_db
 from .tail import leave_one_out_bounds
 
 Array = npt.NDArray[Any]
 
 FALSE_ALARM_RATE = 3e-3
 _FREQUENCIES = 120
-
-
-@dataclass(frozen=True)
-class OutlierScore:
-    """How far one unit exceeds the cover of the others.
-
-    Parameters
-    ----------
-    unit : str
-    score_db : float, dB
-        The excess, referred to the threshold: a unit that is out covers the others and lowers their scores, and with them its own
-        threshold; the difference is added to its excess, so that one threshold serves all units.
-    threshold_db : float, dB
-    outlier : bool
-    freq_hz : float, Hz
-        Where the excess is largest.
-    entry : tuple of int
-        Row and column of the residual's largest entry there, relative to its typical size.
-    excess_db : float, dB
-        Largest excess over frequency over the cover of the inliers; negative for a unit that the others cover everywhere.
-    lowest_db, highest_db : float, dB
-        Range of the excess over all choices of one nominal unit.
-    agreement : float
-        Share of those nominals under which the unit is beyond the threshold that the others' scores then make.
-    """
-
-    unit: str
-    score_db: float
-    threshold_db: float
-    outlier: bool
-    freq_hz: float
-    entry: tuple[int, int]
-    excess_db: float
-    lowest_db: float
-    highest_db: float
-    agreement: float
+_FEWEST = 2  # others that a unit can be compared with
+_NOISY = 2.0  # ratio of variances beyond which a unit takes no part in the cover of the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +60,8 @@ class OutlierModel:
     freqs_hz : ndarray, shape (frequency,), Hz
     responses : ndarray, shape (unit, frequency, p, m), complex
         In scaled coordinates.
+    noise : ndarray, shape (unit, frequency, p, m)
+        Variances of these estimates, zero where nothing is known about them.
     output_scale, input_scale : ndarray, shape (p,) and (m,)
     scores : tuple of OutlierScore
         Of all units that were scored when the model was made, outliers among them.
@@ -107,6 +81,7 @@ class OutlierModel:
     unit_ids: tuple[str, ...]
     freqs_hz: Array
     responses: Array
+    noise: Array
     output_scale: Array
     input_scale: Array
     scores: tuple[OutlierScore, ...]
@@ -116,7 +91,9 @@ class OutlierModel:
     nominal_ids: tuple[str, ...]
     by_nominal_db: Array
 
-    def score(self, unit: str, response: npt.ArrayLike) -> OutlierScore:
+    def score(
+        self, unit: str, response: npt.ArrayLike, deviations: npt.ArrayLike | None = None, without: Collection[str] = ()
+    ) -> OutlierScore:
         """Score a new unit.
 
         Parameters
@@ -124,6 +101,10 @@ class OutlierModel:
         unit : str
         response : array_like, shape (frequency, p, m), complex
             At `freqs_hz`, in physical units.
+        deviations : array_like, shape (draw, frequency, p, m), complex, optional
+            Draws of the error of that estimate. Without them it counts as known as well as the inliers are.
+        without : collection of str
+            Inliers that are not compared with, such as the unit itself.
 
         Returns
         -------
@@ -132,22 +113,32 @@ class OutlierModel:
         Raises
         ------
         DimensionError
-            When the response does not have the shape of the population's.
+            When response or deviations do not have the shape of the population's.
         DataError
-            When the response is not finite.
+            When one of them is not finite, or fewer than two inliers are left.
         """
+        rows = np.array([k for k, other in enumerate(self.unit_ids) if other not in without], dtype=int)
+        if len(rows) < _FEWEST:
+            raise DataError(f"Scoring unit {unit}: {len(rows)} others are left to compare with, two are needed; record more units.")
         G = np.asarray(response)
         if G.shape != self.responses.shape[1:]:
             raise DimensionError(
                 f"Scoring unit {unit}: needs a response of shape {self.responses.shape[1:]} at the stored frequencies, found {G.shape}."
             )
         _require_finite(G[None], (unit,), self.freqs_hz)
-        everyone = np.concatenate([self.responses, (G / self.output_scale[:, None] * self.input_scale)[None]])
+        everyone = np.concatenate([self.responses[rows], (G / self.output_scale[:, None] * self.input_scale)[None]])
         found = distances(self.form, everyone, self.freqs_hz)
         last = np.arange(len(everyone)) == len(everyone) - 1
-        margin = _margins(found.levels, self.false_alarm_rate)[1][-1]
+        margin = float(_margins(found.levels, self.false_alarm_rate)[1][-1])
         summary = _Nominals.of(found, ~last, self.false_alarm_rate)
-        return _scores(self.form, everyone, self.freqs_hz, found, ~last, (margin,), (unit,), self.threshold_db, summary, [len(last) - 1])[0]
+        (score,) = _scores(
+            self.form, everyone, self.freqs_hz, found, ~last, (margin,), (unit,), self.threshold_db, summary, [len(last) - 1]
+        )
+        if deviations is None:
+            return score
+        draws = _deviations(unit, deviations, G.shape) / self.output_scale[:, None] * self.input_scale
+        others = Others.of(self.form, self.responses[rows], self.noise[rows], self.freqs_hz, self.false_alarm_rate)
+        return _with_noise(score, everyone[-1], others, draws)
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``outlier_model.json``."""
@@ -170,7 +161,7 @@ class OutlierModel:
         axes = {"freqs_hz": "f", "responses": "ufpm", "output_scale": "p", "input_scale": "m", "by_nominal_db": "sn"}
         check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         threshold = float("inf") if content["threshold_db"] is None else content["threshold_db"]
-        scores = tuple(OutlierScore(**{**s, "threshold_db": threshold, "entry": tuple(s["entry"])}) for s in content["scores"])
+        scores = tuple(OutlierScore.from_content(s, threshold) for s in content["scores"])
         return cls(
             form=Form(content["form"]),
             unit_ids=tuple(content["unit_ids"]),
@@ -183,7 +174,7 @@ class OutlierModel:
         )
 
 
-_ARRAYS = ("freqs_hz", "responses", "output_scale", "input_scale", "by_nominal_db")
+_ARRAYS = ("freqs_hz", "responses", "noise", "output_scale", "input_scale", "by_nominal_db")
 
 
 def score_outliers(
@@ -195,6 +186,7 @@ def score_outliers(
     output_scale: npt.ArrayLike | None = None,
     input_scale: npt.ArrayLike | None = None,
     false_alarm_rate: float = FALSE_ALARM_RATE,
+    deviations: Sequence[npt.ArrayLike] | None = None,
 ) -> OutlierModel:
     """Score every unit of a population against the others.
 
@@ -210,6 +202,9 @@ def score_outliers(
         Ranges; without both, those at which the responses' typical entries are equal, so that units of measure never matter.
     false_alarm_rate : float
         Nominal rate per unit of the tail model.
+    deviations : sequence of array_like, shape (draw, frequency, p, m), complex, optional
+        Of every unit, draws of the error of its estimate, such as responses of resampled episodes minus those of all. Without them all
+        estimates count as equally good.
 
     Returns
     -------
@@ -239,7 +234,14 @@ def score_outliers(
             f"Outlier scores: ranges should be {G.shape[2]} positive numbers for the outputs and {G.shape[3]} for the inputs, "
             f"found {scales[0].tolist()} and {scales[1].tolist()}."
         )
-    G = G / scales[0][:, None] * scales[1]
+    model = _compared(G / scales[0][:, None] * scales[1], ids, freqs, form, rate, scales)
+    if deviations is None:
+        return model
+    return _with_deviations(model, G, ids, _draws(deviations, ids, rows, G.shape[1:]))
+
+
+def _compared(G: Array, ids: tuple[str, ...], freqs: Array, form: Form, rate: float, scales: tuple[Array, ...]) -> OutlierModel:
+    """Score units whose estimates are equally good, responses in scaled coordinates."""
     found = distances(form, G, freqs)
     parts = separate(found.levels, rate)
     summary = _Nominals.of(found, parts.inliers, rate)
@@ -251,6 +253,7 @@ def score_outliers(
         unit_ids=tuple(ids[k] for k in inliers),
         freqs_hz=freqs,
         responses=G[inliers],
+        noise=np.zeros(G[inliers].shape),
         output_scale=scales[0],
         input_scale=scales[1],
         scores=scores,
@@ -259,6 +262,56 @@ def score_outliers(
         extrapolated=rate < 1 / (len(inliers) + 1),
         nominal_ids=tuple(ids[k] for k in found.nominals),
         by_nominal_db=summary.excess_db,
+    )
+
+
+def _with_deviations(model: OutlierModel, G: Array, ids: tuple[str, ...], draws: list[Array]) -> OutlierModel:
+    """Judge units that are known less well than most by themselves, G and draws in physical units, all others among themselves."""
+    scales = model.output_scale, model.input_scale
+    noise = np.stack([spread(d) for d in draws]) * (scales[1] / scales[0][:, None]) ** 2
+    worse = np.array([times_noisier(own, noise) for own in noise])
+    well = np.flatnonzero(worse <= _NOISY)
+    if len(well) < _FEWEST + 1:
+        well = np.arange(len(G))
+    if len(well) < len(G):
+        model = _compared(
+            G[well] / scales[0][:, None] * scales[1],
+            tuple(ids[k] for k in well),
+            model.freqs_hz,
+            model.form,
+            model.false_alarm_rate,
+            scales,
+        )
+    model = replace(model, noise=np.stack([noise[ids.index(u)] for u in model.unit_ids]))
+    scores = {s.unit: s for s in model.scores}
+    for k, unit in enumerate(ids):
+        if unit not in scores or (scores[unit].outlier and worse[k] > AS_GOOD):
+            scores[unit] = model.score(unit, G[k], draws[k])
+    by_nominal = np.full((len(model.nominal_ids), len(ids)), np.nan)
+    by_nominal[:, well] = model.by_nominal_db
+    return replace(model, scores=tuple(scores[u] for u in ids), by_nominal_db=by_nominal)
+
+
+def _with_noise(score: OutlierScore, G: Array, others: Others, draws: Array) -> OutlierScore:
+    """Take off a score what the noise of its own estimate adds to its bound, and say whether that hides too much."""
+    bounds = others.bounds(G, draws)
+    if bounds is None:
+        return score
+    usual, noisy = bounds
+    lift = max(0.0, noisy - score.detectable_db)
+    outlier = score.outlier and score.excess_db > max(noisy, score.detectable_db)
+    room = room_db(usual, score.detectable_percent * 10 ** ((usual - score.detectable_db) / 20))
+    allowed = min(LARGEST_RISE_DB, room) if room >= 0 else LARGEST_RISE_DB
+    enough = noisy - usual <= allowed
+    status = Status.NOT_ENOUGH_DATA if not enough else Status.OK if room >= 0 else Status.CANNOT_TELL
+    return replace(
+        score,
+        score_db=score.score_db - lift,
+        outlier=outlier,
+        status=Status.OUTLIER if outlier else status,
+        detectable_db=score.detectable_db + lift,
+        detectable_percent=score.detectable_percent * 10 ** (lift / 20),
+        more_data=1.0 if enough else others.more_data(G, draws, allowed),
     )
 
 
@@ -323,12 +376,44 @@ def _scores(
         value[some], where[some] = score[np.searchsorted(members, some)], place[np.searchsorted(members, some)]
     rows = where[list(units)]
     entries = largest_entries(form, G, found, np.asarray(units), rows)
+    change = change_levels(form, G[inliers], found, freqs)
     scores = []
     for k, unit, margin, row, entry in zip(units, ids, margins, rows, entries, strict=True):
-        referred = threshold + margin if np.isfinite(threshold) and np.isfinite(margin) else float(value[k])
+        known = np.isfinite(threshold) and np.isfinite(margin)
+        referred = threshold + margin if known else float(value[k])
         beyond = bool(np.isfinite(threshold) and margin > 0)
-        scores.append(OutlierScore(unit, referred, threshold, beyond, float(freqs[row]), entry, float(value[k]), *summary.summary(k)))
+        bound = float(value[k]) - margin if known else float("inf")
+        others = inliers & (np.arange(len(G)) != k)
+        percent, at, place = smallest_change(change, held(found.levels[others].max(axis=0)), bound)
+        status = Status.OUTLIER if beyond else Status.OK if room_db(bound, percent) >= 0 else Status.CANNOT_TELL
+        seen = status, bound, percent, float(freqs[at]) if known else None, place
+        scores.append(
+            OutlierScore(unit, referred, threshold, beyond, float(freqs[row]), entry, float(value[k]), *summary.summary(k), *seen)
+        )
     return tuple(scores)
+
+
+def _draws(deviations: Sequence[npt.ArrayLike], ids: tuple[str, ...], rows: Array, shape: tuple[int, ...]) -> list[Array]:
+    """Checked deviations of all units at the chosen frequencies."""
+    if len(deviations) != len(ids):
+        raise DataError(f"Outlier scores: need the deviations of every unit, found {len(deviations)} for {len(ids)} units.")
+    listed = []
+    for unit, draws in zip(ids, deviations, strict=True):
+        found = np.asarray(draws)
+        if found.ndim == len(shape) + 1 and found.shape[2:] == shape[1:] and found.shape[1] > rows[-1]:
+            found = found[:, rows]
+        listed.append(_deviations(unit, found, shape))
+    return listed
+
+
+def _deviations(unit: str, draws: npt.ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Checked deviations of one unit."""
+    found = np.asarray(draws)
+    if found.shape[1:] != shape or not len(found) or not np.isfinite(found).all():
+        raise DimensionError(
+            f"Scoring unit {unit}: deviations should be finite and of shape (draws, {', '.join(map(str, shape))}), found {found.shape}."
+        )
+    return found
 
 
 def _population(

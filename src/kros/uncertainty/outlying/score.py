@@ -1,0 +1,99 @@
+"""What is said about one unit: how far it exceeds the others, and what would have been seen had it differed.
+
+A score below the threshold means little by itself. Beside it stands what the unit would have to differ by to be flagged; where that is more
+than anybody would call a defect, nothing is said about the unit instead of "ok".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+LARGEST_DB = 26.0  # beyond the cover of the others: twenty times as far away as any of them is
+LARGEST_PERCENT = 200.0  # change of gain: three times as large
+LARGEST_RISE_DB = 6.0  # of the bound, by the unit's own noise: a defect would have to be twice as large to be seen
+
+
+class Status(StrEnum):
+    """What the recordings say about a unit.
+
+    ``ok``: a change of the size that stands beside it would have been flagged. ``outlier``: flagged. ``not enough data``: too few recordings of this unit.
+    ``cannot tell``: too few units, or too unlike ones, to compare with.
+    """
+
+    OK = "ok"
+    OUTLIER = "outlier"
+    NOT_ENOUGH_DATA = "not enough data"
+    CANNOT_TELL = "cannot tell"
+
+
+@dataclass(frozen=True)
+class OutlierScore:
+    """How far one unit exceeds the cover of the others.
+
+    Parameters
+    ----------
+    unit : str
+    score_db : float, dB
+        The excess, referred to the threshold: a unit that is out covers the others and lowers their scores, and with them its own
+        threshold; the difference is added to its excess, so that one threshold serves all units. What the noise of the unit's own estimate
+        adds to its bound is taken off likewise.
+    threshold_db : float, dB
+    outlier : bool
+    freq_hz : float, Hz
+        Where the excess is largest.
+    entry : tuple of int
+        Row and column of the residual's largest entry there, relative to its typical size.
+    excess_db : float, dB
+        Largest excess over frequency over the cover of the inliers; negative for a unit that the others cover everywhere.
+    lowest_db, highest_db : float, dB
+        Range of the excess over all choices of one nominal unit.
+    agreement : float
+        Share of those nominals under which the unit is beyond the threshold that the others' scores then make.
+    status : Status
+    detectable_db : float, dB
+        What the excess would have to be for the unit to be flagged; infinite where nothing could be.
+    detectable_percent : float
+        Smallest change of gain of one entry of the response that is an excess of that size somewhere, to first order.
+    detectable_hz : float, Hz, or None
+        Where that is; None where `detectable_percent` is infinite.
+    detectable_entry : tuple of int
+        Output and input of the entry.
+    more_data : float
+        How many times as long the unit would have to be recorded for its own noise to hide little; one where the recordings suffice.
+    """
+
+    unit: str
+    score_db: float
+    threshold_db: float
+    outlier: bool
+    freq_hz: float
+    entry: tuple[int, int]
+    excess_db: float
+    lowest_db: float
+    highest_db: float
+    agreement: float
+    status: Status
+    detectable_db: float
+    detectable_percent: float
+    detectable_hz: float | None
+    detectable_entry: tuple[int, int]
+    more_data: float = 1.0
+
+    @classmethod
+    def from_content(cls, content: Mapping[str, Any], threshold_db: float) -> OutlierScore:
+        """Return a score as it was before it became JSON, which knows neither infinity nor tuples."""
+        values = {f.name: content[f.name] for f in fields(cls)} | {"threshold_db": threshold_db, "status": Status(content["status"])}
+        values |= {name: tuple(content[name]) for name in ("entry", "detectable_entry")}
+        return cls(**{name: float("inf") if value is None and name != "detectable_hz" else value for name, value in values.items()})
+
+
+def room_db(detectable_db: float, detectable_percent: float) -> float:
+    """Return by how much a bound could be higher before the absence of an alarm means nothing, dB; negative where it means nothing already."""
+    if not (np.isfinite(detectable_db) and np.isfinite(detectable_percent)):
+        return float("-inf")
+    return float(min(LARGEST_DB - detectable_db, 20 * np.log10(LARGEST_PERCENT / max(detectable_percent, np.finfo(float).tiny))))

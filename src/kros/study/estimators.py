@@ -14,7 +14,17 @@ from ..data.population import EpisodeKey
 from ..evaluate import EpisodeBatch, error_percent, hold_missing
 from ..identify import ModelSet
 from ..lifting import Lifting
-from ..observer import ExtendedKalman, Features, FilteredDifference, Learned, Moments, cutoffs_hz, rates, start_covariance
+from ..observer import (
+    ExtendedKalman,
+    Features,
+    FilteredDifference,
+    Learned,
+    Moments,
+    cutoffs_hz,
+    like_measurement_noise,
+    rates,
+    start_covariance,
+)
 from .baselines import EQUAL, RESIDUAL
 from .tuning import TuningSet, rank
 
@@ -84,7 +94,8 @@ def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) 
     judge, lifting, n = tuning.read(), models.lifting, models.lifting.n_states
     row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
     shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2), RESIDUAL: models.residual_covariance.mean(axis=0)[:n, :n]}
-    tried = [(name, level, 10**level * _relative(shape, R, C)) for name, shape in shapes.items() for level in _LEVELS]
+    sized = {name: shape * like_measurement_noise(shape[np.ix_(C, C)], R) for name, shape in shapes.items()}
+    tried = [(name, level, 10**level * shape) for name, shape in sized.items() for level in _LEVELS]
     start = start_covariance(models.output_scale[:n], R, models.measured)
     values = {name: float(v[row]) for name, v in models.parameters.items()}
     filters = ExtendedKalman(
@@ -150,9 +161,3 @@ def make_learned(tuning: TuningSet, lifting: Lifting, measured: tuple[int, ...])
     estimators: dict[str, Learned] = {unit: moments.estimator([unit]) for unit in moments.units}
     facts = {"status": "trained", "taps": features.taps, "left_out": "the unit under test"}
     return Baseline(estimators | {"": moments.estimator()}, measured, moments.estimated, facts)
-
-
-def _relative(shape: Array, R: Array, measured: list[int]) -> Array:
-    """Process noise whose measured combinations have the variance of the measurement noise."""
-    size = float(np.trace(shape[np.ix_(measured, measured)]))
-    return np.asarray(shape * np.trace(R) / max(size, np.finfo(float).tiny))

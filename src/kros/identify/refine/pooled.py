@@ -14,6 +14,7 @@ from ...core.linalg import qr_triangle
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor
+from ..ranges import Ranges
 from .barrier import stability_barrier
 from .marquardt import minimise
 from .options import RefineOptions
@@ -48,7 +49,7 @@ def start_pooled(
     normal = restrict(problem, rows).run(V)
     with np.errstate(invalid="ignore"):
         error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())
-    span = ranges(factor, rows, lifting)[0][:n]
+    span = ranges(factor, rows, lifting).outputs[:n]
     error = np.clip(np.where(np.isfinite(error), error, span), _LEAST_ERROR * span, span)
     return V, replace(problem, sigma=_sigma(error, span, options.balance)), error, span
 
@@ -155,11 +156,9 @@ def restrict(problem: Problem, rows: npt.NDArray[np.int64]) -> Problem:
     return replace(problem, parameters=own, segments=problem.segments.units(rows), one_step=one_step, pooled=True)
 
 
-def ranges(factor: Factor, rows: npt.NDArray[np.int64], lifting: Lifting) -> tuple[Array, Array]:
+def ranges(factor: Factor, rows: npt.NDArray[np.int64], lifting: Lifting) -> Ranges:
     """Ranges of lifted states and inputs over the pooled units."""
-    peak = factor.peak[rows].max(axis=0)
-    peak = np.where(peak > 0, peak, 1.0)
-    return peak[: lifting.n_lifted], peak[lifting.n_lifted :]
+    return Ranges.of(factor, lifting.n_lifted, rows)
 
 
 def matrices_of(V: Array, T: Array, n_lifted: int) -> KoopmanMatrices:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError, IdentificationError
 from ...data.population import EpisodeKey, Population
+from ...data.scaled import scale_population
 from ...lifting import Lifting
 from ..factors import Factor
 from .judge import Judge, find_unbounded
@@ -75,14 +76,30 @@ def refine_population(
     options = RefineOptions() if options is None else options
     pooled = np.ones(len(keys), dtype=bool) if pooled is None else np.asarray(pooled, dtype=bool)
     _check(population, keys, lifting, parameters, factor, pooled)
-    parameters = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters}
+    values = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters}
+    span = ranges(factor, np.flatnonzero(pooled), lifting)
+    sizes = span.sizes(lifting, population.inputs)
+    found = _refine(scale_population(population, sizes), keys, lifting.in_sizes(sizes), values, span.factor(factor), pooled, options)
+    return found.in_channels(span.inverse)
+
+
+def _refine(
+    population: Population,
+    keys: Mapping[str, Sequence[EpisodeKey]],
+    lifting: Lifting,
+    parameters: Mapping[str, Array],
+    factor: Factor,
+    pooled: npt.NDArray[np.bool_],
+    options: RefineOptions,
+) -> RefinedModels:
+    """Refine in channels divided by their ranges."""
     segments = read_segments(population, keys, max(options.horizons), options.segments, options.seed, lifting.history)
     held = held_segments(options.segments, keys)
     fitted = segments.first(options.segments - held)
     rows = np.flatnonzero(pooled)
     start, problem, error, span = start_pooled(lifting, parameters, factor, fitted, rows, options)
     spans = ranges(factor, rows, lifting)
-    judge = Judge(population, keys, lifting, parameters, rows, problem, spans, options.judged)
+    judge = Judge(population, keys, lifting, parameters, rows, problem, (spans.outputs, spans.inputs), options.judged)
     common = refine_pooled(start, restrict(problem, rows), error, span, lambda V: judge.trade_off([V], (np.inf,))[0].score, options)
     prepared = _with_prior(problem, common, factor, rows, options)
     judge = replace(judge, problem=prepared)
@@ -141,7 +158,8 @@ def _with_prior(problem: Problem, common: Array, factor: Factor, rows: npt.NDArr
     """The problem of all units at the longest horizon, errors in units of those of the pooled model, with a prior around it."""
     edged = normalised(restrict(problem, rows), common[None], options)
     model = matrices_of(common, problem.T, problem.lifting.n_lifted)
-    prior = ResponsePrior(model.A, model.B, problem.T, *ranges(factor, rows, problem.lifting), level=options.level, power=options.power)
+    span = ranges(factor, rows, problem.lifting)
+    prior = ResponsePrior(model.A, model.B, problem.T, span.outputs, span.inputs, level=options.level, power=options.power)
     return replace(problem, sigma=edged.sigma, guard=options.guard, prior=prior)
 
 

@@ -29,6 +29,7 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 from ...core.errors import DataError, DimensionError
+from ...core.linalg import least_squares
 from ...core.norms import gramian
 from ...lifting import Lifting
 from ...synthesis.residual.shaping import Bank
@@ -203,7 +204,7 @@ def _static(inputs: Array, y: Array) -> Array:
     """
     starts = np.all(y[0].std(axis=0) > _APART * _centred(y).std(axis=0))
     rows, values = (inputs[:1], y[:1]) if starts else (inputs, y)
-    return np.asarray(np.linalg.lstsq(_centred(rows), _centred(values), rcond=1e-9)[0].T, dtype=float)
+    return least_squares(_centred(rows), _centred(values), rcond=1e-9).T
 
 
 def seen_by(

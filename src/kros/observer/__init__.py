@@ -1,6 +1,6 @@
 """The observer as it runs: one-step predictor with retraction and re-lifting, and the baselines it is compared with."""
 
-from .baselines.difference import FilteredDifference, cutoffs_hz, rates
+from .baselines.difference import FilteredDifference, cutoffs_hz, followed, rates
 from .baselines.extended_kalman import ExtendedKalman, start_covariance
 from .baselines.kalman import kalman_candidates, like_measurement_noise, luenberger_candidates, noise_covariances
 from .baselines.learned import Features, Learned, Moments
@@ -43,6 +43,7 @@ __all__ = [
     "attack_running",
     "cutoffs_hz",
     "driven_coordinates",
+    "followed",
     "in_sizes",
     "kalman_candidates",
     "like_measurement_noise",

@@ -105,7 +105,8 @@ def test_models_come_back_in_the_units_of_the_recordings(motors, first, tmp_path
     x = np.array([*SCALINGS[-1][:3], 1.0])
     np.testing.assert_allclose(other.A * x / x[:, None], one.A, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(other.output_scale, one.output_scale * x, rtol=1e-12)
-    assert one.alpha_in_ranges and one.alpha == pytest.approx(other.alpha, rel=1e-6)
+    assert one.alpha_in_ranges
+    assert one.alpha == pytest.approx(other.alpha, rel=1e-6)
     assert one.lifting.functions == ("tanh(1.0*velocity)",)
 
 

@@ -115,7 +115,9 @@ def test_phases_and_lags_are_those_of_the_machine(factors):
     columns = [values[:, names.index(n)] for n in ("position", "target_velocity", "velocity")]
     spec = PhaseSpec()
     one = find_segments(*columns, population.sample_period_s, spec)
-    scaled = find_segments(*(c * f for c, f in zip(columns, factors, strict=True)), population.sample_period_s, replace(spec, ratio=spec.ratio / factors[0]))
+    scaled = find_segments(
+        *(c * f for c, f in zip(columns, factors, strict=True)), population.sample_period_s, replace(spec, ratio=spec.ratio / factors[0])
+    )
     assert len(scaled) == len(one) > 1
     np.testing.assert_allclose([s.phase for s in scaled], [s.phase for s in one], rtol=1e-6)
     np.testing.assert_allclose([s.speed / factors[0] for s in scaled], [s.speed for s in one], rtol=1e-9)
@@ -125,7 +127,7 @@ def test_phases_and_lags_are_those_of_the_machine(factors):
 def test_a_constant_is_a_constant_in_any_unit():
     constant = np.full(1000, 0.1)
     converted = constant * (1 + 2e-16 * (np.arange(1000) % 2))  # a bit of rounding apart
-    assert is_constant(constant) and is_constant(converted) and is_constant(np.zeros(5))
+    assert all(is_constant(column) for column in (constant, converted, np.zeros(5)))
     moving = constant.copy()
     moving[700] *= 1 + 1e-10
     for factor in (1e-9, 1.0, 1e9):

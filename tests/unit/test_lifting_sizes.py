@@ -15,7 +15,14 @@ FULL = Lifting(
     ("voltage",),
     ("voltage*velocity",),
 )
-SIZES = {"position": 2e9, "velocity": 3e-9, "voltage": 5e4, "velocity*abs(velocity)": 7e-18, "position[-1]*voltage[-2]": 1e14, "voltage*velocity": 2e-4}
+SIZES = {
+    "position": 2e9,
+    "velocity": 3e-9,
+    "voltage": 5e4,
+    "velocity*abs(velocity)": 7e-18,
+    "position[-1]*voltage[-2]": 1e14,
+    "voltage*velocity": 2e-4,
+}
 
 
 def test_values_and_slopes_are_those_of_the_formulas_over_their_sizes():

@@ -11,6 +11,7 @@ are meant for signals of about one.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,7 +39,7 @@ class Ranges:
     inputs: Array
 
     @classmethod
-    def of(cls, factor: Factor, n_lifted: int, rows: npt.ArrayLike = slice(None)) -> Ranges:  # type: ignore[assignment]
+    def of(cls, factor: Factor, n_lifted: int, rows: Any = slice(None)) -> Ranges:
         """Return the largest magnitudes in the training episodes of some units; one for a channel that is zero in all of them.
 
         Parameters

@@ -125,7 +125,9 @@ def rates(channels: Iterable[Channel], measured: Sequence[str]) -> tuple[tuple[i
     return tuple(pairs)
 
 
-def followed(y: Array, states: Array, lengths: npt.ArrayLike, measured: Sequence[int], sample_period_s: float) -> tuple[tuple[int, int], ...]:
+def followed(
+    y: Array, states: Array, lengths: npt.ArrayLike, measured: Sequence[int], sample_period_s: float
+) -> tuple[tuple[int, int], ...]:
     """Return which states recordings show to be rates of measured ones, whatever the units of measure.
 
     Of all states that are not measured the one counts that a difference of the measurement, at its best cut-off, explains best, and by more than half
@@ -156,7 +158,8 @@ def followed(y: Array, states: Array, lengths: npt.ArrayLike, measured: Sequence
             rate = rate[..., hidden[j]][inside]
             rate = (rate - rate.mean()) / (np.abs(rate).max(initial=0.0) or 1.0)
             power = float(rate @ rate) * float(truth @ truth)
-            share[i, j] = max(share[i, j], float(rate @ truth) * abs(float(rate @ truth)) / power if power else 0.0)
+            found = float(rate @ truth)
+            share[i, j] = max(float(share[i, j]), found * abs(found) / power if power else 0.0)
     pairs = []
     for i in range(len(share)):
         j = int(share[i].argmax()) if hidden else 0

@@ -188,7 +188,6 @@ class Past:
         down, up = down / scale[:, None], up * scale
         return down @ S @ up, down @ E, W @ up
 
-
     def _channel_sizes(self, P: Array, channels: int) -> Array:
         """Size of the channel that every state of the bank is of: what is negligible must not depend on units of measure."""
         delays, q = self.bank.delays, len(self.measured)

@@ -94,7 +94,17 @@ def identify_models(context: Context, condition: str, units: list[str], factor: 
         )
     require_excitation(factor, context.population.inputs, units, condition, float(alpha))
     models = [
-        fit(name, condition, kinds[name], context, units, factors[name], parameters if kinds[name].parameters else {}, float(alpha), ranges[name])
+        fit(
+            name,
+            condition,
+            kinds[name],
+            context,
+            units,
+            factors[name],
+            parameters if kinds[name].parameters else {},
+            float(alpha),
+            ranges[name],
+        )
         for name in kinds
     ]
     if condition == context.facts.identify_on:

@@ -124,10 +124,7 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings |= {"max_order": config.uncertainty.max_order, "max_states": config.synthesis.max_states, "covered": uncertain.unit_ids}
     settings |= {"memory": config.memory, "tune": config.synthesis.tune}
-    return [
-        Task(f"{name}/{method.name}", method.name, models, unit, problem, refusal, noise, tuning, **settings)
-        for method in methods
-    ]
+    return [Task(f"{name}/{method.name}", method.name, models, unit, problem, refusal, noise, tuning, **settings) for method in methods]
 
 
 def usable_problem(

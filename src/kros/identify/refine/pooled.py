@@ -49,7 +49,7 @@ def start_pooled(
     normal = restrict(problem, rows).run(V)
     with np.errstate(invalid="ignore"):
         error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())
-    span = ranges(factor, rows, lifting).outputs[:n]
+    span = ranges(factor, rows, lifting)[0][:n]
     error = np.clip(np.where(np.isfinite(error), error, span), _LEAST_ERROR * span, span)
     return V, replace(problem, sigma=_sigma(error, span, options.balance)), error, span
 
@@ -156,9 +156,10 @@ def restrict(problem: Problem, rows: npt.NDArray[np.int64]) -> Problem:
     return replace(problem, parameters=own, segments=problem.segments.units(rows), one_step=one_step, pooled=True)
 
 
-def ranges(factor: Factor, rows: npt.NDArray[np.int64], lifting: Lifting) -> Ranges:
+def ranges(factor: Factor, rows: npt.NDArray[np.int64], lifting: Lifting) -> tuple[Array, Array]:
     """Ranges of lifted states and inputs over the pooled units."""
-    return Ranges.of(factor, lifting.n_lifted, rows)
+    found = Ranges.of(factor, lifting.n_lifted, rows)
+    return found.outputs, found.inputs
 
 
 def matrices_of(V: Array, T: Array, n_lifted: int) -> KoopmanMatrices:

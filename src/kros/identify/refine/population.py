@@ -21,6 +21,7 @@ from ...data.population import EpisodeKey, Population
 from ...data.scaled import scale_population
 from ...lifting import Lifting
 from ..factors import Factor
+from ..ranges import Ranges
 from .judge import Judge, find_unbounded
 from .marquardt import Solution, minimise
 from .metric import ResponsePrior
@@ -77,7 +78,7 @@ def refine_population(
     pooled = np.ones(len(keys), dtype=bool) if pooled is None else np.asarray(pooled, dtype=bool)
     _check(population, keys, lifting, parameters, factor, pooled)
     values = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters}
-    span = ranges(factor, np.flatnonzero(pooled), lifting)
+    span = Ranges.of(factor, lifting.n_lifted, pooled)
     sizes = span.sizes(lifting, population.inputs)
     found = _refine(scale_population(population, sizes), keys, lifting.in_sizes(sizes), values, span.factor(factor), pooled, options)
     return found.in_channels(span.inverse)
@@ -99,7 +100,7 @@ def _refine(
     rows = np.flatnonzero(pooled)
     start, problem, error, span = start_pooled(lifting, parameters, factor, fitted, rows, options)
     spans = ranges(factor, rows, lifting)
-    judge = Judge(population, keys, lifting, parameters, rows, problem, (spans.outputs, spans.inputs), options.judged)
+    judge = Judge(population, keys, lifting, parameters, rows, problem, spans, options.judged)
     common = refine_pooled(start, restrict(problem, rows), error, span, lambda V: judge.trade_off([V], (np.inf,))[0].score, options)
     prepared = _with_prior(problem, common, factor, rows, options)
     judge = replace(judge, problem=prepared)
@@ -158,8 +159,7 @@ def _with_prior(problem: Problem, common: Array, factor: Factor, rows: npt.NDArr
     """The problem of all units at the longest horizon, errors in units of those of the pooled model, with a prior around it."""
     edged = normalised(restrict(problem, rows), common[None], options)
     model = matrices_of(common, problem.T, problem.lifting.n_lifted)
-    span = ranges(factor, rows, problem.lifting)
-    prior = ResponsePrior(model.A, model.B, problem.T, span.outputs, span.inputs, level=options.level, power=options.power)
+    prior = ResponsePrior(model.A, model.B, problem.T, *ranges(factor, rows, problem.lifting), level=options.level, power=options.power)
     return replace(problem, sigma=edged.sigma, guard=options.guard, prior=prior)
 
 

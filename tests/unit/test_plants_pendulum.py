@@ -54,4 +54,4 @@ def test_settings_out_of_range_are_refused(settings):
 
 def test_plants_are_found_by_name():
     assert PLANTS["pendulum"] is PendulumPopulation
-    assert set(PLANTS) == {"harmonic-drive", "pendulum"}
+    assert set(PLANTS) == {"harmonic-drive", "pendulum", "dc-motor"}

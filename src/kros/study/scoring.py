@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact
-from ..identify import Factor, KoopmanMatrices, ModelSet, combine, edmd, lifted_factor
+from ..identify import Factor, ModelSet, combine, lifted_factor
 from ..uncertainty import OutlierScore, Status
 from .store import Store
 
@@ -109,9 +109,8 @@ class Recorded:
     def response(self, evidence: Sequence[Evidence]) -> Array:
         """Return responses of estimates, shape (estimate, frequency, n, m), each regularised as if it had the usual number of samples."""
         joined = [combine(Factor(e.lifted, e.factor.peak, e.factor.n_samples)).R * np.sqrt(self.usual / e.n_samples) for e in evidence]
-        found: KoopmanMatrices = edmd(np.stack(joined), self.models.lifting.n_lifted, self.models.alpha or 0.0)
-        system = replace(self.models, unit_ids=tuple(map(str, range(len(joined)))), A=found.A, B=found.B).systems()
-        return system.frequency_response(self.freqs_hz)
+        found = self.models.fit(np.stack(joined))
+        return replace(self.models, unit_ids=tuple(map(str, range(len(joined)))), A=found.A, B=found.B).responses(self.freqs_hz)
 
     def deviations(self, evidence: Evidence) -> Array:
         """Return draws of what an estimate from some episodes may be off by, shape (draw, frequency, n, m).
@@ -188,4 +187,5 @@ def _alike(stored: Factor, found: Factor, row: int) -> bool:
     """Tell whether an episode is among stored ones: equal length and equal Gram matrix, but for rounding."""
     candidates = np.flatnonzero(stored.n_samples == found.n_samples[row])
     gram = found.R[row].T @ found.R[row]
-    return any(np.abs(R.T @ R - gram).max() <= _SAME * np.abs(gram).max() for R in stored.R[candidates])
+    size = np.sqrt(np.diag(gram))
+    return any((np.abs(R.T @ R - gram) <= _SAME * np.outer(size, size)).all() for R in stored.R[candidates])

@@ -1,0 +1,70 @@
+"""The simulated DC motors against steady states on paper, the matrix exponential and a general integrator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from kros.plants import DcMotorPopulation
+from kros.plants.dc_motor import CURRENT_LIMIT_A, SAMPLE_PERIOD_S
+
+
+def motors(units=3, **settings):
+    return DcMotorPopulation(n_units=units, n_episodes=1, seconds=1.0, seed=3, **settings).simulate().truth
+
+
+def test_a_constant_voltage_ends_in_the_steady_state_on_paper():
+    truth = motors()
+    x = truth.respond(np.full((1, 2000), 6.0))[:, :, 0, -1]
+    R, k, b, c = truth.resistance, truth.torque_constant, truth.viscous, truth.coulomb
+    velocity = (k * 6.0 - R * c) / (k**2 + R * b)  # v = R i + k w and k i = b w + c
+    np.testing.assert_allclose(x[1], velocity, rtol=1e-6)
+    np.testing.assert_allclose(x[2], (b * velocity + c) / k, rtol=1e-6)
+    np.testing.assert_allclose(truth.steady_velocity(6.0), velocity, rtol=1e-12)
+
+
+def test_without_coulomb_friction_small_voltages_give_the_linear_response():
+    truth = replace(motors(), coulomb=np.zeros(3))
+    voltage = np.random.default_rng(0).uniform(-1, 1, (1, 60))
+    found = truth.respond(voltage)
+    for u in range(3):
+        R, L, k, J, b = (float(p[u]) for p in (truth.resistance, truth.inductance, truth.torque_constant, truth.inertia, truth.viscous))
+        A = np.array([[0, 1, 0, 0], [0, -b / J, k / J, 0], [0, -k / L, -R / L, 1 / L], [0, 0, 0, 0]])
+        step, x = expm(A * SAMPLE_PERIOD_S), np.zeros(4)
+        for n, v in enumerate(voltage[0]):
+            assert np.all(np.abs(found[:, u, 0, n] - x[:3]) < 1e-4 * np.abs(found[:, u]).max(axis=(1, 2)))
+            x[3] = v
+            x = step @ x
+
+
+def test_with_friction_it_agrees_with_a_general_integrator():
+    truth, voltage = motors(1), np.repeat([3.0, -3.0, 1.0], 40)[None]
+    found, x = truth.respond(voltage)[:, 0, 0], np.zeros(3)
+    R, L, k, J, b, c = (
+        float(p[0]) for p in (truth.resistance, truth.inductance, truth.torque_constant, truth.inertia, truth.viscous, truth.coulomb)
+    )
+    for n, v in enumerate(voltage[0]):
+        assert np.all(np.abs(found[:, n] - x) < 1e-3 * np.abs(found).max(axis=1))
+
+        def rhs(_, s, v=v):
+            return [s[1], (k * s[2] - b * s[1] - c * np.tanh(s[1])) / J, (v - R * s[2] - k * s[1]) / L]
+
+        x = solve_ivp(rhs, (0, SAMPLE_PERIOD_S), x, rtol=1e-9, atol=1e-12).y[:, -1]
+
+
+def test_the_amplifier_limits_the_current_and_nothing_else_exceeds_it():
+    truth = motors()
+    found = truth.respond(np.repeat([12.0, -12.0], 300)[None])
+    assert np.abs(found[2]).max() == CURRENT_LIMIT_A
+    assert np.all(found[2, :, 0, 305] == -CURRENT_LIMIT_A)  # 24 V across 1 ohm would be 24 A
+
+
+def test_the_outlier_loses_more_of_its_voltage_to_friction():
+    truth = motors(outlier=True, spread=0.0)
+    friction = truth.coulomb * truth.resistance / truth.torque_constant  # volts that it costs
+    assert friction[0] > 3 * friction[1]
+    assert truth.coulomb[0] == pytest.approx(np.e * truth.coulomb[1])

@@ -1,0 +1,64 @@
+"""Settings, shapes and seeds of the simulated DC motors, and the command that writes them."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from kros.cli import app
+from kros.core.errors import ConfigError
+from kros.data import EpisodeKey, read_parquet
+from kros.plants import PLANTS, DcMotorPopulation
+
+SMALL = DcMotorPopulation(n_units=3, n_episodes=2, seconds=2.0, seed=4, outlier=True)
+KEY = EpisodeKey("002", "default", "1")
+
+
+def test_population_has_three_states_and_an_input():
+    population = SMALL.simulate().population
+    assert (population.states, population.inputs) == (("position", "velocity", "current"), ("voltage",))
+    assert population.measured == ("position",)
+    assert population.unit_ids == ("000", "001", "002", "003")
+    assert population.unit("000").group == "outliers"
+    assert population.read(KEY).shape == (1000, 4)
+    assert len(population.episodes) == 8
+
+
+def test_a_unit_is_the_same_whatever_else_is_simulated():
+    first, second = SMALL.simulate(), DcMotorPopulation(n_units=2, n_episodes=5, seconds=2.0, seed=4).simulate()
+    np.testing.assert_allclose(first.population.read(KEY), second.population.read(KEY), atol=1e-9)
+    np.testing.assert_array_equal(first.population.read(KEY), SMALL.simulate().population.read(KEY))
+    assert np.abs(replace(SMALL, seed=5).simulate().population.read(KEY) - first.population.read(KEY)).max() > 0.1
+
+
+def test_parameters_spread_log_normally_around_the_nominal_ones():
+    truth = DcMotorPopulation(n_units=400, n_episodes=1, seconds=1.0, seed=1).simulate().truth
+    deviation = np.log(truth.viscous / 1e-4)
+    assert abs(deviation.mean()) < 4 * 0.15 / 20  # four standard errors
+    assert deviation.std() == pytest.approx(0.15, rel=0.15)
+    assert json.loads(json.dumps(replace(SMALL, spread=0.0).simulate().truth.as_dict()))["units"]["001"]["resistance"] == 1.0
+
+
+def test_recordings_travel_between_processes():
+    population = SMALL.simulate().population
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(population)).read(KEY), population.read(KEY))
+
+
+@pytest.mark.parametrize("settings", [{"n_units": 0}, {"n_episodes": 0}, {"seconds": 0.5}, {"spread": -1.0}, {"seed": -1}])
+def test_settings_out_of_range_are_refused(settings):
+    with pytest.raises(ConfigError, match=next(iter(settings))):
+        DcMotorPopulation(**settings)
+
+
+def test_the_command_writes_motors_with_their_truth(tmp_path):
+    options = ("--plant", "dc-motor", "--units", 2, "--episodes", 2, "--seconds", 5)
+    result = CliRunner().invoke(app, ["simulate", str(tmp_path / "motors"), *map(str, options)])
+    assert result.exit_code == 0, result.output
+    assert read_parquet(tmp_path / "motors").metadata["plant"] == "dc-motor"
+    assert json.loads((tmp_path / "motors" / "truth.json").read_text())["plant"] == "dc-motor"
+    assert PLANTS["dc-motor"] is DcMotorPopulation

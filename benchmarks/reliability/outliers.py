@@ -107,7 +107,11 @@ def population(rng: np.random.Generator, episodes: list[int]) -> Recorded:
         name="linear_edmd",
         condition="all",
         lifting=LIFTING,
-        channels=(Channel("position", Role.STATE, "", True), Channel("velocity", Role.STATE, "", False), Channel("torque", Role.INPUT, "", True)),
+        channels=(
+            Channel("position", Role.STATE, "", True),
+            Channel("velocity", Role.STATE, "", False),
+            Channel("torque", Role.INPUT, "", True),
+        ),
         sample_period_s=PERIOD_S,
         unit_ids=tuple(f"{k:02d}" for k in range(n)),
         A=np.zeros((n, 2, 2)),

@@ -34,7 +34,9 @@ def uncertainty(peak_db: float, share: float = 0.01) -> dict[str, Any]:
 
 
 def models(percent: float | None) -> dict[str, Any]:
-    return {"koopman": {"freerun_error_percent": {"velocity": {"median": percent, "worst": percent}, "position": {"median": 0.1, "worst": 0.1}}}}
+    return {
+        "koopman": {"freerun_error_percent": {"velocity": {"median": percent, "worst": percent}, "position": {"median": 0.1, "worst": 0.1}}}
+    }
 
 
 APART = {"a": ["cold"], "b": ["cold"], "c": ["hot"], "d": ["hot"], "e": ["hot"]}
@@ -64,7 +66,9 @@ def test_units_without_the_condition_that_is_identified_on_are_named_as_unknown(
     assert "confounded" not in text
 
 
-@pytest.mark.parametrize(("peak_db", "percent", "warned"), [(-49.0, 20.0, True), (-20.0, 20.0, False), (-40.0, 4.9, False), (-40.0, 5.1, True)])
+@pytest.mark.parametrize(
+    ("peak_db", "percent", "warned"), [(-49.0, 20.0, True), (-20.0, 20.0, False), (-40.0, 4.9, False), (-40.0, 5.1, True)]
+)
 def test_a_set_far_smaller_than_the_models_errors_is_a_warning(peak_db: float, percent: float, warned: bool) -> None:
     """The rule: five times the largest residual, 10^(-49 / 20) = 0.35 %, against the worst channel of the middle unit."""
     found = metrics(TOGETHER, uncertainty=uncertainty(peak_db), models=models(percent))
@@ -76,7 +80,9 @@ def test_a_set_far_smaller_than_the_models_errors_is_a_warning(peak_db: float, p
 
 
 def test_nothing_is_compared_where_a_free_run_diverged_or_was_not_made() -> None:
-    diverged = metrics(TOGETHER, uncertainty=uncertainty(-49.0), models={"koopman": {"freerun_error_percent": {"velocity": {"median": None}}}})
+    diverged = metrics(
+        TOGETHER, uncertainty=uncertainty(-49.0), models={"koopman": {"freerun_error_percent": {"velocity": {"median": None}}}}
+    )
     assert small_set_text(diverged) == small_set_text(metrics(TOGETHER, uncertainty=uncertainty(-49.0))) == []
 
 
@@ -88,7 +94,11 @@ def test_advice_about_recordings_speaks_of_units() -> None:
 
 def test_scores_that_tell_nothing_are_no_clean_bill() -> None:
     row = {"condition": "cold", "score": 0.0, "outlier": False, "needed_s": 120.0, "recorded_s": 20.0}
-    rows = [{**row, "unit": "a", "status": "ok"}, {**row, "unit": "b", "status": "not enough data"}, {**row, "unit": "c", "status": "cannot tell"}]
+    rows = [
+        {**row, "unit": "a", "status": "ok"},
+        {**row, "unit": "b", "status": "not enough data"},
+        {**row, "unit": "c", "status": "cannot tell"},
+    ]
     text = told(metrics(TOGETHER, outliers=rows))
     assert "1 of 3 scores say nothing about their unit, as too little was recorded of it: b (cold)." in text
     assert "as the others are too few, or too unlike: c (cold)." in text

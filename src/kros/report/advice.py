@@ -115,4 +115,6 @@ def _recordings(metrics: Mapping[str, Any]) -> list[str]:
     differ = f"of how much {model_label(model)} models differ, where they do most ({where} Hz),"
     if share >= _MANY:
         return [f"Record longer or more episodes: {100 * share:.0f} % {differ} comes from the recordings' length."]
-    return [f"Longer recordings of these units would change little: {100 * (1 - share):.0f} % {differ} is there whatever is drawn from the episodes."]
+    return [
+        f"Longer recordings of these units would change little: {100 * (1 - share):.0f} % {differ} is there whatever is drawn from the episodes."
+    ]

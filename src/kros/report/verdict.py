@@ -135,7 +135,11 @@ def _covered(metrics: Mapping[str, Any]) -> list[str]:
     if entry is None or entry["peak_db"].get(entry["form"]) is None:
         return []
     peak, cover = minus(f"{entry['peak_db'][entry['form']]:.1f}"), entry["weight"]["cover_max"]
-    held = "its weights cover the units that it was made from" if cover is not None and cover <= 1 else "its weights do not cover all units that it was made from"
+    held = (
+        "its weights cover the units that it was made from"
+        if cover is not None and cover <= 1
+        else "its weights do not cover all units that it was made from"
+    )
     return [
         f"The set of machines it is designed for ({form_label(entry['form'])}) has residuals of at most {peak} dB around unit {entry['nominal']}; {held}."
     ]

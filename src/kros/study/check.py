@@ -84,7 +84,11 @@ def check_line(row: dict[str, Any]) -> str:
     line += f"  {row['status'].upper() if row['outlier'] else row['status']}"
     if row["outlier"]:
         return line
-    seen = "no change would have been seen" if row["detectable"] is None else f"a change of gain by {row['detectable']:.2g} % would have been seen"
+    seen = (
+        "no change would have been seen"
+        if row["detectable"] is None
+        else f"a change of gain by {row['detectable']:.2g} % would have been seen"
+    )
     if row["status"] == Status.NOT_ENOUGH_DATA:
         return f"{line}: about {row['needed_s']:.3g} s of recordings are needed, found {row['recorded_s']:.3g} s"
     if row["detectable"] is None:

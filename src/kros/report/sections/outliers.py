@@ -80,7 +80,10 @@ def _scores(run: RunFolder, rows: Sequence[Mapping[str, Any]]) -> Table:
     names = {c: _names(run, {"condition": c}) for c in conditions}
     order = sorted(dict.fromkeys(r["unit"] for r in rows), key=lambda u: -max((_score(found, u, c) for c in conditions), default=0.0))
     cells = [[Cell(u), *(cell for c in conditions for cell in _cells(found.get((u, c)), names[c]))] for u in order]
-    head = ["unit", *(["score (dB)", "over nominals (dB)", "at (Hz)", "entry", "status", "flagged from (dB)", "gain (%)"] * len(conditions))]
+    head = [
+        "unit",
+        *(["score (dB)", "over nominals (dB)", "at (Hz)", "entry", "status", "flagged from (dB)", "gain (%)"] * len(conditions)),
+    ]
     caption = "Outlier scores, highest first; with their range over all nominals, frequency and entry of the residual, and what would have been flagged"
     return Table(head, cells, caption, [("", 1), *((condition_label(c), 7) for c in conditions)], folded=True)
 

@@ -61,9 +61,7 @@ def noise_text(entries: Mapping[str, Any]) -> list[str]:
     if low:
         text += f"Where the units differ most, they really differ ({', '.join(low)}): more recordings of the same units would not shrink the set. "
     if high:
-        text += (
-            f"For {', '.join(high)} most of it is the recordings' length: record longer, or more episodes, before calling it a difference between machines."
-        )
+        text += f"For {', '.join(high)} most of it is the recordings' length: record longer, or more episodes, before calling it a difference between machines."
     return [text.strip()]
 
 

@@ -105,7 +105,9 @@ class Others:
 
     def _worse(self, rows: Array, deviations: Array, variance: Array, draw: int) -> Array:
         """Some units, estimated as badly as a unit with such errors."""
-        share = np.sqrt(np.clip(1 - np.divide(self.noise[rows], variance, out=np.ones(self.noise[rows].shape), where=variance > 0), 0.0, 1.0))
+        share = np.sqrt(
+            np.clip(1 - np.divide(self.noise[rows], variance, out=np.ones(self.noise[rows].shape), where=variance > 0), 0.0, 1.0)
+        )
         chosen = np.random.default_rng([_SEED, draw]).choice(len(deviations), len(rows), replace=len(deviations) < len(rows))
         return self.responses[rows] + share * deviations[chosen]
 

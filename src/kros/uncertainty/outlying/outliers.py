@@ -34,11 +34,10 @@ from ...core.loading import check_shapes, loader
 from ..forms import Form, as_form
 from ..residuals import check_responses
 from .chance import AS_GOOD, Others, spread, times_noisier
-from .detectable import change_levels, smallest_change
-from .distances import Distances, balance, distances, largest_entries
-from .groups import excess, held, separate
-from .score import LARGEST_RISE_DB, OutlierScore, Status, room_db
-from .tail import leave_one_out_bounds
+from .distances import balance, distances
+from .groups import separate
+from .judging import Nominals, margins_of, scores_of, with_noise
+from .score import OutlierScore
 
 Array = npt.NDArray[Any]
 
@@ -129,16 +128,16 @@ class OutlierModel:
         everyone = np.concatenate([self.responses[rows], (G / self.output_scale[:, None] * self.input_scale)[None]])
         found = distances(self.form, everyone, self.freqs_hz)
         last = np.arange(len(everyone)) == len(everyone) - 1
-        margin = float(_margins(found.levels, self.false_alarm_rate)[1][-1])
-        summary = _Nominals.of(found, ~last, self.false_alarm_rate)
-        (score,) = _scores(
+        margin = float(margins_of(found.levels, self.false_alarm_rate)[1][-1])
+        summary = Nominals.of(found, ~last, self.false_alarm_rate)
+        (score,) = scores_of(
             self.form, everyone, self.freqs_hz, found, ~last, (margin,), (unit,), self.threshold_db, summary, [len(last) - 1]
         )
         if deviations is None:
             return score
         draws = _deviations(unit, deviations, G.shape) / self.output_scale[:, None] * self.input_scale
         others = Others.of(self.form, self.responses[rows], self.noise[rows], self.freqs_hz, self.false_alarm_rate)
-        return _with_noise(score, everyone[-1], others, draws)
+        return with_noise(score, everyone[-1], others, draws)
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``outlier_model.json``."""
@@ -244,9 +243,9 @@ def _compared(G: Array, ids: tuple[str, ...], freqs: Array, form: Form, rate: fl
     """Score units whose estimates are equally good, responses in scaled coordinates."""
     found = distances(form, G, freqs)
     parts = separate(found.levels, rate)
-    summary = _Nominals.of(found, parts.inliers, rate)
+    summary = Nominals.of(found, parts.inliers, rate)
     margins = tuple(float(m) for m in parts.margin_db)
-    scores = _scores(form, G, freqs, found, parts.inliers, margins, ids, parts.threshold_db, summary, range(len(G)))
+    scores = scores_of(form, G, freqs, found, parts.inliers, margins, ids, parts.threshold_db, summary, range(len(G)))
     inliers = np.flatnonzero(parts.inliers)
     return OutlierModel(
         form=form,
@@ -290,107 +289,6 @@ def _with_deviations(model: OutlierModel, G: Array, ids: tuple[str, ...], draws:
     by_nominal = np.full((len(model.nominal_ids), len(ids)), np.nan)
     by_nominal[:, well] = model.by_nominal_db
     return replace(model, scores=tuple(scores[u] for u in ids), by_nominal_db=by_nominal)
-
-
-def _with_noise(score: OutlierScore, G: Array, others: Others, draws: Array) -> OutlierScore:
-    """Take off a score what the noise of its own estimate adds to its bound, and say whether that hides too much."""
-    bounds = others.bounds(G, draws)
-    if bounds is None:
-        return score
-    usual, noisy = bounds
-    lift = max(0.0, noisy - score.detectable_db)
-    outlier = score.outlier and score.excess_db > max(noisy, score.detectable_db)
-    room = room_db(usual, score.detectable_percent * 10 ** ((usual - score.detectable_db) / 20))
-    allowed = min(LARGEST_RISE_DB, room) if room >= 0 else LARGEST_RISE_DB
-    enough = noisy - usual <= allowed
-    status = Status.NOT_ENOUGH_DATA if not enough else Status.OK if room >= 0 else Status.CANNOT_TELL
-    return replace(
-        score,
-        score_db=score.score_db - lift,
-        outlier=outlier,
-        status=Status.OUTLIER if outlier else status,
-        detectable_db=score.detectable_db + lift,
-        detectable_percent=score.detectable_percent * 10 ** (lift / 20),
-        more_data=1.0 if enough else others.more_data(G, draws, allowed),
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _Nominals:
-    """Excess of every unit with one nominal at a time, shape (nominal, unit), and whether it is beyond its threshold."""
-
-    excess_db: Array
-    beyond: Array
-
-    @classmethod
-    def of(cls, found: Distances, inliers: npt.NDArray[np.bool_], rate: float) -> _Nominals:
-        shape = found.by_nominal.shape[:2]
-        values, beyond = np.full(shape, np.nan), np.zeros(shape, bool)
-        for row, nominal in enumerate(found.nominals):
-            others = np.arange(shape[1]) != nominal
-            for units, members in _juries(inliers & others, others):
-                score, margin = _margins(found.by_nominal[row, members], rate)
-                place = np.searchsorted(members, units)
-                values[row, units], beyond[row, units] = score[place], margin[place] > 0
-        return cls(values, beyond)
-
-    def summary(self, unit: int) -> tuple[float, float, float]:
-        """Return lowest and highest excess and agreement."""
-        known = np.isfinite(self.excess_db[:, unit])
-        values = self.excess_db[known, unit]
-        return float(values.min()), float(values.max()), float(self.beyond[known, unit].mean())
-
-
-def _juries(inliers: npt.NDArray[np.bool_], wanted: npt.NDArray[np.bool_]) -> list[tuple[Array, Array]]:
-    """Units, and the units that they are scored among: inliers together, every other unit alone with them."""
-    together = np.flatnonzero(inliers)
-    alone = [(np.array([k]), np.sort(np.append(together, k))) for k in np.flatnonzero(wanted & ~inliers)]
-    return [(together, together), *alone] if len(together) > 1 else alone
-
-
-def _margins(levels: Array, rate: float) -> tuple[Array, Array]:
-    """Excess of all units, and what it has beyond the bound of the others' scores."""
-    if len(levels) < 2:
-        return np.zeros(len(levels)), np.full(len(levels), -np.inf)
-    scores = excess(levels)[0]
-    return scores, scores - leave_one_out_bounds(scores, rate)
-
-
-def _scores(
-    form: Form,
-    G: Array,
-    freqs: Array,
-    found: Distances,
-    inliers: npt.NDArray[np.bool_],
-    margins: tuple[float, ...],
-    ids: tuple[str, ...],
-    threshold: float,
-    summary: _Nominals,
-    units: Sequence[int],
-) -> tuple[OutlierScore, ...]:
-    """Scores of some units; `margins` and `ids` are theirs."""
-    wanted = np.isin(np.arange(len(G)), np.asarray(units))
-    value, where = np.zeros(len(G)), np.zeros(len(G), int)
-    for some, members in _juries(inliers, wanted | inliers):
-        score, place = excess(found.levels[members])
-        value[some], where[some] = score[np.searchsorted(members, some)], place[np.searchsorted(members, some)]
-    rows = where[list(units)]
-    entries = largest_entries(form, G, found, np.asarray(units), rows)
-    change = change_levels(form, G[inliers], found, freqs)
-    scores = []
-    for k, unit, margin, row, entry in zip(units, ids, margins, rows, entries, strict=True):
-        known = np.isfinite(threshold) and np.isfinite(margin)
-        referred = threshold + margin if known else float(value[k])
-        beyond = bool(np.isfinite(threshold) and margin > 0)
-        bound = float(value[k]) - margin if known else float("inf")
-        others = inliers & (np.arange(len(G)) != k)
-        percent, at, place = smallest_change(change, held(found.levels[others].max(axis=0)), bound)
-        status = Status.OUTLIER if beyond else Status.OK if room_db(bound, percent) >= 0 else Status.CANNOT_TELL
-        seen = status, bound, percent, float(freqs[at]) if known else None, place
-        scores.append(
-            OutlierScore(unit, referred, threshold, beyond, float(freqs[row]), entry, float(value[k]), *summary.summary(k), *seen)
-        )
-    return tuple(scores)
 
 
 def _draws(deviations: Sequence[npt.ArrayLike], ids: tuple[str, ...], rows: Array, shape: tuple[int, ...]) -> list[Array]:

@@ -87,9 +87,11 @@ class OutlierScore:
     @classmethod
     def from_content(cls, content: Mapping[str, Any], threshold_db: float) -> OutlierScore:
         """Return a score as it was before it became JSON, which knows neither infinity nor tuples."""
-        values = {f.name: content[f.name] for f in fields(cls)} | {"threshold_db": threshold_db, "status": Status(content["status"])}
+        values: dict[str, Any] = {f.name: content[f.name] for f in fields(cls)}
+        unknown = [name for name, value in values.items() if value is None and name != "detectable_hz"]
+        values |= dict.fromkeys(unknown, float("inf"))
         values |= {name: tuple(content[name]) for name in ("entry", "detectable_entry")}
-        return cls(**{name: float("inf") if value is None and name != "detectable_hz" else value for name, value in values.items()})
+        return cls(**values | {"threshold_db": threshold_db, "status": Status(content["status"])})
 
 
 def room_db(detectable_db: float, detectable_percent: float) -> float:

@@ -1,0 +1,138 @@
+"""Scores of units from distances: who covers whom, what a unit exceeds that by, and what its own noise adds to its bound."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..forms import Form
+from .chance import Others
+from .detectable import change_levels, smallest_change
+from .distances import Distances, largest_entries
+from .groups import excess, held
+from .score import LARGEST_RISE_DB, OutlierScore, Status, room_db
+from .tail import leave_one_out_bounds
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Nominals:
+    """Excess of every unit with one nominal at a time, shape (nominal, unit), and whether it is beyond its threshold."""
+
+    excess_db: Array
+    beyond: Array
+
+    @classmethod
+    def of(cls, found: Distances, inliers: npt.NDArray[np.bool_], rate: float) -> Nominals:
+        """Score all units under every nominal, inliers among themselves and each other unit alone with them."""
+        shape = found.by_nominal.shape[:2]
+        values, beyond = np.full(shape, np.nan), np.zeros(shape, bool)
+        for row, nominal in enumerate(found.nominals):
+            others = np.arange(shape[1]) != nominal
+            for units, members in _juries(inliers & others, others):
+                score, margin = margins_of(found.by_nominal[row, members], rate)
+                place = np.searchsorted(members, units)
+                values[row, units], beyond[row, units] = score[place], margin[place] > 0
+        return cls(values, beyond)
+
+    def summary(self, unit: int) -> dict[str, Any]:
+        """Return lowest and highest excess and agreement."""
+        known = np.isfinite(self.excess_db[:, unit])
+        values = self.excess_db[known, unit]
+        return {
+            "lowest_db": float(values.min()),
+            "highest_db": float(values.max()),
+            "agreement": float(self.beyond[known, unit].mean()),
+        }
+
+
+def _juries(inliers: npt.NDArray[np.bool_], wanted: npt.NDArray[np.bool_]) -> list[tuple[Array, Array]]:
+    """Units, and the units that they are scored among: inliers together, every other unit alone with them."""
+    together = np.flatnonzero(inliers)
+    alone = [(np.array([k]), np.sort(np.append(together, k))) for k in np.flatnonzero(wanted & ~inliers)]
+    return [(together, together), *alone] if len(together) > 1 else alone
+
+
+def margins_of(levels: Array, rate: float) -> tuple[Array, Array]:
+    """Excess of all units, and what it has beyond the bound of the others' scores."""
+    if len(levels) < 2:
+        return np.zeros(len(levels)), np.full(len(levels), -np.inf)
+    scores = excess(levels)[0]
+    return scores, scores - leave_one_out_bounds(scores, rate)
+
+
+def scores_of(
+    form: Form,
+    G: Array,
+    freqs: Array,
+    found: Distances,
+    inliers: npt.NDArray[np.bool_],
+    margins: tuple[float, ...],
+    ids: tuple[str, ...],
+    threshold: float,
+    summary: Nominals,
+    units: Sequence[int],
+) -> tuple[OutlierScore, ...]:
+    """Scores of some units; `margins` and `ids` are theirs."""
+    wanted = np.isin(np.arange(len(G)), np.asarray(units))
+    value, where = np.zeros(len(G)), np.zeros(len(G), int)
+    for some, members in _juries(inliers, wanted | inliers):
+        score, place = excess(found.levels[members])
+        value[some], where[some] = score[np.searchsorted(members, some)], place[np.searchsorted(members, some)]
+    rows = where[list(units)]
+    entries = largest_entries(form, G, found, np.asarray(units), rows)
+    change = change_levels(form, G[inliers], found, freqs)
+    scores = []
+    for k, unit, margin, row, entry in zip(units, ids, margins, rows, entries, strict=True):
+        known = np.isfinite(threshold) and np.isfinite(margin)
+        referred = threshold + margin if known else float(value[k])
+        beyond = bool(np.isfinite(threshold) and margin > 0)
+        bound = float(value[k]) - margin if known else float("inf")
+        others = inliers & (np.arange(len(G)) != k)
+        percent, at, changed = smallest_change(change, held(found.levels[others].max(axis=0)), bound)
+        status = Status.OUTLIER if beyond else Status.OK if room_db(bound, percent) >= 0 else Status.CANNOT_TELL
+        found_score = OutlierScore(
+            unit=unit,
+            score_db=referred,
+            threshold_db=threshold,
+            outlier=beyond,
+            freq_hz=float(freqs[row]),
+            entry=entry,
+            excess_db=float(value[k]),
+            **summary.summary(k),
+            status=status,
+            detectable_db=bound,
+            detectable_percent=percent,
+            detectable_hz=float(freqs[at]) if known else None,
+            detectable_entry=changed,
+        )
+        scores.append(found_score)
+    return tuple(scores)
+
+
+def with_noise(score: OutlierScore, G: Array, others: Others, draws: Array) -> OutlierScore:
+    """Take off a score what the noise of its own estimate adds to its bound, and say whether that hides too much."""
+    bounds = others.bounds(G, draws)
+    if bounds is None:
+        return score
+    usual, noisy = bounds
+    lift = max(0.0, noisy - score.detectable_db)
+    outlier = score.outlier and score.excess_db > max(noisy, score.detectable_db)
+    room = room_db(usual, score.detectable_percent * 10 ** ((usual - score.detectable_db) / 20))
+    allowed = min(LARGEST_RISE_DB, room) if room >= 0 else LARGEST_RISE_DB
+    enough = noisy - usual <= allowed
+    status = Status.NOT_ENOUGH_DATA if not enough else Status.OK if room >= 0 else Status.CANNOT_TELL
+    return replace(
+        score,
+        score_db=score.score_db - lift,
+        outlier=outlier,
+        status=Status.OUTLIER if outlier else status,
+        detectable_db=score.detectable_db + lift,
+        detectable_percent=score.detectable_percent * 10 ** (lift / 20),
+        more_data=1.0 if enough else others.more_data(G, draws, allowed),
+    )

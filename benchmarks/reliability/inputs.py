@@ -27,7 +27,8 @@ from campaign import Tally, main
 from kros.core.artifacts import CHECKSUM, load_artifact, plain, read_json, save_artifact
 from kros.core.errors import KrosError
 from kros.core.lti import StateSpace
-from kros.data import Channel, Role, check_population, from_arrays, from_frame, from_pykoop, open_population, scan_population, write_parquet
+from kros.data import Channel, Role, check_population, from_arrays, from_frame, from_pykoop, open_population, write_parquet
+from kros.data.checks import scan_prints
 from kros.identify import ModelSet
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime
@@ -174,10 +175,9 @@ def samples(seed: int, n: int = 60) -> np.ndarray:
 
 def recorded(population: Any) -> Any:
     """Everything that is in a population, for comparison."""
-    check_population(population)
-    kept = scan_population(population)
-    facts = plain([kept.channels, kept.sample_period_s, kept.units, [str(k) for k in kept.episodes], kept.metadata])
-    return facts, [kept.read(k).tobytes() for k in kept.episodes]
+    check_population(population, allow_single=True)
+    facts = plain([population.channels, population.sample_period_s, population.units, population.metadata])
+    return facts, [(str(key), found.digest) for key, found in scan_prints(population)]
 
 
 def matrices(value: Any) -> Any:
@@ -301,7 +301,7 @@ def recordings_targets(root: Path) -> list[Target]:
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(csv_file(10 * episode + ord(unit)))
     raw = root / "raw"
-    for unit in ("001001", "001002"):
+    for unit in ("001001",):
         for episode in range(2):
             path = raw / "batch_b" / "population" / f"20230101T000000_{unit}_noload" / f"cycle_{episode:03d}.csv"
             path.parent.mkdir(parents=True, exist_ok=True)

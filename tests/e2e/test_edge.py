@@ -1,0 +1,262 @@
+"""The edge of the command line: whatever goes wrong, one message and an exit code of 1 or 2, never a traceback."""
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kros.data import Channel, Role, from_arrays, write_parquet
+
+CHANNELS = (Channel("position", Role.STATE, "rad", measured=True), Channel("velocity", Role.STATE, "rad/s"), Channel("torque", Role.INPUT))
+
+
+def motion(seed: int, n: int = 400) -> np.ndarray:
+    """A damped oscillator on noise, shape (n, 3), 0.01 s apart."""
+    rng = np.random.default_rng(seed)
+    u, x = np.repeat(rng.normal(size=n // 10), 10), np.zeros((n, 2))
+    for k in range(n - 1):
+        x[k + 1] = [[1.0, 0.01], [-0.05, 0.95]] @ x[k] + [0.0, 0.1 * u[k]]
+    return np.column_stack([x + 1e-4 * rng.normal(size=(n, 2)), u])
+
+
+def episodes() -> dict:
+    return {unit: [motion(10 * i + k) for k in range(3)] for i, unit in enumerate("abc")}
+
+
+@pytest.fixture
+def store(tmp_path):
+    """Write recordings and a study on them."""
+
+    def write(data=None, period=0.01, extra="") -> Path:
+        write_parquet(from_arrays(data or episodes(), CHANNELS, period), tmp_path / "recordings")
+        (tmp_path / "study.toml").write_text(f'[data]\nsource = "recordings"\nreader = "parquet"\n{extra}\n')
+        return tmp_path / "study.toml"
+
+    return write
+
+
+def said(result, code, *words):
+    assert result.exit_code == code, result.output
+    messages = [line for line in result.stderr.splitlines() if line.startswith("kros: ")]
+    assert len(messages) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    for word in words:
+        assert word in messages[0]
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "x"), ("No space left", "'x'")),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "x"), ("too long",)),
+        (PermissionError(errno.EACCES, "Permission denied", "x"), ("Permission denied",)),
+        (NotADirectoryError(errno.ENOTDIR, "Not a directory", "x", None, "y"), ("'x' -> 'y'",)),
+        (OSError("odd"), ("odd",)),
+        (MemoryError(), ("Memory", "--workers")),
+        (BrokenProcessPool("terminated abruptly"), ("worker",)),
+        (KeyError("alpha"), ("Internal error", "KeyError", "--debug")),
+        (RecursionError("too deep"), ("Internal error",)),
+        (ZeroDivisionError("division by zero"), ("Internal error", "division by zero")),
+        (UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates not allowed"), ("Internal error",)),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+@pytest.mark.parametrize("command", ["run", "report", "check", "estimate", "figures", "convert", "simulate", "demo", "doctor"])
+def test_any_exception_becomes_one_message(kros, tmp_path, monkeypatch, command, error, words):
+    def fail(*_, **__):
+        raise error
+
+    places = {
+        "run": "kros.study.load_config",
+        "report": "kros.study.stages.report.render_run",
+        "check": "kros.study.check.check_units",
+        "estimate": "kros.study.estimate.estimate_recordings",
+        "figures": "kros.study.stages.report.write_figures",
+        "convert": "kros.study.convert.convert_recordings",
+        "simulate": "kros.study.demo.simulate_to",
+        "demo": "kros.study.demo.run_demo",
+        "doctor": "kros.study.doctor.diagnose",
+    }
+    arguments = {"run": 1, "report": 1, "check": 2, "estimate": 3, "figures": 2, "convert": 2, "simulate": 1}
+    monkeypatch.setattr(places[command], fail)
+    said(kros(command, *[tmp_path / f"{i}" for i in range(arguments.get(command, 0))]), 1, *words)
+    debugged = kros("--debug", command, *[tmp_path / f"{i}" for i in range(arguments.get(command, 0))])
+    assert debugged.exception is error
+
+
+@pytest.mark.parametrize("out", ["x" * 300, "file/inside", "locked/inside"])
+def test_folders_that_cannot_be_made(kros, store, tmp_path, out):
+    study = store()
+    (tmp_path / "file").write_text("")
+    (tmp_path / "locked").mkdir()
+    if out.startswith("locked"):
+        if os.geteuid() == 0:
+            pytest.skip("nothing is forbidden to root")
+        (tmp_path / "locked").chmod(0o500)
+    result = kros("run", study, "--out", tmp_path / out, "--until", "read", "--workers", 1)
+    assert result.exit_code in (1, 2)
+    said(result, result.exit_code)
+    result = kros("convert", tmp_path / "recordings", tmp_path / out, "--workers", 1)
+    assert result.exit_code in (1, 2)
+    said(result, result.exit_code)
+
+
+def shell(*arguments: str, **options) -> subprocess.CompletedProcess:
+    code = "from kros.cli import app; app()"
+    return subprocess.run([sys.executable, "-c", code, *map(str, arguments)], stderr=subprocess.PIPE, text=True, check=False, **options)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_an_output_that_is_full_or_gone():
+    with open("/dev/full", "w") as full:
+        done = shell("doctor", stdout=full)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "No space left" in done.stderr
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = shell("doctor", stdout=writer)
+    os.close(writer)
+    assert done.returncode == 1
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_a_study_that_is_no_file(kros, tmp_path, kind):
+    path = tmp_path / "study.toml"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path = Path("/dev/zero")
+    else:
+        path.mkdir()
+    said(kros("run", path, "--out", tmp_path / "out"), 2, "a regular file is needed", kind)
+    said(kros("convert", tmp_path, tmp_path / "out", "--mapping", path), 2, "a regular file is needed")
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        ("a = " + "[" * 5000, "nested"),
+        ("[data]\nsource = 'recordings'\n[identify]\nalpha_factor = inf\n", "alpha_factor"),
+        ("[data]\nsource = 'recordings'\n[load]\nangle_rad = nan\n", "angle_rad"),
+        ('[data]\nsource = "a\\u0000b"\n', "nul"),
+        ("[data]\nsource = 'recordings'\n[[lifting.families]]\nkind = 'harmonics'\nangle = 5\nratio = []\n", "lifting"),
+        ("data = 5\n", "data"),
+    ],
+    ids=range(6),
+)
+def test_studies_that_cannot_be_used(kros, store, tmp_path, content, word):
+    study = store()
+    study.write_text(content)
+    said(kros("run", study, "--out", tmp_path / "out"), 2, word)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("value", ["[" * 5000, "9" * 5000])
+def test_values_on_the_command_line(kros, store, tmp_path, value):
+    result = kros("run", store(), "--out", tmp_path / "out", "--set", f"identify.alpha={value}")
+    said(result, 2, "--set")
+
+
+@pytest.fixture
+def written_by_others(tmp_path):
+    """Write CSV recordings and a study on them."""
+
+    def write(data) -> Path:
+        (tmp_path / "csv").mkdir()
+        for unit, recorded in data.items():
+            for k, values in enumerate(recorded):
+                rows = [",".join(f"{v:.9g}" for v in (0.01 * i, *row)) for i, row in enumerate(values)]
+                (tmp_path / "csv" / f"{unit}_{k}.csv").write_text("t,position,velocity,torque\n" + "\n".join(rows) + "\n")
+        channels = "".join(
+            f'[[data.csv.channel]]\nname = "{c.name}"\ncolumn = "{c.name}"\nrole = "{c.role.value}"\nmeasured = {str(c.measured).lower()}\n'
+            for c in CHANNELS
+        )
+        mapping = f"[data.csv]\nfiles = '(?P<unit>[abc])_(?P<episode>[0-9]+)'\ntime = 't'\n{channels}"
+        (tmp_path / "study.toml").write_text(f"[data]\nsource = 'csv'\nreader = 'csv'\n{mapping}")
+        return tmp_path / "study.toml"
+
+    return write
+
+
+def test_a_copy_is_refused_and_nothing_is_kept(kros, written_by_others, tmp_path):
+    data, out = episodes(), tmp_path / "out"
+    data["c"][2] = data["a"][0]
+    said(kros("run", written_by_others(data), "--out", out, "--workers", 1), 2, "pisode 2 of unit c", "episode 0 of unit a", "copy")
+    assert not out.exists()
+
+
+def test_a_stuck_sensor_is_refused_and_nothing_is_kept(kros, written_by_others, tmp_path):
+    data, out = episodes(), tmp_path / "out"
+    data["b"][1][:, 1] = 0.25
+    said(kros("run", written_by_others(data), "--out", out, "--workers", 1), 2, "pisode 1 of unit b", "'velocity'", "stuck")
+    assert not out.exists()
+
+
+def test_an_implausible_period_is_told_with_the_results(kros, store, tmp_path):
+    out = tmp_path / "out"
+    result = kros("run", store(period=1.0), "--out", out, "--until", "read", "--workers", 1)
+    assert result.exit_code == 0, result.output
+    assert "time_scale" in result.stdout
+    alerts = json.loads((out / "metrics.json").read_text())["study"]["alerts"]
+    assert any("unusual" in alert for alert in alerts)
+
+
+def test_a_good_period_is_not(kros, store, tmp_path):
+    result = kros("run", store(), "--out", tmp_path / "out", "--until", "read", "--workers", 1)
+    assert result.exit_code == 0, result.output
+    assert "alerts" not in json.loads((tmp_path / "out" / "metrics.json").read_text())["study"]
+
+
+def test_runs_of_another_version_and_damaged_ones(kros, demo, recorded, tmp_path):
+    """Every JSON file of a run, emptied of its keys or of its sense: each command says so, or does not need it."""
+    run = tmp_path / "run"
+    shutil.copytree(demo, run)
+    study = json.loads((run / "study.json").read_text())
+    for content in ({**study, "identification": {}}, {"name": "x"}, [], {**study, "data": 5}):
+        (run / "study.json").write_text(json.dumps(content))
+        for command in (("check", run, recorded), ("estimate", run, recorded, tmp_path / "e.parquet")):
+            said(kros(*command), 2, "study.json", "version")
+    (run / "study.json").write_text(json.dumps(study))
+
+
+@pytest.mark.parametrize("content", [b"{}", b'{"schema": 1, "kind": 5}', b"[", b"5"])
+def test_files_of_a_run_without_their_content(kros, demo, recorded, tmp_path, content):
+    run, out = tmp_path / "run", tmp_path / "e.parquet"
+    shutil.copytree(demo, run)
+    for name in ("population/facts.json", "calibration/calibration.json", "observers/deployed.json"):
+        good = (run / name).read_bytes()
+        (run / name).write_bytes(content)
+        said(kros("estimate", run, recorded, out), 2, Path(name).name)
+        (run / name).write_bytes(good)
+    for name in ("metrics.json", "observers/observers.json"):
+        good = (run / name).read_bytes()
+        (run / name).write_bytes(content)
+        result = kros("report", run)
+        assert result.exit_code in (1, 2), (name, result.output)
+        said(result, result.exit_code)
+        assert "Internal error" not in result.stderr
+        (run / name).write_bytes(good)
+
+
+def test_an_observer_with_a_hole_is_not_run(kros, demo, recorded, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(demo, run)
+    path = run / "observers" / "deployed.json"
+    content = json.loads(path.read_text())
+    content["model"]["A"][0][0] = None
+    for keep in (True, False):
+        if not keep:
+            del content["checksum"]
+        path.write_text(json.dumps(content))
+        result = kros("estimate", run, recorded, tmp_path / "e.parquet")
+        said(result, 2, "deployed.json")
+        assert not (tmp_path / "e.parquet").exists()

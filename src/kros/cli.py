@@ -86,7 +86,7 @@ def demo(
 @app.command()
 def simulate(
     out: Annotated[Path, typer.Argument(help="New folder for the recordings.")],
-    plant: Annotated[str, typer.Option()] = "harmonic-drive",
+    plant: Annotated[str, typer.Option(help="harmonic-drive, pendulum or dc-motor.")] = "harmonic-drive",
     units: Annotated[int, typer.Option(min=1)] = 12,
     episodes: Annotated[int, typer.Option(min=1, max=1000)] = 10,
     seconds: Annotated[float, typer.Option(min=5)] = 20.0,

@@ -11,3 +11,30 @@ Array = npt.NDArray[np.float64]
 def qr_triangle(matrix: Array) -> Array:
     """Return the triangular factor R of a QR decomposition, batched; shape (..., min(rows, n), n)."""
     return np.asarray(np.linalg.qr(matrix, mode="r"))
+
+
+def least_squares(regressors: Array, values: Array, rcond: float | None = None) -> Array:
+    """Return X that makes ``regressors X - values`` smallest, of all such X the smallest one with every regressor in units of its own size.
+
+    Which directions count as dependent then does not change with the units of measure.
+
+    Parameters
+    ----------
+    regressors : ndarray, shape (rows, n)
+    values : ndarray, shape (rows, k)
+    rcond : float, optional
+        Relative singular value below which a direction is dependent; rounding by default.
+    """
+    largest = np.abs(regressors).max(axis=0, initial=0.0)
+    largest[largest == 0] = 1.0
+    size = largest * np.sqrt(np.mean((regressors / largest) ** 2, axis=0))
+    size[size == 0] = 1.0
+    return np.asarray(np.linalg.lstsq(regressors / size, values, rcond=rcond)[0] / size[:, None])
+
+
+def solve_balanced(A: Array, values: Array, rcond: float | None = None) -> Array:
+    """Return X that makes ``A X - values`` smallest for a square A between states, which is balanced first: units of measure change nothing."""
+    from scipy.linalg import matrix_balance
+
+    _, (size, _) = matrix_balance(A, permute=False, separate=True)
+    return np.asarray(np.linalg.lstsq(A * size / size[:, None], values / size[:, None], rcond=rcond)[0] * size[:, None])

@@ -17,6 +17,7 @@ from .recording import title
 
 logger = logging.getLogger(__name__)
 
+_ROUNDING = 1e-13  # relative: what conversions of units leave of a constant
 MIN_SAMPLES = 3  # two consecutive states and one more
 
 
@@ -71,8 +72,9 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
 
 
 def is_constant(column: npt.NDArray[np.float64]) -> bool:
-    """Tell whether a signal never changes; a changing one is recognised early."""
-    return bool(column[0] == column[len(column) // 2] and np.all(column == column[0]))
+    """Tell whether a signal never changes by more than rounding, relative to its size; a changing one is recognised early."""
+    slack = _ROUNDING * abs(column[0])
+    return bool(abs(column[len(column) // 2] - column[0]) <= slack and np.all(np.abs(column - column[0]) <= slack))
 
 
 def check_finite(

@@ -9,6 +9,7 @@ from .factors import Factor, combine, lifted_factor, reduce_episode
 from .free_run import free_run
 from .model_set import ModelSet
 from .phase import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
+from .ranges import Ranges
 from .scores import Scores, predict_ahead, score
 from .selection import Choice, LeaveOut, Selection
 
@@ -22,6 +23,7 @@ __all__ = [
     "ModelSet",
     "PhaseCalibration",
     "PhaseSpec",
+    "Ranges",
     "Scores",
     "Segment",
     "Selection",

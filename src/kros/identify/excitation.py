@@ -11,6 +11,7 @@ from ..core.errors import IdentificationError
 from .factors import Factor, dependent_column
 
 log = logging.getLogger(__name__)
+_ROUNDING = 1e-13  # relative: what conversions of units leave of a constant
 
 
 def require_excitation(factor: Factor, inputs: Sequence[str], units: Sequence[str], where: str, alpha: float = 0.0) -> None:
@@ -39,7 +40,7 @@ def require_excitation(factor: Factor, inputs: Sequence[str], units: Sequence[st
     if factor.input_range is None:
         return
     low, high = factor.input_range[..., 0, :], factor.input_range[..., 1, :]
-    still = low == high
+    still = high - low <= _ROUNDING * np.maximum(np.abs(low), np.abs(high))
     dead = [name for name, zero in zip(inputs, np.all(still & (low == 0), axis=0), strict=True) if zero]
     for i, j in np.argwhere(still):
         problem = f"unit {units[i]} ({where}): input {inputs[j]!r} is {'zero' if low[i, j] == 0 else 'constant'} ({low[i, j]:g}) over all training episodes"

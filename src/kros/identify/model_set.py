@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,8 @@ from ..core.artifacts import load_artifact, save_artifact
 from ..core.lti import StateSpace
 from ..data.population import Channel, Role
 from ..lifting import Lifting
+from .edmd import KoopmanMatrices, edmd
+from .ranges import Ranges
 
 Array = npt.NDArray[np.float64]
 
@@ -41,6 +44,8 @@ class ModelSet:
     input_scale : ndarray, shape (m,)
     alpha : float or None
         Tikhonov coefficient, where there is one.
+    alpha_in_ranges : bool
+        Whether `alpha` is for channels divided by the ranges, as one that was searched is, or for the recordings' units.
     status : tuple of str
         Per unit ``ok``, or what is wrong.
     """
@@ -58,6 +63,7 @@ class ModelSet:
     output_scale: Array
     input_scale: Array
     alpha: float | None = None
+    alpha_in_ranges: bool = False
     status: tuple[str, ...] = field(default=())
 
     @property
@@ -87,6 +93,41 @@ class ModelSet:
         states = [c for c in self.channels if c.role is Role.STATE]
         return tuple(i for i, c in enumerate(states) if c.measured)
 
+    @property
+    def ranges(self) -> Ranges:
+        """Ranges of the lifted states and the inputs."""
+        return Ranges(self.output_scale, self.input_scale)
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """The same by name."""
+        return self.ranges.sizes(self.lifting, self.recorded_inputs)
+
+    def normalised(self) -> ModelSet:
+        """Return the models in channels divided by their ranges, which are all one then; the lifting is that of such channels."""
+        matrices = self.ranges.normalise(KoopmanMatrices(self.A, self.B))
+        x, u = self.output_scale, self.input_scale
+        return replace(
+            self,
+            lifting=self.lifting.in_sizes(self.sizes),
+            channels=tuple(replace(c, unit="") for c in self.channels),
+            A=matrices.A,
+            B=matrices.B,
+            residual_covariance=self.residual_covariance / x / x[:, None],
+            output_scale=np.ones_like(x),
+            input_scale=np.ones_like(u),
+        )
+
+    def fit(self, R: Array) -> KoopmanMatrices:
+        """Return EDMD models of other recordings, from factors of ``[Psi | Theta_plus]``, with the regularisation of these."""
+        alpha = self.alpha or 0.0
+        return self.ranges.edmd(R, alpha) if self.alpha_in_ranges else edmd(R, self.lifting.n_lifted, alpha)
+
+    def responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
+        """Return frequency responses from inputs to lifted states in the recordings' units, shape (unit, frequency, n, m)."""
+        scaled = self.normalised().systems(units).frequency_response(freqs_hz)
+        return np.asarray(scaled * self.output_scale[:, None] / self.input_scale)
+
     def systems(self, units: Sequence[str] | None = None) -> StateSpace:
         """Return the models as a batch from input to lifted state, all of it or some units."""
         rows = [self.index(u) for u in units] if units is not None else slice(None)
@@ -105,7 +146,7 @@ class ModelSet:
 
     def spectral_radius(self) -> Array:
         """Return the spectral radius of every unit's model."""
-        return np.abs(np.linalg.eigvals(self.A)).max(axis=-1)
+        return self.ranges.normalise(KoopmanMatrices(self.A, self.B)).spectral_radius()
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``model.json``."""
@@ -123,6 +164,7 @@ class ModelSet:
             "parameters": {k: dict(zip(self.unit_ids, v.tolist(), strict=True)) for k, v in self.parameters.items()},
             "sample_period_s": self.sample_period_s,
             "alpha": self.alpha,
+            "alpha_in_ranges": self.alpha_in_ranges,
             "status": self.status,
         }
         arrays = {name: getattr(self, name) for name in ("A", "B", "residual_covariance", "output_scale", "input_scale")}
@@ -142,6 +184,7 @@ class ModelSet:
             unit_ids=tuple(content["unit_ids"]),
             parameters=parameters,
             alpha=content["alpha"],
+            alpha_in_ranges=content.get("alpha_in_ranges", False),
             status=tuple(content["status"]),
             **arrays,
         )

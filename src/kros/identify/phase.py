@@ -10,7 +10,7 @@ and the branch is chosen for the whole population at once, so that every unit's 
 
 Symbols
 -------
-e     : tracking error, reference - measured
+e     : tracking error, reference - measured; where the reference is constant its periodic part is that of -measured, in any unit
 theta : angle, rad;  r : ratio of the disturbance to the angle
 psi_i : phase of the error in segment i, ``atan2(<e, cos r theta>, <e, sin r theta>)``, the closed form of (40)
 """
@@ -114,7 +114,8 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
 
     Parameters
     ----------
-    angle, reference, measured : ndarray, shape (n_samples,), rad, rad/s, rad/s
+    angle, reference, measured : ndarray, shape (n_samples,)
+        In any units of measure; the speed of a segment is that of the angle.
     dt : float, s
     spec : PhaseSpec
 
@@ -126,15 +127,24 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
     if top == 0:
         return []
     steady = (np.abs(np.diff(reference, prepend=reference[:1])) < _STEADY * top * dt / 1e-3) & (np.abs(reference) > 0.1 * top)
+    per_reference = _speed_per_reference(angle, reference, steady, dt)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
     segments = []
     for start, stop in zip(edges[::2] + round(spec.settle_s / dt), edges[1::2], strict=True):
-        speed = float(np.mean(reference[start:stop])) if stop > start else 0.0
+        speed = per_reference * float(np.mean(reference[start:stop])) if stop > start else 0.0
         period = 2 * np.pi / (spec.ratio * abs(speed) * dt) if speed else np.inf
         if stop - start >= 5 * period and period > 4:
-            phase, amplitude = _error_phase(spec.ratio * angle[start:stop], reference[start:stop] - measured[start:stop])
+            phase, amplitude = _error_phase(spec.ratio * angle[start:stop], -measured[start:stop])
             segments.append(Segment(speed, phase, amplitude, int(stop - start)))
     return segments
+
+
+def _speed_per_reference(angle: Array, reference: Array, steady: npt.NDArray[np.bool_], dt: float) -> float:
+    """Speed of the angle over the reference, which follows from their units of measure: one where these match; zero where nothing moves."""
+    moving = steady[:-1] & steady[1:]
+    wanted = reference[:-1][moving] / max(float(np.max(np.abs(reference))), np.finfo(float).tiny)
+    power = float(wanted @ wanted)
+    return float(wanted @ np.diff(angle)[moving]) / (power * dt * float(np.max(np.abs(reference)))) if power else 0.0
 
 
 def _error_phase(turn: Array, error: Array) -> tuple[float, float]:

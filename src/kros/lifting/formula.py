@@ -10,7 +10,7 @@ import ast
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -39,16 +39,32 @@ class Formula:
         Quantities that may appear.
     delayed : tuple of str
         Quantities of which earlier values may appear: ``position[-2]`` is the value two samples before.
+    sizes : tuple of (str, float)
+        Sizes of quantities whose values come divided by them.
+    size : float
+        What the value of the formula is divided by.
     """
 
     text: str
     names: tuple[str, ...]
     delayed: tuple[str, ...] = ()
+    sizes: tuple[tuple[str, float], ...] = ()
+    size: float = 1.0
+
+    @cached_property
+    def written(self) -> Any:
+        """SymPy tree of the formula as it is written."""
+        return _remembered(self.text, self.names, self.delayed)
 
     @cached_property
     def expression(self) -> Any:
-        """SymPy tree of the formula."""
-        return parse(self.text, self.names, self.delayed)
+        """SymPy tree of the formula, of quantities and with a value that are divided by their sizes."""
+        import sympy as sp
+
+        sizes = dict(self.sizes)
+        known = {symbol: sizes.get(symbol.name.partition("[")[0], 1.0) for symbol in self.written.free_symbols}
+        tree = self.written.xreplace({symbol: sp.Float(size, 17) * symbol for symbol, size in known.items() if size != 1})
+        return tree if self.size == 1 else tree * sp.Float(1 / self.size, 17)
 
     @cached_property
     def used(self) -> frozenset[str]:
@@ -118,6 +134,9 @@ def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
     if expression.has(sp.oo, -sp.oo, sp.zoo, sp.nan, sp.I):
         raise ConfigError(f"Formula {text!r}: evaluates to {expression}; check for a division by zero or a root of a negative number.")
     return expression
+
+
+_remembered = lru_cache(maxsize=1 << 12)(parse)  # a lifting in other units of measure has the same formulas
 
 
 @dataclass(frozen=True)

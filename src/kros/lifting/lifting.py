@@ -12,8 +12,8 @@ gamma     : input functions, formulas of inputs, states, earlier values and per-
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -47,6 +47,8 @@ class Lifting:
         Names of the recorded inputs; needed where formulas name an input, otherwise any number of inputs passes through.
     input_functions : tuple of str
         Formulas that stand behind the inputs as further inputs of the model, such as ``current*voltage``.
+    sizes : tuple of (str, float)
+        Sizes of states, inputs and functions by name, see `in_sizes`; one where none is given.
 
     Raises
     ------
@@ -59,6 +61,7 @@ class Lifting:
     parameters: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     input_functions: tuple[str, ...] = ()
+    sizes: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         everything = (*self.states, *self.parameters, *self.inputs)
@@ -90,7 +93,7 @@ class Lifting:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Rebuild from the texts in a worker process: compiled formulas do not travel."""
-        return Lifting, (self.states, self.functions, self.parameters, self.inputs, self.input_functions)
+        return Lifting, (self.states, self.functions, self.parameters, self.inputs, self.input_functions, self.sizes)
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Lifting:
@@ -101,23 +104,50 @@ class Lifting:
             tuple(content["parameters"]),
             tuple(content.get("lifting_inputs", ())),
             tuple(content.get("input_functions", ())),
+            tuple((name, float(size)) for name, size in content.get("sizes", ())),
         )
 
     def extension(self) -> dict[str, Any]:
         """Return what an artifact has to hold besides states, functions and parameters; nothing for a plain lifting."""
-        return {"lifting_inputs": self.inputs, "input_functions": self.input_functions} if self.inputs else {}
+        found: dict[str, Any] = {"lifting_inputs": self.inputs, "input_functions": self.input_functions} if self.inputs else {}
+        return found | ({"sizes": self.sizes} if self.sizes else {})
+
+    def in_sizes(self, sizes: Mapping[str, float]) -> Lifting:
+        """Return the same lifting for states and inputs divided by sizes, with functions divided by theirs; formulas stay as they are written.
+
+        Parameters
+        ----------
+        sizes : mapping of str to float
+            By name of a state or an input, or text of a function; what is not named keeps its unit. An empty mapping is the way back.
+
+        Examples
+        --------
+        >>> metres = Lifting(("x",), ("x**2",))
+        >>> kilometres = metres.in_sizes({"x": 1000.0, "x**2": 1e6})
+        >>> metres.lift([[3000.0]]).tolist(), kilometres.lift([[3.0]]).tolist()
+        ([[3000.0, 9000000.0]], [[3.0, 9.0]])
+        """
+        return replace(self, sizes=tuple((name, float(size)) for name, size in sizes.items()))
+
+    def sizes_of(self, names: Sequence[str]) -> Array:
+        """Return the sizes of states, inputs or functions, shape (len(names),)."""
+        known = dict(self.sizes)
+        return np.array([known.get(name, 1.0) for name in names], dtype=float)
 
     @cached_property
     def formulas(self) -> tuple[Formula, ...]:
         """Parsed lifted functions."""
-        names, delayed = self.states + self.parameters + self.inputs, self.states + self.inputs
-        return tuple(Formula(text, names, delayed) for text in self.functions)
+        return self._parsed(self.functions)
 
     @cached_property
     def input_formulas(self) -> tuple[Formula, ...]:
         """Parsed input functions."""
-        names, delayed = self.states + self.parameters + self.inputs, self.states + self.inputs
-        return tuple(Formula(text, names, delayed) for text in self.input_functions)
+        return self._parsed(self.input_functions)
+
+    def _parsed(self, texts: tuple[str, ...]) -> tuple[Formula, ...]:
+        names, delayed, own = self.states + self.parameters + self.inputs, self.states + self.inputs, dict(self.sizes)
+        sizes = tuple((name, own[name]) for name in delayed if name in own)
+        return tuple(Formula(text, names, delayed, sizes, own.get(text, 1.0)) for text in texts)
 
     @cached_property
     def window(self) -> Window:
@@ -152,11 +182,11 @@ class Lifting:
         known : mapping of str to str
             Units of states and inputs, such as ``rad/s``.
         """
-        return tuple(known.get(state, "") for state in self.states) + tuple(unit_of(f.expression, known) for f in self.formulas)
+        return tuple(known.get(state, "") for state in self.states) + tuple(unit_of(f.written, known) for f in self.formulas)
 
     def input_units(self, known: Mapping[str, str]) -> tuple[str, ...]:
         """Return the physical unit of every input function."""
-        return tuple(unit_of(f.expression, known) for f in self.input_formulas)
+        return tuple(unit_of(f.written, known) for f in self.input_formulas)
 
     def lift(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the lifted states.
@@ -361,11 +391,11 @@ def _refuse_repeated(formulas: tuple[Formula, ...], originals: tuple[str, ...]) 
 
     known: dict[Any, str] = {}
     for formula in formulas:
-        original = next((name for name in originals if formula.expression == sp.Symbol(name, real=True)), None)
+        original = next((name for name in originals if formula.written == sp.Symbol(name, real=True)), None)
         if original is not None:
             raise ConfigError(f"Lifting: {formula.text!r} is {original!r} itself, which is there already; remove it.")
-        if formula.expression in known:
+        if formula.written in known:
             raise ConfigError(
-                f"Lifting: functions repeat one of them, {formula.text!r} is {known[formula.expression]!r}; every lifted function must be listed once."
+                f"Lifting: functions repeat one of them, {formula.text!r} is {known[formula.written]!r}; every lifted function must be listed once."
             )
-        known[formula.expression] = formula.text
+        known[formula.written] = formula.text

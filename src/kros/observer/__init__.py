@@ -1,8 +1,8 @@
 """The observer as it runs: one-step predictor with retraction and re-lifting, and the baselines it is compared with."""
 
-from .baselines.difference import FilteredDifference, cutoffs_hz, rates
+from .baselines.difference import FilteredDifference, cutoffs_hz, followed, rates
 from .baselines.extended_kalman import ExtendedKalman, start_covariance
-from .baselines.kalman import kalman_candidates, luenberger_candidates, noise_covariances
+from .baselines.kalman import kalman_candidates, like_measurement_noise, luenberger_candidates, noise_covariances
 from .baselines.learned import Features, Learned, Moments
 from .driven import driven_coordinates, refit_measured_rows, with_memory
 from .memory import Past, observer_with_memory, remembering_observer, tune_memory
@@ -18,6 +18,7 @@ from .residual_design import ResidualModel, one_step_rows, residual_models
 from .runtime import Estimate, Runtime
 from .simulate import run_observer, run_observers
 from .tune import Tuned, tune_observer
+from .units import in_sizes
 
 __all__ = [
     "Attack",
@@ -42,7 +43,10 @@ __all__ = [
     "attack_running",
     "cutoffs_hz",
     "driven_coordinates",
+    "followed",
+    "in_sizes",
     "kalman_candidates",
+    "like_measurement_noise",
     "luenberger_candidates",
     "mean_error_dynamics",
     "noise_covariances",

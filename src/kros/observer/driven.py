@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DimensionError
+from ..core.linalg import least_squares
 from ..core.norms import gramian
 from .observer import Observer
 
@@ -134,8 +135,7 @@ def refit_measured_rows(observer: Observer, states: Array, inputs: Array, parame
     lifted = lifting.lift(estimate, values)[..., n:]
     seen = _rows(np.concatenate([estimate[..., others], y, inputs, lifted], axis=-1)[:-1])
     change = _rows(np.diff(y, axis=0))
-    size = np.maximum(np.sqrt(np.mean(seen**2, axis=0)), np.finfo(float).tiny)
-    rows = (np.linalg.lstsq(seen / size, change, rcond=1e-10)[0] / size[:, None]).T
+    rows = least_squares(seen, change, rcond=1e-10).T
     own, at_y, at_u, at_lifted = np.split(rows, np.cumsum([len(others), y.shape[-1], inputs.shape[-1]]), axis=1)
     A, B, D = observer.A.copy(), observer.B.copy(), observer.controller.D.copy()
     A[np.ix_(measured, others)], A[np.ix_(measured, range(n, lifting.n_lifted))] = own, at_lifted

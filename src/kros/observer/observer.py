@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from ..core.artifacts import plain, read_json, write_json
 from ..core.errors import DataError, DimensionError
+from ..core.linalg import solve_balanced
 from ..core.lti import StateSpace, gain
 from ..lifting import Lifting
 from ..synthesis.result import Injection
@@ -117,7 +118,7 @@ class Observer:
         if self.runtime.filter_gain is not None:
             return self.runtime.filter_gain
         n = self.lifting.n_states
-        return np.asarray(np.linalg.lstsq(self.A[:n, :n], (self.into @ self.controller.D)[:n], rcond=1e-9)[0])
+        return solve_balanced(self.A[:n, :n], (self.into @ self.controller.D)[:n], rcond=1e-9)
 
     @property
     def one_step(self) -> Array:
@@ -154,9 +155,8 @@ class Observer:
         if self.replaces and self.lifting.functions and not self.lifting.history:
             others = [i for i in range(n) if i not in self.measured]
             held = self.lifting.lift(x, {**self.parameters, **(parameters or {})})[..., n:] @ self.A[others, n:].T
-            x[..., others] = np.linalg.lstsq(np.eye(len(others)) - self.A[np.ix_(others, others)], held.reshape(-1, len(others)).T)[
-                0
-            ].T.reshape(held.shape)
+            still = np.eye(len(others)) - self.A[np.ix_(others, others)]
+            x[..., others] = solve_balanced(still, held.reshape(-1, len(others)).T).T.reshape(held.shape)
         return x
 
     def start(self, y: npt.ArrayLike, parameters: Mapping[str, float] | None = None) -> RunningObserver:

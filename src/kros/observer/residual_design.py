@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
+from ..core.linalg import least_squares
 from ..lifting import Lifting
 from ..synthesis.residual.shaped import promised_errors
 from .residual import mean_error_dynamics, one_step_residual, residual_spectra
@@ -90,8 +91,7 @@ def one_step_rows(
     regressors, following = regressors[counted], x[:, h + 1 :][counted]
     if len(regressors) < regressors.shape[1]:
         raise DataError(f"One-step rows: {regressors.shape[1]} coefficients need as many steps, found {len(regressors)}; record more.")
-    size = np.maximum(np.sqrt(np.mean(regressors**2, axis=0)), np.finfo(float).tiny)
-    W = np.linalg.lstsq(regressors / size, following, rcond=None)[0].T / size
+    W = least_squares(regressors, following).T
     return W[:, : lifting.n_lifted], W[:, lifting.n_lifted :]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..core.artifacts import plain
 from ..core.errors import ConfigError, DataError
 from ..data import Population, check_population
-from ..identify import Factor, ModelSet, combine, edmd, lifted_factor
+from ..identify import Factor, ModelSet, combine, lifted_factor
 from ..observer import Observer
 from ..uncertainty import OutlierModel
 from .estimate import check_channels, load_calibration, open_data, training_keys, unit_parameters
@@ -68,9 +68,9 @@ def score_condition(
     reduced = [combine(f) for f in executor.map(reduce_episodes, tasks)]
     factor = Factor(*(np.stack([getattr(f, name) for f in reduced]) for name in ("R", "peak", "n_samples")))
     values = {name: np.array([parameters[u][name] for u in units]) for name in lifting.parameters}
-    matrices = edmd(lifted_factor(factor, lifting, values, lifting).R, lifting.n_lifted, models.alpha or 0.0)
+    matrices = models.fit(lifted_factor(factor, lifting, values, lifting).R)
     fresh = replace(models, unit_ids=tuple(units), A=matrices.A, B=matrices.B, parameters=values, status=("ok",) * len(units))
-    responses = fresh.systems().frequency_response(outliers.freqs_hz)
+    responses = fresh.responses(outliers.freqs_hz)
     return [score_row(outliers.score(unit, response), models.condition) for unit, response in zip(units, responses, strict=True)]
 
 

@@ -14,7 +14,18 @@ from ..data.population import EpisodeKey
 from ..evaluate import EpisodeBatch, error_percent, hold_missing
 from ..identify import ModelSet
 from ..lifting import Lifting
-from ..observer import ExtendedKalman, Features, FilteredDifference, Learned, Moments, cutoffs_hz, rates, start_covariance
+from ..observer import (
+    ExtendedKalman,
+    Features,
+    FilteredDifference,
+    Learned,
+    Moments,
+    cutoffs_hz,
+    followed,
+    like_measurement_noise,
+    rates,
+    start_covariance,
+)
 from .baselines import EQUAL, RESIDUAL
 from .tuning import TuningSet, rank
 
@@ -84,7 +95,8 @@ def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) 
     judge, lifting, n = tuning.read(), models.lifting, models.lifting.n_states
     row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
     shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2), RESIDUAL: models.residual_covariance.mean(axis=0)[:n, :n]}
-    tried = [(name, level, 10**level * _relative(shape, R, C)) for name, shape in shapes.items() for level in _LEVELS]
+    sized = {name: shape * like_measurement_noise(shape[np.ix_(C, C)], R) for name, shape in shapes.items()}
+    tried = [(name, level, 10**level * shape) for name, shape in sized.items() for level in _LEVELS]
     start = start_covariance(models.output_scale[:n], R, models.measured)
     values = {name: float(v[row]) for name, v in models.parameters.items()}
     filters = ExtendedKalman(
@@ -107,26 +119,31 @@ def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) 
 
 
 def make_difference(tuning: TuningSet, measured: tuple[int, ...]) -> Baseline:
-    """Choose the cut-off of the filtered difference.
+    """Choose the cut-off of the filtered difference and find its scale.
+
+    Which state is the rate of which measurement the recordings say, and units of measure such as rad and rad/s where these do not.
 
     Raises
     ------
     ConfigError
-        When the units of measure name no state as the rate of a measured one.
+        When no state is found to be the rate of a measured one.
     """
-    population = tuning.population
-    states = [c for c in population.channels if c.name in population.states]
-    pairs = rates(states, [population.states[i] for i in measured])
+    population, judge = tuning.population, tuning.read()
+    states, y, lengths = judge.batch.states, judge.measurements(measured), judge.batch.lengths
+    channels = [c for c in population.channels if c.name in population.states]
+    pairs = followed(y, states, lengths, measured, population.sample_period_s)
+    pairs = pairs or rates(channels, [population.states[i] for i in measured])
     if not pairs:
-        units = ", ".join(f"{c.name} ({c.unit or 'no unit'})" for c in states)
+        units = ", ".join(f"{c.name} ({c.unit or 'no unit'})" for c in channels)
         raise ConfigError(
-            f"Filtered difference: no state is the rate of a measured one by its unit of measure, found {units}; declare units such as rad and rad/s."
+            f"Filtered difference: no state follows the rate of a measured one, nor is one named by its unit of measure, found {units}; "
+            "record the rate, or declare units such as rad and rad/s."
         )
-    judge, estimated = tuning.read(), [state for _, state in pairs]
-    y, truth, lengths = judge.measurements(measured), judge.batch.states[..., estimated], judge.batch.lengths
+    estimated = [state for _, state in pairs]
+    truth = states[..., estimated]
     best: tuple[float, FilteredDifference] | None = None
     for cutoff in cutoffs_hz(population.sample_period_s):
-        trial = FilteredDifference(len(states), pairs, float(cutoff), population.sample_period_s)
+        trial = FilteredDifference(len(channels), pairs, float(cutoff), population.sample_period_s).scaled_to(y, states, lengths)
         error = float(error_percent(trial.run(y, judge.batch.inputs)[..., estimated], truth, lengths).mean())
         if best is None or error < best[0]:
             best = (error, trial)
@@ -150,9 +167,3 @@ def make_learned(tuning: TuningSet, lifting: Lifting, measured: tuple[int, ...])
     estimators: dict[str, Learned] = {unit: moments.estimator([unit]) for unit in moments.units}
     facts = {"status": "trained", "taps": features.taps, "left_out": "the unit under test"}
     return Baseline(estimators | {"": moments.estimator()}, measured, moments.estimated, facts)
-
-
-def _relative(shape: Array, R: Array, measured: list[int]) -> Array:
-    """Process noise whose measured combinations have the variance of the measurement noise."""
-    size = float(np.trace(shape[np.ix_(measured, measured)]))
-    return np.asarray(shape * np.trace(R) / max(size, np.finfo(float).tiny))

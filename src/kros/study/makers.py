@@ -34,8 +34,8 @@ _NOISES = ((0.0, 0.0), (1e-2, 0.0), (0.0, 1e-1), (0.0, 1.0))  # process, measure
 class Task:
     """Everything a worker needs for one observer.
 
-    `problem` is None where there is no usable uncertain set, and `refusal` says why; `noise` is the standard deviation of every
-    measurement's noise, and `covered` names the units whose differences the set covers.
+    Everything is in channels divided by their ranges. `problem` is None where there is no usable uncertain set, and `refusal` says why; `noise` is the
+    standard deviation of every measurement's noise, and `covered` names the units whose differences the set covers.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Task:
     tune: bool = False
 
     def observer(self, synthesis: Synthesis) -> Observer:
-        """Return the observer as it runs."""
+        """Return the observer as it runs, in channels divided by their ranges."""
         models, row = self.models, self.models.index(self.unit)
         own = synthesis if isinstance(synthesis, OwnModel) else None
         return Observer(

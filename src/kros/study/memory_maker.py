@@ -77,7 +77,7 @@ def on_the_circle(lifting: Lifting) -> Lifting:
     """Return the lifting with a cosine beside every sine of a calibrated angle, and a sine beside every cosine: what remembers sees the angle itself."""
     functions = list(lifting.functions)
     for formula in lifting.formulas:
-        outer = type(formula.expression).__name__
+        outer = type(formula.written).__name__
         if outer in _CIRCLE and formula.text.strip().startswith(f"{outer}(") and formula.used & set(lifting.parameters):
             functions.append(_CIRCLE[outer] + formula.text.strip()[len(outer) :])
     return replace(lifting, functions=tuple(dict.fromkeys(functions)))

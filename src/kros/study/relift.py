@@ -92,7 +92,7 @@ def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:
 
 
 def running_of(observers: Sequence[Observer], judge: Judge, task: Task) -> list[Running]:
-    """Certify observers of one lifting, and compare with what they do."""
+    """Certify observers of one lifting, and compare with what they do; certificates come back in the recordings' units."""
     first, batch = observers[0], judge.batch
     values, units = judge.parameters if first.lifting.parameters else None, [key.unit for key in batch.keys]
     scales = scales_of(observers, judge, task)
@@ -104,6 +104,7 @@ def running_of(observers: Sequence[Observer], judge: Judge, task: Task) -> list[
     ]
     hidden = hidden_mean(judge.compare(estimates), first.measured)
     blind = blind_percent(observers, judge, task.models.sample_period_s)
+    certificates = [c.in_sizes(o, {}) for o, c in zip(observers, certificates, strict=True)]
     return [Running(o.name, c, r, float(h), float(b)) for o, c, r, h, b in zip(observers, certificates, rows, hidden, blind, strict=True)]
 
 

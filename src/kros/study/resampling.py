@@ -14,11 +14,13 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact
 from ..core.errors import DataError
+from ..data.scaled import scale_population
 from ..identify import (
     Factor,
     KoopmanMatrices,
     ModelSamples,
     ModelSet,
+    Ranges,
     bootstrap_edmd,
     bootstrap_refined,
     episode_weights,
@@ -61,7 +63,9 @@ def resampled_models(context: Context, name: str, units: list[str]) -> ModelSamp
         everyone = _refined_samples(context, models)
         return _chosen(everyone, [models.index(u) for u in units])
     factor, counts = episode_factor(context, models, units)
-    return bootstrap_edmd(factor.R, models.lifting.n_lifted, models.alpha, episode_weights(counts, DRAWS, _SEED), units)
+    ranges = models.ranges if models.alpha_in_ranges else Ranges(np.ones_like(models.output_scale), np.ones_like(models.input_scale))
+    weights = episode_weights(counts, DRAWS, _SEED)
+    return _restored(bootstrap_edmd(ranges.triangles(factor.R), models.lifting.n_lifted, models.alpha, weights, units), ranges)
 
 
 def episode_factor(context: Context, models: ModelSet, units: list[str]) -> tuple[Factor, list[int]]:
@@ -92,16 +96,22 @@ def _by_unit(values: npt.NDArray[Any], places: list[list[int]], most: int) -> np
 
 
 def _refined_samples(context: Context, models: ModelSet) -> ModelSamples:
-    """Samples of all units that were refined together."""
-    units, facts = list(models.unit_ids), context.facts
-    refined = RefinedModels.load(context.store.path("refinement", models.name))
+    """Samples of all units that were refined together, in channels divided by their ranges as they were."""
+    units, facts, ranges = list(models.unit_ids), context.facts, models.ranges
+    refined = RefinedModels.load(context.store.path("refinement", models.name)).in_channels(ranges)
     factor, counts = episode_factor(context, models, units)
+    population, lifting = scale_population(context.population, models.sizes), models.lifting.in_sizes(models.sizes)
     keys = {u: facts.keys("train", u, facts.identify_on) for u in units}
     pooled = np.array([u in facts.pooled for u in units])
     options = refine_options(context.config.identify)
-    normal = episode_normals(refined, context.population, keys, models.lifting, models.parameters, factor, options, pooled)
+    normal = episode_normals(refined, population, keys, lifting, models.parameters, ranges.factor(factor), options, pooled)
     weights = episode_weights(counts, DRAWS, _SEED)
-    return bootstrap_refined(refined.units, refined.whitening, refined.information, normal, weights, units)
+    return _restored(bootstrap_refined(refined.units, refined.whitening, refined.information, normal, weights, units), ranges)
+
+
+def _restored(samples: ModelSamples, ranges: Ranges) -> ModelSamples:
+    """Samples in the recordings' units from those of channels divided by their ranges."""
+    return replace(samples, estimate=ranges.restore(samples.estimate), samples=ranges.restore(samples.samples))
 
 
 def _chosen(samples: ModelSamples, rows: list[int]) -> ModelSamples:

@@ -13,5 +13,4 @@ Array = npt.NDArray[Any]
 
 def scaled_responses(models: ModelSet, units: list[str], freqs_hz: Array) -> Array:
     """Return frequency responses in units of the population's ranges, shape (unit, frequency, n, m)."""
-    response = models.systems(units).frequency_response(freqs_hz)
-    return response / models.output_scale[:, None] * models.input_scale
+    return models.normalised().systems(units).frequency_response(freqs_hz)

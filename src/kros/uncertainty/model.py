@@ -110,8 +110,11 @@ class UncertainModel(Quantified):
 
 
 def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:
-    """Return `S_y^-1 G S_u`."""
+    """Return `S_y^-1 G S_u`; states that are the outputs are scaled with them, so that all matrices have entries of common sizes."""
     rows = 1.0 / output_scale[:, None]
+    if system.n_states == len(output_scale) and np.all(np.eye(system.n_states) == system.C):
+        A, B = system.A * output_scale * rows, system.B * rows * input_scale
+        return StateSpace(A, B, system.C, system.D * rows * input_scale, system.dt)
     return StateSpace(system.A, system.B * input_scale, system.C * rows, system.D * rows * input_scale, system.dt)
 
 

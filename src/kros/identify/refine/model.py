@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
 from ..edmd import KoopmanMatrices
+from ..ranges import Ranges
 
 Array = npt.NDArray[np.float64]
 
@@ -76,6 +77,19 @@ class RefinedModels:
     information: Array
     whitening: Array
     spectral_radius: Array
+
+    def in_channels(self, ranges: Ranges) -> RefinedModels:
+        """Return the same result for lifted states and inputs divided by ranges; those of `Ranges.inverse` are the way back."""
+        x, u = ranges.outputs, ranges.inputs
+        row = np.repeat(x, len(self.whitening))  # of the parameters V, row after row
+        return replace(
+            self,
+            units=ranges.normalise(self.units),
+            pooled=ranges.normalise(self.pooled),
+            sigma=self.sigma / x[: len(self.sigma)],
+            information=self.information * row * row[:, None],
+            whitening=self.whitening * np.concatenate([x, u])[:, None],
+        )
 
     def save(self, folder: Path) -> list[Path]:
         """Write ``refinement.json`` and ``arrays.npz``; an infinite strength becomes null."""

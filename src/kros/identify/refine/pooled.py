@@ -14,6 +14,7 @@ from ...core.linalg import qr_triangle
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor
+from ..ranges import Ranges
 from .barrier import stability_barrier
 from .marquardt import minimise
 from .options import RefineOptions
@@ -157,9 +158,8 @@ def restrict(problem: Problem, rows: npt.NDArray[np.int64]) -> Problem:
 
 def ranges(factor: Factor, rows: npt.NDArray[np.int64], lifting: Lifting) -> tuple[Array, Array]:
     """Ranges of lifted states and inputs over the pooled units."""
-    peak = factor.peak[rows].max(axis=0)
-    peak = np.where(peak > 0, peak, 1.0)
-    return peak[: lifting.n_lifted], peak[lifting.n_lifted :]
+    found = Ranges.of(factor, lifting.n_lifted, rows)
+    return found.outputs, found.inputs
 
 
 def matrices_of(V: Array, T: Array, n_lifted: int) -> KoopmanMatrices:

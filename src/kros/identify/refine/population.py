@@ -18,8 +18,10 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError, IdentificationError
 from ...data.population import EpisodeKey, Population
+from ...data.scaled import scale_population
 from ...lifting import Lifting
 from ..factors import Factor
+from ..ranges import Ranges
 from .judge import Judge, find_unbounded
 from .marquardt import Solution, minimise
 from .metric import ResponsePrior
@@ -75,7 +77,23 @@ def refine_population(
     options = RefineOptions() if options is None else options
     pooled = np.ones(len(keys), dtype=bool) if pooled is None else np.asarray(pooled, dtype=bool)
     _check(population, keys, lifting, parameters, factor, pooled)
-    parameters = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters}
+    values = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters}
+    span = Ranges.of(factor, lifting.n_lifted, pooled)
+    sizes = span.sizes(lifting, population.inputs)
+    found = _refine(scale_population(population, sizes), keys, lifting.in_sizes(sizes), values, span.factor(factor), pooled, options)
+    return found.in_channels(span.inverse)
+
+
+def _refine(
+    population: Population,
+    keys: Mapping[str, Sequence[EpisodeKey]],
+    lifting: Lifting,
+    parameters: Mapping[str, Array],
+    factor: Factor,
+    pooled: npt.NDArray[np.bool_],
+    options: RefineOptions,
+) -> RefinedModels:
+    """Refine in channels divided by their ranges."""
     segments = read_segments(population, keys, max(options.horizons), options.segments, options.seed, lifting.history)
     held = held_segments(options.segments, keys)
     fitted = segments.first(options.segments - held)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ _ORDER = 2
 _LOWEST_HZ = 1.0
 _HIGHEST = 0.45  # of the sampling frequency
 _CANDIDATES = 24
+_EXPLAINED = 0.5  # share of a variance
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,15 @@ class FilteredDifference:
     cutoff_hz : float
         Of the low-pass, below half the sampling frequency.
     sample_period_s : float
+    scales : tuple of float
+        Of every pair: the state over the rate, which their units of measure decide; one by default.
     """
 
     n_states: int
     pairs: tuple[tuple[int, int], ...]
     cutoff_hz: float
     sample_period_s: float
+    scales: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0 < self.cutoff_hz < 0.5 / self.sample_period_s:
@@ -67,11 +71,31 @@ class FilteredDifference:
             raise DimensionError(f"Filtered difference: measurements should have shape (n_samples, batch, q), found {y.shape}.")
         b, a = butter(_ORDER, self.cutoff_hz, fs=1 / self.sample_period_s)
         estimate = np.full((*y.shape[:2], self.n_states), np.nan)
-        for measurement, state in self.pairs:
+        for number, (measurement, state) in enumerate(self.pairs):
             rate = np.zeros(y.shape[:2])
             rate[2:] = np.diff(y[:-1, :, measurement], axis=0) / self.sample_period_s
-            estimate[..., state] = lfilter(b, a, rate, axis=0)
+            estimate[..., state] = (self.scales[number] if self.scales else 1.0) * lfilter(b, a, rate, axis=0)
         return estimate
+
+    def scaled_to(self, y: Array, states: Array, lengths: npt.ArrayLike) -> FilteredDifference:
+        """Return the same with the scales that recordings give by least squares, so that units of measure do not matter.
+
+        Parameters
+        ----------
+        y : ndarray, shape (n_samples, batch, q)
+        states : ndarray, shape (n_samples, batch, n)
+        lengths : array_like of int, shape (batch,)
+            Samples of every episode that count.
+        """
+        inside = (np.arange(len(y))[:, None] < np.asarray(lengths)).astype(float)
+        found = replace(self, scales=()).run(y, y[..., :0])
+        slopes = []
+        for _, state in self.pairs:
+            rate, truth = found[..., state] * inside, states[..., state] * inside
+            largest = np.abs(rate).max(initial=0.0) or 1.0
+            power = float(np.sum((rate / largest) ** 2))
+            slopes.append(float(np.sum(rate / largest * truth)) / power / largest if power else 1.0)
+        return replace(self, scales=tuple(slopes))
 
 
 def rates(channels: Iterable[Channel], measured: Sequence[str]) -> tuple[tuple[int, int], ...]:
@@ -98,6 +122,49 @@ def rates(channels: Iterable[Channel], measured: Sequence[str]) -> tuple[tuple[i
         alone = sum(unit[other] == unit[name] for other in measured) == 1
         if unit[name] and alone and len(found) == 1:
             pairs.append((i, found[0]))
+    return tuple(pairs)
+
+
+def followed(
+    y: Array, states: Array, lengths: npt.ArrayLike, measured: Sequence[int], sample_period_s: float
+) -> tuple[tuple[int, int], ...]:
+    """Return which states recordings show to be rates of measured ones, whatever the units of measure.
+
+    Of all states that are not measured the one counts that a difference of the measurement, at its best cut-off, explains best, and by more than half
+    of its variance.
+
+    Parameters
+    ----------
+    y : ndarray, shape (n_samples, batch, q)
+    states : ndarray, shape (n_samples, batch, n)
+    lengths : array_like of int, shape (batch,)
+    measured : sequence of int
+        Indices of the measured states.
+    sample_period_s : float
+
+    Returns
+    -------
+    tuple of (int, int)
+        As `rates`.
+    """
+    hidden = [j for j in range(states.shape[-1]) if j not in measured]
+    inside = np.arange(len(y))[:, None] < np.asarray(lengths)
+    share = np.zeros((len(measured), len(hidden)))
+    for i, j in np.ndindex(share.shape):
+        truth = states[..., hidden[j]][inside]
+        truth = (truth - truth.mean()) / (np.abs(truth).max(initial=0.0) or 1.0)
+        for cutoff in cutoffs_hz(sample_period_s)[::4]:
+            rate = FilteredDifference(states.shape[-1], ((i, hidden[j]),), float(cutoff), sample_period_s).run(y, y[..., :0])
+            rate = rate[..., hidden[j]][inside]
+            rate = (rate - rate.mean()) / (np.abs(rate).max(initial=0.0) or 1.0)
+            power = float(rate @ rate) * float(truth @ truth)
+            found = float(rate @ truth)
+            share[i, j] = max(float(share[i, j]), found * abs(found) / power if power else 0.0)
+    pairs = []
+    for i in range(len(share)):
+        j = int(share[i].argmax()) if hidden else 0
+        if hidden and share[i, j] > _EXPLAINED and share[:, j].argmax() == i:
+            pairs.append((i, hidden[j]))
     return tuple(pairs)
 
 

@@ -49,14 +49,20 @@ def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> 
     Yields
     ------
     float
-        Process noise, as variance of the measured combinations relative to the measurement noise.
+        Process noise, as variance of the measured combinations relative to the measurement noise, on average over them.
     Synthesis
     """
     shape = np.diag(shape**2) if shape.ndim == 1 else shape
-    base = np.trace(R) / max(float(np.trace(C @ shape @ C.T)), np.finfo(float).tiny)
+    base = like_measurement_noise(C @ shape @ C.T, R)
     start, stop = _SWEEP_DECADES
     for level in np.logspace(start, stop, _PER_DECADE * (stop - start) + 1):
         yield float(level), kalman(A, C, level * base * shape, R, dt)
+
+
+def like_measurement_noise(covariance: Array, R: Array) -> float:
+    """Return the factor that brings a covariance of the measurements to the size of their noise R, as a mean over the measurements' own units."""
+    shares = np.diag(covariance) / np.diag(R)
+    return 1.0 / max(float(np.mean(shares)), np.finfo(float).tiny)
 
 
 def luenberger_candidates(A: Array, C: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:

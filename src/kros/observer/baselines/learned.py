@@ -13,12 +13,13 @@ common to all.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError, DimensionError
+from ...core.linalg import least_squares
 from ...lifting import Lifting
 
 Array = npt.NDArray[np.float64]
@@ -49,8 +50,8 @@ class Features:
     def of(cls, lifting: Lifting, measured: Sequence[int], y: Array, u: Array, taps: int = TAPS) -> Features:
         """Fit the static part on recordings y (n_samples, batch, q) and u (n_samples, batch, m)."""
         inputs = np.concatenate([np.ones((*u.shape[:-1], 1)), u], axis=-1).reshape(-1, 1 + u.shape[-1])
-        static = np.linalg.lstsq(inputs, y.reshape(-1, y.shape[-1]), rcond=None)[0].T
-        return cls(lifting, tuple(measured), np.asarray(static), taps)
+        static = least_squares(inputs, y.reshape(-1, y.shape[-1])).T
+        return cls(lifting, tuple(measured), static, taps)
 
     @property
     def visible(self) -> tuple[int, ...]:
@@ -73,7 +74,7 @@ class Features:
             )
         parts = [y - self.static[:, 0] - u @ self.static[:, 1:].T, u]
         if self.visible:
-            bare = Lifting(self.lifting.states, tuple(self.lifting.functions[i] for i in self.visible), self.lifting.parameters)
+            bare = replace(self.lifting, functions=tuple(self.lifting.functions[i] for i in self.visible), input_functions=())
             x = np.zeros((*y.shape[:-1], bare.n_states))
             x[..., list(self.measured)] = y
             slopes = bare.slopes(x, parameters)[..., list(self.measured)]

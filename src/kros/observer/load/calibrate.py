@@ -11,7 +11,7 @@ The past of what is seen then needs one lag with the same forgetting: the integr
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -124,7 +124,7 @@ def calibrate_load(
     if current is not None:
         widened[..., current] -= load[:, used] - without_level(load[:, used], level_s, sample_period_s)
     own = {name: np.asarray(values, dtype=float)[used] for name, values in (parameters or {}).items()}
-    with_load = Lifting((*lifting.states, LOAD), lifting.functions, lifting.parameters)
+    with_load = replace(lifting, states=(*lifting.states, LOAD))
     kinds = [_LOADED if found else _UNLOADED for found in loaded]
     bank = Bank(delays, (float(np.exp(-sample_period_s / level_s)),))
     recorded, lengths = inputs[:, used], [len(states)] * len(used)

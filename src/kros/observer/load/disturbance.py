@@ -13,13 +13,13 @@ does, namely that its states, the controller's integrator among them, are the ma
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError, DimensionError
 from ...core.lti import gain
-from ...lifting import Lifting
 from ...synthesis.result import Injection
 from ...synthesis.riccati.constant_gain import kalman
 from ..observer import Observer
@@ -106,6 +106,6 @@ def disturbance_observer(
     A = np.vstack([np.hstack([states, np.vstack([observer.A[:n, n:], np.zeros((1, functions))])]), silent])
     B = np.vstack([observer.B[:n], np.zeros((1 + functions, observer.B.shape[1]))])
     gains = gain(np.vstack([L, np.zeros((functions, len(observer.measured)))]), observer.sample_period_s)
-    widened = Lifting((*lifting.states, LOAD), lifting.functions, lifting.parameters)
+    widened = replace(lifting, states=(*lifting.states, LOAD))
     own = {**observer.parameters, **(parameters or {})}
     return Observer(name, widened, A, B, observer.measured, observer.inputs, gains, Injection.STATE, observer.sample_period_s, own)

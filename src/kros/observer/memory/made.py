@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import null_space
 
+from ...core.linalg import least_squares
 from ...core.lti import gain
 from ...lifting import Lifting
 from ...synthesis.residual.shaping import Bank
@@ -160,7 +162,7 @@ def embedded(
     raw[:, q : q + m] -= raw[:, :q] @ past.static
     raw[list(measured), range(q)] += 1.0
     own[:, list(measured)] = raw[:, :q]
-    widened = Lifting((*lifting.states, *(f"memory_{i + 1}" for i in range(memories))), lifting.functions, lifting.parameters)
+    widened = replace(lifting, states=(*lifting.states, *(f"memory_{i + 1}" for i in range(memories))))
     silent = np.zeros((len(lifting.functions), widened.n_lifted))
     A = np.vstack([np.hstack([own, raw[:, q + m :]]), silent])
     B, D = (np.vstack([M, silent[:, : M.shape[1]]]) for M in (raw[:, q : q + m], raw[:, :q]))
@@ -175,5 +177,4 @@ def _measured_rows(F: Array, G: Array, z: Array, y: Array) -> Array:
         h[k + 1] = h[k] @ F.T + driven[k]
     regressors = np.concatenate([h, z], axis=-1)[SKIP:-1:THIN].reshape(-1, len(F) + z.shape[-1])
     change = np.diff(y, axis=0)[SKIP::THIN].reshape(-1, y.shape[-1])
-    size = np.maximum(np.sqrt(np.mean(regressors**2, axis=0)), np.finfo(float).tiny)
-    return np.asarray((np.linalg.lstsq(regressors / size, change, rcond=None)[0] / size[:, None]).T)
+    return least_squares(regressors, change).T

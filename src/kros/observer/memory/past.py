@@ -29,6 +29,7 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 from ...core.errors import DataError, DimensionError
+from ...core.linalg import least_squares
 from ...core.norms import gramian
 from ...lifting import Lifting
 from ...synthesis.residual.shaping import Bank
@@ -169,7 +170,9 @@ class Past:
         channels = (len(P) - len(self.bank.poles) * q) // delays
         S, E = self.bank.system(channels)
         present = [i for i in range(len(S)) if i < delays * channels or i % channels < q]
-        S, E = S[np.ix_(present, present)], E[present]
+        size = self._channel_sizes(P, channels)
+        P, cross = P / np.outer(size, size), cross / size[:, None]
+        S, E = S[np.ix_(present, present)] * size / size[:, None], E[present] / size[:, None]
         functions = len(self.lifting.functions)
         for channel in range(channels - functions, channels):
             own = np.arange(channel, delays * channels, channels)
@@ -181,9 +184,16 @@ class Past:
         root, inverse = np.sqrt(values[kept])[:, None] * vectors[:, kept].T, vectors[:, kept] / np.sqrt(values[kept])
         leading = np.linalg.eigh(root @ P @ root.T)[1][:, ::-1][:, :order]
         down, up = leading.T @ root, inverse @ leading
-        size = np.sqrt(np.diag(down @ P @ down.T))
-        down, up = down / size[:, None], up * size
+        scale = np.sqrt(np.diag(down @ P @ down.T))
+        down, up = down / scale[:, None], up * scale
         return down @ S @ up, down @ E, W @ up
+
+    def _channel_sizes(self, P: Array, channels: int) -> Array:
+        """Size of the channel that every state of the bank is of: what is negligible must not depend on units of measure."""
+        delays, q = self.bank.delays, len(self.measured)
+        power = np.diag(P)[: delays * channels].reshape(delays, channels).mean(axis=0)
+        size = np.sqrt(np.where(power > 0, power, 1.0))
+        return np.concatenate([np.tile(size, delays), np.tile(size[:q], len(self.bank.poles))])
 
 
 def hidden_of(lifting: Lifting, measured: Sequence[int]) -> list[int]:
@@ -203,7 +213,7 @@ def _static(inputs: Array, y: Array) -> Array:
     """
     starts = np.all(y[0].std(axis=0) > _APART * _centred(y).std(axis=0))
     rows, values = (inputs[:1], y[:1]) if starts else (inputs, y)
-    return np.asarray(np.linalg.lstsq(_centred(rows), _centred(values), rcond=1e-9)[0].T, dtype=float)
+    return least_squares(_centred(rows), _centred(values), rcond=1e-9).T
 
 
 def seen_by(

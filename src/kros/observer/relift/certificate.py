@@ -16,6 +16,7 @@ a semidefinite program over the corners; one whose Lyapunov function knows the n
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -26,6 +27,7 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
 from ..observer import Observer
+from ..units import factors
 from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, without_measurement
 from .ladder import MOST_CORNERS, frozen_gain, mismatch_gain, prove
 from .status import Dropped, ReliftStatus
@@ -104,6 +106,21 @@ class ReliftCertificate:
         e = np.asarray(error, dtype=float)
         energies = [np.sum((e @ R[:, : e.shape[-1]].T) ** 2, axis=-1) for R in self.roots]
         return np.asarray(np.max(energies, axis=0))
+
+    def in_sizes(self, observer: Observer, sizes: Mapping[str, float]) -> ReliftCertificate:
+        """Return what the certificate of an observer says of the same observer for signals divided by other sizes (`kros.observer.in_sizes`)."""
+        x, u = factors(observer, sizes)
+        n, lifting = observer.lifting.n_states, observer.lifting
+        by_name = dict(zip((*lifting.states, *observer.inputs), np.concatenate([x[:n], u[: len(observer.inputs)]]), strict=True))
+        errors = [by_name[name.partition("[")[0]] for name in lifting.window.names if name.partition("[")[0] in lifting.states]
+        y = x[list(observer.measured)]
+        scales = ReliftScales(self.scales.error * x[:n], self.scales.residual * x[:n], self.scales.noise * y)
+        box = {name: tuple(np.multiply(value, by_name.get(name, 1.0)).tolist()) for name, value in self.box.items()}
+        told = tuple(text.replace(_ranges(self.box), _ranges(box)) for text in self.assumptions) if box else self.assumptions
+        roots = self.roots.copy()
+        if roots.size:
+            roots[:, :, : len(errors)] /= errors
+        return replace(self, scales=scales, box=box, assumptions=told, roots=roots)
 
     def save(self, folder: Path) -> None:
         """Write ``relift.json`` and ``arrays.npz``."""

@@ -17,8 +17,8 @@ from ...identify import (
     Factor,
     KoopmanMatrices,
     ModelSet,
+    Ranges,
     combine,
-    edmd,
     lifted_factor,
     reduce_episode,
     residual_covariance,
@@ -79,15 +79,32 @@ def identify_models(context: Context, condition: str, units: list[str], factor: 
     factors = {name: lifted_factor(factor, context.lifting, parameters, lifting) for name, lifting in kinds.items()}
     pooled = np.array([u in context.facts.pooled for u in units])
     config = context.config.identify
+    rows = pooled if pooled.any() else slice(None)
+    ranges = {name: Ranges.of(factors[name], kinds[name].n_lifted, rows) for name in kinds}
     alpha = config.alpha
     if alpha == "auto":
-        shared = [(factors[name].R[pooled if pooled.any() else slice(None)], kinds[name].n_lifted) for name in kinds]
+        shared = [(ranges[name].triangles(factors[name].R[rows]), kinds[name].n_lifted) for name in kinds]
         edge = smallest_stabilising_alpha(shared, config.margin)
         alpha = config.alpha_factor * edge
-        log.info("%s: alpha = %.4g, %g times the smallest that stabilises every model", condition, alpha, config.alpha_factor)
+        log.info(
+            "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model",
+            condition,
+            alpha,
+            config.alpha_factor,
+        )
     require_excitation(factor, context.population.inputs, units, condition, float(alpha))
     models = [
-        fit(name, condition, kinds[name], context, units, factors[name], parameters if kinds[name].parameters else {}, float(alpha), pooled)
+        fit(
+            name,
+            condition,
+            kinds[name],
+            context,
+            units,
+            factors[name],
+            parameters if kinds[name].parameters else {},
+            float(alpha),
+            ranges[name],
+        )
         for name in kinds
     ]
     if condition == context.facts.identify_on:
@@ -141,6 +158,7 @@ def with_matrices(start: ModelSet, matrices: KoopmanMatrices, factor: Factor, co
         B=matrices.B,
         residual_covariance=residual_covariance(lifted.R, start.lifting.n_lifted, matrices, lifted.n_samples),
         alpha=None,
+        alpha_in_ranges=False,
         status=("ok",) * len(start.unit_ids),
     )
 
@@ -164,31 +182,37 @@ def fit(
     factor: Factor,
     parameters: dict[str, Array],
     alpha: float,
-    pooled: npt.NDArray[np.bool_],
+    ranges: Ranges,
 ) -> ModelSet:
-    """Fit the models of one kind in one condition."""
-    n = lifting.n_lifted
+    """Fit the models of one kind in one condition; a regularisation that was searched acts on channels divided by their ranges."""
     if alpha == 0:
         require_independent(factor, lifting.names + context.population.inputs + lifting.input_functions, units, condition)
-    matrices = edmd(factor.R, n, alpha)
-    scale = factor.peak[pooled if pooled.any() else slice(None)].max(axis=0)
-    limit = 1 - context.config.identify.margin
-    radius = matrices.spectral_radius()
-    return ModelSet(
+    config = context.config.identify
+    nothing = np.zeros((len(units), 0, 0))
+    unfitted = ModelSet(
         name=name,
         condition=condition,
         lifting=lifting,
         channels=context.population.channels,
         sample_period_s=context.population.sample_period_s,
         unit_ids=tuple(units),
+        A=nothing,
+        B=nothing,
+        parameters=parameters,
+        residual_covariance=nothing,
+        output_scale=ranges.outputs,
+        input_scale=ranges.inputs,
+        alpha=alpha,
+        alpha_in_ranges=config.alpha == "auto",
+    )
+    matrices = unfitted.fit(factor.R)
+    radius = ranges.normalise(matrices).spectral_radius()
+    return replace(
+        unfitted,
         A=matrices.A,
         B=matrices.B,
-        parameters=parameters,
-        residual_covariance=residual_covariance(factor.R, n, matrices, factor.n_samples),
-        output_scale=scale[:n],
-        input_scale=scale[n:],
-        alpha=alpha,
-        status=tuple("ok" if r < limit else f"unstable, spectral radius {r:.6f}" for r in radius),
+        residual_covariance=residual_covariance(factor.R, lifting.n_lifted, matrices, factor.n_samples),
+        status=tuple("ok" if r < 1 - config.margin else f"unstable, spectral radius {r:.6f}" for r in radius),
     )
 
 

@@ -118,7 +118,7 @@ def score_units(context: Context) -> tuple[list[Path], list[dict[str, Any]]]:
             continue
         freqs = log_grid(models.sample_period_s, context.config.uncertainty.n_freqs)
         outliers = score_outliers(
-            models.systems().frequency_response(freqs),
+            models.responses(freqs),
             freqs,
             context.config.uncertainty.outlier_form,
             unit_ids=models.unit_ids,

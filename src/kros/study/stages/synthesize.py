@@ -15,8 +15,9 @@ import numpy.typing as npt
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import SynthesisError
 from ...data.population import EpisodeKey
+from ...data.scaled import scale_population
 from ...identify import ModelSet
-from ...observer import Observer
+from ...observer import Observer, in_sizes
 from ...synthesis import Injection, ObserverProblem, Synthesis, check_units
 from ...synthesis.robust.certificate import certify
 from ...uncertainty import Structure, UncertainModel
@@ -109,21 +110,21 @@ def robust_of(running: Sequence[Running], facts: Mapping[str, Mapping[str, Any]]
 
 
 def tasks_of(context: Context, name: str) -> list[Task]:
-    """Return a task for every observer of one kind of model."""
-    models, config = context.models(name), context.config
+    """Return a task for every observer of one kind of model, in channels divided by their ranges."""
+    recorded, config = context.models(name), context.config
+    models = recorded.normalised()
     unit = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
     folder = context.store.path("uncertainty", name)
-    noise = measurement_noise(context, models)
+    noise = measurement_noise(context, recorded) / recorded.output_scale[list(recorded.measured)]
+    tuning = tuning_set(context, models)
+    tuning = replace(tuning, population=scale_population(tuning.population, recorded.sizes))
     uncertain = UncertainModel.load(folder)
     problem, refusal = usable_problem(models, unit, uncertain, noise, context)
     methods = suitable(config.observer.baselines + config.synthesis.methods, name, refined=name not in context.edmd_names)
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings |= {"max_order": config.uncertainty.max_order, "max_states": config.synthesis.max_states, "covered": uncertain.unit_ids}
     settings |= {"memory": config.memory, "tune": config.synthesis.tune}
-    return [
-        Task(f"{name}/{method.name}", method.name, models, unit, problem, refusal, noise, tuning_set(context, models), **settings)
-        for method in methods
-    ]
+    return [Task(f"{name}/{method.name}", method.name, models, unit, problem, refusal, noise, tuning, **settings) for method in methods]
 
 
 def usable_problem(
@@ -234,9 +235,10 @@ def of_units(task: Task, synthesis: Synthesis, problem: ObserverProblem) -> dict
 
 
 def save(context: Context, task: Task, synthesis: Synthesis) -> list[Path]:
-    """Write the observer and its synthesis."""
+    """Write the observer and its synthesis, in the recordings' units."""
     path = context.store.path("observers", f"{task.name}.json")
-    task.observer(synthesis).save(path)
+    observer = in_sizes(task.observer(synthesis), {})
+    observer.save(path)
     folder = context.store.path("synthesis", task.name)
-    synthesis.save(folder)
+    replace(synthesis, controller=observer.controller).save(folder)
     return [path, folder / "synthesis.json", folder / "arrays.npz"]

@@ -1,0 +1,43 @@
+"""A population in other units of measure: every channel divided by a size, nothing copied."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from .population import EpisodeKey, EpisodeSource, Population, restrict
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """A source whose channels are divided by sizes, shape (n_channels,)."""
+
+    source: EpisodeSource
+    sizes: Array
+
+    def __call__(self, key: EpisodeKey) -> Array:
+        """Return the samples of an episode, shape (n_samples, n_channels)."""
+        return np.asarray(self.source(key) / self.sizes)
+
+    def restricted(self, keys: Iterable[EpisodeKey]) -> Scaled:
+        """Return the same for fewer episodes."""
+        return Scaled(restrict(self.source, keys), self.sizes)
+
+
+def scale_population(population: Population, sizes: Mapping[str, float]) -> Population:
+    """Return the population with channels divided by sizes; their units of measure are then unknown.
+
+    Parameters
+    ----------
+    population : Population
+    sizes : mapping of str to float
+        By name of a channel; one that is not named stays as it is.
+    """
+    factors = np.array([float(sizes.get(c.name, 1.0)) for c in population.channels])
+    channels = tuple(replace(c, unit="") if c.name in sizes else c for c in population.channels)
+    return replace(population, channels=channels, source=Scaled(population.source, factors))

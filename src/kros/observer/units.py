@@ -1,0 +1,52 @@
+"""An observer in other units of measure: the same estimates from the same machine, every signal divided by another size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.lti import StateSpace
+from ..synthesis.result import Injection
+from .observer import Observer
+from .runtime import Runtime
+
+Array = npt.NDArray[np.float64]
+
+
+def in_sizes(observer: Observer, sizes: Mapping[str, float]) -> Observer:
+    """Return the observer for states and inputs divided by sizes.
+
+    Parameters
+    ----------
+    observer : Observer
+    sizes : mapping of str to float
+        By name of a state or an input, or text of a function, as in `Lifting.in_sizes`. What is not named keeps the recordings' unit; an empty mapping
+        is the way back to these.
+    """
+    lifting = observer.lifting.in_sizes(sizes)
+    x, u = factors(observer, sizes)
+    y, K = x[list(observer.measured)], observer.controller
+    into = u if observer.injection is Injection.INPUT else x
+    return replace(
+        observer,
+        lifting=lifting,
+        A=observer.A * x[:, None] / x,
+        B=observer.B * x[:, None] / u,
+        controller=StateSpace(K.A, K.B / y, K.C * into[:, None], K.D * into[:, None] / y, K.dt),
+        runtime=_runtime(observer.runtime, x[: lifting.n_states], y, into),
+    )
+
+
+def factors(observer: Observer, sizes: Mapping[str, float]) -> tuple[Array, Array]:
+    """Return what lifted states and inputs are multiplied by where other sizes take the place of an observer's own."""
+    old, new = observer.lifting, observer.lifting.in_sizes(sizes)
+    inputs = (*observer.inputs, *old.input_functions)
+    return old.sizes_of(old.names) / new.sizes_of(old.names), old.sizes_of(inputs) / new.sizes_of(inputs)
+
+
+def _runtime(runtime: Runtime, x: Array, y: Array, into: Array) -> Runtime:
+    by = {"lower": x, "upper": x, "correction": into, "filter_gain": x[:, None] / y}
+    return replace(runtime, **{name: getattr(runtime, name) * by[name] for name in by if getattr(runtime, name) is not None})

@@ -1,0 +1,116 @@
+"""Whole studies of the same recordings in other units of measure: the same errors, scores and estimates."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from kros.data import write_parquet
+from kros.identify import ModelSet
+from kros.observer import Observer
+from kros.plants import DcMotorPopulation
+from kros.study import run_study
+from kros.study.config import Stage, validate_config
+
+CHANNELS = ("position", "velocity", "current", "voltage")
+WITHIN = 1e-5  # searches stop where they stop; 1 % is what is promised
+
+
+@dataclass(frozen=True)
+class Multiplied:
+    """A source in other units."""
+
+    source: object
+    factors: tuple[float, ...]
+
+    def __call__(self, key):
+        return self.source(key) * np.array(self.factors)
+
+
+@pytest.fixture(scope="module")
+def motors():
+    population = DcMotorPopulation(n_units=3, n_episodes=3, seconds=1.4, seed=2).simulate().population
+    return replace(population, metadata={})
+
+
+def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
+    scaled = replace(
+        population,
+        source=Multiplied(population.source, factors),
+        channels=tuple(replace(c, unit=c.unit if f == 1 else "") for c, f in zip(population.channels, factors, strict=True)),
+    )
+    write_parquet(scaled, folder / "recordings")
+    raw = {
+        "data": {"source": str(folder / "recordings"), "reader": "parquet"},
+        "lifting": {"functions": [f"tanh({1 / factors[1]!r}*velocity)"]},
+        "identify": {"refine": False, "alpha": alpha},
+        "uncertainty": {"n_freqs": 50, "max_order": 1, "structure": "scalar"},
+        "synthesis": {"input_weight": 3.0, "methods": ["worst_case_h2", "residual_h2", "memory"], "noise": {"position": 4e-4 * factors[0]}},
+        "memory": {"states": 2, "steps": 1},
+        "evaluate": {"robustness": False, "monte_carlo": 0},
+    }
+    metrics = run_study(validate_config(raw, folder), folder / "run", until=until).metrics
+    return json.loads(json.dumps(metrics)), folder / "run"
+
+
+@pytest.fixture(scope="module")
+def first(motors, tmp_path_factory):
+    return study(motors, (1.0, 1.0, 1.0, 1.0), tmp_path_factory.mktemp("first"))
+
+
+def errors(metrics):
+    found = {(r["observer"], r["unit"], r["channel"]): r["error_percent"] for r in metrics["evaluation"]}
+    for name, model in metrics["models"].items():
+        found |= {(name, channel, which): v for channel, e in model["freerun_error_percent"].items() for which, v in e.items()}
+    return found
+
+
+SCALINGS = [(180 / np.pi, 30 / np.pi, 1e3, 1e3), (1e9, 1.0, 1.0, 1.0), (1e-9, 1e9, 1e-9, 1e9)]
+
+
+@pytest.mark.parametrize("factors", SCALINGS, ids=["deg_rpm_mA_mV", "position", "mixed"])
+def test_errors_scores_and_estimates_are_the_same(motors, first, factors, tmp_path):
+    metrics, run = study(motors, factors, tmp_path)
+    one, one_run = first
+    expected, found = errors(one), errors(metrics)
+    assert "filtered_difference" in {key[0] for key in found}
+    assert found.keys() == expected.keys()
+    np.testing.assert_allclose(list(found.values()), [expected[key] for key in found], rtol=WITHIN)
+    np.testing.assert_allclose([r["score"] for r in metrics["outliers"]], [r["score"] for r in one["outliers"]], atol=1e-6)
+    assert metrics["study"]["deployed"] == one["study"]["deployed"]
+    assert metrics["study"]["alpha"] == pytest.approx(one["study"]["alpha"], rel=1e-6)
+    for name, facts in one["observers"].items():
+        for key in ("hidden_error_percent", "relift_gain", "worst_case_h2", "training_error_to_open_loop"):
+            if facts.get(key) is not None:
+                assert metrics["observers"][name][key] == pytest.approx(facts[key], rel=1e-3), (name, key)
+    rms = {(r["observer"], r["unit"], r["channel"]): r["rms"] for r in one["evaluation"]}
+    by = dict(zip(CHANNELS, factors, strict=True))
+    for row in metrics["evaluation"]:
+        key = (row["observer"], row["unit"], row["channel"])
+        assert row["rms"] == pytest.approx(rms[key] * by[row["channel"]], rel=WITHIN)
+
+    y, u = (motors.read(motors.episodes[-1])[:, None, i : i + 1] for i in (0, 3))
+    runs = [Observer.load(folder / "observers" / "deployed.json") for folder in (one_run, run)]
+    plain = runs[0].run(y, u)
+    scaled = runs[1].run(y * factors[0], u * factors[3]) / np.array([*factors[:3], *[1.0] * (plain.shape[-1] - 3)])
+    np.testing.assert_allclose(scaled[..., :3], plain[..., :3], atol=WITHIN * np.abs(plain[..., :3]).max())
+
+
+def test_models_come_back_in_the_units_of_the_recordings(motors, first, tmp_path):
+    _, run = study(motors, SCALINGS[-1], tmp_path, Stage.IDENTIFY)
+    one, other = (ModelSet.load(folder / "models" / "koopman_edmd") for folder in (first[1], run))
+    x = np.array([*SCALINGS[-1][:3], 1.0])
+    np.testing.assert_allclose(other.A * x / x[:, None], one.A, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(other.output_scale, one.output_scale * x, rtol=1e-12)
+    assert one.alpha_in_ranges
+    assert one.alpha == pytest.approx(other.alpha, rel=1e-6)
+    assert one.lifting.functions == ("tanh(1.0*velocity)",)
+
+
+def test_an_alpha_that_is_given_is_in_the_units_of_the_recordings(motors, tmp_path):
+    metrics, run = study(motors, (1.0, 1.0, 1.0, 1.0), tmp_path, Stage.IDENTIFY, alpha=90.0)
+    assert metrics["study"]["alpha"] == 90.0
+    assert not ModelSet.load(run / "models" / "koopman_edmd").alpha_in_ranges

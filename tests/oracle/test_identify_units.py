@@ -1,0 +1,143 @@
+"""Identification in any units of measure: the same models, phases and warnings, told in these units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from kros.core.errors import IdentificationError
+from kros.data import check_episode
+from kros.data.checks import is_constant
+from kros.data.scaled import scale_population
+from kros.identify import Factor, PhaseSpec, Ranges, combine, edmd, find_segments, lifted_factor, reduce_episode, smallest_stabilising_alpha
+from kros.identify.excitation import require_excitation
+from kros.identify.refine import RefineOptions, refine_population
+from kros.lifting import Lifting
+from kros.plants import DcMotorPopulation, HarmonicDrivePopulation
+
+CHANNELS = ("position", "velocity", "current", "voltage")
+SCALINGS = [{name: factor} for name in CHANNELS for factor in (1e-9, 1e9)]
+SCALINGS.append({"position": 1e9, "velocity": 1e-9, "current": 1e-9, "voltage": 1e9})
+QUICK = RefineOptions(horizons=(5, 60), starts=((5, 0.65),), strengths=(10.0, 1.0), iterations=6, path_iterations=3, segments=4)
+
+
+@dataclass(frozen=True)
+class Multiplied:
+    """A source in other units."""
+
+    source: object
+    factors: np.ndarray
+
+    def __call__(self, key):
+        return self.source(key) * self.factors
+
+
+@pytest.fixture(scope="module")
+def motors():
+    return DcMotorPopulation(n_units=3, n_episodes=2, seconds=1.0, seed=2).simulate().population
+
+
+def in_units(population, factors):
+    return replace(population, source=Multiplied(population.source, np.array([factors.get(n, 1.0) for n in CHANNELS])))
+
+
+def lifting_of(factors):
+    function = f"tanh({1 / factors['velocity']!r}*velocity)" if "velocity" in factors else "tanh(velocity)"
+    return Lifting(CHANNELS[:3], (function,))
+
+
+def factor_of(population, lifting):
+    whole = [Factor.stack([reduce_episode(*population.read_parts(k), lifting) for k in population.keys(u)]) for u in population.unit_ids]
+    return lifted_factor(Factor.stack([combine(f) for f in whole]), lifting, {}, lifting)
+
+
+def sizes_of(factors):
+    """What the matrices' rows and columns are multiplied by; the lifted function is a pure number."""
+    return np.array([factors.get(n, 1.0) for n in CHANNELS[:3]] + [1.0]), np.array([factors.get("voltage", 1.0)])
+
+
+@pytest.mark.parametrize("factors", SCALINGS, ids=str)
+def test_edmd_with_a_searched_alpha_gives_the_same_models(motors, factors):
+    found = []
+    for own in ({}, factors):
+        factor = factor_of(in_units(motors, own), lifting_of(own))
+        ranges = Ranges.of(factor, 4)
+        alpha = 4 * smallest_stabilising_alpha([(ranges.triangles(factor.R), 4)])
+        found.append((alpha, ranges.edmd(factor.R, alpha)))
+    x, u = sizes_of(factors)
+    (alpha, one), (other_alpha, other) = found
+    assert other_alpha == pytest.approx(alpha, rel=1e-6)
+    np.testing.assert_allclose(other.A * x / x[:, None], one.A, atol=1e-9 * np.abs(one.A).max())
+    np.testing.assert_allclose(other.B * u / x[:, None], one.B, rtol=1e-6)
+
+
+def test_in_the_units_of_the_recordings_alpha_is_the_papers(motors):
+    factor = factor_of(motors, lifting_of({}))
+    ones = Ranges(np.ones(4), np.ones(1))
+    np.testing.assert_array_equal(ones.edmd(factor.R, 90.0).A, edmd(factor.R, 4, 90.0).A)
+    assert np.abs(Ranges.of(factor, 4).edmd(factor.R, 90.0).A - ones.edmd(factor.R, 90.0).A).max() > 1e-3
+
+
+@pytest.mark.parametrize("factors", [SCALINGS[3], SCALINGS[4], SCALINGS[-1]], ids=str)
+def test_refined_models_are_the_same(motors, factors):
+    found = []
+    for own in ({}, factors):
+        population, lifting = in_units(motors, own), lifting_of(own)
+        keys = {u: population.keys(u) for u in population.unit_ids}
+        found.append(refine_population(population, keys, lifting, {}, factor_of(population, lifting), None, QUICK))
+    one, other = found
+    x, u = sizes_of(factors)
+    assert other.strength == one.strength
+    np.testing.assert_allclose(other.units.A * x / x[:, None], one.units.A, atol=1e-6 * np.abs(one.units.A).max())
+    np.testing.assert_allclose(other.units.B * u / x[:, None], one.units.B, atol=1e-6 * np.abs(one.units.B).max())
+    np.testing.assert_allclose(other.sigma / x[:3], one.sigma, rtol=1e-6)
+    np.testing.assert_allclose([r.score for r in other.trade_off], [r.score for r in one.trade_off], rtol=1e-6)
+    ranges, scaled = Ranges(x, u), other.in_channels(Ranges(x, u))
+    np.testing.assert_allclose(scaled.information, one.information, atol=1e-6 * np.abs(one.information).max())
+    np.testing.assert_allclose(scaled.in_channels(ranges.inverse).whitening, other.whitening, rtol=1e-12)
+
+
+def test_a_scaled_population_is_divided_and_nothing_else(motors):
+    scaled = scale_population(motors, {"velocity": 4.0}).select(motors.unit_ids[:2])
+    key = scaled.episodes[1]
+    np.testing.assert_array_equal(scaled.read(key) * [1, 4, 1, 1], motors.read(key))
+    assert [c.unit for c in scaled.channels] == ["rad", "", "A", "V"]
+    check_episode(scaled.read(key), key, scaled.channels)
+
+
+@pytest.mark.parametrize("factors", [(1e-9, 1, 1), (1, 1e9, 1), (1, 1, 1e-9), (1e9, 1e-9, 1e9)])
+def test_phases_and_lags_are_those_of_the_machine(factors):
+    population = HarmonicDrivePopulation(n_units=1, n_episodes=1, seconds=8.0, seed=1).simulate().population
+    values = population.read(population.episodes[0])
+    names = population.states + population.inputs
+    columns = [values[:, names.index(n)] for n in ("position", "target_velocity", "velocity")]
+    spec = PhaseSpec()
+    one = find_segments(*columns, population.sample_period_s, spec)
+    scaled = find_segments(
+        *(c * f for c, f in zip(columns, factors, strict=True)), population.sample_period_s, replace(spec, ratio=spec.ratio / factors[0])
+    )
+    assert len(scaled) == len(one) > 1
+    np.testing.assert_allclose([s.phase for s in scaled], [s.phase for s in one], rtol=1e-6)
+    np.testing.assert_allclose([s.speed / factors[0] for s in scaled], [s.speed for s in one], rtol=1e-9)
+    assert abs(one[0].speed) == pytest.approx(np.abs(columns[1]).max(), rel=0.01)  # where units match it is the reference's
+
+
+def test_a_constant_is_a_constant_in_any_unit():
+    constant = np.full(1000, 0.1)
+    converted = constant * (1 + 2e-16 * (np.arange(1000) % 2))  # a bit of rounding apart
+    assert all(is_constant(column) for column in (constant, converted, np.zeros(5)))
+    moving = constant.copy()
+    moving[700] *= 1 + 1e-10
+    for factor in (1e-9, 1.0, 1e9):
+        assert not is_constant(factor * moving)
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1.0, 1e9])
+def test_an_input_that_rests_but_for_rounding_is_refused(factor):
+    span = factor * np.array([[[0.1], [0.1 * (1 + 3e-16)]]])
+    held = Factor(np.eye(3)[None], np.ones((1, 2)), np.array([10]), span)
+    with pytest.raises(IdentificationError, match="constant"):
+        require_excitation(held, ("voltage",), ("001",), "default")
+    require_excitation(replace(held, input_range=span * np.array([[1.0], [1.01]])), ("voltage",), ("001",), "default")

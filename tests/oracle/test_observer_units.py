@@ -1,0 +1,158 @@
+"""Observers and baselines in any units of measure: the same estimates, told in these units."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kros.core.linalg import least_squares, solve_balanced
+from kros.core.lti import StateSpace, gain
+from kros.lifting import Lifting
+from kros.observer import (
+    Features,
+    FilteredDifference,
+    Observer,
+    ReliftScales,
+    Runtime,
+    followed,
+    in_sizes,
+    kalman_candidates,
+    like_measurement_noise,
+    relift_certificate,
+    run_observer,
+)
+from kros.synthesis import Injection
+
+DT = 0.01
+LIFTING = Lifting(("x", "v"), ("sin(x)",), (), ("u",))
+SIZES = {"x": 1e9, "v": 3e-9, "u": 2e5, "sin(x)": 0.7}
+
+
+def observer(injection=Injection.STATE, runtime=None):
+    rng = np.random.default_rng(4)
+    A = np.array([[0.9, 0.05, -0.02], [-0.1, 0.8, -0.05], [0.1, 0.1, 0.3]])
+    B, width = np.array([[0.01], [0.2], [0.05]]), 1 if injection is Injection.INPUT else 3
+    K = StateSpace([[0.5]], [[1.0]], rng.normal(size=(width, 1)) * 0.1, rng.normal(size=(width, 1)) * 0.2, DT)
+    return Observer("o", LIFTING, A, B, (0,), ("u",), K, injection, DT, runtime=runtime or Runtime())
+
+
+RUNTIMES = [
+    Runtime(),
+    Runtime(lower=np.array([-0.2, -0.5]), upper=np.array([0.3, np.inf]), delay=2),
+    Runtime(filter_gain=np.array([[0.3], [0.1]])),
+]
+
+
+@pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
+@pytest.mark.parametrize("runtime", RUNTIMES, ids=["plain", "limits", "filter"])
+@pytest.mark.parametrize("estimate", ["predict", "filter"])
+def test_estimates_in_other_sizes_are_the_same(injection, runtime, estimate):
+    one, rng = observer(injection, runtime), np.random.default_rng(0)
+    other = in_sizes(one, SIZES)
+    y, u = rng.normal(size=(200, 3, 1)), rng.normal(size=(200, 3, 1))
+    y[50:60] = np.nan
+    found = run_observer(other, y / 1e9, u / 2e5, estimate=estimate)
+    np.testing.assert_allclose(found * [1e9, 3e-9], run_observer(one, y, u, estimate=estimate), rtol=1e-6, atol=1e-9)
+    back = in_sizes(other, {})
+    assert back.lifting == one.lifting
+    for name in "AB":
+        np.testing.assert_allclose(getattr(back, name), getattr(one, name), rtol=1e-12)
+
+
+def test_a_correction_limit_goes_with_the_sizes():
+    one = observer(runtime=Runtime(correction=np.array([0.01, 0.02, 0.03])))
+    np.testing.assert_allclose(in_sizes(one, SIZES).runtime.correction, [0.01 / 1e9, 0.02 / 3e-9, 0.03 / 0.7])
+
+
+def test_the_certificate_says_the_same_in_other_sizes():
+    one, box = observer(), {"x": (-1.0, 2.0)}
+    scales = ReliftScales(np.array([2.0, 3.0]), np.array([0.1, 0.2]), np.array([0.01]))
+    found = relift_certificate(
+        in_sizes(one, {"x": 2.0, "v": 3.0}), {"x": (-0.5, 1.0)}, ReliftScales(np.ones(2), np.array([0.05, 0.2 / 3]), np.array([0.005]))
+    )
+    direct = relift_certificate(one, box, scales)
+    told = found.in_sizes(in_sizes(one, {"x": 2.0, "v": 3.0}), {})
+    assert all(found.certified for found in (direct, told))
+    assert told.gain == pytest.approx(direct.gain, rel=0.02)  # a proof stops within two percent of the least gain
+    assert told.assumptions == direct.assumptions
+    np.testing.assert_allclose(told.scales.error, scales.error)
+    np.testing.assert_allclose(told.scales.residual, scales.residual)
+    error = np.array([0.4, -0.3])
+    np.testing.assert_allclose(told.initial_energy(error), found.initial_energy(error / [2.0, 3.0]))
+    assert told.system(one).corner(np.ones(1))[0].shape == (3, 3)
+
+
+def signals(seed=3):
+    """Position with quantisation, its rate and something else."""
+    t, rng = np.arange(3000) * DT, np.random.default_rng(seed)
+    x = np.stack([np.sin(t), np.sin(1.7 * t + 1)], axis=1)
+    v = np.stack([np.cos(t), 1.7 * np.cos(1.7 * t + 1)], axis=1)
+    return np.stack([np.rint(x * 1e4) / 1e4, v, rng.normal(size=x.shape)], axis=-1)
+
+
+@pytest.mark.parametrize("factors", [(1, 1, 1), (180 / np.pi, 30 / np.pi, 1), (1e-9, 1e9, 1e9), (1e9, 1e-9, 1)])
+def test_the_filtered_difference_learns_pair_and_scale(factors):
+    states = signals()
+    lengths = [3000, 2500]
+    scaled = states * factors
+    assert followed(scaled[..., :1], scaled, lengths, (0,), DT) == ((0, 1),)
+    plain = FilteredDifference(3, ((0, 1),), 20.0, DT).scaled_to(scaled[..., :1], scaled, lengths)
+    assert plain.scales[0] == pytest.approx(factors[1] / factors[0], rel=0.02)
+    found = plain.run(scaled[..., :1], scaled[..., :0])[..., 1] / factors[1]
+    assert np.abs(found[100:] - states[100:, :, 1]).max() < 0.1
+
+
+def test_what_is_no_rate_is_not_taken_for_one():
+    states = signals()
+    assert followed(states[..., 2:], states, [3000, 3000], (2,), DT) == ()
+    assert followed(states[..., :2], states[..., :2], [3000, 3000], (0, 1), DT) == ()
+
+
+@pytest.mark.parametrize("factors", [np.array([1e9, 1e-9]), np.array([1e-9, 1e9])])
+def test_kalman_sweeps_try_the_same_filters(factors):
+    A, shape, R = np.array([[0.9, 0.1], [-0.2, 0.7]]), np.diag([1.0, 4.0]), np.diag([0.1, 0.3])
+    one = like_measurement_noise(shape, R)
+    D = np.diag(factors)
+    assert like_measurement_noise(D @ shape @ D, D @ R @ D) == pytest.approx(one, rel=1e-12)
+    assert one == pytest.approx(1 / np.mean([1.0 / 0.1, 4.0 / 0.3]))
+    (level, first), *_ = kalman_candidates(A, np.eye(2), shape, R, DT)
+    P = level * one * shape  # so little process noise that the gain is the limit for P near zero
+    assert np.abs(first.controller.D).max() < 10 * np.abs(P).max() / 0.1
+
+
+def test_least_squares_decides_about_rank_in_units_of_every_column():
+    rng = np.random.default_rng(1)
+    rows, values = rng.normal(size=(100, 3)), rng.normal(size=(100, 2))
+    factors = np.array([1e9, 1e-9, 1e-170])
+    expected = np.linalg.lstsq(rows, values, rcond=None)[0]
+    np.testing.assert_allclose(least_squares(rows * factors, values) * factors[:, None], expected, rtol=1e-9)
+    assert not least_squares(np.zeros((5, 2)), values[:5]).any()
+
+
+def test_balanced_solution_does_not_depend_on_the_states_units():
+    A, b = np.array([[0.9, 0.1], [-0.2, 0.7]]), np.array([[1.0], [2.0]])
+    x = np.array([1e9, 1e-9])
+    found = solve_balanced(A * x[:, None] / x, b * x[:, None], rcond=1e-9)
+    np.testing.assert_allclose(found / x[:, None], np.linalg.solve(A, b), rtol=1e-9)
+
+
+def test_first_estimate_at_rest_is_the_same():
+    A = np.array([[0.2, 0.3, 0.1, 0.4], [0.1, 0.8, 0.05, 0.3], [0.2, 0.1, 0.7, -0.5], [0.0, 0.0, 0.0, 0.0]])
+    lifting = Lifting(("x", "v", "w"), ("sin(x)",))
+    D = A[:, [0]]
+    one = Observer("m", lifting, A, np.ones((4, 1)), (0,), ("u",), gain(D, DT), Injection.STATE, DT)
+    assert one.replaces
+    y, sizes = np.array([[0.7]]), {"x": 1e-9, "v": 1e9, "w": 1e-9}
+    np.testing.assert_allclose(in_sizes(one, sizes).initial(y / 1e-9) * [1e-9, 1e9, 1e-9], one.initial(y), rtol=1e-9)
+
+
+def test_learned_features_see_the_same_whatever_the_units():
+    states, rng = signals(), np.random.default_rng(2)
+    u = np.stack([states[..., 0] + 0.1 * rng.normal(size=states.shape[:2]), rng.normal(size=states.shape[:2])], axis=-1)
+    lifting = Lifting(("x", "v", "w"))
+    one = Features.of(lifting, (0,), states[..., :1], u)
+    other = Features.of(lifting, (0,), states[..., :1] * 1e9, u * [1e-9, 1e9])
+    np.testing.assert_allclose(other.static * [1, 1e-9, 1e9] / 1e9, one.static, rtol=1e-6, atol=1e-12)
+    assert replace(one, taps=3).taps == 3

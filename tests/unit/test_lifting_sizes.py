@@ -1,0 +1,60 @@
+"""Liftings of channels that are divided by sizes: the same functions, written as before."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+
+from kros.lifting import Lifting
+
+FULL = Lifting(
+    ("position", "velocity"),
+    ("sin(100*position + phase)", "velocity*abs(velocity)", "position[-1]*voltage[-2]"),
+    ("phase",),
+    ("voltage",),
+    ("voltage*velocity",),
+)
+SIZES = {
+    "position": 2e9,
+    "velocity": 3e-9,
+    "voltage": 5e4,
+    "velocity*abs(velocity)": 7e-18,
+    "position[-1]*voltage[-2]": 1e14,
+    "voltage*velocity": 2e-4,
+}
+
+
+def test_values_and_slopes_are_those_of_the_formulas_over_their_sizes():
+    rng, scaled = np.random.default_rng(0), FULL.in_sizes(SIZES)
+    window, u = rng.normal(size=(50, len(FULL.window.names))), rng.normal(size=(50, 1))
+    by = np.array([SIZES[name.partition("[")[0]] for name in FULL.window.names])
+    window[:, [0, 2]] *= 1e-9  # so that the sine is not aliased by rounding
+    out, into = scaled.sizes_of(FULL.names), scaled.sizes_of(("voltage", "voltage*velocity"))
+    values, u_recorded = {"phase": 0.4}, u * SIZES["voltage"]
+    np.testing.assert_allclose(scaled.lift(window, values) * out, FULL.lift(window * by, values), rtol=1e-9)
+    np.testing.assert_allclose(scaled.lift_inputs(u, window, values) * into, FULL.lift_inputs(u_recorded, window * by, values), rtol=1e-12)
+    recorded = FULL.slopes(window * by, values) * by
+    np.testing.assert_allclose(scaled.slopes(window, values) * out[2:, None], recorded, rtol=1e-6)
+
+
+def test_boxes_are_in_the_same_sizes():
+    plain = Lifting(("x",), ("x**2",))
+    np.testing.assert_allclose(plain.slope_bounds({"x": (-1.0, 3.0)})[1], 6.0)
+    np.testing.assert_allclose(plain.in_sizes({"x": 100.0, "x**2": 50.0}).slope_bounds({"x": (-0.01, 0.03)})[1], 6.0 * 100 / 50)
+
+
+def test_formulas_names_and_units_stay_as_they_are_written():
+    scaled = FULL.in_sizes(SIZES)
+    assert (scaled.names, scaled.input_functions) == (FULL.names, FULL.input_functions)
+    assert scaled.units({"position": "rad", "velocity": "rad/s"}) == FULL.units({"position": "rad", "velocity": "rad/s"})
+    assert scaled != FULL
+    assert scaled.in_sizes({}) == FULL
+
+
+def test_sizes_travel_between_processes_and_into_files():
+    scaled = FULL.in_sizes(SIZES)
+    assert pickle.loads(pickle.dumps(scaled)) == scaled
+    content = {"states": scaled.states, "lifting": scaled.functions, "parameters": scaled.parameters, **scaled.extension()}
+    assert Lifting.from_content(content) == scaled
+    assert "sizes" not in FULL.extension()

@@ -123,15 +123,17 @@ def attained(problem: ObserverProblem, K: StateSpace, theta: Array, rng: np.rand
     at_input = name in ("input_multiplicative", "inverse_additive", "inverse_input_multiplicative")
     T = S_x @ (G @ W_L if at_input else W_L)
     M = W_R @ (W_u if name in ("additive", "input_multiplicative", "inverse_input_multiplicative") else G @ W_u)
-    N = {"inverse_additive": lambda: W_R @ G @ W_L, "inverse_input_multiplicative": lambda: W_R @ W_L, "inverse_output_multiplicative": lambda: W_R @ W_L}.get(
-        name, lambda: np.zeros((len(theta), M.shape[-2], T.shape[-1]))
-    )()
+    N = {
+        "inverse_additive": lambda: W_R @ G @ W_L,
+        "inverse_input_multiplicative": lambda: W_R @ W_L,
+        "inverse_output_multiplicative": lambda: W_R @ W_L,
+    }.get(name, lambda: np.zeros((len(theta), M.shape[-2], T.shape[-1])))()
     noise = np.concatenate([W_p @ S @ R @ J @ gains * problem.noise, W_p @ S @ R * np.asarray(problem.process_noise)], axis=-1)
     rest = np.zeros((len(theta), T.shape[-2], m))
     if problem.remainder_left is not None and problem.remainder_right is not None:
         left, right = response(problem.remainder_left, theta), response(problem.remainder_right, theta) @ W_u
-        U, _, Vh = np.linalg.svd(np.swapaxes((S_x @ left).conj(), -1, -2), full_matrices=False)
-        V, _, Zh = np.linalg.svd(right, full_matrices=False)
+        U, _, _ = np.linalg.svd(np.swapaxes((S_x @ left).conj(), -1, -2), full_matrices=False)
+        V, _, _ = np.linalg.svd(right, full_matrices=False)
         k = min(U.shape[-1], V.shape[-1])
         rest = S_x @ left @ (U[..., :k] @ np.swapaxes(V[..., :k], -1, -2).conj()) @ right
     found = np.zeros(len(theta))
@@ -157,7 +159,9 @@ def fine_grid(problem: ObserverProblem, K: StateSpace) -> Array:
     loop = problem.error_system(K)
     systems = [loop, problem.W_L, problem.W_R, problem.input_weight, problem.nominal]
     poles = np.log(np.concatenate([s.poles() for s in systems]).astype(complex) + 1e-12)
-    around = (np.abs(poles.imag)[:, None] + np.abs(poles.real)[:, None] * np.r_[-(2.0 ** np.arange(-3, 6)), 0, 2.0 ** np.arange(-3, 6)]).ravel()
+    around = (
+        np.abs(poles.imag)[:, None] + np.abs(poles.real)[:, None] * np.r_[-(2.0 ** np.arange(-3, 6)), 0, 2.0 ** np.arange(-3, 6)]
+    ).ravel()
     return np.unique(np.concatenate([np.geomspace(1e-6, np.pi, POINTS), around[(around > 1e-6) & (around < np.pi)]]))
 
 
@@ -173,7 +177,10 @@ def other_observers(problem: ObserverProblem, found: Synthesis, rng: np.random.G
     yield problem, gain(np.zeros((K.n_outputs, q)), 1.0)
     for _ in range(OTHERS):
         size = 10.0 ** rng.uniform(-3, 0)
-        yield problem, StateSpace(K.A, K.B * (1 + size * rng.standard_normal(K.B.shape)), K.C, K.D * (1 + size * rng.standard_normal(K.D.shape)), 1.0)
+        yield (
+            problem,
+            StateSpace(K.A, K.B * (1 + size * rng.standard_normal(K.B.shape)), K.C, K.D * (1 + size * rng.standard_normal(K.D.shape)), 1.0),
+        )
     for injection, rows, scale in ((Injection.STATE, n, problem.output_scale), (Injection.INPUT, m, problem.input_scale)):
         same = replace(problem, injection=injection)
         best, least = np.zeros((rows, q)), np.inf
@@ -195,8 +202,12 @@ def value_of(problem: ObserverProblem, K: StateSpace) -> float:
 
 def run(count: int, seed: int) -> list[Tally]:
     """Try random problems."""
-    upper = Tally("worst_case_h2, certified value", "perturbations that climb at every frequency of a fine grid, from the definition of the set")
-    density = Tally("worst_case_h2, lower bound", "certified values of other observers: none, perturbed, searched gains, the other injection")
+    upper = Tally(
+        "worst_case_h2, certified value", "perturbations that climb at every frequency of a fine grid, from the definition of the set"
+    )
+    density = Tally(
+        "worst_case_h2, lower bound", "certified values of other observers: none, perturbed, searched gains, the other injection"
+    )
     gaps = []
     for k in range(count):
         rng = np.random.default_rng([seed, k])

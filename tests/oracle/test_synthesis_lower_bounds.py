@@ -1,6 +1,7 @@
 """Lower bounds of worst-case designs against observers that are there: none may lie above what somebody attains."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from kros.synthesis.robust.everywhere import Everywhere
 from kros.synthesis.robust.robust_gain import robust_gain
 
 DT = 1.0
+FULL = StateSpace([[0.6]], [[1.0, 0.3]], [[0.1], [0.05]], [[0.2, 0.1], [0.0, 0.2]], DT)
 
 
 def stored(name):
@@ -54,7 +56,11 @@ def others(problem, found, rng, count=6):
     yield gain(np.zeros_like(K.D), K.dt)
     for size in np.geomspace(0.01, 0.5, count):
         other = StateSpace(
-            K.A, K.B * (1 + size * rng.standard_normal(K.B.shape)), K.C, K.D + size * np.abs(K.D).max() * rng.standard_normal(K.D.shape), K.dt
+            K.A,
+            K.B * (1 + size * rng.standard_normal(K.B.shape)),
+            K.C,
+            K.D + size * np.abs(K.D).max() * rng.standard_normal(K.D.shape),
+            K.dt,
         )
         if problem.error_system(other).is_stable():
             yield other
@@ -75,10 +81,11 @@ def test_a_lightly_damped_population():
 
 
 def test_the_best_over_orders_is_kept_and_a_bound_belongs_to_all():
-    case = stored("lightly_damped_population")
+    case = replace(stored("lightly_damped_population"), remainder_left=None, remainder_right=None)
+    nothing = certify(case, gain(np.zeros((4, 1)), case.nominal.dt))[0]
     found = [worst_case_h2(case, refinements=0, causal=False, order=order) for order in (1, 4)]
-    lowest = max(f.lower_bound for f in found)
-    assert all(lowest < f.worst_case_h2 <= 24.82 for f in found)
+    assert max(f.lower_bound for f in found) < min(f.worst_case_h2 for f in found)
+    assert max(f.worst_case_h2 for f in found) <= nothing
 
 
 # --- filters below a spectrum between the points of any grid
@@ -122,7 +129,8 @@ def test_a_response_stays_within_its_enclosure():
         A = rng.standard_normal((5, 5))
         A *= rng.uniform(0.5, 0.999) / np.abs(np.linalg.eigvals(A)).max()
         T = np.diag(10.0 ** rng.uniform(-4, 4, 5))
-        system = StateSpace(T @ A @ np.linalg.inv(T), T @ rng.standard_normal((5, 2)), rng.standard_normal((3, 5)) @ np.linalg.inv(T), rng.standard_normal((3, 2)), DT)
+        B, C, D = (rng.standard_normal(shape) for shape in ((5, 2), (3, 5), (3, 2)))
+        system = StateSpace(T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T), D, DT)
         theta = rng.uniform(0, np.pi, 40)
         half = 10.0 ** rng.uniform(-4, -1, 40)
         middle, distance = Enclosure(system)(theta, half)
@@ -220,14 +228,14 @@ def test_no_bound_without_states_or_performance():
         {"W_L": resonance(0.999, 1.3, 0.4, 0.1)},
         {"form": "input_multiplicative", "W_R": resonance(0.995, 0.7, 2.0, 0.2)},
         {"form": "additive", "W_L": block_diagonal([resonance(0.99, 1.0, 0.3, 0.1), gain([[0.2]], DT)]), "W_R": gain([[1.0], [0.5]], DT)},
-        {"form": "inverse_output_multiplicative", "W_L": StateSpace([[0.6]], [[1.0, 0.3]], [[0.1], [0.05]], [[0.2, 0.1], [0.0, 0.2]], DT), "W_R": gain(np.eye(2), DT)},
+        {"form": "inverse_output_multiplicative", "W_L": FULL, "W_R": gain(np.eye(2), DT)},
         {"remainder_left": gain([[0.1, 0.05], [0.0, 0.1]], DT), "remainder_right": gain([[1.0]], DT), "W_L": gain([[0.01]], DT)},
     ],
     ids=["plain", "input", "resonant", "resonant chain", "additive", "full weight", "correlated remainder"],
 )  # fmt: skip
 def test_no_observer_is_below_the_bound(changes):
     case = small_problem(**changes)
-    found = worst_case_h2(case, refinements=0, causal=False, max_order=2)
+    found = worst_case_h2(case, refinements=0, causal=False, max_order=1)
     assert 0.4 * found.worst_case_h2 < found.lower_bound <= found.worst_case_h2
     rng = np.random.default_rng(0)
     for injection in (Injection.STATE, Injection.INPUT):

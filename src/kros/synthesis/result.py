@@ -135,7 +135,11 @@ def enclosed(value: float, lower: float | None) -> tuple[float | None, float | N
         return None, None, ("No lower bound could be proven.",)
     if lower > value * (1 + _ROUNDING):
         log.error("Lower bound %.9g above the attained value %.9g: it is dropped.", lower, value)
-        return None, None, (f"Internal error: a lower bound of {lower:.9g} above the attained {value:.9g} was dropped; please report this problem.",)
+        return (
+            None,
+            None,
+            (f"Internal error: a lower bound of {lower:.9g} above the attained {value:.9g} was dropped; please report this problem.",),
+        )
     lower = min(lower, value)
     return lower, 100 * (value / lower - 1), ()
 

@@ -140,5 +140,9 @@ class ForPlant:
             gap_percent=gap,
             spectral_radius=stability_margin(closed),
             solve_s=synthesis.solve_s + seconds,
-            notes=(*synthesis.notes, f"{what}: H2 norm {value:.6g} against {before:.6g} before ({100 * (value / before - 1):+.2f} %)", *told),
+            notes=(
+                *synthesis.notes,
+                f"{what}: H2 norm {value:.6g} against {before:.6g} before ({100 * (value / before - 1):+.2f} %)",
+                *told,
+            ),
         )

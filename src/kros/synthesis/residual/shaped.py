@@ -182,7 +182,9 @@ class _Problem:
         """Root mean square of the scaled error that no correction falls below; None where none is proven."""
         A, G, C = self.shaped(shaping)
         q, k = len(C), G.shape[1]
-        squared = predictor_bound(A, np.hstack([G, np.zeros((len(A), q))]), C, np.hstack([np.zeros((q, k)), np.diag(self.noise)]), np.eye(len(self.A), len(A)))
+        squared = predictor_bound(
+            A, np.hstack([G, np.zeros((len(A), q))]), C, np.hstack([np.zeros((q, k)), np.diag(self.noise)]), np.eye(len(self.A), len(A))
+        )
         return None if squared is None else float(np.sqrt(squared))
 
     def correction(self, shaping: StateSpace) -> StateSpace:

@@ -132,8 +132,8 @@ def attained(problem: ObserverProblem, K: StateSpace, theta: Array, rng: np.rand
     rest = np.zeros((len(theta), T.shape[-2], m))
     if problem.remainder_left is not None and problem.remainder_right is not None:
         left, right = response(problem.remainder_left, theta), response(problem.remainder_right, theta) @ W_u
-        U, _, Vh = np.linalg.svd(np.swapaxes((S_x @ left).conj(), -1, -2), full_matrices=False)
-        V, _, Zh = np.linalg.svd(right, full_matrices=False)
+        U, _, _ = np.linalg.svd(np.swapaxes((S_x @ left).conj(), -1, -2), full_matrices=False)
+        V, _, _ = np.linalg.svd(right, full_matrices=False)
         k = min(U.shape[-1], V.shape[-1])
         rest = S_x @ left @ (U[..., :k] @ np.swapaxes(V[..., :k], -1, -2).conj()) @ right
     found = np.zeros(len(theta))

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, block_diagonal, gain
 from ..problem.observer_problem import ObserverProblem
 from .ball import Ball, below

@@ -92,10 +92,8 @@ class Everywhere:
             distance = np.where(room > 0, distance, np.inf)
         root = np.sqrt(spectrum.power(self.channels.ball_of(N, M), self.channels.nearest(theta)))
         if spectrum.sharp:
-            proven = np.maximum(root - distance[:, None], 0.0)
-        else:  # the whole matrix counts, not its diagonal alone
-            proven = root * _kept(root, distance)
-        return proven, root
+            return np.maximum(root - distance[:, None], 0.0), root
+        return root * _kept(root, distance), root  # the whole matrix counts, not its diagonal alone
 
     def symmetric_part(self, theta: Array, half: Array) -> tuple[Array, Array]:
         """Magnitude of every component of w2 for filters below ``||R_r M|| R_l``, (k, b).

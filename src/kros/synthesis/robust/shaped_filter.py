@@ -96,7 +96,7 @@ def lower_bound(problem: ObserverProblem, shaping: Shaping) -> float | None:
 def _kalman(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> StateSpace:
     """Best predictor for shaped disturbances: its filter for state injection, scaled."""
     model = _Model.of(problem, d, r)
-    A, B, C, _ = problem.scaled
+    A, B, _, _ = problem.scaled
     n, kd, kr = len(A), d.n_states, r.n_states
     L, _ = predictor(model.A, model.C, model.B @ model.B.T, model.D @ model.D.T, model.B @ model.D.T, "Worst-case H2 synthesis")
     L_xi, L_d, L_r = L[:n], L[n : n + kd], L[n + kd : n + kd + kr]

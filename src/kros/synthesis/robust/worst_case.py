@@ -2,11 +2,11 @@ r"""Worst-case H2 observers: filtering of a shaped disturbance, by one Riccati e
 
 K is outside the loop of the uncertainty, so the worst case over the set is a disturbance spectrum, and the best K for a given spectrum is a
 Kalman predictor (state injection) or an H2 controller (input injection). The game between K and the spectrum is solved by fictitious play:
-start from the average spectrum of the set, find the
-spectrum that is worst for the resulting K, then for the next, and average these. Every iterate is certified
-independently, the best is kept; every averaged spectrum gives a lower bound, the best is kept.
+start from the average spectrum of the set, find the spectrum that is worst for the resulting K, then for the next, and average these. Every
+iterate is certified independently and the best is kept, no correction and filters of lower orders among them (`search`). The last averaged spectrum
+gives the lower bound.
 
-The filters themselves are told in `shaped_filter`, the bounds in `everywhere` and `riccati.filter_bound`.
+The filters themselves are told in `shaped_filter`; that a lower bound holds, in `everywhere` and `riccati.filter_bound`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis, enclosed
 from .causal import causal_h2
 from .disturbance import Channels, Fit, Shaping, default_fit, design_grid, symmetric
-from .everywhere import Everywhere
 from .search import Search
 from .shaped_filter import design
 
@@ -41,7 +40,7 @@ def worst_case_h2(
     ----------
     problem : ObserverProblem
     order : int, optional
-        Order of each shaping filter; default the smallest within `tolerance_db`, up to `max_order`.
+        Order of each shaping filter; default the smallest within `tolerance_db`, up to `max_order`, and lower ones where those do better.
     max_order : int
     tolerance_db : float
         Accuracy of the shaping filters. It costs optimality, never validity: the certificate uses the set itself.
@@ -72,7 +71,7 @@ def worst_case_h2(
     problem.require_sound()
     fit = fit or default_fit()
     options = {"order": order, "max_order": max_order, "tolerance_db": tolerance_db}
-    channels, sharp = Channels(problem, design_grid(problem)), symmetric(problem)
+    channels = Channels(problem, design_grid(problem))
     spectrum = channels.average()
     if not bounded:
         return _design_alone(problem, channels.shaping(spectrum, fit, "above", options))
@@ -81,11 +80,10 @@ def worst_case_h2(
     for round_ in range(1, refinements + 1):
         spectrum = spectrum.mixed_with(*channels.worst(search.best.controller), 1 / round_)
         search.again(spectrum)
-    if sharp:
-        final = spectrum.mixed_with(*channels.worst(search.best.controller), 1 / (refinements + 1))
-    else:
-        final = channels.below_average()
-    return _result(problem, search, search.bound(final), causal)
+    if not symmetric(problem):
+        return _result(problem, search, search.bound(channels.below_average()), causal)
+    worst = channels.worst(search.best.controller)
+    return _result(problem, search, search.bound(spectrum.mixed_with(*worst, 1 / (refinements + 1))), causal)
 
 
 def _design_alone(problem: ObserverProblem, shaping: Shaping) -> Synthesis:

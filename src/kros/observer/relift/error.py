@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError, KrosError
 from ...core.lti import StateSpace
-from ...lifting.intervals import bounds_of
+from ...lifting.continuity import break_of, slope_bounds_of
 from ...synthesis.result import Injection
 from ..observer import Observer
 from .status import Dropped
@@ -230,14 +230,15 @@ def slope_box(
     Earlier inputs are not among the names: machine and observer have the same ones.
     """
     formulas = observer.lifting.formulas + observer.lifting.input_formulas
-    found = bounds_of([f.derivative(name) for f in formulas for name in names], {**(box or {}), **(parameters or {})})
-    lower, upper = (bound.reshape(len(formulas), len(names)) for bound in found)
+    ranges = {**(box or {}), **(parameters or {})}
+    lower, upper = slope_bounds_of(formulas, names, ranges)
     unbounded = np.argwhere(~(np.isfinite(lower) & np.isfinite(upper)))
     if len(unbounded):
         i, j = unbounded[0]
         raise UnboundedSlopeError(
             f"the slope of {formulas[i].text!r} by {names[j]!r} has no bound"
             + (f" in the box {dict(box)}" if box else "")
+            + (f", {where}" if (where := break_of(formulas[i].expression, ranges)) else "")
             + "; give a box: the ranges of the states and inputs it depends on"
         )
     return (np.minimum(lower, 0.0), np.maximum(upper, 0.0)) if clipped else (lower, upper)

@@ -45,6 +45,10 @@ class UnboundedSlopeError(KrosError):
     """A lifted function may be arbitrarily steep where the observer may be."""
 
 
+class UncoveredRuntimeError(KrosError):
+    """An observer runs with what the equations of its error do not know."""
+
+
 @dataclass(frozen=True, eq=False)
 class ReliftScales:
     """Sizes that turn a gain into a statement: errors are divided by `error`, residuals and noise by theirs.
@@ -185,7 +189,10 @@ def error_system(
     ------
     UnboundedSlopeError
         When a slope is unbounded in the box; name ranges of the states it depends on.
+    UncoveredRuntimeError
+        When the observer runs with a delay or limits.
     """
+    require_covered(observer)
     scales = scales or ReliftScales.ones(observer)
     lifting, K, q = observer.lifting, observer.controller, len(observer.measured)
     n = lifting.n_states
@@ -220,6 +227,15 @@ def error_system(
     C[:, :n] = np.diag(1 / scales.error)
     told = tuple(f"{functions[i]} by {names[j]}" for i, j in moving)
     return ErrorSystem(A, L, B, M, np.zeros((len(moving), n + q)), C, observer.sample_period_s, told)
+
+
+def require_covered(observer: Observer) -> None:
+    """Refuse an observer whose `runtime` changes what runs: the error then obeys other equations than those that are certified."""
+    if declared := observer.runtime.changes:
+        raise UncoveredRuntimeError(
+            f"observer {observer.name} runs with {', '.join(declared)}, which the error equations do not cover; "
+            "certify it without, and do not take that certificate for one of the observer as declared"
+        )
 
 
 def slope_box(

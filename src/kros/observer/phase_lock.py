@@ -91,7 +91,12 @@ def track_parameter(
             f"found parameters {lifting.parameters}, a history of {lifting.history} and a delay of {observer.runtime.delay}."
         )
     samples, given = judged(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
-    found = started_anew(lambda y, u, values: _followed(observer, y, u, values, name, settle_s), samples, given)
+    found = started_anew(
+        lambda y, u, values: _followed(observer, y, u, values, name, settle_s),
+        samples,
+        given,
+        lambda found, begin, own: {name: found[1][begin, own]},
+    )
     return Tracked(*found)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DimensionError
 from .careful import innovation, next_estimate
 from .observer import Observer
-from .screen import SampleStatus, Screen
+from .screen import LONGEST, Held, SampleStatus, Screen
 
 Array = npt.NDArray[np.float64]
 
@@ -51,11 +52,10 @@ class RunningObserver:
     def reset(self, y: npt.ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
         m = len(self.observer.inputs)
-        self._held, self._known = np.zeros(m), np.zeros(m, dtype=bool)
-        samples = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, m)))
-        self._status = SampleStatus(int(samples.status[0, 0]))
-        self._fresh, self._started = bool(np.isfinite(samples.y).any()), False
-        self._begin(samples.y[0, 0])
+        first = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, m)))
+        self._status, self._held = SampleStatus(int(first.status[0, 0])), Held.nothing(1, m)
+        self._fresh = bool(np.isfinite(first.y).any())
+        self._begin(first.y[0, 0])
 
     def _begin(self, y: Array) -> None:
         self._x = self.observer.initial(y, self.parameters)
@@ -117,17 +117,16 @@ class RunningObserver:
         return self.estimate
 
     def _take(self, y: Array, u: Array) -> tuple[Array, Array]:
-        """Judge a sample; start anew at the first one with a measurement and all inputs, unless that is the one that the observer started at."""
-        samples = self._screen.take(y[None, None], u[None, None], self._held[None], self._known[None])
-        self._status, self._held = SampleStatus(int(samples.status[0, 0])), samples.u[0, 0]
-        self._known = self._known | (np.abs(u) <= self._screen.inputs.believed)
-        y = samples.y[0, 0]
-        if not self._started and samples.known[0, 0] and (self._fresh or np.isfinite(y).any()):
-            self._started = True
-            if not self._fresh:
-                self._begin(y)
+        """Judge a sample, and start anew where that is due; the first sample is the one that the observer started at."""
+        samples = self._screen.take(y[None, None], u[None, None], self._held)
+        self._status, self._held = SampleStatus(int(samples.status[0, 0])), samples.held
+        y, first = samples.y[0, 0], self._fresh
         self._fresh = False
-        return y, self._held
+        if first and not (samples.held.since > LONGEST).any():
+            self._held = replace(samples.held, stale=np.zeros(1, dtype=bool))
+        elif samples.starts[0, 0]:
+            self._begin(y)
+        return y, samples.u[0, 0]
 
     def _measurement(self, y: npt.ArrayLike) -> Array:
         return self._shaped(y, len(self.observer.measured), "measurements", [self.observer.lifting.states[i] for i in self.observer.measured])

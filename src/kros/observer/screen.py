@@ -13,12 +13,13 @@ The range is the declared limits', else the largest size seen in training; witho
 anything possible enters a state, linear or lifted, and what is left of a fault is what the model misses while it lasts.
 
 Observers start at a measurement. Where none has arrived yet, or no value of some input, the estimate is that from rest, and the observer starts
-anew at the first sample at which there are both.
+anew at the first sample at which there are both. It does so, too, after an input was held for more than a few samples: what a held reference
+does to an observer that watches tracking errors grows with every sample, and a start costs no more than a start. Parameters stay.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any
@@ -34,7 +35,9 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Bits = npt.NDArray[np.uint8]
 Whole = npt.NDArray[np.intp]
+Flags = npt.NDArray[np.bool_]
 BEYOND = 1.5  # times the range: what is further away is not believed
+LONGEST = 5  # samples for which an input may be held without a new start
 _ANY = np.finfo(float).max
 
 
@@ -114,11 +117,35 @@ class Bounds:
         low, high = np.maximum(self.lower, -self.believed), np.minimum(self.upper, self.believed)
         return bool(np.all((values >= low) & (values <= high)))
 
-    def judge(self, values: Array) -> tuple[Array, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    def judge(self, values: Array) -> tuple[Array, Flags, Flags]:
         """Return samples within their limits, which of them are believed, and which are beyond a limit or their range."""
         believed = np.abs(values) <= self.believed
         kept = np.clip(values, self.lower, self.upper)
         return kept, believed, np.isfinite(values) & (~believed | (kept != values))
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """What is remembered from sample to sample.
+
+    Parameters
+    ----------
+    inputs : ndarray, shape (batch, m)
+        Last good ones; zero before the first.
+    since : ndarray of int, shape (batch, m)
+        Samples since then.
+    stale : ndarray of bool, shape (batch,)
+        Whether the observer starts anew at the next sample with a measurement and all inputs.
+    """
+
+    inputs: Array
+    since: Whole
+    stale: Flags
+
+    @classmethod
+    def nothing(cls, batch: int, m: int) -> Held:
+        """Return what is known before the first sample."""
+        return cls(np.zeros((batch, m)), np.full((batch, m), LONGEST + 1), np.ones(batch, dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,24 +160,27 @@ class Screened:
         Finite.
     status : ndarray of uint8, shape (n_samples, batch)
         Bits of `SampleStatus`.
-    known : ndarray of bool, shape (n_samples, batch)
-        Whether every input has had a good value by then.
+    starts : ndarray of bool, shape (n_samples, batch)
+        Samples at which an observer starts anew.
+    held : Held
+        After the last sample.
     """
 
     y: Array
     u: Array
     status: Bits
-    known: npt.NDArray[np.bool_]
+    starts: Flags
+    held: Held
 
-    @property
-    def begins(self) -> Whole:
-        """First sample at which there are a measurement and all inputs, shape (batch,); 0 where there is none."""
-        return np.argmax(np.isfinite(self.y).any(axis=-1) & self.known, axis=0)
+    def of(self, members: Sequence[int]) -> Screened:
+        """Return the samples of some members of the batch."""
+        held = Held(self.held.inputs[members], self.held.since[members], self.held.stale[members])
+        return Screened(self.y[:, members], self.u[:, members], self.status[:, members], self.starts[:, members], held)
 
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """Judges samples one by one; nothing is remembered but the last good inputs."""
+    """Judges samples one by one."""
 
     measured: Bounds
     inputs: Bounds
@@ -169,31 +199,29 @@ class Screen:
         sizes = (None, None) if seen is None else (seen.measured, seen.inputs)
         return cls(Bounds.of(q, seen=sizes[0]), Bounds.of(m, seen=sizes[1]))
 
-    def take(self, y: Array, u: Array, last: Array | None = None, known: npt.NDArray[np.bool_] | None = None) -> Screened:
+    def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
         """Judge samples in the order in which they arrive.
 
         Parameters
         ----------
         y : ndarray, shape (n_samples, batch, q)
         u : ndarray, shape (n_samples, batch, m)
-        last : ndarray, shape (batch, m), optional
-            Inputs before the first sample; zero by default.
-        known : ndarray of bool, shape (batch, m), optional
-            Which of them were measured; none by default.
+        held : Held, optional
+            What is known before the first sample; nothing by default.
         """
-        shape = y.shape[:2]
+        before = Held.nothing(*u.shape[1:]) if held is None else held
         if self.measured.pass_all(y) and self.inputs.pass_all(u):
-            return Screened(y, u, np.zeros(shape, np.uint8), np.ones(shape, dtype=bool))
+            return _as_they_are(y, u, before)
         kept, believed, beyond = self.measured.judge(y)
-        held, good, far = self.inputs.judge(u)
+        limited, good, far = self.inputs.judge(u)
         status = _bit(~np.isfinite(y), SampleStatus.MISSING) | _bit(~np.isfinite(u), SampleStatus.INVALID_INPUT)
         status |= _bit(beyond, SampleStatus.LIMIT) | _bit(far, SampleStatus.LIMIT)
-        first = np.zeros(u.shape[1:]) if last is None else last
         count = np.arange(1, len(u) + 1)[:, None, None]
         latest = np.maximum.accumulate(np.where(good, count, 0), axis=0)
-        inputs = np.take_along_axis(np.concatenate([first[None], held]), latest, axis=0)
-        before = np.zeros(u.shape[1:], dtype=bool) if known is None else known
-        return Screened(np.where(believed, kept, np.nan), inputs, status, np.all((latest > 0) | before, axis=-1))
+        since = np.where(latest > 0, count - latest, count + before.since)
+        inputs = np.take_along_axis(np.concatenate([before.inputs[None], limited]), latest, axis=0)
+        starts, stale = _starts((since > LONGEST).any(axis=-1), good.all(axis=-1) & believed.any(axis=-1), before.stale)
+        return Screened(np.where(believed, kept, np.nan), inputs, status, starts, Held(inputs[-1], since[-1], stale))
 
 
 def sample_status(observer: Observer, y: Array, u: Array) -> Bits:
@@ -209,9 +237,12 @@ def sample_status(observer: Observer, y: Array, u: Array) -> Bits:
 
 
 def started_anew(
-    run: Callable[[Array, Array, Mapping[str, Any]], tuple[Array, ...]], samples: Screened, parameters: Mapping[str, npt.ArrayLike] | None
+    run: Callable[[Array, Array, Mapping[str, Any]], tuple[Array, ...]],
+    samples: Screened,
+    parameters: Mapping[str, npt.ArrayLike] | None,
+    carried: Callable[[tuple[Array, ...], int, Whole], Mapping[str, Array]] | None = None,
 ) -> tuple[Array, ...]:
-    """Run a batch, and members without a first measurement or input once more from where they have both.
+    """Run a batch, and every member once more from each sample at which it starts anew to the next.
 
     Parameters
     ----------
@@ -219,16 +250,21 @@ def started_anew(
         From measurements, inputs and parameters to arrays of shape (n_samples, batch, ...), row 0 being the start.
     samples : Screened
     parameters : mapping of str to array_like, shape (batch,)
+    carried : callable, optional
+        From what was found so far, a sample and members to parameters that a new start goes on with.
     """
-    values = dict(parameters or {})
+    values, (n_samples, batch) = dict(parameters or {}), samples.starts.shape
     found = run(samples.y, samples.u, values)
-    begins, batch = samples.begins, samples.y.shape[1]
-    for begin in np.unique(begins[begins > 0]):
-        own = np.flatnonzero(begins == begin)
+    for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:
+        own = np.flatnonzero(samples.starts[begin])
+        again = samples.starts[begin + 1 :, own]
+        lasts = np.where(again.any(axis=0), begin + 1 + again.argmax(axis=0), n_samples - 1) if len(again) else begin
+        rows = slice(begin, int(np.max(lasts)) + 1)
         part = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[own] for name, v in values.items()}
-        late = run(samples.y[begin:, own], samples.u[begin:, own], part)
+        part |= carried(found, int(begin), own) if carried is not None else {}
+        late = run(samples.y[rows, own], samples.u[rows, own], part)
         for whole, rest in zip(found, late, strict=True):
-            whole[begin + 1 :, own] = rest[1:]
+            whole[begin + 1 : rows.stop, own] = rest[1:]
     return found
 
 
@@ -245,5 +281,21 @@ def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, 
         raise DimensionError(f"Running {who}: expected {measured} measurements on the last axis of y, found shape {y.shape}.")
 
 
-def _bit(wrong: npt.NDArray[np.bool_], bit: SampleStatus) -> Bits:
+def _bit(wrong: Flags, bit: SampleStatus) -> Bits:
     return np.where(wrong.any(axis=-1), np.uint8(bit), np.uint8(0))
+
+
+def _as_they_are(y: Array, u: Array, before: Held) -> Screened:
+    starts = np.zeros(y.shape[:2], dtype=bool)
+    starts[0] = before.stale
+    after = Held(u[-1], np.zeros(u.shape[1:], dtype=int), np.zeros(y.shape[1], dtype=bool))
+    return Screened(y, u, np.zeros(y.shape[:2], np.uint8), starts, after)
+
+
+def _starts(lost: Flags, complete: Flags, stale: Flags) -> tuple[Flags, Flags]:
+    """Return the complete samples, shape (n_samples, batch), that are the first ones after some input was lost, and whether one is due at the end."""
+    count = np.arange(1, len(lost) + 1)[:, None]
+    lost_at = np.maximum.accumulate(np.where(lost, count, np.where(stale, 0, -1)), axis=0)
+    complete_at = np.maximum.accumulate(np.where(complete, count, -1), axis=0)
+    before = np.concatenate([np.full((1, lost.shape[1]), -1), complete_at[:-1]])
+    return complete & (lost_at > before), lost_at[-1] > complete_at[-1]

@@ -16,7 +16,7 @@ from ..evaluate import EpisodeBatch, error_percent, hold_missing
 from ..identify import ModelSet
 from ..lifting import Lifting
 from ..observer import ExtendedKalman, Features, FilteredDifference, Learned, Moments, Seen, cutoffs_hz, rates, start_covariance
-from ..observer.screen import Screen, Screened, started_anew
+from ..observer.screen import Screen, started_anew
 from .baselines import EQUAL, RESIDUAL
 from .tuning import TuningSet, rank
 
@@ -71,8 +71,8 @@ class Baseline:
         samples = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u)
         found: Array | None = None
         for name, rows in pieces.items():
-            own = Screened(samples.y[:, rows], samples.u[:, rows], samples.status[:, rows], samples.known[:, rows])
-            (part,) = started_anew(partial(self._piece, self.by_unit[name]), own, {k: v[rows] for k, v in parameters.items()})
+            own = {k: v[rows] for k, v in parameters.items()}
+            (part,) = started_anew(partial(self._piece, self.by_unit[name]), samples.of(rows), own)
             found = np.empty((*y.shape[:2], part.shape[-1])) if found is None else found
             found[:, rows] = part
         assert found is not None

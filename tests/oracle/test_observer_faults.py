@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -26,10 +27,10 @@ from kros.observer.relift.error import error_system
 from kros.observer.relift.status import ReliftStatus
 from kros.synthesis import Injection
 
-DT, N, AT = 0.001, 9000, 3000
+DT, N, AT = 0.001, 2700, 200
 DRIVE = Lifting(("position", "velocity"), ("sin(10*position + phase)",), ("phase",))
 LATE = Lifting(("position", "velocity"), ("position[-2]*velocity", "tanh(velocity)"), (), ("a", "b"), ("velocity*a",))
-SEEN = Seen(np.array([1.2]), np.array([1.0, 1.0]))
+SEEN = Seen(np.array([2.0]), np.array([1.0, 1.0]))
 
 
 def observer(kind="lifted", seen=SEEN, runtime=None):
@@ -52,10 +53,21 @@ def observer(kind="lifted", seen=SEEN, runtime=None):
     return Observer(kind, lifting, A, B, (0,), ("a", "b"), K, Injection.STATE, DT, parameters, runtime or Runtime(), seen)
 
 
-def recordings(n_samples=N):
-    t = np.arange(n_samples) * DT
+@cache
+def machine(n_samples):
+    """What the lifted observer's model does, with another phase: position, and inputs that swing."""
+    t, o = np.arange(n_samples) * DT, observer()
     u = np.stack([np.sin(7 * t + 1), np.cos(3 * t)], axis=-1)[:, None]
-    return 0.8 * np.sin(5 * t + 0.7)[:, None, None], u
+    x = np.zeros((n_samples, 1, 2))
+    x[0] = [0.5, 0.1]
+    for k in range(n_samples - 1):
+        x[k + 1] = DRIVE.lift(x[k], {"phase": 0.5}) @ o.A[:2].T + u[k] @ o.B[:2].T
+    return x[..., :1], u
+
+
+def recordings(n_samples=N):
+    y, u = machine(n_samples)
+    return y.copy(), u.copy()
 
 
 def single(o, y, u, parameters=None):
@@ -106,30 +118,35 @@ def spoiled(fault):
     return y, u, bad_y, bad_u
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+def together():
+    """Clean recordings and all faults, side by side."""
+    given = [recordings(), *(spoiled(fault)[2:] for fault in FAULTS)]
+    return np.concatenate([y for y, _ in given], axis=1), np.concatenate([u for _, u in given], axis=1)
+
+
+def require_forgotten(found):
+    assert np.isfinite(found).all()
+    clean, spoilt = found[:, :1], found[:, 1:]
+    away = np.abs(spoilt - clean) / np.sqrt(np.mean(clean**2, axis=0))
+    assert (away.max(axis=(0, 2)) > 1e-6).all()  # every fault is seen
+    worst = dict(zip(FAULTS, away[LAST + 2000 :].max(axis=(0, 2)), strict=True))
+    assert not {fault: share for fault, share in worst.items() if not share < 0.01}
+
+
 @pytest.mark.parametrize("kind", ["lifted", "filter", "linear", "delays"])
-def test_a_fault_is_forgotten(kind, fault):
+def test_a_fault_is_forgotten(kind):
     """Within one percent of the estimate's RMS after 2000 good samples; the slowest time constant is a fifth of that at most."""
     o = observer(kind)
     slowest = np.abs(np.linalg.eigvals(error_system(o, box={"a": (-1, 1), "position": (-2, 2), "velocity": (-2, 2)}).A)).max()
     assert -1 / np.log(slowest) < 400
-    y, u, bad_y, bad_u = spoiled(fault)
-    clean, found = run_observer(o, y, u), run_observer(o, bad_y, bad_u)
-    assert np.isfinite(found).all()
-    assert not np.array_equal(clean, found) or fault == "the first input"
-    size = np.sqrt(np.mean(clean**2, axis=0))
-    assert np.all(np.abs(found - clean)[LAST + 2000 :] < 0.01 * size)
+    require_forgotten(run_observer(o, *together()))
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_the_phase_locked_loop_forgets_too(fault):
-    o = observer("lifted")
-    y, u, bad_y, bad_u = spoiled(fault)
-    clean, found = (track_parameter(o, *given, {"phase": 0.1}, settle_s=0.3) for given in ((y, u), (bad_y, bad_u)))
-    assert np.isfinite(found.estimates).all()
-    size = np.sqrt(np.mean(clean.estimates**2, axis=0))
-    assert np.all(np.abs(found.estimates - clean.estimates)[LAST + 2000 :] < 0.01 * size)
-    assert np.all(np.abs(found.values - clean.values)[LAST + 2000 :] < 0.01)
+def test_the_phase_locked_loop_forgets_too():
+    y, u = together()
+    found = track_parameter(observer("lifted"), y, u, {"phase": 0.1}, settle_s=0.3)
+    require_forgotten(found.estimates)
+    assert np.all(np.abs(found.values[:, 1:] - found.values[:, :1])[LAST + 2000 :] < 0.01)
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -137,12 +154,12 @@ def test_the_phase_locked_loop_forgets_too(fault):
 @pytest.mark.parametrize("delay", [0, 3])
 def test_one_machine_and_a_batch_judge_alike(kind, delay, fault):
     limits = Runtime(delay, lower=np.array([-0.7, -np.inf]), upper=np.array([0.7, 5.0]), input_upper=np.array([0.9, np.inf]))
-    y, u, bad_y, bad_u = (x[: AT + 400] for x in spoiled(fault))
+    y, u, bad_y, bad_u = (x[AT - 40 : AT + 40] if not fault.startswith("the first") else x[:40] for x in spoiled(fault))
     for o in (observer(kind, runtime=limits), observer(kind, runtime=Runtime(delay))):
         found, status = single(o, bad_y, bad_u)
         both = run_observer(o, np.concatenate([y, bad_y], axis=1), np.concatenate([u, bad_u], axis=1))
         np.testing.assert_allclose(both[:, 1], found, rtol=1e-9, atol=1e-12)
-        np.testing.assert_array_equal(both[:, 0], run_observer(o, y, u)[:, 0])  # the other machine of the batch does not notice
+        np.testing.assert_allclose(both[:, 0], run_observer(o, y, u)[:, 0], rtol=1e-9, atol=1e-12)  # the other machine of the batch does not notice
         own = sample_status(o, bad_y, bad_u)[:, 0]
         assert all(SampleStatus(int(b)) in s for b, s in zip(own, status, strict=True))
 
@@ -171,23 +188,23 @@ def test_every_kind_of_fault_has_its_bit():
 def test_what_lies_within_one_and_a_half_times_the_range_is_believed():
     o = observer()
     y, u = recordings(50)
-    y[20], u[30, 0, 1] = 1.79, -1.49
+    y[20], u[30, 0, 1] = 2.99, -1.49
     assert not sample_status(o, y, u).any()
     np.testing.assert_array_equal(run_observer(o, y, u), run_observer(replace(o, seen=None), y, u))
-    y[20] = 1.81
+    y[20] = 3.01
     missing = y.copy()
     missing[20] = np.nan
     np.testing.assert_array_equal(run_observer(o, y, u), run_observer(o, missing, u))
     assert np.flatnonzero(sample_status(o, y, u)).tolist() == [20]
     assert not sample_status(replace(o, seen=None), 1e6 * y, u).any()
-    zero = replace(o, seen=Seen(np.array([1.2]), np.array([0.0, 1.0])))  # nothing is known of an input that never was anything but zero
+    zero = replace(o, seen=Seen(np.array([2.0]), np.array([0.0, 1.0])))  # nothing is known of an input that never was anything but zero
     assert not sample_status(zero, np.clip(y, -1, 1), u).any()
 
 
 def test_a_declared_limit_takes_the_place_of_the_range():
     o = observer(runtime=Runtime(lower=np.array([-3.0, -9.0]), upper=np.array([2.0, 9.0]), input_lower=[-0.5, -0.5], input_upper=[0.5, 0.5]))
     y, u = recordings(50)
-    y[10:12], u[20] = 2.5, [0.7, -0.7]
+    y[10:12], u[20] = 2.5, [1e9, -0.7]
     clipped = replace(o, runtime=replace(o.runtime, input_lower=None, input_upper=None))
     np.testing.assert_array_equal(run_observer(o, y, u), run_observer(clipped, np.clip(y, -3, 2), np.clip(u, -0.5, 0.5)))
     status = sample_status(o, y, np.clip(u, -0.5, 0.5))
@@ -235,7 +252,7 @@ def test_reset_leaves_nothing_of_the_past():
 
 def test_observers_that_believe_differently_run_side_by_side():
     y, u = recordings(40)
-    y[20] = 3.0
+    y[20] = 4.0
     pair = [observer(), observer(seen=None)]
     for found, o in zip(run_observers(pair, y, u), pair, strict=True):
         np.testing.assert_array_equal(found, run_observer(o, y, u))

@@ -9,8 +9,9 @@ A sample is judged by itself, before the observer sees it:
 | a sample beyond a declared limit | the limit | `LIMIT` |
 | a sample beyond 1.5 times its range | as if it were missing, or not finite | `LIMIT` |
 
-The range is the declared limits', else the largest size seen in training; without either a sample has none. So nothing that is far from
-anything possible enters a state, linear or lifted, and what is left of a fault is what the model misses while it lasts.
+The range is the largest size seen in training, or that of the declared limits; without either a sample has none. An input with declared limits has
+none either: however large a command is, the machine gets the limit. So nothing that is far from anything possible enters a state, linear or
+lifted, and what is left of a fault is what the model misses while it lasts.
 
 Observers start at a measurement. Where none has arrived yet, or no value of some input, the estimate is that from rest, and the observer starts
 anew at the first sample at which there are both. It does so, too, after an input was held for more than a few samples: what a held reference
@@ -98,30 +99,41 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Limits of some channels, and how far a sample is believed; all of shape (channels,)."""
+    """Limits of some channels, and between which values a sample is believed; all of shape (channels,)."""
 
     lower: Array
     upper: Array
-    believed: Array
+    least: Array
+    most: Array
 
     @classmethod
-    def of(cls, count: int, lower: Array | None = None, upper: Array | None = None, seen: Array | None = None) -> Bounds:
-        """Return the bounds that follow from declared limits and sizes seen in training, where there are any."""
-        low, high = (np.full(count, side) if given is None else given for side, given in ((-np.inf, lower), (np.inf, upper)))
-        size = np.full(count, np.inf) if seen is None else np.where(seen > 0, seen, np.inf)
-        range_ = np.maximum(np.where(np.isfinite(low), np.abs(low), size), np.where(np.isfinite(high), np.abs(high), size))
-        return cls(low, high, np.minimum(BEYOND * range_, _ANY))
+    def of_measurements(cls, count: int, lower: Array | None = None, upper: Array | None = None, seen: Array | None = None) -> Bounds:
+        """Return the bounds that follow from declared limits of the states and sizes seen in training, where there are any."""
+        low, high, size = _declared(count, lower, upper, seen)
+        far = BEYOND * np.maximum(np.where(np.isfinite(low), np.abs(low), size), np.where(np.isfinite(high), np.abs(high), size))
+        return cls(low, high, -np.minimum(far, _ANY), np.minimum(far, _ANY))
+
+    @classmethod
+    def of_inputs(cls, count: int, lower: Array | None = None, upper: Array | None = None, seen: Array | None = None) -> Bounds:
+        """Return those of inputs, which are believed beyond a declared limit: the machine gets the limit."""
+        low, high, size = _declared(count, lower, upper, seen)
+        far = np.minimum(BEYOND * size, _ANY)
+        return cls(low, high, np.where(np.isfinite(low), -_ANY, -far), np.where(np.isfinite(high), _ANY, far))
 
     def pass_all(self, values: Array) -> bool:
         """Whether all samples, shape (..., channels), are good as they are."""
-        low, high = np.maximum(self.lower, -self.believed), np.minimum(self.upper, self.believed)
-        return bool(np.all((values >= low) & (values <= high)))
+        return bool(np.all((values >= np.maximum(self.lower, self.least)) & (values <= np.minimum(self.upper, self.most))))
 
     def judge(self, values: Array) -> tuple[Array, Flags, Flags]:
         """Return samples within their limits, which of them are believed, and which are beyond a limit or their range."""
-        believed = np.abs(values) <= self.believed
+        believed = (values >= self.least) & (values <= self.most)
         kept = np.clip(values, self.lower, self.upper)
         return kept, believed, np.isfinite(values) & (~believed | (kept != values))
+
+
+def _declared(count: int, lower: Array | None, upper: Array | None, seen: Array | None) -> tuple[Array, Array, Array]:
+    low, high = (np.full(count, side) if given is None else given for side, given in ((-np.inf, lower), (np.inf, upper)))
+    return low, high, np.full(count, np.inf) if seen is None else np.where(seen > 0, seen, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,14 +202,15 @@ class Screen:
         """Return the screen of an observer: its declared limits, and the sizes seen in training."""
         at, limits, seen = list(observer.measured), observer.runtime, observer.seen
         lower, upper = (None if side is None else side[at] for side in (limits.lower, limits.upper))
-        measured = Bounds.of(len(at), lower, upper, None if seen is None else seen.measured)
-        return cls(measured, Bounds.of(len(observer.inputs), limits.input_lower, limits.input_upper, None if seen is None else seen.inputs))
+        sizes = (None, None) if seen is None else (seen.measured, seen.inputs)
+        measured = Bounds.of_measurements(len(at), lower, upper, sizes[0])
+        return cls(measured, Bounds.of_inputs(len(observer.inputs), limits.input_lower, limits.input_upper, sizes[1]))
 
     @classmethod
     def sized(cls, seen: Seen | None, q: int, m: int) -> Screen:
         """Return the screen of an estimator that declares no limits."""
         sizes = (None, None) if seen is None else (seen.measured, seen.inputs)
-        return cls(Bounds.of(q, seen=sizes[0]), Bounds.of(m, seen=sizes[1]))
+        return cls(Bounds.of_measurements(q, seen=sizes[0]), Bounds.of_inputs(m, seen=sizes[1]))
 
     def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
         """Judge samples in the order in which they arrive.

@@ -82,7 +82,7 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
             f"Running {len(observers)} observers side by side: they differ in lifting, measured states or inputs; run them one by one."
         )
     if any(o.runtime.delay or o.runtime.limited or _screens(o) != _screens(observer) for o in observers):
-        return np.stack([_one_by_one(o, y, u, parameters) for o in observers])
+        return np.stack([_alone(o, y, u, parameters) for o in observers])
     return started_anew(lambda y, u, values: (_together(observers, y, u, values),), samples, values)[0].transpose(2, 0, 1, 3)
 
 
@@ -93,14 +93,16 @@ def judged(observer: Observer, y: Array, u: Array) -> Screened:
     return Screen.of(observer).take(y, u)
 
 
-def _one_by_one(observer: Observer, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
+def _alone(observer: Observer, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
+    if not (observer.runtime.delay or observer.runtime.limited):
+        return run_observers([observer], y, u, parameters)[0]
     samples, values = judged(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
     return started_anew(lambda y, u, values: (run_carefully(observer, y, u, values, Estimate.PREDICT),), samples, values)[0]
 
 
 def _screens(observer: Observer) -> tuple[bytes, ...]:
     screen = Screen.of(observer)
-    return tuple(side.tobytes() for bounds in (screen.measured, screen.inputs) for side in (bounds.lower, bounds.upper, bounds.believed))
+    return tuple(side.tobytes() for bounds in (screen.measured, screen.inputs) for side in (bounds.lower, bounds.upper, bounds.least, bounds.most))
 
 
 def _together(observers: Sequence[Observer], y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:

@@ -9,8 +9,11 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
+from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
 from kros.observer import (
+    ExtendedKalman,
+    FilteredDifference,
     Observer,
     Runtime,
     SampleStatus,
@@ -21,10 +24,12 @@ from kros.observer import (
     run_observer,
     run_observers,
     sample_status,
+    start_covariance,
     track_parameter,
 )
 from kros.observer.relift.error import error_system
 from kros.observer.relift.status import ReliftStatus
+from kros.study.estimators import Baseline
 from kros.synthesis import Injection
 
 DT, N, AT = 0.001, 2700, 200
@@ -159,7 +164,9 @@ def test_one_machine_and_a_batch_judge_alike(kind, delay, fault):
         found, status = single(o, bad_y, bad_u)
         both = run_observer(o, np.concatenate([y, bad_y], axis=1), np.concatenate([u, bad_u], axis=1))
         np.testing.assert_allclose(both[:, 1], found, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(both[:, 0], run_observer(o, y, u)[:, 0], rtol=1e-9, atol=1e-12)  # the other machine of the batch does not notice
+        np.testing.assert_allclose(
+            both[:, 0], run_observer(o, y, u)[:, 0], rtol=1e-9, atol=1e-12
+        )  # the other machine of the batch does not notice
         own = sample_status(o, bad_y, bad_u)[:, 0]
         assert all(SampleStatus(int(b)) in s for b, s in zip(own, status, strict=True))
 
@@ -181,7 +188,12 @@ def test_every_kind_of_fault_has_its_bit():
         assert running.status == expected
         running.step(*good)
         assert running.status == SampleStatus.GOOD
-    assert [b.value for b in (SampleStatus.MISSING, SampleStatus.INVALID_INPUT, SampleStatus.LIMIT, SampleStatus.UNCERTIFIED)] == [1, 2, 4, 8]
+    assert [b.value for b in (SampleStatus.MISSING, SampleStatus.INVALID_INPUT, SampleStatus.LIMIT, SampleStatus.UNCERTIFIED)] == [
+        1,
+        2,
+        4,
+        8,
+    ]
     assert o.start([np.nan]).status == SampleStatus.MISSING
 
 
@@ -202,7 +214,9 @@ def test_what_lies_within_one_and_a_half_times_the_range_is_believed():
 
 
 def test_a_declared_limit_takes_the_place_of_the_range():
-    o = observer(runtime=Runtime(lower=np.array([-3.0, -9.0]), upper=np.array([2.0, 9.0]), input_lower=[-0.5, -0.5], input_upper=[0.5, 0.5]))
+    o = observer(
+        runtime=Runtime(lower=np.array([-3.0, -9.0]), upper=np.array([2.0, 9.0]), input_lower=[-0.5, -0.5], input_upper=[0.5, 0.5])
+    )
     y, u = recordings(50)
     y[10:12], u[20] = 2.5, [1e9, -0.7]
     clipped = replace(o, runtime=replace(o.runtime, input_lower=None, input_upper=None))
@@ -261,7 +275,11 @@ def test_observers_that_believe_differently_run_side_by_side():
 def test_what_does_not_fit_is_named():
     o, (y, u) = observer(), recordings(5)
     running = o.start([0.0])
-    for make in (lambda: o.start([0.0], {"phse": 1.0}), lambda: run_observer(o, y, u, {"phse": 1.0}), lambda: running.parameters.update(phse=1.0)):
+    for make in (
+        lambda: o.start([0.0], {"phse": 1.0}),
+        lambda: run_observer(o, y, u, {"phse": 1.0}),
+        lambda: running.parameters.update(phse=1.0),
+    ):
         with pytest.raises(ConfigError, match="'phse' is unknown; its lifting has phase"):
             make()
     bare = replace(o, parameters={})
@@ -344,3 +362,25 @@ def test_corners_move_what_enters_directly():
     np.testing.assert_allclose(system.corner(d)[1], system.L * d, rtol=1e-12)
     C, D = moved.multiplied(np.array([4.0]), 2.0)[1:]
     np.testing.assert_allclose((C @ xi + D @ np.append(0.0, w))[:1], 2 * (moved.M @ xi + moved.D @ w), rtol=1e-9)
+
+
+def test_baselines_judge_samples_as_observers_do():
+    y, u = together()
+    keys = tuple(EpisodeKey("a", "c", str(i)) for i in range(y.shape[1]))
+    o = observer()
+    extended = ExtendedKalman(
+        DRIVE,
+        o.A,
+        o.B,
+        (0,),
+        ("a", "b"),
+        1e-4 * np.eye(2),
+        np.array([[1e-4]]),
+        start_covariance(np.ones(2), np.array([[1e-4]]), (0,)),
+        {"phase": 0.3},
+    )
+    for estimator, states, knows in ((extended, (0, 1), True), (FilteredDifference(2, ((0, 1),), 20.0, DT), (1,), False)):
+        baseline = Baseline({"": estimator}, (0,), states, {}, knows, SEEN)
+        found = baseline.estimate(keys, y, u, {})[..., list(states)]
+        away = np.abs(found[:, 1:] - found[:, :1]) / np.sqrt(np.mean(found[:, :1] ** 2, axis=0))
+        assert np.all(away[LAST + 2000 :] < 0.01)

@@ -55,7 +55,12 @@ def test_what_is_no_text_is_refused(text):
 
 
 def test_numbers_are_those_of_double_precision():
-    for text, value in {"9**20*x": 9.0**20, "(1/3)**40*x": 3.0**-40, "sqrt(2)*pi*x": np.sqrt(2) * np.pi, "exp(exp(6))*x": np.exp(np.exp(6))}.items():
+    for text, value in {
+        "9**20*x": 9.0**20,
+        "(1/3)**40*x": 3.0**-40,
+        "sqrt(2)*pi*x": np.sqrt(2) * np.pi,
+        "exp(exp(6))*x": np.exp(np.exp(6)),
+    }.items():
         assert float(Formula(text, ("x",))(x=1.0)) == pytest.approx(value, rel=1e-14)
 
 

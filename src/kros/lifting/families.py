@@ -51,7 +51,9 @@ def harmonics(angle: str, ratio: float = 1.0, orders: Sequence[int] = (1,), phas
     """
     _require_whole("harmonics", "orders", orders, 1)
     if not math.isfinite(ratio) or not ratio:
-        raise ConfigError(f"harmonics: ratio is {ratio:g}, it should be finite and not zero; give the number of periods per turn of the angle.")
+        raise ConfigError(
+            f"harmonics: ratio is {ratio:g}, it should be finite and not zero; give the number of periods per turn of the angle."
+        )
     inner = wrapped(angle) if ratio == 1 else f"{number(ratio)}*{wrapped(angle)}"
     inner = inner if phase is None else f"{inner} + {wrapped(phase)}"
     texts = [inner if k == 1 else f"{int(k)}*({inner})" for k in orders]
@@ -130,8 +132,9 @@ def _monomial(factors: Sequence[str]) -> str:
 
 def require_names(family: str, names: Sequence[str]) -> Formulas:
     """Return names or formulas as a tuple, refusing what is not a list of different ones."""
-    if isinstance(names, str) or not names or not all(isinstance(name, str) and name.strip() for name in names):
-        raise ConfigError(f"{family}: needs a list of names or formulas, found {names!r}.")
+    listed = isinstance(names, Sequence) and not isinstance(names, str)
+    if not listed or not names or not all(isinstance(name, str) and name.strip() for name in names):
+        raise ConfigError(f"{family}: needs a list of names or formulas, found {names!r:.200}.")
     if len(set(names)) != len(names):
         raise ConfigError(f"{family}: {list(names)} repeat a name; give each once.")
     return tuple(names)
@@ -139,7 +142,9 @@ def require_names(family: str, names: Sequence[str]) -> Formulas:
 
 def is_whole(value: object, least: int) -> bool:
     """Whether a value is a whole number, at least so large and no larger than a double can count."""
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and least <= value <= 2**53 and int(value) == value
+    return bool(
+        isinstance(value, int | float | np.number) and not isinstance(value, bool) and least <= value <= 2**53 and int(value) == value
+    )
 
 
 def require_count(family: str, count: float) -> None:

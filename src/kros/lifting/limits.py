@@ -28,7 +28,8 @@ class TooCostlyError(ConfigError):
 
 def require_size(tree: ast.AST) -> None:
     """Refuse a tree with too many nodes, or too many inside each other; without recursion, for a tree may be deeper than Python's stack."""
-    todo, count = [(tree, 0, None)], 0
+    todo: list[tuple[ast.AST, int, Any]] = [(tree, 0, None)]
+    count = 0
     while todo:
         node, depth, chain = todo.pop()
         if isinstance(node, ast.expr):
@@ -74,7 +75,9 @@ def finite(number: Any) -> float:
     except (TypeError, ArithmeticError):
         value = math.nan
     if not math.isfinite(value):
-        raise TooCostlyError("holds a number that is not finite and real; check for a division by zero, a root of a negative number, and powers.")
+        raise TooCostlyError(
+            "holds a number that is not finite and real; check for a division by zero, a root of a negative number, and powers."
+        )
     return value
 
 

@@ -129,7 +129,9 @@ class RunningObserver:
         return y, samples.u[0, 0]
 
     def _measurement(self, y: npt.ArrayLike) -> Array:
-        return self._shaped(y, len(self.observer.measured), "measurements", [self.observer.lifting.states[i] for i in self.observer.measured])
+        return self._shaped(
+            y, len(self.observer.measured), "measurements", [self.observer.lifting.states[i] for i in self.observer.measured]
+        )
 
     def _input(self, u: npt.ArrayLike) -> Array:
         return self._shaped(u, len(self.observer.inputs), "inputs", self.observer.inputs)
@@ -164,7 +166,7 @@ class _Checked(MutableMapping[str, float]):
         self._values = observer.values(values, ())
 
     def __getitem__(self, name: str) -> float:
-        return self._values[name]  # type: ignore[return-value]
+        return float(self._values[name])
 
     def __setitem__(self, name: str, value: float) -> None:
         self._values = self._observer.values({**self._values, name: value}, ())

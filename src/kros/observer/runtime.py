@@ -85,8 +85,14 @@ class Runtime:
     @property
     def changes(self) -> tuple[str, ...]:
         """What is declared that changes the predicted estimate, in words; empty for an observer that runs as its matrices say."""
-        limits = {"the estimate": (self.lower, self.upper), "the correction": (self.correction,), "the inputs": (self.input_lower, self.input_upper)}
-        found = [f"limits of {what}" for what, sides in limits.items() if any(side is not None and np.isfinite(side).any() for side in sides)]
+        limits = {
+            "the estimate": (self.lower, self.upper),
+            "the correction": (self.correction,),
+            "the inputs": (self.input_lower, self.input_upper),
+        }
+        found = [
+            f"limits of {what}" for what, sides in limits.items() if any(side is not None and np.isfinite(side).any() for side in sides)
+        ]
         return (*((f"a delay of {self.delay} samples",) if self.delay else ()), *found)
 
     def binds(self, x: Array, y_c: Array) -> bool:

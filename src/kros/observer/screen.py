@@ -233,7 +233,8 @@ class Screen:
         latest = np.maximum.accumulate(np.where(good, count, 0), axis=0)
         since = np.where(latest > 0, count - latest, count + before.since)
         inputs = np.take_along_axis(np.concatenate([before.inputs[None], limited]), latest, axis=0)
-        starts, stale = _starts((since > LONGEST).any(axis=-1), good.all(axis=-1) & believed.any(axis=-1), before.stale)
+        lost, complete = np.asarray((since > LONGEST).any(axis=-1)), np.asarray(good.all(axis=-1) & believed.any(axis=-1))
+        starts, stale = _starts(lost, complete, before.stale)
         return Screened(np.where(believed, kept, np.nan), inputs, status, starts, Held(inputs[-1], since[-1], stale))
 
 
@@ -289,7 +290,9 @@ def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, 
             "least one sample."
         )
     if u.shape[2] != len(inputs):
-        raise DimensionError(f"Running {who}: expected the {len(inputs)} inputs {tuple(inputs)} on the last axis of u, found shape {u.shape}.")
+        raise DimensionError(
+            f"Running {who}: expected the {len(inputs)} inputs {tuple(inputs)} on the last axis of u, found shape {u.shape}."
+        )
     if y.shape[2] != measured:
         raise DimensionError(f"Running {who}: expected {measured} measurements on the last axis of y, found shape {y.shape}.")
 

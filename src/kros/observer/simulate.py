@@ -102,7 +102,9 @@ def _alone(observer: Observer, y: Array, u: Array, parameters: Mapping[str, npt.
 
 def _screens(observer: Observer) -> tuple[bytes, ...]:
     screen = Screen.of(observer)
-    return tuple(side.tobytes() for bounds in (screen.measured, screen.inputs) for side in (bounds.lower, bounds.upper, bounds.least, bounds.most))
+    return tuple(
+        side.tobytes() for bounds in (screen.measured, screen.inputs) for side in (bounds.lower, bounds.upper, bounds.least, bounds.most)
+    )
 
 
 def _together(observers: Sequence[Observer], y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:

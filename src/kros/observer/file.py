@@ -24,6 +24,7 @@ from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .observer import Observer
 from .runtime import Runtime
+from .screen import Seen
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -48,6 +49,7 @@ def observer_content(observer: Observer) -> dict[str, Any]:
         "model": {"A": observer.A, "B": observer.B},
         "controller": {key: getattr(observer.controller, key) for key in "ABCD"},
         **observer.runtime.content(),
+        **({} if observer.seen is None else {"seen": {"measured": observer.seen.measured, "inputs": observer.seen.inputs}}),
     }
     found: dict[str, Any] = plain(content)
     return found
@@ -127,6 +129,7 @@ def observer_from(content: Mapping[str, Any], where: str) -> Observer:
         float(period),
         parameters,
         _runtime(content, where),
+        _seen(content.get("seen"), q, len(content["inputs"]), where),
     )
     _known(content, [*observer_content(observer), "runtime", "lifting_inputs", "input_functions", CHECKSUM], where)
     return observer
@@ -214,6 +217,14 @@ def _runtime(content: Mapping[str, Any], where: str) -> Runtime:
         if bad:
             raise DataError(f"{where}: runtime.{key} should hold finite numbers, found {shortened(repr(bad[0]), 60)}; correct the file.")
     return Runtime.from_content(content)
+
+
+def _seen(found: Any, measured: int, inputs: int, where: str) -> Seen | None:
+    if found is None:
+        return None
+    counts = {"measured": measured, "inputs": inputs}
+    _known(found, counts, f"{where}: seen")
+    return Seen(*(matrix([found[name]], (1, count), f"{where}: seen.{name}")[0] for name, count in counts.items()))
 
 
 def _known(found: Any, known: Sequence[str] | Mapping[str, Any] | str, where: str) -> None:

@@ -36,7 +36,8 @@ def in_sizes(observer: Observer, sizes: Mapping[str, float]) -> Observer:
         A=observer.A * x[:, None] / x,
         B=observer.B * x[:, None] / u,
         controller=StateSpace(K.A, K.B / y, K.C * into[:, None], K.D * into[:, None] / y, K.dt),
-        runtime=_runtime(observer.runtime, x[: lifting.n_states], y, into),
+        runtime=_runtime(observer.runtime, x[: lifting.n_states], y, into, u),
+        seen=None if observer.seen is None else observer.seen.times(y, u[: len(observer.inputs)]),
     )
 
 
@@ -47,6 +48,7 @@ def factors(observer: Observer, sizes: Mapping[str, float]) -> tuple[Array, Arra
     return old.sizes_of(old.names) / new.sizes_of(old.names), old.sizes_of(inputs) / new.sizes_of(inputs)
 
 
-def _runtime(runtime: Runtime, x: Array, y: Array, into: Array) -> Runtime:
+def _runtime(runtime: Runtime, x: Array, y: Array, into: Array, u: Array) -> Runtime:
     by = {"lower": x, "upper": x, "correction": into, "filter_gain": x[:, None] / y}
+    by |= {name: u[: len(limit)] for name in ("input_lower", "input_upper") if (limit := getattr(runtime, name)) is not None}
     return replace(runtime, **{name: getattr(runtime, name) * by[name] for name in by if getattr(runtime, name) is not None})

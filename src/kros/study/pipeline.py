@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.artifacts import read_json
+from ..core.errors import ConfigError
 from .config import Stage, StudyConfig
 from .context import Context, Progress, Silent
 from .executors import open_executor
@@ -37,8 +38,8 @@ class RunResult:
 
 def run_study(
     config: StudyConfig,
-    out: Path,
-    until: Stage = Stage.REPORT,
+    out: Path | str,
+    until: Stage | str = Stage.REPORT,
     workers: int = 1,
     scheduler: str | None = None,
     progress: Progress | None = None,
@@ -48,9 +49,9 @@ def run_study(
     Parameters
     ----------
     config : StudyConfig
-    out : Path
+    out : Path or str
         Run folder; a stage that finds its own earlier result there is skipped.
-    until : Stage
+    until : Stage or str
         Last stage to run.
     workers : int
         Processes for maps over units. More than one needs the usual ``if __name__ == "__main__":`` guard in a script.
@@ -68,7 +69,7 @@ def run_study(
     KrosError
         Bad input leaves no folder behind that was not there before; so does a folder in which another study lives, or another run is at work.
     """
-    out = Path(out)
+    out, until = Path(out), stage_of(until)
     require_own(out, config)
     require_usable(config, until)
     with open_run(out, config) as store:
@@ -103,6 +104,14 @@ def kept_metrics(store: Store, metrics: dict[str, Any]) -> dict[str, Any]:
         return earlier
     store.keep("metrics.json", metrics)
     return metrics
+
+
+def stage_of(name: Stage | str) -> Stage:
+    """Return a stage by its name."""
+    try:
+        return Stage(name)
+    except ValueError as error:
+        raise ConfigError(f"Stage {name!r}: is unknown; known are {', '.join(stage.value for stage in Stage)}.") from error
 
 
 def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:

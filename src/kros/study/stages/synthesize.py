@@ -115,7 +115,9 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     folder = context.store.path("uncertainty", name)
     noise = measurement_noise(context, recorded) / recorded.output_scale[list(recorded.measured)]
     tuning = tuning_set(context, models)
-    tuning = replace(tuning, population=scale_population(tuning.population, recorded.sizes))
+    outputs, inputs = recorded.output_scale[list(recorded.measured)], recorded.input_scale[: len(recorded.recorded_inputs)]
+    seen = tuning.seen.times(1 / outputs, 1 / inputs) if tuning.seen is not None else None
+    tuning = replace(tuning, population=scale_population(tuning.population, recorded.sizes), seen=seen)
     uncertain = UncertainModel.load(folder)
     problem, refusal = usable_problem(models, unit, uncertain, noise, context)
     methods = suitable(config.observer.baselines + config.synthesis.methods, name, refined=name not in context.edmd_names)
@@ -180,7 +182,7 @@ def tuning_set(context: Context, models: ModelSet) -> TuningSet:
     parameters: dict[str, dict[str, float]] = {
         u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in units
     }
-    return TuningSet(context.population.select(units), keys, parameters)
+    return TuningSet(context.population.select(units), keys, parameters, context.seen(models.measured))
 
 
 def spread(keys: Sequence[EpisodeKey], count: int) -> list[EpisodeKey]:

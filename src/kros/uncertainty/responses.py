@@ -19,6 +19,7 @@ from .quantified import Quantified, findings
 from .quantify import bound_continuous, choose_by
 from .residuals import check_responses
 from .weights.bounded import bound_residuals
+from .weights.check import nearest
 from .weights.cover import Structure, as_structure
 
 Array = npt.NDArray[Any]
@@ -128,7 +129,7 @@ def quantify_responses(
     names = (*ids, *others)
     index, chosen = _nominal(nominal, G, others, names, choices[form].index)
     base = chosen / scales[0][:, None] * scales[1]
-    options: dict[str, Any] = {"structure": structure, "max_order": max_order, "tolerance_db": tolerance_db, "density": 1}
+    options: dict[str, Any] = {"structure": structure, "max_order": max_order, "tolerance_db": tolerance_db, "sampled": True}
 
     def of_nominal(at_hz: Array) -> Array:
         return base[nearest(freqs, at_hz)]
@@ -146,13 +147,6 @@ def quantify_responses(
         certificate=f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them",
         **findings(form, ids, tuple(others), index, freqs, scales, choices, found),
     )
-
-
-def nearest(grid: Array, freqs_hz: Array) -> npt.NDArray[np.intp]:
-    """Return the index of the nearest grid point: the responses elsewhere are not known, and the ends stand for what is beyond them."""
-    if len(grid) == 1:
-        return np.zeros(len(freqs_hz), np.intp)
-    return np.asarray(np.searchsorted((grid[1:] + grid[:-1]) / 2, freqs_hz))
 
 
 def _check(G: Array, freqs: Array, ids: tuple[str, ...], others: Mapping[str, Array]) -> None:

@@ -277,6 +277,8 @@ class _Problem:
         system = spectral_factor(bound, self.dt, nyquist_zeros=self.nyquist_zeros, dc_zeros=self.dc_zeros)
         ratio = np.abs(system.frequency_response(self.freqs[keep])[:, 0, 0]) / self.values[keep]
         margin = 1 + 1e-12
+        if not (ratio.min() > 0 and np.isfinite(ratio).all()):
+            raise KrosError("Magnitude fit: the system vanishes or is infinite at a frequency of the grid; try another order.")
         touch = margin / ratio.min() if self.side is Side.ABOVE else 1 / (margin * ratio.max())
         system = StateSpace(system.A, system.B, system.C * touch, system.D * touch, system.dt)
         overbound = float(20 * np.log10(ratio.max() / ratio.min()))
@@ -342,7 +344,11 @@ def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None, ho
             return best
         n, d = phi @ rational.numerator, phi @ rational.denominator
         ratio = np.where((n > 0) & (d > 0), n / (targets * np.where(d > 0, d, 1.0)), 0.0)
-        bad = sorted(on_half_line(roots(rational.numerator, knots)[0]) + on_half_line(roots(rational.denominator, knots)[0]))
+        try:
+            bad = sorted(on_half_line(roots(rational.numerator, knots)[0]) + on_half_line(roots(rational.denominator, knots)[0]))
+        except KrosError as error:  # multiple roots: this order is left to what was found before
+            _LOG.debug("Magnitude fit: %s", error)
+            return best
         if not bad and ratio.min() > 0 and (best is None or ratio.max() / ratio.min() < best.ratio):
             best, start = (
                 _Bound(RationalMagnitude(rational.numerator / ratio.min(), rational.denominator, knots), float(ratio.max() / ratio.min())),

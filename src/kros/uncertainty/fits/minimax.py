@@ -133,9 +133,12 @@ class Grid:
         none = np.zeros_like(edge)
         rows = [np.hstack([x, y, np.full((len(x), 1), t)]) for x, y, t in blocks]
         rows += [np.hstack([edge / self.targets[self.nearest, None], none, none[:, :1]]), np.hstack([none, edge, none[:, :1]])]
-        unit = np.concatenate([1 / n.max(axis=0), 1 / d.max(axis=0), [1.0]])
-        table = np.vstack(rows) * unit
-        table /= np.abs(table).max(axis=1, keepdims=True)
+        with np.errstate(all="ignore"):
+            unit = np.concatenate([1 / n.max(axis=0), 1 / d.max(axis=0), [1.0]])
+            table = np.vstack(rows) * unit
+            table /= np.abs(table).max(axis=1, keepdims=True)
+        if not np.isfinite(table).all():  # a basis function that is zero on the grid
+            return None
         result = linprog(
             np.append(np.zeros(2 * size), 1.0),
             A_ub=table,

@@ -54,7 +54,8 @@ def quantify(
     form : Form or str
         Uncertainty form of the weights; the bounds of all six are reported.
     freqs_hz : array_like, shape (frequency,), Hz, optional
-        1000 logarithmic points over the six decades below Nyquist by default; of continuous models from a hundredth of the slowest to ten
+        1000 logarithmic points over the six decades below Nyquist by default, of a model set from recordings not below what its longest episode
+        resolves, one over its length; of continuous models from a hundredth of the slowest to ten
         times the fastest pole. To the grid of continuous models points up to ten times its end are added; beyond these, residuals count as constant.
     unit_ids : sequence of str, optional
         Names; ``0, 1, ...`` by default. Of a model set: the units to use.
@@ -106,7 +107,7 @@ def quantify(
     check_fit(max_order, tolerance_db, density)
     system, ids, scales = read_models(models, unit_ids, output_scale, input_scale)
     others = read_candidates(extra, system, ids)
-    axis, freqs = _axis(system, freqs_hz)
+    axis, freqs = _axis(system, freqs_hz, getattr(models, "longest_s", None))
     responses = scale_system(system, *scales).frequency_response(freqs)
     of_others = np.array([scale_system(s, *scales).frequency_response(freqs) for s in others.values()]).reshape(-1, *responses.shape[1:])
     choices = choose_by(responses, form, criterion, of_others, candidates, freqs, structure)
@@ -176,9 +177,9 @@ def bound_continuous(form: Form, nominal: Responder, units: Responder, freqs_hz:
     return replace(found, weight=axis.continuous_weight(found.weight), remainder=remainder)
 
 
-def _axis(system: StateSpace, freqs_hz: npt.ArrayLike | None) -> tuple[_Axis, Array]:
+def _axis(system: StateSpace, freqs_hz: npt.ArrayLike | None, longest_s: float | None) -> tuple[_Axis, Array]:
     if system.dt > 0:
-        freqs = log_grid(system.dt) if freqs_hz is None else check_grid(freqs_hz, system.dt)
+        freqs = log_grid(system.dt, longest_s=longest_s) if freqs_hz is None else check_grid(freqs_hz, system.dt)
         return _Axis(freqs, system.dt, None), freqs
     freqs = continuous_grid(system) if freqs_hz is None else check_continuous_grid(freqs_hz)
     wide = beyond(freqs)

@@ -66,7 +66,8 @@ def run(context: Context) -> list[Path]:
         if context.config.identify.refine and condition == facts.identify_on:
             refined, written = refine_models(context, units, factor, parameters, found)
             found, files = found + refined, files + written
-        for models in found:
+        longest = max(int(f.n_samples.max()) for f in episodes) * context.population.sample_period_s
+        for models in (replace(m, longest_s=longest) for m in found):
             folder = context.model_folder(models.name, condition)
             models.save(folder)
             files += [folder / "model.json", folder / "arrays.npz"]

@@ -49,6 +49,13 @@ class Checks:
         """Return the frequencies at which a fit is checked."""
         return checking_grid(freqs_hz, sample_period_s, _BETWEEN if self.sampled else self.density, self.also_hz)
 
+    def of_fit(self, freqs_hz: Array) -> Array:
+        """Return the frequencies that a fit follows: those asked for, and the peaks between them."""
+        if self.also_hz is None:
+            return freqs_hz
+        inside = (self.also_hz >= freqs_hz[0]) & (self.also_hz <= freqs_hz[-1])
+        return joined(freqs_hz, self.also_hz[inside])[0]
+
     def claimed(self, freqs_hz: Array, sample_period_s: float) -> Array:
         """Return the frequencies at which the bound has to hold to begin with."""
         return checking_grid(freqs_hz, sample_period_s, 1) if self.sampled else self.grid(freqs_hz, sample_period_s)

@@ -50,7 +50,7 @@ class EntrywiseWeight(Weight):
         return Cover(np.ones_like(values), values)
 
     def matrix(self) -> StateSpace:
-        """Return the matrix of weights, p' by m'."""
+        """Return the matrix of weights, p' by m'; the bounds of the entries."""
         return self.left @ self.right
 
 

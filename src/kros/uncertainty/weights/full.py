@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import KrosError
+from ...core.errors import ConfigError, KrosError
 from ...core.lti import StateSpace, gain
 from ..fits.magnitude import invert
 from .certificate import Method
@@ -59,6 +59,20 @@ class FullWeight(Weight):
         left, right, before, after = (s.frequency_response(freqs_hz) for s in (self.left, self.right, *self.frames))
         left, right = np.linalg.solve(before, left), np.swapaxes(np.linalg.solve(np.swapaxes(after, 1, 2), np.swapaxes(right, 1, 2)), 1, 2)
         return Cover(*(np.abs(np.einsum("fii->fi", x)) for x in (left, right)))
+
+    def matrix(self) -> StateSpace:
+        """Return the p' by m' system that bounds every entry of the residuals, where the frames do not turn.
+
+        Raises
+        ------
+        ConfigError
+            When they do: rows of the weights then mix entries.
+        """
+        if any(frame.n_states or not np.array_equal(frame.D, np.eye(frame.n_outputs)) for frame in self.frames):
+            raise ConfigError(
+                "Full weights: in turned frames they bound no single entries of the residuals; ask for structure 'diagonal' or 'entrywise'."
+            )
+        return super().matrix()
 
     @property
     def frames(self) -> tuple[StateSpace, StateSpace]:

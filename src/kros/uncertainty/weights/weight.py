@@ -39,7 +39,7 @@ _ROUNDS = 4
 _WORST = 20  # frequencies added in a round
 _POINTS = 160  # of the grid in the joint fit
 _MISSED_DB = 0.05  # a cost higher than this between the points of the fit brings further ones
-_PROOFS = 3  # fits, each with the frequencies at which the proof found the one before exceeded
+_PROOFS = 2  # fits, each with the frequencies at which the proof found the one before exceeded
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +91,11 @@ class Weight:
     def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""
         return Cover(_diagonal(self.left, freqs_hz), _diagonal(self.right, freqs_hz))
+
+    def matrix(self) -> StateSpace:
+        """Return the p' by m' system `W_L 1 W_R`, with 1 a matrix of ones, that bounds every entry of the residuals: `|E_ij| <= |W_ij|`."""
+        ones = gain(np.ones((self.left.n_inputs, self.right.n_outputs)), self.left.dt)
+        return self.left @ ones @ self.right
 
     def mapped(self, change: Callable[[StateSpace], StateSpace]) -> Weight:
         """Return the weight with its systems changed, for example to another time."""
@@ -158,25 +163,19 @@ def fit_weight(
         fit = fit_entrywise if structure is Structure.ENTRYWISE else fit_full
         options: dict[str, Any] = {"max_order": max_order, "tolerance_db": tolerance_db, "density": density}
         return fit(residuals, freqs_hz, sample_period_s, systems=systems, also_hz=also_hz, sampled=sampled, **options)
-    E = residuals(freqs_hz)
-    single = E.shape[2:] == (1, 1)  # of one entry, diagonal weights are scalar ones
-    best = optimal_cover(E, Structure.SCALAR if single else structure)
     checks = Checks(density, None if also_hz is None else np.asarray(also_hz, float), systems, sampled)
-    dense = checks.grid(freqs_hz, sample_period_s)
+    dense, claimed = checks.grid(freqs_hz, sample_period_s), checks.claimed(freqs_hz, sample_period_s)
     checked = _Checked(dense, residuals(dense))
     fitter = _Fitter(sample_period_s, max_order, tolerance_db, (freqs_hz[0], freqs_hz[-1]))
-    of_fit = freqs_hz
+    of_fit = checks.of_fit(freqs_hz)
     for _ in range(_PROOFS):
-        if structure is Structure.DIAGONAL and best.left.any() and not single:
-            unscaled = _fit_diagonal(fitter, residuals, freqs_hz, E, best, checked)
-        else:
-            unscaled = _fit_scalar(fitter, of_fit, residuals(of_fit), checked, structure, poles)
-        proof = _proof(unscaled, residuals, checks, checks.claimed(freqs_hz, sample_period_s))
+        unscaled = _fit(fitter, residuals, of_fit, structure, checked, poles)
+        proof = _proof(unscaled, residuals, checks, claimed)
         found = np.array([proof.freq_hz])
         if proof.peak <= _LIFT * max(1.0, float(checked.ratio(unscaled).max(initial=0.0))):
             break
         checked, of_fit = checked.with_points(found, residuals(found)), joined(of_fit, found)[0]
-    weight = _finish(unscaled, checked, proof, checks.claimed(freqs_hz, sample_period_s))
+    weight, best = _finish(unscaled, checked, proof, claimed), optimal_cover(residuals(freqs_hz), structure)
     excess = overbound_db(weight, freqs_hz, best)
     return replace(
         weight,
@@ -234,12 +233,24 @@ class _Fitter:
         return Weight(left, right, orders[:n_left], orders[n_left:], Structure.DIAGONAL, np.nan, np.nan)
 
 
+def _fit(
+    fitter: _Fitter, residuals: Residuals, freqs_hz: Array, structure: Structure, checked: _Checked, poles: npt.ArrayLike | None
+) -> Weight:
+    """Fit diagonal or scalar magnitudes; of one entry, diagonal weights are scalar ones."""
+    E = residuals(freqs_hz)
+    if structure is Structure.DIAGONAL and E.any() and E.shape[2:] != (1, 1):
+        return _fit_diagonal(fitter, residuals, freqs_hz, E, optimal_cover(E), checked)
+    return _fit_scalar(fitter, freqs_hz, E, checked, structure, poles)
+
+
 def _fit_scalar(fitter: _Fitter, freqs_hz: Array, E: Array, checked: _Checked, structure: Structure, poles: npt.ArrayLike | None) -> Weight:
     """One magnitude for the largest singular values, fitted again with the frequencies at which it is exceeded."""
-    dt, p, m = fitter.sample_period_s, E.shape[2], E.shape[3]
+    dt, p, m, lowest = fitter.sample_period_s, E.shape[2], E.shape[3], 0
+    options: dict[str, Any] = {"max_order": fitter.max_order, "tolerance_db": fitter.tolerance_db, "poles": poles}
     for _ in range(_ROUNDS):
         size = optimal_cover(E, Structure.SCALAR).left[:, 0]
-        fit = fit_magnitude(freqs_hz, size, dt, max_order=fitter.max_order, tolerance_db=fitter.tolerance_db, poles=poles)
+        fit = fit_magnitude(freqs_hz, size, dt, min_order=lowest, **options)
+        lowest = max(fit.order - 1, 0)  # further points do not make a lower order better
         left = block_diagonal([fit.system] * p)
         weight = Weight(left, gain(np.eye(m), dt), (fit.order,) * p, (0,) * m, structure, np.nan, np.nan)
         ratio = checked.ratio(weight).max(axis=0)

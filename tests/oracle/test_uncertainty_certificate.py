@@ -10,7 +10,8 @@ from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.uncertainty import cover_ratio, fit_magnitude, residual
 from kros.uncertainty.fits.magnitude import alternation_db
-from kros.uncertainty.weights.certificate import Method, ResidualSystems, _pencils, certify
+from kros.uncertainty.weights.certificate import Method, certify
+from kros.uncertainty.weights.pencils import ResidualSystems, ratio_systems
 from kros.uncertainty.weights.weight import fit_weight
 
 DT = 1e-3
@@ -40,7 +41,7 @@ def test_realisations_have_the_responses_of_the_residuals(form: str, shape: tupl
     E = residual(form, nominal.frequency_response(GRID), units.frequency_response(GRID))
     left, right = (gain(np.diag(np.arange(1.0, n + 1)), DT) for n in E.shape[2:])
     expected = cover_ratio(E, np.tile(np.diag(left.D), (60, 1)), np.tile(np.diag(right.D), (60, 1)))
-    for unit, pencil in enumerate(_pencils(ResidualSystems(form, nominal, units), left, right)):
+    for unit, pencil in enumerate(ratio_systems(ResidualSystems(form, nominal, units), left, right)):
         s = 1j * np.tan(np.pi * GRID[:-1] * DT)
         found = [np.linalg.norm(pencil.C @ np.linalg.solve(x * pencil.F - pencil.A, pencil.B) + pencil.D, 2) for x in s]
         np.testing.assert_allclose(found, expected[unit, :-1], rtol=1e-7)

@@ -21,7 +21,7 @@ from kros.uncertainty import (
     quantify,
     residual,
 )
-from kros.uncertainty.weights.certificate import _pencils
+from kros.uncertainty.weights.pencils import ratio_systems
 
 DT = 1e-3
 GRID = np.geomspace(0.01, 500.0, 60)
@@ -107,7 +107,7 @@ def test_realisations_of_entries(form: str) -> None:
     two, one = gain([[2.0]], DT), gain([[1.0]], DT)
     s = 1j * np.tan(np.pi * GRID[:-1] * DT)
     for i, j in np.ndindex(2, 2):
-        pencil = _pencils(ResidualSystems(form, nominal, units, (i, j)), two, one)[1]
+        pencil = ratio_systems(ResidualSystems(form, nominal, units, (i, j)), two, one)[1]
         found = [(pencil.C @ np.linalg.solve(x * pencil.F - pencil.A, pencil.B) + pencil.D)[0, 0] for x in s]
         np.testing.assert_allclose(np.abs(found), np.abs(E[1, :-1, i, j]) / 2, rtol=1e-6)
 

@@ -12,9 +12,9 @@ from scipy.optimize import check_grad
 from kros.core.lti import StateSpace, block_diagonal, gain
 from kros.uncertainty import FullWeight, Method, Perturbation, ResidualSystems, Structure, UncertainModel, fit_weight, quantify, residual
 from kros.uncertainty.small import entries_first
-from kros.uncertainty.weights.certificate import _pencils
 from kros.uncertainty.weights.full import volume_db
 from kros.uncertainty.weights.full_frames import _Search, best_frames, unit_triangular, with_floor
+from kros.uncertainty.weights.pencils import ratio_systems
 
 DT = 1e-3
 GRID = np.geomspace(0.05, 500.0, 60)
@@ -118,7 +118,7 @@ def test_realisations_between_weights_that_are_not_symmetric(form: str) -> None:
     freqs = GRID[:-1:10]
     E = residual(form, units[0].frequency_response(freqs), units.frequency_response(freqs))
     left, right = gain(ROTATED @ np.diag([1.0, 5.0]), DT), gain(SKEWED, DT)
-    pencil = _pencils(ResidualSystems(form, units[0], units), left, right)[2]
+    pencil = ratio_systems(ResidualSystems(form, units[0], units), left, right)[2]
     found = [
         np.linalg.norm(pencil.C @ np.linalg.solve(1j * np.tan(np.pi * f * DT) * pencil.F - pencil.A, pencil.B) + pencil.D, 2) for f in freqs
     ]

@@ -15,6 +15,8 @@ from .errors import ConfigError
 
 Array = npt.NDArray[np.float64]
 
+_WIDEST = 0.5  # of Nyquist: where the grid of a recording of a few samples begins
+
 
 def nyquist_hz(sample_period_s: float) -> float:
     """Return half the sampling frequency, Hz."""
@@ -25,7 +27,7 @@ def nyquist_hz(sample_period_s: float) -> float:
     return 0.5 / sample_period_s
 
 
-def log_grid(sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0) -> Array:
+def log_grid(sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0, longest_s: float | None = None) -> Array:
     """Return logarithmically spaced frequencies that end at Nyquist, the Nyquist frequency included.
 
     Parameters
@@ -34,7 +36,9 @@ def log_grid(sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0) 
     n_freqs : int
         Number of frequencies, at least two.
     decades : float
-        Width of the band below Nyquist.
+        Width of the band below Nyquist, at most.
+    longest_s : float, s, optional
+        Length of the longest recording behind the models: it resolves no frequency below its inverse, and the grid does not go below that.
 
     Returns
     -------
@@ -45,7 +49,12 @@ def log_grid(sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0) 
             f"Frequency grid: needs at least two frequencies over a positive number of decades, found {n_freqs} over {decades}."
         )
     top = nyquist_hz(sample_period_s)
-    grid = np.geomspace(top * 10.0**-decades, top, n_freqs)
+    low = top * 10.0**-decades
+    if longest_s is not None:
+        if not longest_s > 0:
+            raise ConfigError(f"Frequency grid: the longest recording should have a positive length, found {longest_s} s.")
+        low = min(max(low, 1 / longest_s), _WIDEST * top)
+    grid = np.geomspace(low, top, n_freqs)
     grid[-1] = top
     return grid
 

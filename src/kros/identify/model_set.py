@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
+from ..core.frequency import log_grid
 from ..core.loading import check_shapes, loader
 from ..core.lti import StateSpace
 from ..data.population import Channel, Role
@@ -49,6 +50,8 @@ class ModelSet:
         Whether `alpha` is for channels divided by the ranges, as one that was searched is, or for the recordings' units.
     status : tuple of str
         Per unit ``ok``, or what is wrong.
+    longest_s : float or None, s
+        Length of the longest episode behind the models, below whose inverse they know no frequency; None where it is not known.
     """
 
     name: str
@@ -66,6 +69,7 @@ class ModelSet:
     alpha: float | None = None
     alpha_in_ranges: bool = False
     status: tuple[str, ...] = field(default=())
+    longest_s: float | None = None
 
     @property
     def recorded_inputs(self) -> tuple[str, ...]:
@@ -136,6 +140,10 @@ class ModelSet:
         n, m = B.shape[-2:]
         return StateSpace(A, B, np.broadcast_to(np.eye(n), A.shape), np.zeros((len(A), n, m)), self.sample_period_s)
 
+    def frequencies(self, n_freqs: int = 1000, decades: float = 6.0) -> Array:
+        """Return logarithmic frequencies, Hz, from what the longest episode resolves (at most some decades below Nyquist) up to Nyquist."""
+        return log_grid(self.sample_period_s, n_freqs, decades, self.longest_s)
+
     def index(self, unit: str) -> int:
         """Return the row of a unit."""
         return self.unit_ids.index(unit)
@@ -167,6 +175,7 @@ class ModelSet:
             "alpha": self.alpha,
             "alpha_in_ranges": self.alpha_in_ranges,
             "status": self.status,
+            "longest_s": self.longest_s,
         }
         arrays = {name: getattr(self, name) for name in ("A", "B", "residual_covariance", "output_scale", "input_scale")}
         save_artifact(folder, "model", content, arrays)
@@ -191,5 +200,6 @@ class ModelSet:
             alpha=content["alpha"],
             alpha_in_ranges=content.get("alpha_in_ranges", False),
             status=tuple(content["status"]),
+            longest_s=content.get("longest_s"),
             **arrays,
         )

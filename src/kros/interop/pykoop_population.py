@@ -76,6 +76,8 @@ def models_from_pykoop(
         residual_covariance=np.stack([f[1] for f in facts]),
         output_scale=peak[:n],
         input_scale=peak[n:],
+        longest_s=max(len(population.read(key)) for unit in adopted for key in population.keys(unit, condition))
+        * population.sample_period_s,
         status=tuple("ok" if np.abs(np.linalg.eigvals(model.A)).max() < 1 else "unstable" for model in models),
     )
 

@@ -17,7 +17,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..core.errors import KrosError
-from ..core.frequency import log_grid
 from ..identify import ModelSet
 from ..uncertainty import (
     Form,
@@ -100,7 +99,7 @@ def _noise(context: Context, name: str, units: list[str], uncertain: UncertainMo
     compare = partial(
         variation_and_noise,
         samples,
-        log_grid(models.sample_period_s, _NOISE_POINTS),
+        models.frequencies(_NOISE_POINTS),
         models.sample_period_s,
         uncertain.form,
         nominal=chosen.index(uncertain.nominal_id),
@@ -146,7 +145,7 @@ def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Work]:
     others = [u for u, state in zip(sets[0].unit_ids, sets[0].status, strict=True) if state == "ok" and u not in outside]
     if len(others) < 2:
         return []
-    responses = scaled_responses(sets[0], others, log_grid(sets[0].sample_period_s, _POINTS))
+    responses = scaled_responses(sets[0], others, sets[0].frequencies(_POINTS))
     nominal = others[choose_nominals(responses)[Form(context.config.uncertainty.form)].index]
     return [
         (
@@ -165,7 +164,7 @@ def most_conspicuous(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | N
 
 def against_others(models: ModelSet, others: list[str], outside: list[str], nominal: str, config: UncertaintyConfig) -> UnitResiduals:
     """Return the residuals of all units beside the smallest diagonal cover of `others`, frequency by frequency, and beside fits to their entries."""
-    freqs, form, row = log_grid(models.sample_period_s, _POINTS), Form(config.form), others.index(nominal)
+    freqs, form, row = models.frequencies(_POINTS), Form(config.form), others.index(nominal)
     everyone = [*others, *outside]
     responses = scaled_responses(models, everyone, freqs)
     cover = optimal_cover(residual(form, responses[row], responses[: len(others)]))

@@ -12,10 +12,11 @@ from .quantified import Quantified
 from .quantify import quantify
 from .residuals import all_bounds, bounds, completion, misfit, sigma_max
 from .responses import ResponseUncertainty, quantify_responses
-from .weights.certificate import Method, ResidualSystems, certify
+from .weights.certificate import Method, certify
 from .weights.cover import Cover, Perturbation, Structure, cover_ratio, optimal_cover, optimal_left
 from .weights.entrywise import EntrywiseWeight
 from .weights.full import FullWeight
+from .weights.pencils import ResidualSystems
 from .weights.weight import Weight, fit_weight
 
 __all__ = [

@@ -22,7 +22,6 @@ from .weights.weight import Weight
 Array = npt.NDArray[Any]
 
 _BEYOND = 10.0  # how far above the last frequency the grid goes on, for systems
-_HELD = 30.0  # how far above the last frequency the weight is held above the residuals at the end of the grid
 _POINTS_BEYOND = 16
 _DEFAULT_POINTS = 1000
 
@@ -58,10 +57,6 @@ class BilinearAxis:
         angle = np.pi * self.period_s * np.asarray(freqs_hz, float)
         return np.asarray(np.minimum(np.tan(np.minimum(angle, np.pi / 2)) / (np.pi * self.period_s), self.last_hz))
 
-    def held(self) -> Array:
-        """Return discrete frequencies beyond the end of the grid."""
-        return self.discrete_hz(np.geomspace(self.last_hz, _HELD * self.last_hz, _POINTS_BEYOND)[1:])
-
     def continuous(self, system: StateSpace) -> StateSpace:
         """Return the continuous system with the same response at mapped frequencies."""
         n = system.n_states
@@ -74,6 +69,14 @@ class BilinearAxis:
             system.D - system.C @ inverse @ system.B,
             0.0,
         )
+
+    def discrete(self, system: StateSpace) -> StateSpace:
+        """Return the discrete system, or batch, with the same response at mapped frequencies."""
+        eye, rate = np.eye(system.n_states), 2 / self.period_s
+        inverse = np.linalg.inv(rate * eye - system.A)
+        scale = np.sqrt(2 * rate)
+        A, through = inverse @ (rate * eye + system.A), system.C @ inverse @ system.B
+        return StateSpace(A, scale * (inverse @ system.B), scale * (system.C @ inverse), system.D + through, self.period_s)
 
     def continuous_weight(self, weight: Weight) -> Weight:
         """Return a weight with both sides continuous."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.frequency import check_grid, log_grid
+from ..core.frequency import check_grid, dense_grid, log_grid
 from ..core.lti import StateSpace
 from .bilinear import BilinearAxis, beyond, check_continuous_grid, continuous_grid
 from .forms import Form, as_form
@@ -18,8 +18,9 @@ from .model import UncertainModel, scale_system
 from .population.nominal import Criterion, NominalChoice, as_criterion, choose_nominal, choose_nominals
 from .quantified import findings
 from .weights.bounded import Bounded, Responder, bound_residuals
-from .weights.certificate import ResidualSystems
-from .weights.cover import Cover, Structure, as_structure
+from .weights.check import checking_grid
+from .weights.cover import Structure, as_structure
+from .weights.pencils import ResidualSystems, peaks_hz
 
 Array = npt.NDArray[Any]
 
@@ -53,7 +54,8 @@ def quantify(
     form : Form or str
         Uncertainty form of the weights; the bounds of all six are reported.
     freqs_hz : array_like, shape (frequency,), Hz, optional
-        1000 logarithmic points over the six decades below Nyquist by default; of continuous models from a hundredth of the slowest to ten
+        1000 logarithmic points over the six decades below Nyquist by default, of a model set from recordings not below what its longest episode
+        resolves, one over its length; of continuous models from a hundredth of the slowest to ten
         times the fastest pole. To the grid of continuous models points up to ten times its end are added; beyond these, residuals count as constant.
     unit_ids : sequence of str, optional
         Names; ``0, 1, ...`` by default. Of a model set: the units to use.
@@ -105,7 +107,7 @@ def quantify(
     check_fit(max_order, tolerance_db, density)
     system, ids, scales = read_models(models, unit_ids, output_scale, input_scale)
     others = read_candidates(extra, system, ids)
-    axis, freqs = _axis(system, freqs_hz)
+    axis, freqs = _axis(system, freqs_hz, getattr(models, "longest_s", None))
     responses = scale_system(system, *scales).frequency_response(freqs)
     of_others = np.array([scale_system(s, *scales).frequency_response(freqs) for s in others.values()]).reshape(-1, *responses.shape[1:])
     choices = choose_by(responses, form, criterion, of_others, candidates, freqs, structure)
@@ -154,31 +156,30 @@ class _Axis:
         """Return weights in the time of the models."""
         options: dict[str, Any] = {"structure": structure, "max_order": max_order, "tolerance_db": tolerance_db, "density": density}
         if self.map is None:
-            systems = ResidualSystems(form, nominal, units)
+            systems, dt = ResidualSystems(form, nominal, units), self.sample_period_s
+            also = peaks_hz(systems, checking_grid(self.freqs_hz, dt, density), dt)
             return bound_residuals(
-                form, nominal.frequency_response, units.frequency_response, self.freqs_hz, self.sample_period_s, systems, **options
+                form, nominal.frequency_response, units.frequency_response, self.freqs_hz, dt, systems, also_hz=also, **options
             )
-        return bound_continuous(form, nominal.frequency_response, units.frequency_response, self.freqs_hz, self.map, **options)
+        mapped = ResidualSystems(form, self.map.discrete(nominal), self.map.discrete(units))
+        grid = dense_grid(self.map.discrete_hz(self.freqs_hz), self.map.period_s, density)
+        also = peaks_hz(mapped, grid[grid <= self.map.discrete_hz(self.freqs_hz[-1])], self.map.period_s)
+        return bound_continuous(
+            form, nominal.frequency_response, units.frequency_response, self.freqs_hz, self.map, also_hz=also, **options
+        )
 
 
 def bound_continuous(form: Form, nominal: Responder, units: Responder, freqs_hz: Array, axis: BilinearAxis, **options: Any) -> Bounded:
     """Return continuous weights for responses at continuous frequencies, as `bound_residuals`."""
-    back, count = axis.continuous_hz, len(freqs_hz)
-    grid = np.concatenate([axis.discrete_hz(freqs_hz), axis.held()])
+    back, grid = axis.continuous_hz, axis.discrete_hz(freqs_hz)
     found = bound_residuals(form, lambda f: nominal(back(f)), lambda f: units(back(f)), grid, axis.period_s, **options)
-    return Bounded(
-        bound=found.bound[:count],
-        cover=Cover(found.cover.left[:count], found.cover.right[:count]),
-        weight=axis.continuous_weight(found.weight),
-        misfit=found.misfit[:, :count],
-        remainder=None if found.remainder is None else axis.continuous_weight(found.remainder),
-        remainder_cover=found.remainder_cover and Cover(found.remainder_cover.left[:count], found.remainder_cover.right[:count]),
-    )
+    remainder = None if found.remainder is None else axis.continuous_weight(found.remainder)
+    return replace(found, weight=axis.continuous_weight(found.weight), remainder=remainder)
 
 
-def _axis(system: StateSpace, freqs_hz: npt.ArrayLike | None) -> tuple[_Axis, Array]:
+def _axis(system: StateSpace, freqs_hz: npt.ArrayLike | None, longest_s: float | None) -> tuple[_Axis, Array]:
     if system.dt > 0:
-        freqs = log_grid(system.dt) if freqs_hz is None else check_grid(freqs_hz, system.dt)
+        freqs = log_grid(system.dt, longest_s=longest_s) if freqs_hz is None else check_grid(freqs_hz, system.dt)
         return _Axis(freqs, system.dt, None), freqs
     freqs = continuous_grid(system) if freqs_hz is None else check_continuous_grid(freqs_hz)
     wide = beyond(freqs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,9 +20,13 @@ from .quantified import Quantified, findings
 from .quantify import bound_continuous, choose_by
 from .residuals import check_responses
 from .weights.bounded import bound_residuals
+from .weights.check import nearest
 from .weights.cover import Structure, as_structure
 
 Array = npt.NDArray[Any]
+
+_LOG = logging.getLogger(__name__)
+_RESOLVED, _ROUNDING = 10 ** (3 / 20), 1e-8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -35,12 +40,16 @@ class ResponseUncertainty(Quantified):
     sample_period_s : float, s
         Zero for continuous time.
     certificate : str
-        Where the bound holds; all others are those of `Quantified`.
+        Where the bound holds.
+    unresolved_hz : ndarray, shape (n,), Hz
+        Frequencies of local maxima of the bound that fall by more than 3 dB to a neighbouring frequency: peaks that the grid does not resolve, and
+        that may be higher beside it. All other fields are those of `Quantified`.
     """
 
     nominal_response: Array
     sample_period_s: float
     certificate: str
+    unresolved_hz: Array
 
 
 def quantify_responses(
@@ -62,8 +71,9 @@ def quantify_responses(
 ) -> ResponseUncertainty:
     """Quantify how frequency responses of units differ from a nominal one.
 
-    The weights are stable systems and bound the residuals at every frequency given, which is checked for the weights as returned. Between and beyond
-    these frequencies the responses are not known, and nothing is claimed: take a grid that resolves every resonance.
+    The weights are stable systems and bound the residuals at every frequency given, which is checked for the weights as returned; so is what they say
+    about the tolerance. Between and beyond these frequencies the responses are not known, and nothing is claimed: take a grid that resolves every
+    resonance. Peaks that it does not resolve are named, with a warning.
 
     Parameters
     ----------
@@ -128,7 +138,7 @@ def quantify_responses(
     names = (*ids, *others)
     index, chosen = _nominal(nominal, G, others, names, choices[form].index)
     base = chosen / scales[0][:, None] * scales[1]
-    options: dict[str, Any] = {"structure": structure, "max_order": max_order, "tolerance_db": tolerance_db, "density": 1}
+    options: dict[str, Any] = {"structure": structure, "max_order": max_order, "tolerance_db": tolerance_db, "sampled": True}
 
     def of_nominal(at_hz: Array) -> Array:
         return base[nearest(freqs, at_hz)]
@@ -140,19 +150,33 @@ def quantify_responses(
         found = bound_residuals(form, of_nominal, of_units, freqs, sample_period_s, **options)
     else:
         found = bound_continuous(form, of_nominal, of_units, freqs, BilinearAxis.over(freqs), **options)
+    unresolved = freqs[unresolved_peaks(found.bound)]
+    certificate = f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
+    if unresolved.size:
+        some = ", ".join(f"{f:.4g}" for f in unresolved[:5]) + (" ..." if unresolved.size > 5 else "")
+        certificate += f"; they do not resolve {unresolved.size} peak{'s' * (unresolved.size > 1)} of the residuals, at {some} Hz"
+        _LOG.warning(
+            "Weights of responses: the residuals peak within less than a step of the frequencies given, at %s Hz, and may be larger beside them; "
+            "measure more densely there.",
+            some,
+        )
     return ResponseUncertainty(
         nominal_response=chosen,
         sample_period_s=float(sample_period_s),
-        certificate=f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them",
+        certificate=certificate,
+        unresolved_hz=unresolved,
         **findings(form, ids, tuple(others), index, freqs, scales, choices, found),
     )
 
 
-def nearest(grid: Array, freqs_hz: Array) -> npt.NDArray[np.intp]:
-    """Return the index of the nearest grid point: the responses elsewhere are not known, and the ends stand for what is beyond them."""
-    if len(grid) == 1:
-        return np.zeros(len(freqs_hz), np.intp)
-    return np.asarray(np.searchsorted((grid[1:] + grid[:-1]) / 2, freqs_hz))
+def unresolved_peaks(bound: Array) -> npt.NDArray[np.intp]:
+    """Return the indices of inner local maxima from which a bound, shape (frequency,), falls by more than 3 dB to a neighbour.
+
+    A resonance falls by 3 dB within its half-width: three points within its width show one that falls less.
+    """
+    middle, before, after = bound[1:-1], bound[:-2], bound[2:]
+    peaks = (middle >= before) & (middle >= after) & (middle > np.maximum(_RESOLVED * np.minimum(before, after), _ROUNDING * bound.max()))
+    return np.flatnonzero(peaks) + 1
 
 
 def _check(G: Array, freqs: Array, ids: tuple[str, ...], others: Mapping[str, Array]) -> None:

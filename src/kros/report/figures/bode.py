@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.frequency import log_grid
 from ...identify import ModelSet
 from ..canvas import decibel, frequency_axis, grid, legend, limit_decibels
 from ..names import best_models, is_koopman, model_label, model_look
@@ -51,7 +50,7 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
     nominal : str, optional
         Unit that is drawn on top.
     """
-    freqs = log_grid(models.sample_period_s, _POINTS, decades=5)
+    freqs = models.frequencies(_POINTS, decades=5)
     scale = models.input_scale / models.output_scale[:, None]
     magnitude = decibel(models.systems().frequency_response(freqs) * scale)
     _, _, rows, columns = magnitude.shape

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.frequency import log_grid
 from ...core.lti import StateSpace
 from ...identify import ModelSet
 from ...synthesis.result import Injection, Synthesis
@@ -54,7 +53,7 @@ def draw(run: RunFolder) -> Drawing:
 
 def _panel(axes: Axes, run: RunFolder, name: str, syntheses: dict[str, Synthesis]) -> list[tuple[float, str, str]]:
     models = run.models[name]
-    freqs = log_grid(models.sample_period_s, _POINTS, decades=5)
+    freqs = models.frequencies(_POINTS, decades=5)
     plant = models.systems([str(run.choice["nominal"])])[0].frequency_response(freqs) * models.input_scale / models.output_scale[:, None]
     curves = [("plant G", plant, Tone.INK.light, "-")]
     weight = run.uncertain[name].weight if name in run.uncertain else None

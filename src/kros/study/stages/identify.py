@@ -64,7 +64,8 @@ def run(context: Context) -> None:
         found = identify_models(context, condition, units, factor, parameters)
         if context.config.identify.refine and condition == facts.identify_on:
             found += refine_models(context, units, factor, parameters, found)
-        for models in found:
+        longest = max(int(f.n_samples.max()) for f in episodes) * context.population.sample_period_s
+        for models in (replace(m, longest_s=longest) for m in found):
             models.save(context.store.draft("models", context.model_folder(models.name, condition)))
 
 

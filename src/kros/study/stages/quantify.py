@@ -11,7 +11,6 @@ import numpy as np
 
 from ...core.artifacts import save_artifact, write_json
 from ...core.errors import IdentificationError
-from ...core.frequency import log_grid
 from ...core.norms import hinf_norm
 from ...identify import ModelSet
 from ...uncertainty import Form, OutlierScore, UncertainModel, choose_nominals, quantify, residual, score_outliers, sigma_max
@@ -51,7 +50,7 @@ def run(context: Context) -> None:
 def choose_nominal(models: ModelSet, units: list[str], config: UncertaintyConfig) -> str:
     """Return the nominal unit: the one asked for, else the best of the first kind of models, which all others share as in the paper."""
     if config.nominal is None:
-        responses = scaled_responses(models, units, log_grid(models.sample_period_s, config.n_freqs))
+        responses = scaled_responses(models, units, models.frequencies(config.n_freqs))
         return units[choose_nominals(responses)[Form(config.form)].index]
     if config.nominal not in units:
         raise IdentificationError(f"uncertainty.nominal = {config.nominal!r}: is not among the units {', '.join(units)}; name one of them.")
@@ -69,7 +68,7 @@ def quantify_models(models: ModelSet, units: list[str], config: UncertaintyConfi
         return quantify(
             models.systems(units),
             config.form,
-            log_grid(models.sample_period_s, config.n_freqs),
+            models.frequencies(config.n_freqs),
             unit_ids=units,
             output_scale=models.output_scale,
             input_scale=models.input_scale,
@@ -115,7 +114,7 @@ def score_units(context: Context) -> list[dict[str, Any]]:
         if len(models.unit_ids) < 3:
             log.info("%s: outlier scores need at least three units, found %d", condition, len(models.unit_ids))
             continue
-        freqs = log_grid(models.sample_period_s, context.config.uncertainty.n_freqs)
+        freqs = models.frequencies(context.config.uncertainty.n_freqs)
         recorded = Recorded.load(context.store, models, freqs)
         evidence = list(recorded.units.values())
         outliers = score_outliers(

@@ -11,6 +11,7 @@ Orders: of at most four to begin with. Within the tolerance they are lowered ent
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.errors import KrosError
 from ..small import entries_first, sigma_max_first
 from ..weights.cover import Cover, optimal_cover
 from .joint import NEPER_DB, Fitted, JointFit, follow
@@ -25,6 +27,8 @@ from .magnitude import majorant
 from .sections import Sections
 
 Array = npt.NDArray[Any]
+
+_LOG = logging.getLogger(__name__)
 
 _PULLS = (0.03, 0.1, 1.0)
 _GAUGES, _EVEN = 2, (0.3, 1.0)  # right entries that are one, shares of knots that are evenly spaced
@@ -118,8 +122,9 @@ def fit_sections(problem: Problem, max_order: int, tolerance_db: float) -> Fitte
     joint, order = problem.joint(), max_order if max_order <= _START_ORDER else _START_ORDER - max_order % 2
     found = _jumped(joint, _first(problem, joint, _starts(problem, joint, order), tolerance_db), tolerance_db)
     if found.excess_db > _UNSATISFIED * tolerance_db:
-        other = _first(problem, joint, _from_scalar(problem, joint, order), tolerance_db)
-        found = min(found, _jumped(joint, other, tolerance_db), key=_excess)
+        others = list(_from_scalar(problem, joint, order))
+        if others:
+            found = min(found, _jumped(joint, _first(problem, joint, others, tolerance_db), tolerance_db), key=_excess)
     while found.excess_db > tolerance_db and order + 2 <= max_order:
         order += 2
         higher = joint.descend(joint.grown(found.sections, _JUMP[1]), _JUMP[:1] + _POLISH, _POLISH_STEPS)
@@ -159,7 +164,7 @@ def _starts(problem: Problem, joint: JointFit, order: int) -> Iterator[Sections]
 
 
 def _from_scalar(problem: Problem, joint: JointFit, order: int) -> Iterator[Sections]:
-    """The scalar magnitude of the order in all left entries, and ones with poles upon zeros in the right ones."""
+    """The scalar magnitude of the order in all left entries, ones with poles upon zeros in the right ones; none where there is no such magnitude."""
     inside, (p, m) = np.isfinite(problem.optimal), problem.residuals.shape[2:]
     size = _level(sigma_max_first(entries_first(problem.residuals)).max(axis=0), inside)
     scalar = majorant(problem.tau, size, order)
@@ -169,7 +174,10 @@ def _from_scalar(problem: Problem, joint: JointFit, order: int) -> Iterator[Sect
     for reference in np.argsort(-np.median(cover.right, axis=0), kind="stable")[:_GAUGES]:
         orders = [0] * p + [0 if j == reference else order for j in range(m)]
         places = [_knots(problem.tau, np.log(size), (n + 1) // 2, _EVEN[0]) for n in orders]
-        yield Sections.spread(places, orders, _WIDTH).like(np.arange(p), scalar)
+        try:
+            yield Sections.spread(places, orders, _WIDTH).like(np.arange(p), scalar)
+        except KrosError as error:
+            _LOG.debug("Diagonal weights: the scalar magnitude is no start (%s)", error)
 
 
 def _jumped(joint: JointFit, found: Fitted, tolerance_db: float) -> Fitted:

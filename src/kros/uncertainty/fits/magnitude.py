@@ -22,7 +22,7 @@ from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
 from ...core.lti import StateSpace, gain
 from .given import best_numerator, pole_roots
-from .minimax import Grid
+from .minimax import Grid, Programs
 from .spectral import RationalMagnitude, basis, on_half_line, roots, spectral_factor
 
 Array = npt.NDArray[Any]
@@ -31,6 +31,7 @@ _LOG = logging.getLogger(__name__)
 _FLOOR = 1e-8  # magnitudes below this fraction of the largest count as this fraction (-160 dB)
 _POINTS = 150  # of the grid in the first programs
 _ROUNDS = 6
+_PROGRAMS = 150  # for one order; more than 200 were never seen to gain anything
 _TOP = 10.0  # tau beyond which (80 % of Nyquist) no knots are placed
 _EXCHANGE = 10**0.002 - 1  # 0.02 dB of squared magnitude
 _HOPELESS = 2.0  # an order whose overbound is beyond this many tolerances is not polished while a higher one is allowed
@@ -83,6 +84,7 @@ def fit_magnitude(
     sample_period_s: float,
     order: int | None = None,
     *,
+    min_order: int = 0,
     max_order: int = 4,
     tolerance_db: float = 1.0,
     side: Side | str = Side.ABOVE,
@@ -101,7 +103,8 @@ def fit_magnitude(
     sample_period_s : float, s
     order : int, optional
         Best fit of at most this order; by default the smallest order within the tolerance, or the best up to `max_order`.
-    max_order : int
+    min_order, max_order : int
+        Orders that are tried.
     tolerance_db : float, dB
         Largest distance accepted when the order is chosen.
     side : {"above", "below"}
@@ -155,12 +158,14 @@ def fit_magnitude(
         best, _ = problem.fit(order, tolerance_db, None, last=True)
         if best is not None and best.overbound_db < best.proven_db + _UNPROVEN_DB:
             return best
-    for candidate in range(highest + 1):
+    for candidate in range(min(min_order, highest), highest + 1):
         found, lower = problem.fit(candidate, tolerance_db, lower, last=candidate == highest)
         if found is not None and (best is None or found.overbound_db < best.overbound_db):
             best = found
         if best is not None and best.within_tolerance:
             break
+    if best is None and min_order:
+        return fit_magnitude(freqs, magnitude, sample_period_s, order, max_order=max_order, tolerance_db=tolerance_db, side=side)
     if best is None:
         raise KrosError(
             f"Magnitude fit: no system of order up to {highest} found for {len(freqs)} points; raise max_order or smooth the data."
@@ -277,6 +282,8 @@ class _Problem:
         system = spectral_factor(bound, self.dt, nyquist_zeros=self.nyquist_zeros, dc_zeros=self.dc_zeros)
         ratio = np.abs(system.frequency_response(self.freqs[keep])[:, 0, 0]) / self.values[keep]
         margin = 1 + 1e-12
+        if not (ratio.min() > 0 and np.isfinite(ratio).all()):
+            raise KrosError("Magnitude fit: the system vanishes or is infinite at a frequency of the grid; try another order.")
         touch = margin / ratio.min() if self.side is Side.ABOVE else 1 / (margin * ratio.max())
         system = StateSpace(system.A, system.B, system.C * touch, system.D * touch, system.dt)
         overbound = float(20 * np.log10(ratio.max() / ratio.min()))
@@ -301,11 +308,12 @@ def _minimax(tau: Array, targets: Array, order: int, lower: _Bound | None, hopel
     """
     if order == 0:
         return _Bound(RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0)), float(targets.max() / targets.min()))
-    best = _exchange(tau, targets, _knots(tau, targets, order, 0.05), lower, hopeless)
+    programs = Programs(_PROGRAMS)
+    best = _exchange(tau, targets, _knots(tau, targets, order, 0.05), lower, hopeless, programs)
     for even in (1.0, 0.3):
         if best is not None and (lower is None or best.ratio < lower.ratio * (1 - 1e-3) or lower.ratio < 1 + _EXCHANGE):
             break
-        other = _exchange(tau, targets, _knots(tau, targets, order, even), lower, hopeless)
+        other = _exchange(tau, targets, _knots(tau, targets, order, even), lower, hopeless, programs)
         best = other if best is None or (other is not None and other.ratio < best.ratio) else best
     return best
 
@@ -324,7 +332,7 @@ def _knots(tau: Array, targets: Array, order: int, even: float) -> Array:
     return np.exp(np.interp((np.arange(order) + 0.5) / order * share[-1], share, middle))
 
 
-def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None, hopeless: float) -> _Bound | None:
+def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None, hopeless: float, programs: Programs) -> _Bound | None:
     """Solve on part of the grid, and add the points at which the bound found there is worse; a ratio beyond `hopeless` is left as it is."""
     chosen = np.unique(np.linspace(0, len(tau) - 1, _POINTS).round().astype(int))
     cuts = np.zeros(0)
@@ -337,12 +345,16 @@ def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None, ho
             starts.append(start[chosen])
         if best is None:
             starts.append(np.ones(len(chosen)))
-        rational = Grid.build(tau[chosen], targets[chosen], knots, cuts).best(starts, enough)
+        rational = Grid.build(tau[chosen], targets[chosen], knots, cuts, programs).best(starts, enough)
         if rational is None:
             return best
         n, d = phi @ rational.numerator, phi @ rational.denominator
         ratio = np.where((n > 0) & (d > 0), n / (targets * np.where(d > 0, d, 1.0)), 0.0)
-        bad = sorted(on_half_line(roots(rational.numerator, knots)[0]) + on_half_line(roots(rational.denominator, knots)[0]))
+        try:
+            bad = sorted(on_half_line(roots(rational.numerator, knots)[0]) + on_half_line(roots(rational.denominator, knots)[0]))
+        except KrosError as error:  # multiple roots: this order is left to what was found before
+            _LOG.debug("Magnitude fit: %s", error)
+            return best
         if not bad and ratio.min() > 0 and (best is None or ratio.max() / ratio.min() < best.ratio):
             best, start = (
                 _Bound(RationalMagnitude(rational.numerator / ratio.min(), rational.denominator, knots), float(ratio.max() / ratio.min())),

@@ -30,6 +30,14 @@ _STARTS = 10
 _STEPS = 12
 _EXACT_DB = 1e-4
 _STALLED_DB = 5e-3
+_PIVOTS = 1500  # of the simplex method: about ten times what programs take that end
+
+
+@dataclass
+class Programs:
+    """How many linear programs may still be solved: bad data would take thousands, one after the other, and gain nothing."""
+
+    left: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +53,8 @@ class Grid:
     end, inner : ndarray, shape (n_edges, order + 1)
         Basis at DC, Nyquist and cuts, and at the grid point next to each: n and d may not fall by more than a factor between them.
     nearest : ndarray of int, shape (n_edges,)
+    programs : Programs
+        Counted down; none is solved when none is left.
     """
 
     targets: Array
@@ -53,13 +63,14 @@ class Grid:
     end: Array
     inner: Array
     nearest: Array
+    programs: Programs
 
     @classmethod
-    def build(cls, tau: Array, targets: Array, knots: Array, cuts: Array) -> Grid:
+    def build(cls, tau: Array, targets: Array, knots: Array, cuts: Array, programs: Programs) -> Grid:
         """Evaluate the basis on a grid."""
         phi = basis(tau, knots)
         nearest = np.concatenate([[0], np.searchsorted(tau, cuts).clip(0, len(tau) - 1), [len(tau) - 1]])
-        return cls(targets, knots, phi, basis(np.concatenate([[0.0], cuts, [np.inf]]), knots), phi[nearest], nearest)
+        return cls(targets, knots, phi, basis(np.concatenate([[0.0], cuts, [np.inf]]), knots), phi[nearest], nearest, programs)
 
     def best(self, starts: Sequence[Array], enough: float) -> RationalMagnitude | None:
         """Return the best bound from several first denominators, shape (n_points,) each, or the first whose ratio is below `enough`."""
@@ -128,14 +139,20 @@ class Grid:
         """Minimise t over (a, b, t) under blocks of rows, the normalisation and the edges."""
         from scipy.optimize import linprog
 
+        if self.programs.left <= 0:
+            return None
+        self.programs.left -= 1
         size = self.phi.shape[1]
         edge = (_EDGE * self.inner - self.end) / scale[self.nearest, None]
         none = np.zeros_like(edge)
         rows = [np.hstack([x, y, np.full((len(x), 1), t)]) for x, y, t in blocks]
         rows += [np.hstack([edge / self.targets[self.nearest, None], none, none[:, :1]]), np.hstack([none, edge, none[:, :1]])]
-        unit = np.concatenate([1 / n.max(axis=0), 1 / d.max(axis=0), [1.0]])
-        table = np.vstack(rows) * unit
-        table /= np.abs(table).max(axis=1, keepdims=True)
+        with np.errstate(all="ignore"):
+            unit = np.concatenate([1 / n.max(axis=0), 1 / d.max(axis=0), [1.0]])
+            table = np.vstack(rows) * unit
+            table /= np.abs(table).max(axis=1, keepdims=True)
+        if not np.isfinite(table).all():  # a basis function that is zero on the grid
+            return None
         result = linprog(
             np.append(np.zeros(2 * size), 1.0),
             A_ub=table,
@@ -144,7 +161,7 @@ class Grid:
             b_eq=[1.0],
             bounds=[(None, None)] * (2 * size + 1),
             method="highs",
-            options={"primal_feasibility_tolerance": 1e-9, "dual_feasibility_tolerance": 1e-9, "time_limit": 5.0},
+            options={"primal_feasibility_tolerance": 1e-9, "dual_feasibility_tolerance": 1e-9, "time_limit": 5.0, "maxiter": _PIVOTS},
         )
         if result.x is None:
             _LOG.debug("Magnitude fit: linear program ended with status %s (%s)", result.status, result.message)

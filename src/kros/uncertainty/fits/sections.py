@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.errors import KrosError
 from ...core.lti import StateSpace
 from .spectral import RationalMagnitude, cascade, roots
 
@@ -78,12 +79,21 @@ class Sections:
         return cls(np.zeros(len(places)), entry.astype(int), sign, pair.astype(bool), place.astype(float), np.full(len(rows), width))
 
     def like(self, entries: Array, magnitude: RationalMagnitude) -> Sections:
-        """Return the same with poles, zeros and level of a magnitude in some entries."""
+        """Return the same with poles, zeros and level of a magnitude in some entries.
+
+        Raises
+        ------
+        KrosError
+            When the magnitude is zero or infinite at DC or Nyquist, or its roots are not found.
+        """
         others, level = ~np.isin(self.entry, entries), self.level.copy()
+        sides = [roots(c, magnitude.knots)[0] for c in (magnitude.numerator, magnitude.denominator)]
+        if any(len(side) < len(magnitude.knots) or 0 in side for side in sides):
+            raise KrosError("Weight sections: the magnitude is zero or infinite at DC or Nyquist; try another order.")
         level[entries] = np.log(magnitude.numerator[0] / magnitude.denominator[0]) / 2
         columns = [[getattr(self, x)[others]] for x in ("entry", "sign", "pair", "place", "width")]
-        for sign, coefficients in ((1.0, magnitude.numerator), (-1.0, magnitude.denominator)):
-            for pair, place, width in _paired([np.sqrt(-complex(t)) for t in roots(coefficients, magnitude.knots)[0]]):
+        for sign, side in zip((1.0, -1.0), sides, strict=True):
+            for pair, place, width in _paired([np.sqrt(-complex(t)) for t in side]):
                 for column, value in zip(columns, (entries, sign, pair, place, width), strict=True):
                     column.append(np.broadcast_to(np.asarray(value), len(entries)))
         entry, sign_, pair_, place_, width_ = (np.concatenate(column) for column in columns)

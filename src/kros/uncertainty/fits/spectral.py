@@ -33,6 +33,7 @@ Array = npt.NDArray[Any]
 _DIGITS = 60
 _POLISH = 60
 _REAL = 1e-12  # relative imaginary part below which a root counts as real
+_INSIDE = 1e-13  # distance from the unit circle that is no rounding
 _AT_NYQUIST = complex("inf")  # a zero at z = -1
 
 
@@ -77,7 +78,7 @@ def roots(coefficients: Array, knots: Array) -> tuple[list[complex], float]:
     Raises
     ------
     KrosError
-        When the roots do not settle.
+        When the roots do not settle, or all coefficients are zero.
     """
     import mpmath
 
@@ -91,8 +92,10 @@ def roots(coefficients: Array, knots: Array) -> tuple[list[complex], float]:
         low = next((k for k in range(order + 1) if powers[k] != 0), order)
         high = next((k for k in range(order, -1, -1) if powers[k] != 0), 0)
         inner = powers[low : high + 1]
-        found = [mpmath.mpc(r) for r in _aberth(np.array([float(c) for c in inner]))]
-        for _ in range(_POLISH):
+        with np.errstate(all="ignore"):
+            started = _aberth(np.array([float(c) for c in inner])) if high >= low else np.full(1, np.nan)
+        found, change = [mpmath.mpc(r) for r in started], mpmath.inf
+        for _ in range(_POLISH if np.isfinite(started).all() else 0):
             change = max((_polish(inner, found, i) for i in range(len(found))), default=mpmath.mpf(0))
             if change < mpmath.mpf(10) ** -25:
                 return [0j] * low + [complex(r * unit) for r in found], float(powers[order])
@@ -146,10 +149,11 @@ def _polish(powers: list[Any], found: list[Any], i: int) -> Any:
     for c in reversed(powers[:-1]):
         slope = slope * z + value
         value = value * z + c
-    if value == 0 or slope == 0:
+    if value == 0 or slope == 0 or z == 0:
         return abs(value)
     step = value / slope
-    step = step / (1 - step * sum(1 / (z - other) for k, other in enumerate(found) if k != i and other != z))
+    apart = 1 - step * sum(1 / (z - other) for k, other in enumerate(found) if k != i and other != z)
+    step = step / apart if apart != 0 else step
     found[i] = z - step
     return abs(step) / abs(z)
 
@@ -179,18 +183,32 @@ def spectral_factor(magnitude: RationalMagnitude, sample_period_s: float, *, nyq
     Raises
     ------
     KrosError
-        When numerator or denominator is not positive on the whole axis.
+        When numerator or denominator is not positive on the whole axis, or their roots lie so near to it that no system in double precision has
+        them.
     """
     zero_roots, lead_n = roots(magnitude.numerator, magnitude.knots)
     pole_roots, lead_d = roots(magnitude.denominator, magnitude.knots)
     bad = on_half_line(zero_roots) + on_half_line(pole_roots)
-    if bad or not lead_n / lead_d > 0 or len(zero_roots) != len(pole_roots):
+    if not (lead_n * np.sign(lead_d) > 0 and np.isfinite([lead_n, lead_d]).all()):
+        bad.append(float("inf"))
+    if bad:
         raise KrosError(
             f"Spectral factor: the squared magnitude is not positive and finite at tau = {bad}; lift the numerator or refine the grid."
         )
+    degree = len(zero_roots)
     zeros = [-np.sqrt(-complex(r)) for r in zero_roots] + [_AT_NYQUIST] * nyquist_zeros + [0j] * dc_zeros
     poles = [-np.sqrt(-complex(r)) for r in pole_roots] + [-1.0 + 0j] * (nyquist_zeros + dc_zeros)
-    return cascade(zeros, poles, float(np.sqrt(lead_n / lead_d)), sample_period_s)
+    _check_inside([*zeros[:degree], *poles[:degree]])
+    return cascade(zeros, poles, float(np.sqrt(abs(lead_n)) / np.sqrt(abs(lead_d))), sample_period_s)
+
+
+def _check_inside(found: Sequence[complex]) -> None:
+    """Raise a `KrosError` when poles or zeros in w are on the unit circle of z as far as double precision tells."""
+    distance = np.array([1 - abs(1 + _to_zeta(w)) for w in found])
+    if not (distance > _INSIDE).all():
+        raise KrosError(
+            f"Spectral factor: a pole or zero is {distance.min():.1e} from the unit circle, which double precision does not hold; try another order."
+        )
 
 
 def cascade(zeros: Sequence[complex], poles: Sequence[complex], factor: float, sample_period_s: float) -> StateSpace:
@@ -262,6 +280,8 @@ def _split(values: list[complex]) -> tuple[list[complex], list[complex]]:
     """Upper halves of the conjugate pairs, and the real ones."""
     real = [v for v in values if np.isinf(v) or abs(v.imag) <= _REAL * abs(v)]
     upper = [v for v in values if v not in real and v.imag > 0]
+    if len(real) + 2 * len(upper) != len(values):
+        raise KrosError(f"Spectral factor: complex roots should come in conjugate pairs, found {values}; try another order.")
     return upper, [v if np.isinf(v) else complex(v.real) for v in real]
 
 

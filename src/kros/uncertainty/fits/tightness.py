@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.loading import loader
+from ..weights.check import Residuals
 from ..weights.cover import Structure
-from ..weights.weight import Residuals, fit_weight
+from ..weights.weight import fit_weight
 from .magnitude import _FLOOR, FittedMagnitude, Side, _Problem, fit_magnitude
 
 Array = npt.NDArray[Any]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,8 +13,9 @@ import numpy.typing as npt
 
 from ..forms import Form, residual
 from ..residuals import completion, misfit, sigma_max
-from .certificate import ResidualSystems
+from .check import Residuals, between_points
 from .cover import Cover, Structure
+from .pencils import Part, ResidualSystems
 from .weight import Weight, fit_weight
 
 Array = npt.NDArray[Any]
@@ -56,6 +57,8 @@ def bound_residuals(
     freqs_hz: Array,
     sample_period_s: float,
     systems: ResidualSystems | None = None,
+    *,
+    sampled: bool = False,
     **options: Any,
 ) -> Bounded:
     """Return weights for the residuals and for the remainder.
@@ -68,7 +71,9 @@ def bound_residuals(
     freqs_hz : ndarray, shape (frequency,), Hz
     sample_period_s : float, s
     systems : ResidualSystems, optional
-        The systems behind the responses, for a proof between grid points; the remainder's weight is checked on a grid.
+        The systems behind the responses, for a proof between grid points, also of the remainder's weight.
+    sampled : bool
+        The responses are known at `freqs_hz` only, and nominal and units are asked for no others.
     **options
         Of `fit_weight`.
 
@@ -76,11 +81,12 @@ def bound_residuals(
     -------
     Bounded
     """
+    options["sampled"] = sampled
     residuals = _Residuals(form, nominal, units)
     G, Gp = residuals.responses(freqs_hz)
     E = residual(form, G, Gp)
-    of_form = options | ({"structure": Structure.SCALAR} if E.shape[-2:] == (1, 1) else {})  # of one entry the same, and one fit less
-    weight, cover = fit_weight(residuals.of_form, freqs_hz, sample_period_s, systems=systems, **of_form)
+    of_form: Residuals = between_points(E, freqs_hz) if sampled else residuals.of_form
+    weight, cover = fit_weight(of_form, freqs_hz, sample_period_s, systems=systems, **options)
     ratio = misfit(form, G, Gp, E)
     bound = sigma_max(E).max(axis=0)
     if not _leaves_out(form, ratio):
@@ -88,7 +94,9 @@ def bound_residuals(
     looser = options | {"tolerance_db": _REMAINDER_TOLERANCE * options["tolerance_db"]}
     if weight.structure not in (Structure.SCALAR, Structure.DIAGONAL):  # the remainder is small, and its block apart from the form's
         looser["structure"] = Structure.DIAGONAL
-    remainder, remainder_cover = fit_weight(residuals.left_over, freqs_hz, sample_period_s, **looser)
+    left_over: Residuals = between_points(residuals.left_over(freqs_hz), freqs_hz) if sampled else residuals.left_over
+    rest = None if systems is None else replace(systems, part=Part.REMAINDER)
+    remainder, remainder_cover = fit_weight(left_over, freqs_hz, sample_period_s, systems=rest, **looser)
     return Bounded(bound, cover, weight, ratio, remainder, remainder_cover)
 
 

@@ -18,9 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace, block_diagonal, gain
-from .certificate import Method, ResidualSystems
+from .certificate import Method
+from .check import Checks, Residuals
 from .cover import Cover, Structure
-from .weight import Residuals, Weight, checking_grid, fit_weight
+from .pencils import ResidualSystems
+from .weight import Weight, fit_weight
 
 Array = npt.NDArray[Any]
 
@@ -48,7 +50,7 @@ class EntrywiseWeight(Weight):
         return Cover(np.ones_like(values), values)
 
     def matrix(self) -> StateSpace:
-        """Return the matrix of weights, p' by m'."""
+        """Return the matrix of weights, p' by m'; the bounds of the entries."""
         return self.left @ self.right
 
 
@@ -87,7 +89,8 @@ def fit_entrywise(
     left, right = dyads([fit.left for fit in fits], p, m, sample_period_s)
     sizes = np.abs(E).max(axis=0).reshape(len(freqs_hz), p * m)
     cover = Cover(np.ones_like(sizes), sizes)
-    dense = checking_grid(freqs_hz, sample_period_s, options.get("density", 10))
+    checks = Checks(options.get("density", 10), options.get("also_hz"), systems, options.get("sampled", False))
+    dense = checks.claimed(freqs_hz, sample_period_s)
     weight = EntrywiseWeight(
         left=left,
         right=right,

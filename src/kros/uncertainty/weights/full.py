@@ -17,13 +17,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import KrosError
+from ...core.errors import ConfigError, KrosError
 from ...core.lti import StateSpace, gain
 from ..fits.magnitude import invert
-from .certificate import Method, ResidualSystems, certify
+from .certificate import Method
+from .check import Checks, Residuals
 from .cover import Cover, Structure
 from .full_frames import Frames, best_frames, with_floor
-from .weight import Residuals, Weight, checking_grid, fit_weight, scaled
+from .pencils import ResidualSystems
+from .weight import Weight, fit_weight, overbound_db, overbound_entry_db, scaled
 
 Array = npt.NDArray[Any]
 
@@ -58,6 +60,20 @@ class FullWeight(Weight):
         left, right = np.linalg.solve(before, left), np.swapaxes(np.linalg.solve(np.swapaxes(after, 1, 2), np.swapaxes(right, 1, 2)), 1, 2)
         return Cover(*(np.abs(np.einsum("fii->fi", x)) for x in (left, right)))
 
+    def matrix(self) -> StateSpace:
+        """Return the p' by m' system that bounds every entry of the residuals, where the frames do not turn.
+
+        Raises
+        ------
+        ConfigError
+            When they do: rows of the weights then mix entries.
+        """
+        if any(frame.n_states or not np.array_equal(frame.D, np.eye(frame.n_outputs)) for frame in self.frames):
+            raise ConfigError(
+                "Full weights: in turned frames they bound no single entries of the residuals; ask for structure 'diagonal' or 'entrywise'."
+            )
+        return super().matrix()
+
     @property
     def frames(self) -> tuple[StateSpace, StateSpace]:
         """Left and right frame."""
@@ -91,14 +107,14 @@ def fit_full(
     diagonal, cover = _filters(residuals, freqs_hz, sample_period_s, systems=systems, **options)
     p, m = E.shape[2:]
     same = tuple(gain(np.eye(k), sample_period_s) for k in (p, m))
-    if not cover.left.any():
+    if not cover.left.any() or (p, m) == (1, 1):
         return _full(diagonal, *same), cover
     *turned, still = best_frames(E, freqs_hz, sample_period_s)
-    dense = checking_grid(freqs_hz, sample_period_s, options.get("density", 10))
+    checks = Checks(options.get("density", 10), options.get("also_hz"), systems, options.get("sampled", False))
     for frames in turned:
         if (still.cost - frames.cost) * _NEPER_DB < _WORTH_DB:
             continue
-        weight, of_frames = _in_frames(frames, residuals, freqs_hz, dense, sample_period_s, systems, options)
+        weight, of_frames = _in_frames(frames, residuals, freqs_hz, checks, sample_period_s, options)
         saved = volume_db(diagonal, freqs_hz) - volume_db(weight, freqs_hz)
         if saved > 0:
             return replace(weight, saved_db=saved), of_frames
@@ -111,7 +127,7 @@ def volume_db(weight: Weight, freqs_hz: Array) -> float:
 
 
 def _in_frames(
-    frames: Frames, residuals: Residuals, freqs_hz: Array, dense: Array, dt: float, systems: ResidualSystems | None, options: dict[str, Any]
+    frames: Frames, residuals: Residuals, freqs_hz: Array, checks: Checks, dt: float, options: dict[str, Any]
 ) -> tuple[FullWeight, Cover]:
     """Fit the filters in frames, return the weights of the residuals themselves and certify them."""
     filters, cover = _filters(lambda f: frames.of(with_floor(residuals(f)), f), freqs_hz, dt, **options)
@@ -123,7 +139,8 @@ def _in_frames(
         turned = frames.of(residuals(at_hz), at_hz) / used.left[:, :, None] / used.right[:, None, :]
         return np.asarray(np.linalg.norm(turned, 2, axis=(-2, -1)))
 
-    proof = certify(ratio, dense, weight.left, weight.right, systems)
+    dense = checks.claimed(freqs_hz, dt)
+    proof = checks.proof(ratio, dense, weight.left, weight.right)
     bound = proof.peak * (1 + proof.margin) if proof.method is Method.LEVEL_SETS else proof.peak
     lift = bound * (1 + _MARGIN)
     lifted = scaled(weight, lift)
@@ -131,7 +148,16 @@ def _in_frames(
     if on_grid > 1:  # rounding of the product of frames and filters
         lifted, on_grid = scaled(lifted, on_grid * (1 + _MARGIN)), 1 / (1 + _MARGIN)
     assert isinstance(lifted, FullWeight)
-    return replace(lifted, cover_max=on_grid, method=proof.method, remaining_margin=1 - max(bound / lift, on_grid)), cover
+    excess = overbound_db(lifted, freqs_hz, cover)
+    return replace(
+        lifted,
+        cover_max=on_grid,
+        method=proof.method,
+        remaining_margin=1 - max(bound / lift, on_grid),
+        overbound_db_max=excess,
+        overbound_entry_db=overbound_entry_db(lifted, freqs_hz, cover),
+        within_tolerance=excess <= options.get("tolerance_db", 1.0),
+    ), cover
 
 
 def _filters(residuals: Residuals, freqs_hz: Array, dt: float, **options: Any) -> tuple[Weight, Cover]:

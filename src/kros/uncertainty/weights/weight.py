@@ -19,17 +19,18 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError
-from ...core.frequency import bilinear_squared, dense_grid
+from ...core.frequency import bilinear_squared
 from ...core.lti import StateSpace, block_diagonal, gain
 from ..fits.chain import diagonal_response
 from ..fits.diagonal import Problem, fit_sections, refit
 from ..fits.magnitude import fit_magnitude
 from ..fits.sections import Sections
-from .certificate import Method, ResidualSystems, certify
+from .certificate import Certificate, Method
+from .check import Checks, Residuals, joined
 from .cover import Cover, Perturbation, Structure, as_structure, cover_ratio, optimal_cover
+from .pencils import ResidualSystems
 
 Array = npt.NDArray[Any]
-Residuals = Callable[[Array], Array]
 
 _LOG = logging.getLogger(__name__)
 _MARGIN = 1e-9
@@ -38,7 +39,7 @@ _ROUNDS = 4
 _WORST = 20  # frequencies added in a round
 _POINTS = 160  # of the grid in the joint fit
 _MISSED_DB = 0.05  # a cost higher than this between the points of the fit brings further ones
-_TAIL = 16  # points towards DC and Nyquist, four a decade
+_PROOFS = 2  # fits, each with the frequencies at which the proof found the one before exceeded
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,8 @@ class Weight:
     overbound_db_max : float, dB
         Largest excess over the grid of `mean_i log left_i + mean_j log right_j`, by which covers are compared, over the optimal cover.
     within_tolerance : bool
-        Whether the overbound (scalar weights: of every fit) is within the tolerance asked for.
+        Whether the overbound of the weight as returned, at every frequency of the grid, is within the tolerance asked for: `overbound_db_max`,
+        and of entrywise weights that of every entry.
     overbound_entry_db : float, dB
         Largest fitted over optimal `left_i right_j` over the grid and all (i, j). The optimal cover is rarely unique: a large value beside a
         small `overbound_db_max` says that another cover of nearly the same cost was taken.
@@ -90,6 +92,11 @@ class Weight:
         """Return the magnitudes of the diagonals at some frequencies."""
         return Cover(_diagonal(self.left, freqs_hz), _diagonal(self.right, freqs_hz))
 
+    def matrix(self) -> StateSpace:
+        """Return the p' by m' system `W_L 1 W_R`, with 1 a matrix of ones, that bounds every entry of the residuals: `|E_ij| <= |W_ij|`."""
+        ones = gain(np.ones((self.left.n_inputs, self.right.n_outputs)), self.left.dt)
+        return self.left @ ones @ self.right
+
     def mapped(self, change: Callable[[StateSpace], StateSpace]) -> Weight:
         """Return the weight with its systems changed, for example to another time."""
         return replace(self, left=change(self.left), right=change(self.right))
@@ -106,6 +113,8 @@ def fit_weight(
     density: int = 10,
     systems: ResidualSystems | None = None,
     poles: npt.ArrayLike | None = None,
+    also_hz: npt.ArrayLike | None = None,
+    sampled: bool = False,
 ) -> tuple[Weight, Cover]:
     """Fit weights to residuals that can be evaluated at any frequency.
 
@@ -127,6 +136,11 @@ def fit_weight(
         The systems behind the residuals: the bound is then tested at all frequencies, by level sets, and not on a grid alone.
     poles : array_like of complex, optional
         Poles in z that scalar weights must have, see `fit_magnitude`. (Zeros at DC or Nyquist a weight cannot have: it would cover nothing there.)
+    also_hz : array_like, shape (n,), Hz, optional
+        Where the bound is checked besides, see `peaks_hz`.
+    sampled : bool
+        The residuals are known at `freqs_hz` only. The bound is claimed there and, as the ends stand for what is beyond them, towards DC and
+        Nyquist; between the points the weight is not lifted.
 
     Returns
     -------
@@ -148,31 +162,27 @@ def fit_weight(
 
         fit = fit_entrywise if structure is Structure.ENTRYWISE else fit_full
         options: dict[str, Any] = {"max_order": max_order, "tolerance_db": tolerance_db, "density": density}
-        return fit(residuals, freqs_hz, sample_period_s, systems=systems, **options)
-    E = residuals(freqs_hz)
-    best = optimal_cover(E, structure)
-    dense = checking_grid(freqs_hz, sample_period_s, density)
+        return fit(residuals, freqs_hz, sample_period_s, systems=systems, also_hz=also_hz, sampled=sampled, **options)
+    checks = Checks(density, None if also_hz is None else np.asarray(also_hz, float), systems, sampled)
+    dense, claimed = checks.grid(freqs_hz, sample_period_s), checks.claimed(freqs_hz, sample_period_s)
     checked = _Checked(dense, residuals(dense))
     fitter = _Fitter(sample_period_s, max_order, tolerance_db, (freqs_hz[0], freqs_hz[-1]))
-    if structure is Structure.DIAGONAL and best.left.any():
-        unscaled = _fit_diagonal(fitter, residuals, freqs_hz, E, best, checked)
-    else:
-        unscaled = _fit_scalar(fitter, freqs_hz, E, checked, structure, poles)
-    weight = _finish(unscaled, residuals, checked, systems)
+    of_fit = checks.of_fit(freqs_hz)
+    for _ in range(_PROOFS):
+        unscaled = _fit(fitter, residuals, of_fit, structure, checked, poles)
+        proof = _proof(unscaled, residuals, checks, claimed)
+        found = np.array([proof.freq_hz])
+        if proof.peak <= _LIFT * max(1.0, float(checked.ratio(unscaled).max(initial=0.0))):
+            break
+        checked, of_fit = checked.with_points(found, residuals(found)), joined(of_fit, found)[0]
+    weight, best = _finish(unscaled, checked, proof, claimed), optimal_cover(residuals(freqs_hz), structure)
     excess = overbound_db(weight, freqs_hz, best)
-    kept = weight.within_tolerance if structure is Structure.SCALAR else excess <= tolerance_db
     return replace(
-        weight, overbound_db_max=excess, overbound_entry_db=overbound_entry_db(weight, freqs_hz, best), within_tolerance=bool(kept)
+        weight,
+        overbound_db_max=excess,
+        overbound_entry_db=overbound_entry_db(weight, freqs_hz, best),
+        within_tolerance=excess <= tolerance_db,
     ), best
-
-
-def checking_grid(freqs_hz: Array, sample_period_s: float, density: int) -> Array:
-    """Return a dense grid that goes on from its ends to DC and Nyquist, in decades of tau: a fit is free to bend wherever nobody looks."""
-    dense = dense_grid(freqs_hz, sample_period_s, density)
-    inner = dense[(dense > 0) & (bilinear_squared(dense, sample_period_s) < np.inf)]
-    tails = 10.0 ** (np.arange(1, _TAIL + 1) / 4)
-    tau = bilinear_squared(inner[[0, -1]], sample_period_s)
-    return np.unique(np.concatenate([dense, np.arctan(np.sqrt(np.append(tau[0] / tails**2, tau[1] * tails))) / (np.pi * sample_period_s)]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,14 +197,19 @@ class _Checked:
         used = weight.magnitudes(self.freqs_hz)
         return cover_ratio(self.E, used.left, used.right)
 
+    def at(self, freqs_hz: Array) -> _Checked:
+        """Return those of some frequencies, and of none beyond them."""
+        some = np.isin(self.freqs_hz, freqs_hz)
+        return _Checked(self.freqs_hz[some], self.E[:, some])
+
     def with_points(self, freqs_hz: Array, E: Array) -> _Checked:
         """Return the same with further frequencies."""
-        freqs, index = np.unique(np.concatenate([self.freqs_hz, freqs_hz]), return_index=True)
-        return _Checked(freqs, np.concatenate([self.E, E], axis=1)[:, index]) if len(freqs_hz) else self
+        freqs, index = joined(self.freqs_hz, freqs_hz)
+        return _Checked(freqs, np.concatenate([self.E, E], axis=1)[:, index])
 
     def added(self, worst: Array, freqs_hz: Array, E: Array) -> tuple[Array, Array]:
         """Grid and residuals with the worst frequencies in them."""
-        freqs, index = np.unique(np.concatenate([freqs_hz, self.freqs_hz[worst]]), return_index=True)
+        freqs, index = joined(freqs_hz, self.freqs_hz[worst])
         return freqs, np.concatenate([E, self.E[:, worst]], axis=1)[:, index]
 
 
@@ -218,14 +233,26 @@ class _Fitter:
         return Weight(left, right, orders[:n_left], orders[n_left:], Structure.DIAGONAL, np.nan, np.nan)
 
 
+def _fit(
+    fitter: _Fitter, residuals: Residuals, freqs_hz: Array, structure: Structure, checked: _Checked, poles: npt.ArrayLike | None
+) -> Weight:
+    """Fit diagonal or scalar magnitudes; of one entry, diagonal weights are scalar ones."""
+    E = residuals(freqs_hz)
+    if structure is Structure.DIAGONAL and E.any() and E.shape[2:] != (1, 1):
+        return _fit_diagonal(fitter, residuals, freqs_hz, E, optimal_cover(E), checked)
+    return _fit_scalar(fitter, freqs_hz, E, checked, structure, poles)
+
+
 def _fit_scalar(fitter: _Fitter, freqs_hz: Array, E: Array, checked: _Checked, structure: Structure, poles: npt.ArrayLike | None) -> Weight:
     """One magnitude for the largest singular values, fitted again with the frequencies at which it is exceeded."""
-    dt, p, m = fitter.sample_period_s, E.shape[2], E.shape[3]
+    dt, p, m, lowest = fitter.sample_period_s, E.shape[2], E.shape[3], 0
+    options: dict[str, Any] = {"max_order": fitter.max_order, "tolerance_db": fitter.tolerance_db, "poles": poles}
     for _ in range(_ROUNDS):
         size = optimal_cover(E, Structure.SCALAR).left[:, 0]
-        fit = fit_magnitude(freqs_hz, size, dt, max_order=fitter.max_order, tolerance_db=fitter.tolerance_db, poles=poles)
+        fit = fit_magnitude(freqs_hz, size, dt, min_order=lowest, **options)
+        lowest = max(fit.order - 1, 0)  # further points do not make a lower order better
         left = block_diagonal([fit.system] * p)
-        weight = Weight(left, gain(np.eye(m), dt), (fit.order,) * p, (0,) * m, structure, np.nan, np.nan, fit.within_tolerance)
+        weight = Weight(left, gain(np.eye(m), dt), (fit.order,) * p, (0,) * m, structure, np.nan, np.nan)
         ratio = checked.ratio(weight).max(axis=0)
         if ratio.max(initial=0.0) <= _LIFT:
             break
@@ -307,20 +334,24 @@ def overbound_entry_db(weight: Weight, freqs_hz: Array, cover: Cover) -> float:
     return float(20 * np.log10(np.max(fitted[some] / optimal[some]))) if some.any() else 0.0
 
 
-def _finish(weight: Weight, residuals: Residuals, checked: _Checked, systems: ResidualSystems | None) -> Weight:
-    """Scale the left weight until it touches the residuals from above, between grid points too, and measure what is returned."""
-    if not checked.ratio(weight).max(initial=0.0) > 0:
-        return replace(weight, cover_max=0.0, remaining_margin=1.0)
+def _proof(weight: Weight, residuals: Residuals, checks: Checks, claimed_hz: Array) -> Certificate:
+    """Largest ratio wherever the bound is claimed."""
 
     def ratio(freqs_hz: Array) -> Array:
         used = weight.magnitudes(freqs_hz)
         return cover_ratio(residuals(freqs_hz), used.left, used.right)
 
-    proof = certify(ratio, checked.freqs_hz, weight.left, weight.right, systems)
+    return checks.proof(ratio, claimed_hz, weight.left, weight.right)
+
+
+def _finish(weight: Weight, checked: _Checked, proof: Certificate, claimed_hz: Array) -> Weight:
+    """Scale the left weight until it touches the residuals from above, between grid points too, and measure what is returned."""
+    if not proof.peak > 0:
+        return replace(weight, cover_max=0.0, remaining_margin=1.0)
     bound = proof.peak * (1 + proof.margin) if proof.method is Method.LEVEL_SETS else proof.peak
     lift = bound * (1 + _MARGIN)
     weight = scaled(weight, lift)
-    on_grid = float(checked.ratio(weight).max())
+    on_grid = float(checked.at(claimed_hz).ratio(weight).max())
     return replace(weight, cover_max=on_grid, method=proof.method, remaining_margin=1 - max(bound / lift, on_grid))
 
 

@@ -1,0 +1,129 @@
+"""Where a weight is checked: at which frequencies, what residuals count there, and what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.frequency import bilinear_squared, dense_grid
+from ...core.lti import StateSpace
+from ..residuals import sigma_max
+from .certificate import Certificate, Method, certify
+from .pencils import ResidualSystems
+
+Array = npt.NDArray[Any]
+Residuals = Callable[[Array], Array]
+
+_TAIL = 16  # points towards DC and Nyquist, four a decade
+_BETWEEN = 3  # steps between known points in which a fit is held up
+_SAME = 1e-9  # relative distance of frequencies that are one
+
+
+@dataclass(frozen=True, eq=False)
+class Checks:
+    """How a weight is checked.
+
+    Parameters
+    ----------
+    density : int
+        How much denser than the grid of the fit.
+    also_hz : ndarray, shape (n,), Hz, optional
+        Further frequencies, where residuals peak between the points.
+    systems : ResidualSystems, optional
+        For a proof by level sets.
+    sampled : bool
+        Residuals are known at the frequencies of the fit only: there, and beyond their ends, the bound is claimed. Between them the fit is kept
+        above what `between_points` draws, and nothing is claimed.
+    """
+
+    density: int = 10
+    also_hz: Array | None = None
+    systems: ResidualSystems | None = None
+    sampled: bool = False
+
+    def grid(self, freqs_hz: Array, sample_period_s: float) -> Array:
+        """Return the frequencies at which a fit is checked."""
+        return checking_grid(freqs_hz, sample_period_s, _BETWEEN if self.sampled else self.density, self.also_hz)
+
+    def of_fit(self, freqs_hz: Array) -> Array:
+        """Return the frequencies that a fit follows: those asked for, and the peaks between them."""
+        if self.also_hz is None:
+            return freqs_hz
+        inside = (self.also_hz >= freqs_hz[0]) & (self.also_hz <= freqs_hz[-1])
+        return joined(freqs_hz, self.also_hz[inside])[0]
+
+    def claimed(self, freqs_hz: Array, sample_period_s: float) -> Array:
+        """Return the frequencies at which the bound has to hold to begin with."""
+        return checking_grid(freqs_hz, sample_period_s, 1) if self.sampled else self.grid(freqs_hz, sample_period_s)
+
+    def proof(self, ratio: Callable[[Array], Array], claimed_hz: Array, left: StateSpace, right: StateSpace) -> Certificate:
+        """Return the largest ratio wherever the bound is claimed."""
+        if not self.sampled:
+            return certify(ratio, claimed_hz, left, right, self.systems)
+        known = ratio(claimed_hz).max(axis=0)
+        return Certificate(Method.GRID, float(known.max()), float(claimed_hz[known.argmax()]), float("nan"))
+
+
+def checking_grid(freqs_hz: Array, sample_period_s: float, density: int, also_hz: Array | None = None) -> Array:
+    """Return a dense grid that goes on from its ends to DC and Nyquist, in decades of tau: a fit is free to bend wherever nobody looks."""
+    dense = dense_grid(freqs_hz, sample_period_s, density)
+    inner = dense[(dense > 0) & (bilinear_squared(dense, sample_period_s) < np.inf)]
+    tails = 10.0 ** (np.arange(1, _TAIL + 1) / 4)
+    tau = bilinear_squared(inner[[0, -1]], sample_period_s) if inner.size else np.ones(2)
+    further = np.append(tau[0] / tails**2, tau[1] * tails)
+    dense = np.unique(np.concatenate([dense, np.arctan(np.sqrt(further)) / (np.pi * sample_period_s)]))
+    return dense if also_hz is None else joined(dense, also_hz)[0]
+
+
+def joined(freqs_hz: Array, others_hz: Array) -> tuple[Array, Array]:
+    """Return both in increasing order without those of the others that are nearly there, and where each comes from in their concatenation."""
+    both = np.concatenate([freqs_hz, others_hz])
+    others = np.unique(others_hz, return_index=True)[1]
+    at = np.searchsorted(freqs_hz, others_hz[others]).clip(1, max(len(freqs_hz) - 1, 1))
+    near = np.minimum(np.abs(others_hz[others] - freqs_hz[at - 1]), np.abs(others_hz[others] - freqs_hz[np.minimum(at, len(freqs_hz) - 1)]))
+    index = np.concatenate([np.arange(len(freqs_hz)), len(freqs_hz) + others[near > _SAME * others_hz[others]]])
+    index = index[np.argsort(both[index], kind="stable")]
+    return both[index], index
+
+
+def between_points(E: Array, freqs_hz: Array) -> Residuals:
+    """Return residuals that are known at some frequencies at any frequency.
+
+    Between two points they are those of the nearer one, with the largest on the straight line between both in logarithms; beyond the ends those
+    of the ends. A weight that follows the points and dips between them is below this.
+
+    Parameters
+    ----------
+    E : ndarray, shape (unit, frequency, p', m')
+    freqs_hz : ndarray, shape (frequency,), Hz
+    """
+    size = sigma_max(E).max(axis=0)
+
+    def at(asked_hz: Array) -> Array:
+        near = nearest(freqs_hz, asked_hz)
+        if len(freqs_hz) == 1:
+            return E[:, near]
+        low = (np.searchsorted(freqs_hz, asked_hz, side="right") - 1).clip(0, len(freqs_hz) - 2)
+        ends = np.log(np.maximum(freqs_hz[[low, low + 1]], _first_positive(freqs_hz)))
+        share = ((np.log(np.maximum(asked_hz, _first_positive(freqs_hz))) - ends[0]) / np.maximum(ends[1] - ends[0], 1e-300)).clip(0, 1)
+        alive = (size[low] > 0) & (size[low + 1] > 0)
+        logs = np.log(np.where(size > 0, size, 1.0))
+        line = (1 - share) * logs[low] + share * logs[low + 1]
+        return np.asarray(E[:, near] * np.where(alive, np.exp(line - logs[near]), 1.0)[:, None, None])
+
+    return at
+
+
+def nearest(grid: Array, freqs_hz: Array) -> npt.NDArray[np.intp]:
+    """Return the index of the nearest grid point; the ends stand for what is beyond them."""
+    if len(grid) == 1:
+        return np.zeros(len(freqs_hz), np.intp)
+    return np.asarray(np.searchsorted((grid[1:] + grid[:-1]) / 2, freqs_hz))
+
+
+def _first_positive(freqs_hz: Array) -> float:
+    return float(freqs_hz[freqs_hz > 0].min(initial=np.inf)) / 10

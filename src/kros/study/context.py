@@ -84,10 +84,12 @@ class Context:
 
     @cached_property
     def sizes(self) -> dict[str, float]:
-        """Largest absolute value of every channel in the training episodes of all units and conditions that take part."""
-        population = self.population
-        largest = np.max([np.abs(population.read(key)).max(axis=0) for key in self.facts.train], axis=0)
-        return dict(zip(population.states + population.inputs, map(float, largest), strict=True))
+        """Largest absolute value of every channel in the training episodes of all units and conditions, as their factors kept it."""
+        states, inputs = self.population.states, self.population.inputs
+        conditions = sorted({key.condition for key in self.facts.train})
+        peak = np.concatenate([load_artifact(self.factors_folder(c), "factors")[1]["peak"] for c in conditions]).max(axis=0)
+        behind = len(states) + len(self.lifting.separation.basis)
+        return dict(zip(states + inputs, [*peak[: len(states)].tolist(), *peak[behind : behind + len(inputs)].tolist()], strict=True))
 
     def seen(self, measured: Sequence[int]) -> Seen:
         """Return the sizes of the measured states and of the inputs, beyond which an observer believes less."""
@@ -123,6 +125,12 @@ class Context:
     def edmd_names(self) -> tuple[str, ...]:
         """The paper's kinds of models, identified in every condition; the first one scores outliers."""
         return ("koopman_edmd", "linear_edmd") if self.lifting.functions + self.lifting.input_functions else ("linear_edmd",)
+
+    def factors_folder(self, condition: str) -> Path:
+        """Return where the factors of a condition's training episodes are kept."""
+        from urllib.parse import quote
+
+        return self.store.path("factors", quote(condition, safe=""))
 
     def models(self, name: str, condition: str | None = None) -> ModelSet:
         """Load the models of one kind, in the condition that feeds the synthesis or another."""

@@ -70,9 +70,7 @@ def resampled_models(context: Context, name: str, units: list[str]) -> ModelSamp
 
 def episode_factor(context: Context, models: ModelSet, units: list[str]) -> tuple[Factor, list[int]]:
     """Return the stored factors of ``[Psi | Theta_plus]``, batch (unit, episode), and every unit's number of episodes."""
-    from urllib.parse import quote
-
-    content, arrays = load_artifact(context.store.path("factors", quote(context.facts.identify_on, safe="")), "factors")
+    content, arrays = load_artifact(context.factors_folder(context.facts.identify_on), "factors")
     places: dict[str, list[int]] = {unit: [] for unit in units}
     for place, (unit, _) in enumerate(content["rows"]):
         if unit in places:

@@ -42,6 +42,7 @@ class RunningObserver:
 
     @parameters.setter
     def parameters(self, values: Mapping[str, float]) -> None:
+        """Change all of them."""
         self._parameters = _Checked(self.observer, values)
 
     @property

@@ -11,7 +11,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 RESULTS = Path(__file__).parent / "results"
@@ -55,7 +55,7 @@ def main(name: str, title: str, run: Callable[[int, int], list[Tally]], count: i
         "title": title,
         "seed": options.seed,
         "seconds": round(time.perf_counter() - began, 1),
-        "tallies": [asdict(t) for t in tallies],
+        "tallies": [vars(t) for t in tallies],
     }
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.json").write_text(json.dumps(result, indent=1, sort_keys=True) + "\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import product
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
+from .families import is_whole, require_count
 
 Array = npt.NDArray[np.float64]
 _ROUNDS = 100
@@ -25,10 +27,11 @@ def grid_centres(ranges: Sequence[Sequence[float]], counts: Sequence[int]) -> Ar
         Points along every dimension; one point stands in the middle.
     """
     box = _box(ranges)
-    if len(counts) != len(box) or any(isinstance(c, bool) or int(c) != c or c < 1 for c in counts):
+    if len(counts) != len(box) or not all(is_whole(c, 1) for c in counts):
         raise ConfigError(
             f"Grid of centres: counts = {list(counts)} should be one whole number of at least 1 for each of {len(box)} ranges."
         )
+    require_count("grid of centres", math.prod(int(c) for c in counts))
     axes = [np.linspace(low, high, int(c)) if c > 1 else np.array([(low + high) / 2]) for (low, high), c in zip(box, counts, strict=True)]
     return np.array(list(product(*axes)))
 
@@ -93,6 +96,7 @@ def _box(ranges: Sequence[Sequence[float]]) -> Array:
 
 
 def _count(n: int) -> int:
-    if isinstance(n, bool) or int(n) != n or n < 1:
-        raise ConfigError(f"Centres: n = {n} should be a whole number of at least 1.")
+    if not is_whole(n, 1):
+        raise ConfigError(f"Centres: n = {n!r} should be a whole number of at least 1.")
+    require_count("centres", n)
     return int(n)

@@ -7,13 +7,16 @@ Numbers are written so that reading them gives the same number again.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import combinations_with_replacement
+
+import numpy as np
 
 from ..core.errors import ConfigError
 from .formula import MAX_DELAY, delayed_name
 
 Formulas = tuple[str, ...]
+MAX_FORMULAS = 100_000  # of one family
 
 
 def number(value: float) -> str:
@@ -22,7 +25,10 @@ def number(value: float) -> str:
     >>> number(100.0), number(0.1), number(-2)
     ('100', '0.1', '-2')
     """
-    value = float(value)
+    try:
+        value = float(value)
+    except OverflowError:
+        value = math.inf
     if not math.isfinite(value):
         raise ConfigError(f"Lifting families: {value} cannot stand in a formula; give finite numbers.")
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
@@ -44,11 +50,13 @@ def harmonics(angle: str, ratio: float = 1.0, orders: Sequence[int] = (1,), phas
     ('sin(100*position + phase)', 'cos(100*position + phase)')
     """
     _require_whole("harmonics", "orders", orders, 1)
-    if not ratio:
-        raise ConfigError("harmonics: ratio is 0, the functions would be constant; give the number of periods per turn of the angle.")
+    if not math.isfinite(ratio) or not ratio:
+        raise ConfigError(
+            f"harmonics: ratio is {ratio:g}, it should be finite and not zero; give the number of periods per turn of the angle."
+        )
     inner = wrapped(angle) if ratio == 1 else f"{number(ratio)}*{wrapped(angle)}"
     inner = inner if phase is None else f"{inner} + {wrapped(phase)}"
-    texts = [inner if k == 1 else f"{k}*({inner})" for k in orders]
+    texts = [inner if k == 1 else f"{int(k)}*({inner})" for k in orders]
     return tuple(f"{function}({text})" for text in texts for function in ("sin", "cos"))
 
 
@@ -63,6 +71,7 @@ def polynomials(names: Sequence[str], degree: int, lowest: int = 2, cross: bool 
     names = require_names("polynomials", names)
     _require_whole("polynomials", "lowest", [lowest], 1)
     _require_whole("polynomials", "degree", [degree], lowest)
+    require_count("polynomials", math.comb(len(names) + degree, degree) if degree <= MAX_FORMULAS else math.inf)
     chosen = (combo for d in range(lowest, degree + 1) for combo in combinations_with_replacement(names, d))
     return tuple(_monomial(combo) for combo in chosen if cross or len(set(combo)) == 1)
 
@@ -80,6 +89,7 @@ def delays(names: Sequence[str], depth: int) -> Formulas:
         raise ConfigError(f"delays: only states and inputs have earlier values, found {others}; write the delay inside the formula.")
     if depth > MAX_DELAY:
         raise ConfigError(f"delays: depth = {depth} is too deep; at most {MAX_DELAY} samples are kept.")
+    require_count("delays", depth * len(names))
     return tuple(delayed_name(name, d) for d in range(1, depth + 1) for name in names)
 
 
@@ -89,7 +99,9 @@ def products(names: Sequence[str], others: Sequence[str]) -> Formulas:
     >>> products(["position", "current"], ["voltage"])
     ('position*voltage', 'current*voltage')
     """
-    return tuple(f"{wrapped(a)}*{wrapped(b)}" for b in require_names("products", others) for a in require_names("products", names))
+    names, others = require_names("products", names), require_names("products", others)
+    require_count("products", len(names) * len(others))
+    return tuple(f"{wrapped(a)}*{wrapped(b)}" for b in others for a in names)
 
 
 def formulas(functions: Sequence[str]) -> Formulas:
@@ -120,14 +132,28 @@ def _monomial(factors: Sequence[str]) -> str:
 
 def require_names(family: str, names: Sequence[str]) -> Formulas:
     """Return names or formulas as a tuple, refusing what is not a list of different ones."""
-    if isinstance(names, str) or not names or not all(isinstance(name, str) and name.strip() for name in names):
-        raise ConfigError(f"{family}: needs a list of names or formulas, found {names!r}.")
+    listed = isinstance(names, Sequence) and not isinstance(names, str)
+    if not listed or not names or not all(isinstance(name, str) and name.strip() for name in names):
+        raise ConfigError(f"{family}: needs a list of names or formulas, found {names!r:.200}.")
     if len(set(names)) != len(names):
         raise ConfigError(f"{family}: {list(names)} repeat a name; give each once.")
     return tuple(names)
 
 
+def is_whole(value: object, least: int) -> bool:
+    """Whether a value is a whole number, at least so large and no larger than a double can count."""
+    return bool(
+        isinstance(value, int | float | np.number) and not isinstance(value, bool) and least <= value <= 2**53 and int(value) == value
+    )
+
+
+def require_count(family: str, count: float) -> None:
+    """Refuse a family that is larger than anything can use."""
+    if count > MAX_FORMULAS:
+        raise ConfigError(f"{family}: these options make more than {MAX_FORMULAS} formulas; ask for fewer.")
+
+
 def _require_whole(family: str, option: str, values: Sequence[int], least: int) -> None:
-    wrong = [v for v in values if type(v) is bool or int(v) != v or v < least]
-    if wrong or not values or len(set(values)) != len(values):
-        raise ConfigError(f"{family}: {option} = {list(values)} should be different whole numbers of at least {least}.")
+    listed = isinstance(values, Iterable) and not isinstance(values, str)
+    if not listed or not (numbers := list(values)) or not all(is_whole(v, least) for v in numbers) or len(set(numbers)) != len(numbers):
+        raise ConfigError(f"{family}: {option} = {values!r:.200} should be different whole numbers of at least {least}.")

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import ast
 import operator
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,11 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from .evaluation import FUNCTIONS, Evaluator, compile_expression
+from .limits import MAX_EXPONENT, MAX_LENGTH, TooCostlyError, finite, require_size, settled
 
 _BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv, ast.Pow: operator.pow}
 _UNARY: dict[type, Callable[[Any], Any]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
 _SPELLINGS = {"abs": "Abs"}
-_MAX_LENGTH = 2000
-_MAX_EXPONENT = 64
 MAX_DELAY = 1000
 
 
@@ -68,7 +68,9 @@ class Formula:
         """Return the SymPy tree of the partial derivative with respect to one name."""
         import sympy as sp
 
-        return sp.diff(self.expression, sp.Symbol(name, real=True))
+        magnitude, jump = _real_magnitude()
+        real = self.expression.replace(sp.Abs, magnitude).replace(sp.sign, jump)
+        return sp.diff(real, sp.Symbol(name, real=True)).replace(magnitude, sp.Abs).replace(jump, sp.sign)
 
     def c_expression(self, pointers: Sequence[str] = ()) -> str:
         """Return the formula as a C expression in double precision.
@@ -98,26 +100,44 @@ def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
     Allowed are numbers, the given names, ``pi``, ``+ - * / **``, parentheses and the functions
     sin, cos, tan, exp, log, sqrt, tanh, atan, abs, sign; of the quantities in `delayed` also earlier values, ``position[-1]``.
 
+    What may take long is refused before it does: see `limits`.
+
     Raises
     ------
     ConfigError
-        When the text holds anything else.
+        When the text holds anything else, is too long or too deep, or holds a number that is not finite.
     """
-    import sympy as sp
-
-    if len(text) > _MAX_LENGTH:
-        raise ConfigError(f"Formula of {len(text)} characters: at most {_MAX_LENGTH} are read; split it into several functions.")
+    if not isinstance(text, str):
+        raise ConfigError(f"Formula {text!r}: should be a text such as 'sin(100*position + phase)', found {type(text).__name__}.")
+    if len(text) > MAX_LENGTH:
+        raise ConfigError(f"Formula of {len(text)} characters: at most {MAX_LENGTH} are read; split it into several functions.")
     try:
-        tree = ast.parse(text.strip(), mode="eval")
-    except (SyntaxError, ValueError, RecursionError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # Python warns of text such as 1if
+            tree = ast.parse(text.strip(), mode="eval")
+    except (SyntaxError, ValueError, RecursionError, MemoryError, Warning) as error:
         raise ConfigError(f"Formula {text!r}: not readable ({error}); write it like 'sin(100*position + phase)'.") from error
     try:
-        expression = _Reader(text, tuple(names), tuple(delayed)).read(tree.body)
-    except RecursionError as error:
-        raise ConfigError(f"Formula {text!r}: nested too deeply; split it into several functions.") from error
-    if expression.has(sp.oo, -sp.oo, sp.zoo, sp.nan, sp.I):
-        raise ConfigError(f"Formula {text!r}: evaluates to {expression}; check for a division by zero or a root of a negative number.")
-    return expression
+        require_size(tree.body)
+        return _Reader(text, tuple(names), tuple(delayed)).read(tree.body)
+    except TooCostlyError as error:
+        raise ConfigError(f"Formula {text!r}: {error}") from error
+
+
+@cache
+def _real_magnitude() -> tuple[Any, Any]:
+    """Functions that differentiate as Abs and sign of real numbers do; SymPy's own ask first whether their argument is complex."""
+    import sympy as sp
+
+    def slope_of_jump(self: Any, argindex: int = 1) -> Any:
+        return 2 * sp.DiracDelta(self.args[0])
+
+    jump = type("RealSign", (sp.Function,), {"fdiff": slope_of_jump})
+
+    def slope_of_magnitude(self: Any, argindex: int = 1) -> Any:
+        return jump(self.args[0])
+
+    return type("RealMagnitude", (sp.Function,), {"fdiff": slope_of_magnitude}), jump
 
 
 @dataclass(frozen=True)
@@ -127,6 +147,10 @@ class _Reader:
     delayed: tuple[str, ...]
 
     def read(self, node: ast.AST) -> Any:
+        """Return the tree of a node, its numbers settled."""
+        return settled(self._read(node))
+
+    def _read(self, node: ast.AST) -> Any:
         import sympy as sp
 
         if isinstance(node, ast.Constant) and type(node.value) in (int, float):
@@ -137,8 +161,8 @@ class _Reader:
             return self._earlier(node.value.id, node.slice)
         if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
             left, right = self.read(node.left), self.read(node.right)
-            if isinstance(node.op, ast.Pow) and not (right.is_number and abs(right) <= _MAX_EXPONENT):
-                raise self._error(f"the exponent {right} should be a number of magnitude at most {_MAX_EXPONENT}.")
+            if isinstance(node.op, ast.Pow) and not (right.is_number and abs(finite(right)) <= MAX_EXPONENT):
+                raise self._error(f"the exponent {right} should be a number of magnitude at most {MAX_EXPONENT}.")
             return _BINARY[type(node.op)](left, right)
         if isinstance(node, ast.UnaryOp) and type(node.op) in _UNARY:
             return _UNARY[type(node.op)](self.read(node.operand))

@@ -38,10 +38,11 @@ def bounds_of(expressions: Sequence[Any], box: Box) -> tuple[Array, Array]:
     ConfigError
         When a range is empty or not a number.
     """
-    ranges = {name: _range(name, value) for name, value in box.items()}
+    for name, value in box.items():
+        _range(name, value)
     with np.errstate(all="ignore"):
-        found = [_bounds(expression, ranges) for expression in expressions]
-    lower, upper = np.array([f[0] for f in found]), np.array([f[1] for f in found])
+        found = [pieces_of(expression, box) for expression in expressions]
+    lower, upper = np.array([np.min(low) for low, _ in found]), np.array([np.max(high) for _, high in found])
     return lower - _WIDENING * np.abs(np.where(np.isfinite(lower), lower, 0.0)), upper + _WIDENING * np.abs(
         np.where(np.isfinite(upper), upper, 0.0)
     )
@@ -54,11 +55,11 @@ def _range(name: str, value: Any) -> tuple[float, float]:
     return low, high
 
 
-def _bounds(expression: Any, ranges: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
+def pieces_of(expression: Any, box: Box) -> Interval:
+    """Return bounds of a tree over every piece of a box, each of shape (pieces,); rounding is not covered."""
     names = sorted(symbol.name for symbol in expression.free_symbols)
-    sides = {name: ranges.get(name, ranges.get(name.partition("[")[0], _REALS)) for name in names}
-    low, high = _walk(expression, _pieces(sides))
-    return float(np.min(low)), float(np.max(high))
+    sides = {name: _range(name, box.get(name, box.get(name.partition("[")[0], _REALS))) for name in names}
+    return _walk(expression, _pieces(sides))
 
 
 def _pieces(sides: Mapping[str, tuple[float, float]]) -> dict[str, Interval]:

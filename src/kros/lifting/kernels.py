@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
-from .families import Formulas, number, require_names, wrapped
+from .families import Formulas, is_whole, number, require_count, require_names, wrapped
 
 Array = npt.NDArray[np.float64]
 _GUARD = 1e-30  # keeps the logarithm of the thin plate finite at the centre; changes no value by more than 1e-30
@@ -107,8 +107,9 @@ def fourier_features(
     """
     names = require_names("fourier", names)
     lengths = length_scales("fourier", length, len(names))
-    if isinstance(n, bool) or int(n) != n or n < 1:
-        raise ConfigError(f"fourier: n = {n} should be a whole number of at least 1.")
+    if not is_whole(n, 1):
+        raise ConfigError(f"fourier: n = {n!r} should be a whole number of at least 1.")
+    require_count("fourier", n)
     rng = np.random.default_rng(seed)
     try:
         draw = {Kernel.GAUSSIAN: rng.standard_normal, Kernel.LAPLACIAN: rng.standard_cauchy}[Kernel(kernel)]

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
+from .continuity import slope_bounds_of
 from .evaluation import Columns
 from .formula import Formula
 from .intervals import Box, bounds_of
@@ -270,7 +271,8 @@ class Lifting:
     def slope_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
         """Return bounds of the slopes of every lifted function by every entry of the window over an operating box.
 
-        Interval arithmetic on the derivatives: the bounds hold everywhere in the box, and are infinite where a slope is.
+        Interval arithmetic on the derivatives: the bounds hold between any two points of the box, and are infinite where a slope is, or where
+        a function jumps or is not defined.
         Rounding is covered by a relative widening of 1e-12, not by directed rounding.
 
         Parameters
@@ -290,9 +292,7 @@ class Lifting:
         array([[100.]])
         """
         given = {**(box or {}), **(parameters or {})}
-        lower, upper = bounds_of([f.derivative(name) for f in self.formulas for name in self.window.names], given)
-        shape = (len(self.functions), len(self.window.names))
-        return lower.reshape(shape), upper.reshape(shape)
+        return slope_bounds_of(self.formulas, self.window.names, given)
 
     def c_expressions(self) -> tuple[str, ...]:
         """Return every lifted function as a C expression.

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 from .evaluation import Columns, compile_expression
 from .formula import Formula
+from .limits import MAX_TERMS, count_terms
 from .window import Window
 
 Array = npt.NDArray[np.float64]
@@ -82,8 +83,11 @@ def _terms(formula: Formula, parameters: set[Any]) -> list[tuple[Any, Any]]:
 
     if not formula.expression.free_symbols & parameters:
         return [(sp.Integer(1), formula.expression)]
+    _require_short(formula, formula.expression)
+    apart = _split_angles(formula.expression, parameters)
+    _require_short(formula, apart)
     pairs = []
-    for term in sp.Add.make_args(sp.expand(_split_angles(formula.expression, parameters), trig=False)):
+    for term in sp.Add.make_args(sp.expand(apart, trig=False)):
         coefficient, function = term.as_independent(*(s for s in term.free_symbols if s not in parameters), as_Add=False)
         if function.free_symbols & parameters:
             names = tuple(sorted(p.name for p in parameters))
@@ -92,6 +96,15 @@ def _terms(formula: Formula, parameters: set[Any]) -> list[tuple[Any, Any]]:
             )
         pairs.append((coefficient, function))
     return pairs
+
+
+def _require_short(formula: Formula, expression: Any) -> None:
+    count = count_terms(expression)
+    if count > MAX_TERMS:
+        raise ConfigError(
+            f"Lifting function {formula.text!r}: multiplied out to separate its parameters it has up to {count:.3g} terms, at most {MAX_TERMS} are kept; "
+            "split it into several functions."
+        )
 
 
 def _split_angles(expression: Any, parameters: set[Any]) -> Any:

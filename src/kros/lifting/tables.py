@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from .centres import grid_centres, kmeans_centres, latin_hypercube_centres, random_centres
-from .families import Formulas, delays, formulas, harmonics, polynomials, products
+from .families import MAX_FORMULAS, Formulas, delays, formulas, harmonics, is_whole, polynomials, products, require_names
 from .kernels import fourier_features, radial
 
 Array = npt.NDArray[np.float64]
@@ -60,7 +60,7 @@ def family(table: Table, sample: Sample | None = None) -> Formulas:
     if isinstance(arguments.get("centres"), Mapping):
         given = arguments["centres"]
         if given.get("kind") == "kmeans" and sample is not None:
-            given = {**given, "data": sample(tuple(arguments.get("names", ())))}
+            given = {**given, "data": sample(require_names("centres", arguments.get("names", ())))}
         arguments["centres"] = _call("centres", CENTRES, given)
     return tuple(_call("family", KINDS, arguments))
 
@@ -71,9 +71,10 @@ def check_family(table: Table) -> None:
     if isinstance(centres, Mapping) and centres.get("kind") == "kmeans":
         names = table.get("names", ())
         width = len(names) if isinstance(names, list | tuple) else 1
-        points = np.random.default_rng(0).normal(size=(max(int(centres.get("n", 1)), 1), width))
         if "data" in centres:
             raise ConfigError("Lifting centres 'kmeans': unknown key 'data'; the data are those of the study.")
+        count = centres.get("n", 1)
+        points = np.random.default_rng(0).normal(size=(int(count) if is_whole(count, 1) and count <= MAX_FORMULAS else 1, width))
         family(table, lambda _: points)
     else:
         family(table)
@@ -82,7 +83,7 @@ def check_family(table: Table) -> None:
 def _call(what: str, kinds: Mapping[str, Callable[..., Any]], table: Table) -> Any:
     arguments = dict(table)
     kind = arguments.pop("kind", None)
-    if kind not in kinds:
+    if not isinstance(kind, str) or kind not in kinds:
         raise ConfigError(f"Lifting {what}: kind = {kind!r} is unknown; known are {', '.join(kinds)}.")
     function = kinds[kind]
     known = inspect.signature(function).parameters
@@ -93,7 +94,7 @@ def _call(what: str, kinds: Mapping[str, Callable[..., Any]], table: Table) -> A
         raise ConfigError(f"Lifting {what} {kind!r}: {', '.join(problems)}; it takes {', '.join(known)}.")
     try:
         return function(**arguments)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"Lifting {what} {kind!r}: {error}; check {table}.") from error
+        raise ConfigError(f"Lifting {what} {kind!r}: {error}; check {table!s:.500}.") from error

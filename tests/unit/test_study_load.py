@@ -8,7 +8,7 @@ import pytest
 from kros.core.errors import ConfigError
 from kros.data import split_episodes
 from kros.lifting import Lifting
-from kros.observer import Observer
+from kros.observer import Observer, Seen
 from kros.plants import HarmonicDrivePopulation
 from kros.report.figures import load_torque
 from kros.study.config import LoadConfig
@@ -34,6 +34,7 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
         model_names=("linear",),
         models=lambda name: SimpleNamespace(measured=(0,)),
         store=Store(folder),
+        seen=lambda measured: Seen([7.0], [7.0] * len(population.inputs)),
     )
 
 
@@ -47,7 +48,9 @@ def test_a_declared_load_is_found_on_the_other_units(tmp_path: Path) -> None:
     assert row["observer"] == "linear/load"
     assert row["error_to_floor"] == pytest.approx(row["error_rms"] / row["floor_rms"])
     assert 0 < row["error_rms"] < row["load_rms"]
-    assert Observer.load(tmp_path / "load" / "linear.json").lifting.states[3] == "load"
+    made = Observer.load(tmp_path / "load" / "linear.json")
+    assert made.lifting.states[3] == "load"
+    assert made.seen is not None
     assert "linear/load" in load_torque.draw(SimpleNamespace(folder=tmp_path, sample_period_s=1e-3)).caption
 
 

@@ -16,6 +16,7 @@ from .relift.status import Dropped, ReliftStatus
 from .residual import mean_error_dynamics, one_step_residual, residual_spectra
 from .residual_design import ResidualModel, one_step_rows, residual_models
 from .runtime import Estimate, Runtime
+from .screen import SampleStatus, Seen, sample_status
 from .simulate import run_observer, run_observers
 from .tune import Tuned, tune_observer
 
@@ -36,6 +37,8 @@ __all__ = [
     "ReliftStatus",
     "ResidualModel",
     "Runtime",
+    "SampleStatus",
+    "Seen",
     "Tracked",
     "Tuned",
     "attack",
@@ -58,6 +61,7 @@ __all__ = [
     "residual_spectra",
     "run_observer",
     "run_observers",
+    "sample_status",
     "start_covariance",
     "track_parameter",
     "tune_memory",

@@ -31,7 +31,7 @@ def innovation(observer: Observer, x: Array, y: Array) -> Array:
 
 
 def run_carefully(observer: Observer, y: Array, u: Array, parameters: Parameters | None, wanted: Estimate) -> Array:
-    """Run an observer as `run_observer` does, with missing measurements, a delay and limits.
+    """Run an observer on screened samples as `run_observer` does, with missing measurements, a delay and limits.
 
     While the first `delay` samples go by, what arrives was measured before the start and says nothing but where to start.
 

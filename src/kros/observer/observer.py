@@ -17,17 +17,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import plain, read_json, write_json
-from ..core.errors import DataError, DimensionError
+from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.lti import StateSpace, gain
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .runtime import Runtime
+from .screen import Seen
 from .simulate import run_observer
 
 if TYPE_CHECKING:
@@ -64,6 +65,8 @@ class Observer:
         Default values of the lifting's parameters, the nominal unit's.
     runtime : Runtime
         Delay of the measurement, limits, and the gain of filtered estimates.
+    seen : Seen, optional
+        Largest sizes of measurements and inputs in training, beyond which samples are implausible (see `screen`); none by default.
     """
 
     name: str
@@ -77,8 +80,10 @@ class Observer:
     sample_period_s: float
     parameters: Mapping[str, float] = field(default_factory=dict)
     runtime: Runtime = field(default_factory=Runtime)
+    seen: Seen | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "injection", Injection(self.injection))
         if self.B.shape[1] != len(self.inputs) + len(self.lifting.input_functions):
             raise DimensionError(
                 f"Observer {self.name}: {len(self.inputs)} inputs {self.inputs} and {len(self.lifting.input_functions)} functions of them need as many "
@@ -91,7 +96,12 @@ class Observer:
                 f"Observer {self.name}: the controller should map {len(self.measured)} innovations to {width} corrections ({self.injection.value} injection), "
                 f"found {K.n_inputs} to {K.n_outputs}."
             )
-        self.runtime.require_fit(self.name, self.lifting.n_states, len(self.measured), width)
+        self.runtime.require_fit(self.name, self.lifting.n_states, len(self.measured), width, len(self.inputs))
+        if self.seen is not None and (len(self.seen.measured), len(self.seen.inputs)) != (len(self.measured), len(self.inputs)):
+            raise DimensionError(
+                f"Observer {self.name}: {len(self.measured)} measurements and {len(self.inputs)} inputs need as many sizes seen in training, found "
+                f"{len(self.seen.measured)} and {len(self.seen.inputs)}."
+            )
 
     @classmethod
     def open_loop(
@@ -160,16 +170,56 @@ class Observer:
         return x
 
     def start(self, y: npt.ArrayLike, parameters: Mapping[str, float] | None = None) -> RunningObserver:
-        """Return a running observer that starts at a first measurement, shape (q,)."""
+        """Return a running observer that starts at a first measurement, shape (q,).
+
+        Raises
+        ------
+        ConfigError
+            When a parameter is unknown, missing or not finite.
+        DimensionError
+            When there are not as many measurements as the observer has.
+        """
         from .running import RunningObserver
 
-        return RunningObserver(self, np.atleast_1d(np.asarray(y, dtype=float)), {**self.parameters, **(parameters or {})})
+        return RunningObserver(self, y, {**self.parameters, **(parameters or {})})
+
+    def values(self, parameters: Mapping[str, npt.ArrayLike] | None = None, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
+        """Return the lifting's parameters: those that are given, the observer's own for the others.
+
+        Parameters
+        ----------
+        parameters : mapping of str to array_like
+        shape : tuple of int, optional
+            What every value has to broadcast to.
+
+        Raises
+        ------
+        ConfigError
+            When one is unknown, missing or not finite.
+        DimensionError
+            When one has another shape.
+        """
+        known, values = self.lifting.parameters, {**self.parameters, **(parameters or {})}
+        unknown = [name for name in values if name not in known and name not in self.parameters]
+        missing = [name for name in known if values.get(name) is None]
+        wrong = [name for name in known if name not in missing and not np.isfinite(np.asarray(values[name], dtype=float)).all()]
+        for names, what in ((unknown, "unknown"), (missing, "missing"), (wrong, "not finite")):
+            if names:
+                raise ConfigError(
+                    f"Running observer {self.name}: the parameter {', '.join(map(repr, names))} is {what}; its lifting has "
+                    f"{', '.join(known) or 'no parameters'}."
+                )
+        for name in known if shape is not None else ():
+            found = np.shape(values[name])
+            if found not in ((), shape, (1,) * len(shape or ())):
+                raise DimensionError(f"Running observer {self.name}: the parameter {name!r} should have shape {shape}, found {found}.")
+        return values
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Estimate a batch of episodes; see `run_observer`."""
         return run_observer(self, y, u, parameters)
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Write the observer as one JSON file that a person can read."""
         content = {
             "schema": 1,
@@ -187,12 +237,14 @@ class Observer:
             "controller": {key: getattr(self.controller, key) for key in "ABCD"},
             **self.runtime.content(),
         }
-        write_json(path, plain(content))
+        if self.seen is not None:
+            content["seen"] = {"measured": self.seen.measured, "inputs": self.seen.inputs}
+        write_json(Path(path), plain(content))
 
     @classmethod
-    def load(cls, path: Path) -> Observer:
+    def load(cls, path: Path | str) -> Observer:
         """Read what `save` wrote."""
-        content = read_json(path)
+        content = read_json(Path(path))
         if not isinstance(content, dict) or (content.get("schema"), content.get("kind")) != (1, "observer"):
             raise DataError(f"Loading an observer from {path}: not an observer file of schema 1; write it again with this version of kros.")
         lifting = Lifting.from_content(content)
@@ -218,4 +270,5 @@ class Observer:
             dt,
             defaults,
             Runtime.from_content(content),
+            Seen.from_content(content.get("seen")),
         )

@@ -27,7 +27,8 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 from .careful import innovation, next_estimate
 from .observer import Observer
-from .simulate import require_recordings
+from .screen import started_anew
+from .simulate import judged
 
 Array = npt.NDArray[np.float64]
 _STEP = 1e-5
@@ -81,25 +82,38 @@ def track_parameter(
     Raises
     ------
     ConfigError
-        When the lifting has no such parameter, or the observer has delays.
+        When the lifting has no such parameter, a parameter is unknown or not finite, or the observer has delays.
     """
-    lifting, K, n = observer.lifting, observer.controller, observer.lifting.n_states
+    lifting = observer.lifting
     if name not in lifting.parameters or lifting.history or lifting.input_functions or observer.runtime.delay:
         raise ConfigError(
             f"Phase-locked loop of observer {observer.name}: needs a lifting of present states with the parameter {name!r} and measurements without delay, "
             f"found parameters {lifting.parameters}, a history of {lifting.history} and a delay of {observer.runtime.delay}."
         )
-    require_recordings(f"the phase-locked loop of observer {observer.name}", observer.inputs, y, u)
+    samples, given = judged(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
+    found = started_anew(
+        lambda y, u, values: _followed(observer, y, u, values, name, settle_s),
+        samples,
+        given,
+        lambda found, begin, own: {name: found[1][begin, own]},
+    )
+    return Tracked(*found)
+
+
+def _followed(
+    observer: Observer, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike], name: str, settle_s: float
+) -> tuple[Array, Array]:
+    """Estimates and values of the parameter along screened samples."""
+    lifting, K, n = observer.lifting, observer.controller, observer.lifting.n_states
     batch, C = y.shape[1], list(observer.measured)
-    values = {
-        k: np.broadcast_to(np.asarray(v, dtype=float), (batch,)).copy() for k, v in {**observer.parameters, **(parameters or {})}.items()
-    }
+    values = {k: np.broadcast_to(np.asarray(v, dtype=float), (batch,)).copy() for k, v in parameters.items()}
     forget = min(observer.sample_period_s / settle_s, 1.0)
     coupling, into = observer.A[:n, n:], observer.into[:n]
-    x, x_c = observer.initial(y[0]), np.zeros((batch, K.n_states))
+    x, x_c = observer.initial(y[0], values), np.zeros((batch, K.n_states))
     s, s_c, power = np.zeros((batch, n)), np.zeros((batch, K.n_states)), np.zeros(batch)
     estimates, followed = np.empty((*y.shape[:2], n)), np.empty(y.shape[:2])
-    scale = np.ptp(observer.initial(y)[..., C], axis=(0, 1))
+    there = np.isfinite(y)
+    scale = np.max(y, axis=(0, 1), where=there, initial=-np.inf) - np.min(y, axis=(0, 1), where=there, initial=np.inf)
     scale = np.where(scale > 0, scale, 1.0)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for k in range(len(y)):
@@ -116,4 +130,4 @@ def track_parameter(
             s, s_c = moved + (s_c @ K.C.T - psi @ K.D.T) @ into.T, s_c @ K.A.T - psi @ K.B.T
             seen = np.divide(pull, power, out=np.zeros(batch), where=(power > 0) & np.isfinite(pull))
             values[name] = values[name] + forget * np.clip(seen, -_MOST, _MOST)
-    return Tracked(estimates, followed)
+    return estimates, followed

@@ -43,6 +43,8 @@ class Runtime:
         Largest size of every correction.
     filter_gain : ndarray, shape (n, q), optional
         Gain of filtered estimates, in place of the one that follows from the correction.
+    input_lower, input_upper : ndarray, shape (m,), optional
+        Limits of the recorded inputs. What is beyond them is taken at the limit, as measurements are beyond the limits of their states.
 
     Raises
     ------
@@ -55,6 +57,8 @@ class Runtime:
     upper: Array | None = None
     correction: Array | None = None
     filter_gain: Array | None = None
+    input_lower: Array | None = None
+    input_upper: Array | None = None
 
     def __post_init__(self) -> None:
         if int(self.delay) != self.delay or self.delay < 0:
@@ -67,8 +71,9 @@ class Runtime:
                     raise DataError(
                         f"Runtime of an observer: {name} contains what is not a number; leave limits out, or make them infinite."
                     )
-        if self.lower is not None and self.upper is not None and np.any(self.lower > self.upper):
-            raise DataError(f"Runtime of an observer: lower limits {self.lower} should not exceed the upper ones {self.upper}.")
+        for lower, upper in ((self.lower, self.upper), (self.input_lower, self.input_upper)):
+            if lower is not None and upper is not None and np.any(lower > upper):
+                raise DataError(f"Runtime of an observer: lower limits {lower} should not exceed the upper ones {upper}.")
         if self.correction is not None and np.any(self.correction < 0):
             raise DataError(f"Runtime of an observer: the largest corrections {self.correction} should be positive.")
 
@@ -76,6 +81,24 @@ class Runtime:
     def limited(self) -> bool:
         """Whether anything is limited."""
         return any(limit is not None for limit in (self.lower, self.upper, self.correction))
+
+    @property
+    def changes(self) -> tuple[str, ...]:
+        """What is declared that changes the predicted estimate, in words; empty for an observer that runs as its matrices say."""
+        limits = {
+            "the estimate": (self.lower, self.upper),
+            "the correction": (self.correction,),
+            "the inputs": (self.input_lower, self.input_upper),
+        }
+        found = [
+            f"limits of {what}" for what, sides in limits.items() if any(side is not None and np.isfinite(side).any() for side in sides)
+        ]
+        return (*((f"a delay of {self.delay} samples",) if self.delay else ()), *found)
+
+    def binds(self, x: Array, y_c: Array) -> bool:
+        """Whether an estimate, shape (n,), meets a limit, or a correction, shape (width,), exceeds one."""
+        sides = ((self.lower, x.__le__), (self.upper, x.__ge__), (self.correction, np.abs(y_c).__gt__))
+        return any(limit is not None and bool(np.any(meets(limit))) for limit, meets in sides)
 
     def clip_estimate(self, x: Array) -> Array:
         """Return estimates within their limits, shape (..., n)."""
@@ -87,9 +110,9 @@ class Runtime:
         """Return corrections within their limits, shape (..., width)."""
         return y_c if self.correction is None else np.asarray(np.clip(y_c, -self.correction, self.correction))
 
-    def require_fit(self, name: str, n: int, q: int, width: int) -> None:
+    def require_fit(self, name: str, n: int, q: int, width: int, m: int) -> None:
         """Refuse limits of another size than the observer's."""
-        wanted = {"lower": (n,), "upper": (n,), "correction": (width,), "filter_gain": (n, q)}
+        wanted = {"lower": (n,), "upper": (n,), "correction": (width,), "filter_gain": (n, q), "input_lower": (m,), "input_upper": (m,)}
         for key, shape in wanted.items():
             value = getattr(self, key)
             if value is not None and value.shape != shape:
@@ -108,12 +131,12 @@ class Runtime:
         for name in _ARRAYS:
             if name in found:
                 values = np.array(found[name], dtype=object)
-                values[values == None] = -np.inf if name == "lower" else np.inf  # noqa: E711
+                values[values == None] = -np.inf if name.endswith("lower") else np.inf  # noqa: E711
                 found[name] = values.astype(float)
         return cls(**found)
 
 
-_ARRAYS = ("lower", "upper", "correction", "filter_gain")
+_ARRAYS = ("lower", "upper", "correction", "filter_gain", "input_lower", "input_upper")
 
 
 def _finite(value: Array) -> list[Any]:

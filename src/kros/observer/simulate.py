@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ..core.errors import DimensionError
 from .careful import run_carefully
 from .runtime import Estimate
+from .screen import Screen, Screened, require_samples, started_anew
 
 if TYPE_CHECKING:
     from .observer import Observer
@@ -33,6 +34,7 @@ def run_observer(
     y : ndarray, shape (n_samples, batch, q)
         Row k is what arrives at k; NaN or infinite where a measurement is missing, which then corrects nothing.
     u : ndarray, shape (n_samples, batch, m)
+        Not finite where an input is not known: the last good value stands for it. What is implausible, and where a run starts: see `screen`.
     parameters : mapping of str to array_like, shape (batch,)
         Lifting parameters of the machine behind each episode; the observer's own where absent.
     estimate : Estimate or "predict" or "filter"
@@ -42,12 +44,19 @@ def run_observer(
     -------
     ndarray, shape (n_samples, batch, n)
         Row 0 of a prediction is the start.
+
+    Raises
+    ------
+    DimensionError
+        When measurements and inputs do not fit to each other or to the observer.
+    ConfigError
+        When a parameter is unknown, missing or not finite.
     """
     wanted = Estimate(estimate)
     if wanted is Estimate.PREDICT:
         return run_observers([observer], y, u, parameters)[0]
-    require_recordings(f"observer {observer.name}", observer.inputs, y, u)
-    return run_carefully(observer, y, u, parameters, wanted)
+    samples, values = judged(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
+    return started_anew(lambda y, u, values: (run_carefully(observer, y, u, values, wanted),), samples, values)[0]
 
 
 def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
@@ -66,24 +75,51 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
         A view with the samples outermost in memory.
     """
     observer = observers[0]
-    require_recordings(f"observer {observer.name}", observer.inputs, y, u)
-    lifting, n_samples, batch = observer.lifting, *y.shape[:2]
+    samples, values = judged(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
+    lifting = observer.lifting
     if any((o.lifting, o.measured, o.inputs) != (lifting, observer.measured, observer.inputs) for o in observers[1:]):
         raise DimensionError(
             f"Running {len(observers)} observers side by side: they differ in lifting, measured states or inputs; run them one by one."
         )
-    if any(o.runtime.delay or o.runtime.limited for o in observers):
-        return np.stack([run_carefully(o, y, u, parameters, Estimate.PREDICT) for o in observers])
+    if any(o.runtime.delay or o.runtime.limited or _screens(o) != _screens(observer) for o in observers):
+        return np.stack([_alone(o, y, u, parameters) for o in observers])
+    return started_anew(lambda y, u, values: (_together(observers, y, u, values),), samples, values)[0].transpose(2, 0, 1, 3)
+
+
+def judged(observer: Observer, y: Array, u: Array) -> Screened:
+    """Return a batch of samples as an observer takes them."""
+    y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
+    require_samples(f"observer {observer.name}", len(observer.measured), observer.inputs, y, u)
+    return Screen.of(observer).take(y, u)
+
+
+def _alone(observer: Observer, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
+    if not (observer.runtime.delay or observer.runtime.limited):
+        return run_observers([observer], y, u, parameters)[0]
+    samples, values = judged(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
+    return started_anew(lambda y, u, values: (run_carefully(observer, y, u, values, Estimate.PREDICT),), samples, values)[0]
+
+
+def _screens(observer: Observer) -> tuple[bytes, ...]:
+    screen = Screen.of(observer)
+    return tuple(
+        side.tobytes() for bounds in (screen.measured, screen.inputs) for side in (bounds.lower, bounds.upper, bounds.least, bounds.most)
+    )
+
+
+def _together(observers: Sequence[Observer], y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
+    """Run observers of one model on screened samples; shape (n_samples, batch, observer, n)."""
+    observer, n_samples, batch = observers[0], *y.shape[:2]
+    lifting = observer.lifting
     n, n_lifted, m, k = lifting.n_states, lifting.n_lifted, observer.B.shape[1], len(observers)
     order = max(o.controller.n_states for o in observers)
-    values = {**observer.parameters, **(parameters or {})}
     step = np.stack([_padded(o, order) for o in observers])
     # One column a machine, so that each quantity of all machines lies together: [theta, x^c, u, y]. The product gives [x_hat+, x^c+].
     column = np.zeros((k, step.shape[2], batch))
     row = np.swapaxes(column, 1, 2)
     lifted, inflow, measurement = row[..., :n_lifted], row[..., n_lifted + order : n_lifted + order + m], row[..., n_lifted + order + m :]
     for own, first in zip(row, observers, strict=True):
-        own[..., :n] = first.initial(y[0], parameters)
+        own[..., :n] = first.initial(y[0], values)
     missing = ~np.isfinite(y)
     gone = np.atleast_1d(missing.any(axis=(1, 2)))
     estimates = np.empty((n_samples, k, n, batch))
@@ -109,15 +145,7 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
             np.matmul(step, column, out=following)
             column[:, :n] = following[:, :n]
             column[:, n_lifted : n_lifted + order] = following[:, n:]
-    return estimates.transpose(1, 0, 3, 2)
-
-
-def require_recordings(who: str, inputs: Sequence[str], y: Array, u: Array) -> None:
-    """Refuse measurements and inputs that do not fit together, or to the inputs of an observer."""
-    if y.ndim != 3 or u.ndim != 3 or y.shape[:2] != u.shape[:2]:
-        raise DimensionError(f"Running {who}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch).")
-    if u.shape[2] != len(inputs):
-        raise DimensionError(f"Running {who}: expected inputs {tuple(inputs)}, found shape {u.shape}.")
+    return estimates.transpose(0, 3, 1, 2)
 
 
 def _padded(observer: Observer, order: int) -> Array:

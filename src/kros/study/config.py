@@ -240,7 +240,7 @@ class StudyConfig(_Section):
         return self.model_dump(mode="json")
 
 
-def load_config(path: Path, overrides: Sequence[str] = ()) -> StudyConfig:
+def load_config(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
     """Read a study file and apply ``KEY=VALUE`` overrides such as ``identify.alpha=90``.
 
     Raises
@@ -248,6 +248,7 @@ def load_config(path: Path, overrides: Sequence[str] = ()) -> StudyConfig:
     ConfigError
         When the file is missing, not TOML, or holds unknown keys or values out of range.
     """
+    path = Path(path)
     try:
         raw = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:

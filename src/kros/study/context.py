@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
+
+import numpy as np
 
 from ..core.artifacts import load_artifact
 from ..core.errors import DataError
 from ..data.population import OUTLIERS, EpisodeKey, Population
 from ..identify import ModelSet, PhaseSpec
 from ..lifting import Lifting
+from ..observer import Seen
 from .config import StudyConfig
 from .executors import Executor
 from .store import Store
@@ -78,6 +81,18 @@ class Context:
         from ..data import read_parquet
 
         return read_parquet(self.recordings).select(self.facts.groups)
+
+    @cached_property
+    def sizes(self) -> dict[str, float]:
+        """Largest absolute value of every channel in the training episodes of all units and conditions that take part."""
+        population = self.population
+        largest = np.max([np.abs(population.read(key)).max(axis=0) for key in self.facts.train], axis=0)
+        return dict(zip(population.states + population.inputs, map(float, largest), strict=True))
+
+    def seen(self, measured: Sequence[int]) -> Seen:
+        """Return the sizes of the measured states and of the inputs, beyond which an observer believes less."""
+        states, inputs = self.population.states, self.population.inputs
+        return Seen(np.array([self.sizes[states[i]] for i in measured]), np.array([self.sizes[name] for name in inputs]))
 
     @property
     def recordings(self) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,7 +15,8 @@ from ..data.population import EpisodeKey
 from ..evaluate import EpisodeBatch, error_percent, hold_missing
 from ..identify import ModelSet
 from ..lifting import Lifting
-from ..observer import ExtendedKalman, Features, FilteredDifference, Learned, Moments, cutoffs_hz, rates, start_covariance
+from ..observer import ExtendedKalman, Features, FilteredDifference, Learned, Moments, Seen, cutoffs_hz, rates, start_covariance
+from ..observer.screen import Screen, started_anew
 from .baselines import EQUAL, RESIDUAL
 from .tuning import TuningSet, rank
 
@@ -46,6 +48,8 @@ class Baseline:
         For the records.
     bears_missing : bool
         Whether it knows what to do where a measurement is missing; others get the last one that arrived.
+    seen : Seen, optional
+        Largest sizes in training: samples are judged as those of an observer are.
     """
 
     by_unit: Mapping[str, Estimator]
@@ -53,24 +57,29 @@ class Baseline:
     estimated: tuple[int, ...]
     facts: dict[str, Any]
     bears_missing: bool = False
+    seen: Seen | None = None
 
     def run(self, batch: EpisodeBatch, parameters: Parameters) -> Array:
         """Estimate all episodes, each with the estimator of its unit; NaN for states that are not estimated."""
         return self.estimate(batch.keys, batch.states[..., list(self.measured)], batch.inputs, parameters)
 
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Parameters) -> Array:
-        """Estimate episodes from measurements of any origin, shape (n_samples, batch, q); not finite where one is missing."""
+        """Estimate episodes from measurements and inputs of any origin, shape (n_samples, batch, q) and (..., m); not finite where one is missing."""
         pieces: dict[str, list[int]] = {}
         for i, key in enumerate(keys):
             pieces.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
-        y = y if self.bears_missing else hold_missing(y)
+        samples = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u)
         found: Array | None = None
         for name, rows in pieces.items():
-            part = self.by_unit[name].run(y[:, rows], u[:, rows], {k: v[rows] for k, v in parameters.items()})
+            own = {k: v[rows] for k, v in parameters.items()}
+            (part,) = started_anew(partial(self._piece, self.by_unit[name]), samples.of(rows), own)
             found = np.empty((*y.shape[:2], part.shape[-1])) if found is None else found
             found[:, rows] = part
         assert found is not None
         return found
+
+    def _piece(self, estimator: Estimator, y: Array, u: Array, parameters: Parameters) -> tuple[Array]:
+        return (estimator.run(y if self.bears_missing else hold_missing(y), u, parameters),)
 
 
 def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) -> Baseline:
@@ -103,7 +112,7 @@ def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) 
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
     shape_name, level, Q = tried[first]
     facts = {"status": "tuned", "process_noise_level": 10**level, "process_noise_shape": shape_name}
-    return Baseline({"": replace(filters, Q=Q)}, models.measured, tuple(range(n)), facts, bears_missing=True)
+    return Baseline({"": replace(filters, Q=Q)}, models.measured, tuple(range(n)), facts, bears_missing=True, seen=tuning.seen)
 
 
 def make_difference(tuning: TuningSet, measured: tuple[int, ...]) -> Baseline:
@@ -131,7 +140,7 @@ def make_difference(tuning: TuningSet, measured: tuple[int, ...]) -> Baseline:
         if best is None or error < best[0]:
             best = (error, trial)
     assert best is not None
-    return Baseline({"": best[1]}, measured, tuple(estimated), {"status": "tuned", "cutoff_hz": best[1].cutoff_hz})
+    return Baseline({"": best[1]}, measured, tuple(estimated), {"status": "tuned", "cutoff_hz": best[1].cutoff_hz}, seen=tuning.seen)
 
 
 def make_learned(tuning: TuningSet, lifting: Lifting, measured: tuple[int, ...]) -> Baseline:
@@ -149,7 +158,7 @@ def make_learned(tuning: TuningSet, lifting: Lifting, measured: tuple[int, ...])
     moments = Moments.of(features, batch.states, batch.inputs, batch.lengths, units, judge.parameters)
     estimators: dict[str, Learned] = {unit: moments.estimator([unit]) for unit in moments.units}
     facts = {"status": "trained", "taps": features.taps, "left_out": "the unit under test"}
-    return Baseline(estimators | {"": moments.estimator()}, measured, moments.estimated, facts)
+    return Baseline(estimators | {"": moments.estimator()}, measured, moments.estimated, facts, seen=tuning.seen)
 
 
 def _relative(shape: Array, R: Array, measured: list[int]) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> list[Path]:
         try:
             calibration = study.calibration(lifting)
             observer = load_observer(f"{kind}/load", calibration, study.context.population.inputs, context.config.load.memories)
+            observer = replace(observer, seen=context.seen(observer.measured))
         except KrosError as error:
             facts[f"{kind}/load"] = {"status": "failed", "reason": str(error)}
             log.info("%s/load could not be made: %s", kind, error)

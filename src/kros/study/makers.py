@@ -69,6 +69,7 @@ class Task:
             injection=synthesis.injection,
             sample_period_s=models.sample_period_s,
             parameters={name: float(values[row]) for name, values in models.parameters.items()},
+            seen=self.tuning.seen,
         )
 
     @property

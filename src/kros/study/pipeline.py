@@ -36,8 +36,8 @@ class RunResult:
 
 def run_study(
     config: StudyConfig,
-    out: Path,
-    until: Stage = Stage.REPORT,
+    out: Path | str,
+    until: Stage | str = Stage.REPORT,
     workers: int = 1,
     scheduler: str | None = None,
     progress: Progress | None = None,
@@ -47,9 +47,9 @@ def run_study(
     Parameters
     ----------
     config : StudyConfig
-    out : Path
+    out : Path or str
         Run folder; a stage that finds its own earlier result there is skipped.
-    until : Stage
+    until : Stage or str
         Last stage to run.
     workers : int
         Processes for maps over units. More than one needs the usual ``if __name__ == "__main__":`` guard in a script.
@@ -68,7 +68,7 @@ def run_study(
         Bad input leaves no folder behind that was not there before.
     """
     began = time.perf_counter()
-    out = Path(out)
+    out, until = Path(out), stage_of(until)
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Output {out}: is a file; name a folder.")
     fresh = not out.exists() or not any(out.iterdir())
@@ -92,6 +92,14 @@ def run_study(
     metrics = collect_metrics(context, until, time.perf_counter() - began)
     write_json(store.path("metrics.json"), metrics)
     return RunResult(out, metrics, violations(config, metrics))
+
+
+def stage_of(name: Stage | str) -> Stage:
+    """Return a stage by its name."""
+    try:
+        return Stage(name)
+    except ValueError as error:
+        raise ConfigError(f"Stage {name!r}: is unknown; known are {', '.join(stage.value for stage in Stage)}.") from error
 
 
 def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..data.population import EpisodeKey, Population
 from ..evaluate import EpisodeBatch, error_percent
-from ..observer import Observer, run_observer, run_observers
+from ..observer import Observer, Seen, run_observer, run_observers
 
 Array = npt.NDArray[np.float64]
 TUNING_UNITS = 12
@@ -21,11 +21,12 @@ SIDE_BY_SIDE = 20  # keeps a study of twelve units below 200 MB
 
 @dataclass(frozen=True, eq=False)
 class TuningSet:
-    """The first training episodes of some units, cut short, with each unit's lifting parameters."""
+    """The first training episodes of some units, cut short, with each unit's lifting parameters; `seen` are the sizes in all training episodes."""
 
     population: Population
     keys: tuple[EpisodeKey, ...]
     parameters: dict[str, dict[str, float]]
+    seen: Seen | None = None
 
     def read(self) -> Judge:
         """Read the episodes."""

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError
 from ...lifting import Lifting
-from ..simulate import require_recordings
+from ..screen import require_samples
 
 Array = npt.NDArray[np.float64]
 
@@ -87,7 +87,7 @@ class ExtendedKalman:
 
     def run_all(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Run all filters of a stack Q (k, n, n) side by side, shape (k, n_samples, batch, n)."""
-        require_recordings("the extended Kalman filter", self.inputs, y, u)
+        require_samples("the extended Kalman filter", len(self.measured), self.inputs, y, u)
         lifting, n, C = self.lifting, self.lifting.n_states, list(self.measured)
         Q = self.Q.reshape(-1, 1, n, n)
         k, (n_samples, batch) = len(Q), y.shape[:2]

@@ -13,7 +13,7 @@ disturbances, at many amplitudes, drive a machine that is the observer's own mod
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,7 @@ from ...core.errors import DimensionError
 from ..observer import Observer
 from ..simulate import run_observer
 from .certificate import ReliftCertificate
-from .error import ErrorSystem
+from .error import ErrorSystem, require_covered
 from .ladder import frozen_gain
 from .rows import first_error
 
@@ -239,6 +239,8 @@ def attack_running(
     """
     if certificate.gain is None:
         raise DimensionError(f"Attack on observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")
+    require_covered(observer)
+    observer = replace(observer, seen=None)  # the disturbances are to arrive
     rng, lifting, scales = np.random.default_rng(seed), observer.lifting, certificate.scales
     n, steps, batch = lifting.n_states, len(disturbance), len(start)
     values = {**observer.parameters, **(parameters or {})} if lifting.parameters else None

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
 from ..observer import Observer
-from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, without_measurement
+from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, UncoveredRuntimeError, error_system, without_measurement
 from .ladder import MOST_CORNERS, frozen_gain, mismatch_gain, prove
 from .status import Dropped, ReliftStatus
 
@@ -134,7 +134,7 @@ def relift_certificate(
     parameters: Box | None = None,
     *,
     clipped: bool = False,
-    dropped: Dropped = Dropped.NEVER,
+    dropped: Dropped | str = Dropped.NEVER,
     memory: int = 1,
     mismatch: bool = True,
     tight: bool = False,
@@ -145,6 +145,7 @@ def relift_certificate(
     Parameters
     ----------
     observer : Observer
+        Without a delay and limits in its `runtime`: with them there is no certificate, and `reason` says so.
     box : mapping of str to (lower, upper), optional
         Ranges of states (and of inputs, for input functions) inside which true and estimated values stay; needed where slopes have no global bound.
     scales : ReliftScales, optional
@@ -153,7 +154,7 @@ def relift_certificate(
         Ranges of the lifting's parameters; any value by default, so that the certificate holds for every unit.
     clipped : bool
         The lifted functions see the estimate clipped to the box; then only the true state has to stay inside.
-    dropped : Dropped
+    dropped : Dropped or str
         What the observer does without a measurement, where any may be missing, in any pattern.
     memory : int
         How many coming slopes the Lyapunov function may know, where one matrix does not do.
@@ -179,7 +180,7 @@ def relift_certificate(
     >>> round(relift_certificate(plant).gain, 1)
     3.3
     """
-    start, nothing = time.perf_counter(), np.zeros((0, 0))
+    start, nothing, dropped = time.perf_counter(), np.zeros((0, 0)), Dropped(dropped)
     empty = ReliftCertificate(
         certified=False,
         status=ReliftStatus.UNBOUNDED,
@@ -202,8 +203,9 @@ def relift_certificate(
     )
     try:
         system = empty.system(observer)
-    except UnboundedSlopeError as error:
-        return replace(empty, reason=f"No certificate: {error}.", solve_s=time.perf_counter() - start)
+    except (UnboundedSlopeError, UncoveredRuntimeError) as error:
+        status = ReliftStatus.UNBOUNDED if isinstance(error, UnboundedSlopeError) else ReliftStatus.NOT_COVERED
+        return replace(empty, status=status, reason=f"No certificate: {error}.", solve_s=time.perf_counter() - start)
     modes = [system, *without_measurement(observer, system, dropped)]
     few = system.corner_count <= MOST_CORNERS
     places = np.array(list(product((-1.0, 1.0), repeat=system.L.shape[1]))) if few else np.zeros((0, system.L.shape[1]))
@@ -245,8 +247,9 @@ def _assumptions(observer: Observer, box: Box | None, parameters: Box | None, dr
         told.append(f"the true state stays within {_ranges(box)}, and lifted functions see the estimate clipped to it")
     elif box:
         told.append(f"true and estimated state stay within {_ranges(box)}")
-    if dropped is not Dropped.NEVER:
-        told.append(f"any measurement may be missing; {_WITHOUT[dropped]}")
+    told.append("every measurement arrives" if dropped is Dropped.NEVER else f"any measurement may be missing; {_WITHOUT[dropped]}")
+    if observer.seen is not None:
+        told.append("no measurement and no input is refused as implausible")
     return tuple(told)
 
 

@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError, KrosError
 from ...core.lti import StateSpace
-from ...lifting.intervals import bounds_of
+from ...lifting.continuity import break_of, slope_bounds_of
 from ...synthesis.result import Injection
 from ..observer import Observer
 from .status import Dropped
@@ -43,6 +43,10 @@ _CONSTANT = 4e-12  # interval bounds are widened by 1e-12: a slope within that i
 
 class UnboundedSlopeError(KrosError):
     """A lifted function may be arbitrarily steep where the observer may be."""
+
+
+class UncoveredRuntimeError(KrosError):
+    """An observer runs with what the equations of its error do not know."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +189,10 @@ def error_system(
     ------
     UnboundedSlopeError
         When a slope is unbounded in the box; name ranges of the states it depends on.
+    UncoveredRuntimeError
+        When the observer runs with a delay or limits.
     """
+    require_covered(observer)
     scales = scales or ReliftScales.ones(observer)
     lifting, K, q = observer.lifting, observer.controller, len(observer.measured)
     n = lifting.n_states
@@ -222,6 +229,15 @@ def error_system(
     return ErrorSystem(A, L, B, M, np.zeros((len(moving), n + q)), C, observer.sample_period_s, told)
 
 
+def require_covered(observer: Observer) -> None:
+    """Refuse an observer whose `runtime` changes what runs: the error then obeys other equations than those that are certified."""
+    if declared := observer.runtime.changes:
+        raise UncoveredRuntimeError(
+            f"observer {observer.name} runs with {', '.join(declared)}, which the error equations do not cover; "
+            "certify it without, and do not take that certificate for one of the observer as declared"
+        )
+
+
 def slope_box(
     observer: Observer, names: Sequence[str], box: Box | None = None, parameters: Box | None = None, *, clipped: bool = False
 ) -> tuple[Array, Array]:
@@ -230,14 +246,15 @@ def slope_box(
     Earlier inputs are not among the names: machine and observer have the same ones.
     """
     formulas = observer.lifting.formulas + observer.lifting.input_formulas
-    found = bounds_of([f.derivative(name) for f in formulas for name in names], {**(box or {}), **(parameters or {})})
-    lower, upper = (bound.reshape(len(formulas), len(names)) for bound in found)
+    ranges = {**(box or {}), **(parameters or {})}
+    lower, upper = slope_bounds_of(formulas, names, ranges)
     unbounded = np.argwhere(~(np.isfinite(lower) & np.isfinite(upper)))
     if len(unbounded):
         i, j = unbounded[0]
         raise UnboundedSlopeError(
             f"the slope of {formulas[i].text!r} by {names[j]!r} has no bound"
             + (f" in the box {dict(box)}" if box else "")
+            + (f", {where}" if (where := break_of(formulas[i].expression, ranges)) else "")
             + "; give a box: the ranges of the states and inputs it depends on"
         )
     return (np.minimum(lower, 0.0), np.maximum(upper, 0.0)) if clipped else (lower, upper)

@@ -181,7 +181,7 @@ def tuning_set(context: Context, models: ModelSet) -> TuningSet:
     parameters: dict[str, dict[str, float]] = {
         u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in units
     }
-    return TuningSet(context.population.select(units), keys, parameters)
+    return TuningSet(context.population.select(units), keys, parameters, context.seen(models.measured))
 
 
 def spread(keys: Sequence[EpisodeKey], count: int) -> list[EpisodeKey]:

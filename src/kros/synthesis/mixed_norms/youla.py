@@ -199,12 +199,20 @@ def samples_infeasible(plant: GeneralizedPlant, gamma: float, horizon: int = 24,
 def _in_units(block: Block, family: Family) -> Block:
     """Taps in units of what they do to T22, so that the solver's box is no limit for controllers that hardly reach it; rounding is left out."""
     sizes = np.linalg.norm(block.basis, axis=(-2, -1)).max(axis=-1)
-    _, two, three = family.channel(0)
-    whole = float(np.linalg.norm(two.D) + np.linalg.norm(two.C) * np.linalg.norm(two.B))
-    whole *= float(np.linalg.norm(three.D) + np.linalg.norm(three.C) * np.linalg.norm(three.B))
+    _, two, three = family.channel(2)
+    whole = _uncancelled(two) * _uncancelled(three)
     constant = max(float(np.linalg.norm(block.constant)), 1e-300)
-    unit = np.where(sizes > 1e-13 * whole, constant / np.where(sizes > 0, sizes, 1.0), 0.0)
+    unit = np.where((sizes > 1e-13 * whole) & (sizes > 0), constant / np.where(sizes > 0, sizes, 1.0), 0.0)
     return Block(block.constant, block.basis * unit[:, None, None, None])
+
+
+def _uncancelled(system: StateSpace) -> float:
+    """Size of the impulse response if nothing in it cancelled; it does not depend on the units of the states."""
+    size, state = float(np.linalg.norm(system.D)), system.B
+    for _ in range(2 * system.n_states):
+        size = max(size, float(np.linalg.norm(np.abs(system.C) @ np.abs(state))))
+        state = system.A @ state
+    return size
 
 
 def _family(plant: GeneralizedPlant, centre: str | None) -> Family:

@@ -145,7 +145,7 @@ def _observers(context: Context) -> dict[str, Any]:
             synthesis = Synthesis.load(context.store.path("synthesis", name))
             entry |= {"status": synthesis.status, "solve_s": synthesis.solve_s}
             entry |= {key: getattr(synthesis, key) for key in ("h2_norm", "hinf_norm")}
-            if synthesis.worst_case_h2 is not None:  # a Kalman filter's own optimum bounds nothing in the worst case
+            if synthesis.bounded_in_h2:  # a Kalman filter's own optimum bounds nothing in the worst case
                 entry |= {key: getattr(synthesis, key) for key in ("lower_bound", "gap_percent")}
         entries[name] = entry
     return entries

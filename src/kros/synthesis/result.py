@@ -110,6 +110,11 @@ class Synthesis:
                 "no result claims that. Please report the problem that led here."
             )
 
+    @property
+    def bounded_in_h2(self) -> bool:
+        """Whether `lower_bound` is about `worst_case_h2`; a worst-case H-infinity observer has both norms and a bound of the other."""
+        return self.worst_case_h2 is not None and self.worst_case_hinf is None
+
     def save(self, folder: Path) -> None:
         """Write `synthesis.json` and `arrays.npz`."""
         content = {name: getattr(self, name) for name in _PLAIN}

@@ -27,7 +27,7 @@ def draw(run: RunFolder) -> Drawing:
     certified = {n: float(v) for n in run.observer_names if (v := facts.get(n, {}).get("worst_case_h2")) is not None}
     if not certified:
         raise NotShownError("no observer has a certificate")
-    bounds = {n: s.lower_bound for n, s in run.syntheses.items() if n in certified and s.worst_case_h2 is not None}
+    bounds = {n: s.lower_bound for n, s in run.syntheses.items() if n in certified and s.bounded_in_h2}
     figure, axes = grid(1, 1, 0.3 * len(certified) + 0.7, legend_rows=0)
     draw_certificates(axes[0, 0], certified, bounds, run.deployed)
     return Drawing(

@@ -76,8 +76,7 @@ class ForObserver:
         value, error = certify(problem, controller)
         before = certify(problem, synthesis.controller)[0]
         loop, white = problem.error_system(controller), problem.nominal.n_inputs + problem.nominal.n_states
-        in_h2 = synthesis.worst_case_h2 is not None and synthesis.worst_case_hinf is None  # what the lower bound is about
-        lower, gap, told = enclosed(value, synthesis.lower_bound) if in_h2 else (None, None, ())
+        lower, gap, told = enclosed(value, synthesis.lower_bound) if synthesis.bounded_in_h2 else (None, None, ())
         change = 100 * (value / before - 1)
         stale: dict[str, Any] = dict.fromkeys(("hinf_norm", "worst_case_hinf", "causal_h2"))
         return replace(

@@ -28,7 +28,8 @@ Array = npt.NDArray[Any]
 Ratio = Callable[[Array, Array], tuple[Array, Array]]
 
 _CORRELATED = 1e-10  # regularises the coordinates, in which everything holds whatever they are
-_ROUNDING = 1e-7  # of responses, relative to the terms they are summed from
+_ROUNDING = 1e-7  # of responses, relative
+_RESOLVENT = 1e-14  # of resolvents, relative, for every state: what counts near a pole
 _ROUNDS = 60
 
 
@@ -59,7 +60,8 @@ class Enclosure:
         slope, twice = np.linalg.norm(CR @ RB, axis=-1), np.linalg.norm(CR @ R, axis=-1)
         reach = half * size_R
         tail = twice * (np.linalg.norm(RB, axis=(-2, -1)) / np.where(reach < 1, 1 - reach, 1.0))[:, None]
-        distance = half[:, None] * slope + half[:, None] ** 2 * tail + _ROUNDING * size
+        lost = n * _RESOLVENT * np.linalg.norm(CR, axis=-1) * np.linalg.norm(RB, axis=(-2, -1))[:, None]
+        distance = half[:, None] * slope + half[:, None] ** 2 * tail + lost + _ROUNDING * size
         return response, np.where((reach < 1)[:, None], distance, np.inf)
 
 

@@ -52,6 +52,10 @@ class Spectrum:
         shares = tuple((share * (1 - weight), other) for share, other in self.thetas)
         return replace(self, phi=(1 - weight) * self.phi + weight * phi, thetas=(*shares, (weight, theta)))
 
+    def calmed(self) -> Spectrum:
+        """Return the average of this spectrum and of the average over the ball, which lets no channel of any frequency go; phi is left to `mixture`."""
+        return replace(self, thetas=tuple((share / 2, theta) for share, theta in self.thetas))
+
     def power(self, ball: Ball, index: Array) -> Array:
         """Power of w2 at other frequencies, shape (k, b): the same contractions, those of the given points of the design grid, in another ball."""
         if not self.sharp:

@@ -110,12 +110,14 @@ def worst_case_hinf(
     if reasons and best[1] is nothing:
         raise SynthesisError(f"Worst-case H-infinity synthesis: no design survived verification ({'; '.join(reasons)}).")
     lower = _lower_bound(problem, fit, options, tolerance) if bounded else None
-    return _result(problem, *best, lower, elapsed / (refinements + 1))
+    return _result(problem, *best, lower, elapsed / (refinements + 1), bounded)
 
 
-def _result(problem: ObserverProblem, value: RobustGain, controller: StateSpace, lower: float | None, elapsed: float) -> Synthesis:
+def _result(
+    problem: ObserverProblem, value: RobustGain, controller: StateSpace, lower: float | None, elapsed: float, bounded: bool = True
+) -> Synthesis:
     loop = problem.error_system(controller)
-    lower, _, notes = enclosed(value.attained, lower)
+    lower, _, notes = enclosed(value.attained, lower) if bounded else (None, None, ())
     n_d = problem.nominal.n_inputs + problem.nominal.n_states
     in_h2, error = certify(problem, controller)
     return Synthesis(

@@ -27,13 +27,13 @@ from campaign import Tally, main
 from kros.core.artifacts import CHECKSUM, load_artifact, plain, read_json, save_artifact
 from kros.core.errors import KrosError
 from kros.core.lti import StateSpace
+from kros.core.records import read_record
 from kros.data import Channel, Role, check_population, from_arrays, from_frame, from_pykoop, open_population, write_parquet
 from kros.data.checks import scan_prints
 from kros.identify import ModelSet
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime
-from kros.study.config import Stage, load_config, stored_config
-from kros.study.store import Store
+from kros.study.config import load_config, stored_config
 from kros.synthesis.result import Injection, Status, Synthesis
 from kros.uncertainty import OutlierModel, UncertainModel, quantify, score_outliers
 
@@ -94,18 +94,18 @@ def mutate_bytes(content: bytes, rng: random.Random) -> bytes:
 
 
 def mutate_tree(content: Any, rng: random.Random) -> Any:
-    """Change one place of nested lists and tables: remove it, double it, or put something odd there."""
+    """Change one place of nested lists and tables, each depth as often: remove it, double it, or put something odd there."""
     tree = copy.deepcopy(content)
-    places: list[tuple[Any, Any]] = []
+    places: dict[int, list[tuple[Any, Any]]] = {}
 
-    def walk(node: Any) -> None:
+    def walk(node: Any, depth: int = 0) -> None:
         for key in list(node) if isinstance(node, dict) else range(len(node)):
-            places.append((node, key))
+            places.setdefault(depth, []).append((node, key))
             if isinstance(node[key], (dict, list)):
-                walk(node[key])
+                walk(node[key], depth + 1)
 
     walk(tree)
-    node, key = rng.choice(places)
+    node, key = rng.choice(rng.choice(list(places.values())))
     kind = rng.choice(("remove", "odd", "odd", "odd", "nest", "rename", "double"))
     if kind == "remove":
         del node[key]
@@ -365,10 +365,10 @@ def memory_targets() -> list[Target]:
         return frame
 
     def arrays(data: Any) -> Any:
-        return recorded(from_arrays(data["data"], named, data["period"]))
+        return recorded(from_arrays(data.get("data"), named, data.get("period")))
 
     def koop(data: Any) -> Any:
-        return recorded(from_pykoop(data["data"], data["inputs"], data["period"]))
+        return recorded(from_pykoop(data.get("data"), data.get("inputs"), data.get("period")))
 
     frame_good = recorded(from_frame(pd.DataFrame(rows), named, sample_period_s=0.01))
     good, other = {"data": table, "period": 0.01}, {"data": pykoop, "period": 0.01, "inputs": 1}
@@ -444,13 +444,14 @@ def study_targets(root: Path) -> list[Target]:
     def stored(folder: Path) -> Any:
         return stored_config(read_json(folder / "study.json"), folder / "study.json").dump()
 
-    def current(folder: Path) -> Any:
-        return Store(folder).is_current(Stage.READ, "0" * 64)
+    def stage(folder: Path) -> Any:
+        found = read_record(folder, "read")
+        return None if found is None else found.content()
 
     return [
         toml_target("study TOML", toml, STUDY, lambda p: load_config(p).dump()),
         folder_target("study.json", root / "run", stored, mutate_file, False),
-        folder_target("stage record", root / "record", current, mutate_file, False),
+        folder_target("stage record", root / "record", stage, mutate_file, False),
     ]
 
 

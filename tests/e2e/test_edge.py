@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +59,6 @@ def said(result, code, *words):
         (NotADirectoryError(errno.ENOTDIR, "Not a directory", "x", None, "y"), ("'x' -> 'y'",)),
         (OSError("odd"), ("odd",)),
         (MemoryError(), ("Memory", "--workers")),
-        (BrokenProcessPool("terminated abruptly"), ("worker",)),
         (KeyError("alpha"), ("Internal error", "KeyError", "--debug")),
         (RecursionError("too deep"), ("Internal error",)),
         (ZeroDivisionError("division by zero"), ("Internal error", "division by zero")),

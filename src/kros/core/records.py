@@ -94,7 +94,7 @@ def read_record(folder: Path, stage: str) -> Record | None:
         return None
     try:
         return _parsed(folder, stage, read_json(path))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(f"Record {path}: is damaged, or of another version of kros ({error}); run the study again.") from error
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError
+from ..core.files import shortened
 from .copies import Print, print_of, refuse_copies
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 from .recording import title
@@ -192,9 +193,14 @@ def check_period(period_s: Any, what: str) -> float:
     ------
     DataError
     """
-    if isinstance(period_s, bool) or not isinstance(period_s, Real) or not 0 < float(period_s) < math.inf:
-        raise DataError(f"{what}: the sampling period should be a number of seconds above zero, found {period_s!r}; give it in seconds.")
-    return float(period_s)
+    try:
+        seconds = math.nan if isinstance(period_s, bool) or not isinstance(period_s, Real) else float(period_s)
+    except OverflowError:
+        seconds = math.inf
+    if not 0 < seconds < math.inf:
+        found = shortened(repr(period_s))
+        raise DataError(f"{what}: the sampling period should be a number of seconds above zero, found {found}; give it in seconds.")
+    return seconds
 
 
 def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey]) -> None:

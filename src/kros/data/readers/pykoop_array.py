@@ -64,6 +64,8 @@ def from_pykoop(
         ) from error
     if not arrays:
         raise DataError("from_pykoop: the mapping is empty; give one array per unit.")
+    if isinstance(n_inputs, bool) or not isinstance(n_inputs, (int, np.integer)):
+        raise DataError(f"from_pykoop: n_inputs should be a whole number, found {n_inputs!r}; correct it.")
     widths = sorted({x.shape[-1] if x.ndim == 2 else -1 for x in arrays.values()})
     n_columns = widths[0] - int(episode_feature)
     if len(widths) > 1 or n_columns < 1 or not 0 <= n_inputs < n_columns:

@@ -244,5 +244,5 @@ def _level(values: Array, inside: Array) -> Array:
 def _smoothed(values: Array, freqs_hz: Array) -> Array:
     """Gaussian average of log values over log frequency; columns are smoothed one by one."""
     x = np.log10(np.maximum(freqs_hz, freqs_hz[freqs_hz > 0].min(initial=np.inf)))
-    kernel = np.exp(-0.5 * ((x[:, None] - x) / _SMOOTHING_DECADES) ** 2) * (np.gradient(x).clip(0.0) if len(x) > 1 else 1.0)
+    kernel = np.exp(-0.5 * ((x[:, None] - x) / _SMOOTHING_DECADES) ** 2) * (np.gradient(x).clip(1e-12) if len(x) > 1 else 1.0)
     return np.exp(kernel @ np.log(values) / kernel.sum(axis=1, keepdims=True))

@@ -97,7 +97,8 @@ class JointFit:
     def ends(self) -> tuple[float, float]:
         """Places that sections may take."""
         inner = np.log(self.tau[(self.tau > 0) & (self.tau < 1e12)])
-        return float(inner.min() - _BEYOND), float(inner.max() + _BEYOND)
+        low, high = (inner.min(), inner.max()) if inner.size else (0.0, 0.0)  # DC and Nyquist alone
+        return float(low - _BEYOND), float(high + _BEYOND)
 
     def evaluate(self, start: Sections) -> Fitted:
         """Return sections raised to be sound."""

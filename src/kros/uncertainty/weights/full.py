@@ -107,7 +107,7 @@ def fit_full(
     diagonal, cover = _filters(residuals, freqs_hz, sample_period_s, systems=systems, **options)
     p, m = E.shape[2:]
     same = tuple(gain(np.eye(k), sample_period_s) for k in (p, m))
-    if not cover.left.any() or (p, m) == (1, 1):
+    if (p, m) == (1, 1) or not (cover.left.any(axis=1) & (freqs_hz > 0)).any():
         return _full(diagonal, *same), cover
     *turned, still = best_frames(E, freqs_hz, sample_period_s)
     checks = Checks(options.get("density", 10), options.get("also_hz"), systems, options.get("sampled", False))

@@ -1,0 +1,195 @@
+"""Weights of lightly damped units, of responses alone and of remainders: bounds and statements checked with formulas of this file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kros.core import StateSpace
+from kros.uncertainty import EntrywiseWeight, FullWeight, Structure, optimal_cover, quantify, quantify_responses
+
+Array = np.ndarray[Any, Any]
+
+
+def mode(radius: float, angle: float, gain: Array, through: Array, dt: float = 1.0) -> StateSpace:
+    """A pair of poles between inputs (columns of through) and outputs (rows)."""
+    A = radius * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    B = np.vstack([np.ones(through.shape[1]), np.arange(through.shape[1])])
+    return StateSpace(A, B, (1 - radius) * gain, through, dt)
+
+
+def single(radius: float, angle: float, gain: float = 1.0) -> StateSpace:
+    return mode(radius, angle, np.array([[gain, 0.3]]), np.array([[0.2]]))
+
+
+def response(system: StateSpace, freqs: Array) -> Array:
+    z = np.exp(2j * np.pi * freqs * system.dt) if system.dt else 2j * np.pi * freqs
+    return system.C @ np.linalg.solve(z[:, None, None] * np.eye(system.n_states) - system.A, system.B + 0j) + system.D
+
+
+def around(systems: list[StateSpace]) -> Array:
+    """Frequencies within ten half-widths of every pole, and 2000 others up to Nyquist."""
+    poles = np.concatenate([np.log(s.poles().astype(complex)) for s in systems if s.n_states])
+    steps = np.linspace(-10, 10, 81)
+    found = np.abs(poles.imag)[:, None] + np.abs(poles.real)[:, None] * steps
+    freqs = np.concatenate([np.geomspace(1e-5, 0.5, 2000), found.ravel() / (2 * np.pi)])
+    return np.unique(freqs[(freqs > 0) & (freqs <= 0.5)])
+
+
+def largest(weight: Any, E: Array, freqs: Array) -> Array:
+    """Largest sigma_max(W_L^-1 E_k W_R^-1) at every frequency."""
+    left, right = response(weight.left, freqs), response(weight.right, freqs)
+    return np.linalg.norm(np.linalg.solve(left, E) @ np.linalg.inv(right), 2, axis=(-2, -1)).max(axis=0)
+
+
+LIGHT = [single(0.999, 0.3), single(0.999, 0.309, 1.1), single(0.999, 0.288, 0.9)]
+GRID = np.geomspace(1e-4, 0.4999, 30)
+
+
+def test_peaks_between_the_points_of_a_grid_are_covered_and_not_at_the_price_of_all_others() -> None:
+    found = quantify(LIGHT, "additive", GRID, max_order=3, density=2)
+    freqs = around([*LIGHT, found.weight.left])
+    G = response(found.nominal_system, freqs)
+    E = np.array([response(u, freqs) - G for u in LIGHT])
+    assert largest(found.weight, E, freqs).max() <= 1 + 1e-9
+    given = np.array([response(u, GRID) - response(found.nominal_system, GRID) for u in LIGHT])
+    loose = -20 * np.log10(largest(found.weight, given, GRID))
+    assert loose.max() == pytest.approx(found.overbound_db_max, abs=1e-6)
+    assert found.weight.within_tolerance == (loose.max() <= 1.0)
+
+
+@pytest.mark.parametrize(("angles", "radius", "order"), [((0.3, 0.309, 0.288), 0.999, 5), ((2.0, 2.01, 1.99), 0.9995, 4)])
+def test_lightly_damped_units_of_any_order_get_a_weight(angles: tuple[float, ...], radius: float, order: int) -> None:
+    units = [single(radius, angle, 1 + 0.1 * k) for k, angle in enumerate(angles)]
+    found = quantify(units, "additive", np.geomspace(1e-4, 0.4999, 60), max_order=order, tolerance_db=3.0)
+    assert found.weight.left.is_stable()
+    assert max(found.weight.left_orders) <= order
+    assert found.cover_max <= 1
+
+
+def resonances(freqs: Array) -> Array:
+    s = 2j * np.pi * freqs
+    rows = []
+    for shift, size in ((1.0, 1.0), (1.02, 1.1), (0.97, 0.9)):
+        natural = 2 * np.pi * 0.03 * shift
+        rows.append(size * natural**2 / (s**2 + 2 * 0.01 * natural * s + natural**2))
+    return np.array(rows)[:, :, None, None]
+
+
+@pytest.mark.parametrize("structure", ["scalar", "diagonal", "full", "entrywise"])
+@pytest.mark.parametrize("period", [0.0, 1.0])
+def test_weights_of_responses_touch_at_a_given_frequency_and_tell_how_loose_they_are(structure: str, period: float) -> None:
+    freqs = np.geomspace(1e-3, 0.4999, 40)
+    given = resonances(freqs)
+    found = quantify_responses(given, freqs, "additive", sample_period_s=period, structure=structure, max_order=2)
+    E = given - found.nominal_response
+    allowed = np.abs(response(found.weight.matrix(), freqs))[:, 0, 0]
+    ratio = np.abs(E).max(axis=0)[:, 0, 0] / allowed
+    assert ratio.max() <= 1 + 1e-9
+    if period:  # the ends of a continuous grid are held, too
+        assert ratio.max() >= 0.9
+    loose = -20 * np.log10(ratio.min())
+    assert found.overbound_db_max == pytest.approx(loose, abs=1e-6)
+    assert found.weight.within_tolerance == (loose <= 1.0)
+
+
+def test_responses_that_do_not_resolve_a_peak_are_told_so(caplog: pytest.LogCaptureFixture) -> None:
+    coarse, fine = np.geomspace(1e-3, 0.4, 60), np.unique(np.concatenate([np.geomspace(1e-3, 0.4, 60), np.linspace(0.028, 0.032, 81)]))
+    found = quantify_responses(resonances(coarse), coarse, "additive", sample_period_s=1.0, max_order=1)
+    assert found.unresolved_hz.size
+    assert np.all(np.abs(found.unresolved_hz - 0.03) < 0.003)
+    assert "do not resolve" in found.certificate
+    assert "more densely" in caplog.text
+    caplog.clear()
+    resolved = quantify_responses(resonances(fine), fine, "additive", sample_period_s=1.0, max_order=1)
+    assert not resolved.unresolved_hz.size
+    assert "resolve" not in resolved.certificate
+    assert not caplog.records
+
+
+def tall(radius: float, angle: float, size: float) -> StateSpace:
+    return mode(radius, angle, size * np.array([[1.0, 0.2], [-0.4, 0.9]]), np.array([[0.5], [0.3 * size]]))
+
+
+@pytest.mark.parametrize("form", ["input_multiplicative", "inverse_input_multiplicative", "inverse_additive"])
+@pytest.mark.parametrize("wide", [False, True])
+def test_remainders_are_covered_between_the_points_of_a_grid(form: str, wide: bool) -> None:
+    units = [tall(0.9995, 0.7, 1.0), tall(0.9993, 0.705, 1.2), tall(0.9996, 0.694, 0.8)]
+    if wide:
+        form = form.replace("input", "output")
+        units = [StateSpace(u.A.T, u.C.T, u.B.T, u.D.T, u.dt) for u in units]
+    found = quantify(units, form, np.geomspace(1e-3, 0.49, 16), max_order=1, density=2)
+    weight = found.remainder
+    assert weight is not None
+    if form != "inverse_additive":
+        assert weight.method.value == "level sets"
+    freqs = around([*units, weight.left, weight.right])
+    G = response(found.nominal_system, freqs)
+    parts = []
+    for unit in units:
+        P = response(unit, freqs)
+        if form == "inverse_additive":
+            E = np.linalg.pinv(P) @ (P - G) @ np.linalg.pinv(G)
+            parts.append(P - G @ np.linalg.inv(np.eye(G.shape[-1]) - E @ G))
+        elif form.startswith("inverse_output"):
+            parts.append(P - np.linalg.solve(np.eye(G.shape[1]) - (P - G) @ np.linalg.pinv(P), G))
+        elif form.startswith("inverse"):
+            parts.append(P - G @ np.linalg.inv(np.eye(G.shape[-1]) - np.linalg.pinv(P) @ (P - G)))
+        elif wide:
+            parts.append((P - G) @ (np.eye(G.shape[-1]) - np.linalg.pinv(G) @ G))
+        else:
+            parts.append((np.eye(G.shape[1]) - G @ np.linalg.pinv(G)) @ (P - G))
+    assert largest(weight, np.array(parts), freqs).max() <= 1 + 1e-8
+
+
+@pytest.mark.parametrize(("structure", "kind"), [("entrywise", EntrywiseWeight), ("full", FullWeight)])
+def test_one_entry_has_the_weight_of_the_structure_asked_for(structure: str, kind: type) -> None:
+    units = [single(0.9, 0.5), single(0.88, 0.5, 1.2)]
+    found = quantify(units, "additive", GRID, structure=structure)
+    assert isinstance(found.weight, kind)
+    assert found.weight.structure is Structure(structure)
+
+
+@pytest.mark.parametrize("structure", [s.value for s in Structure])
+def test_every_structure_has_a_matrix_that_bounds_entries(structure: str) -> None:
+    units = [single(0.9, 0.5), single(0.88, 0.5, 1.2), single(0.92, 0.45, 0.9)]
+    found = quantify(units, "additive", GRID, structure=structure)
+    freqs = np.geomspace(1e-5, 0.5, 500)
+    E = np.array([response(u, freqs) - response(found.nominal_system, freqs) for u in units])
+    ratio = np.abs(E).max(axis=0) / np.abs(response(found.weight.matrix(), freqs))
+    assert 0.9 < ratio.max() <= 1
+
+
+def test_identical_units_and_single_frequencies_get_weights() -> None:
+    units = [single(0.9, 0.5)] * 3
+    for structure in Structure:
+        assert quantify(units, "additive", GRID, structure=structure).cover_max == 0
+    pair = [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 1.1)]
+    for freqs in ([0.1], [0.0, 0.5], [0.5]):
+        assert quantify(pair, "additive", freqs, max_order=2).cover_max <= 1
+
+
+def test_full_weights_say_how_far_they_are_from_the_cover_in_their_frames_as_returned() -> None:
+    rng = np.random.default_rng(3)
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    sizes = np.geomspace(1.0, 100.0, 2)
+    units = [
+        StateSpace([[0.5 + 0.1 * k]], [[1.0, 0.4]], 0.2 * turn @ np.array([[1.0], [0.01]]), turn @ np.diag(sizes) @ np.diag(rng.random(2)), 1.0)
+        for k in range(3)
+    ]
+    found = quantify(units, "additive", GRID, structure="full", max_order=2)
+    used = found.weight.magnitudes(GRID)
+    excess = (used.cost_db() - found.cover.cost_db()).max()
+    assert found.overbound_db_max == pytest.approx(excess, abs=1e-9)
+    assert found.weight.within_tolerance == (excess <= 1.0)
+
+
+def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
+    units = [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 1.1), tall(0.85, 0.4, 0.8)]
+    found = quantify(units, "additive", GRID, structure="diagonal", max_order=1, tolerance_db=0.1)
+    E = np.array([response(u, GRID) - response(found.nominal_system, GRID) for u in units])
+    excess = (found.weight.magnitudes(GRID).cost_db() - optimal_cover(E).cost_db()).max()
+    assert found.overbound_db_max == pytest.approx(excess, abs=1e-6)
+    assert not found.weight.within_tolerance

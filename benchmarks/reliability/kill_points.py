@@ -45,7 +45,7 @@ baselines = ["open_loop", "kalman_white"]
 robustness = false
 monte_carlo = 0
 """
-TIMES = {"seconds", "solve_s", "timing_s"}
+TIMES = {"seconds", "solve_s", "timing_s", "checksum"}  # a checksum is of the times too
 STAGES = ("simulate", "read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report")
 IN_A_ROW, PATIENCE = 4, 10  # kills before a run is let finish; times that a run nobody killed takes, after which one hangs
 _TIMED_TABLE = re.compile(r"<table>(?:(?!</table>).)*?(?:>seconds<|solved in \(s\))(?:(?!</table>).)*?</table>", re.DOTALL)

@@ -1,6 +1,6 @@
 """Outlier scores on populations whose truth is known: how often good units are flagged that were recorded less, and whether bad ones are found.
 
-    python benchmarks/reliability/outliers.py --count 120
+    python benchmarks/reliability/outliers.py --count 100
 
 Every population is 12 drives (two states, one input) with log-normal parameters, driven by noise of their own in episodes of 300 samples, identified by
 regularised least squares as a study does it. Good units of the same distribution and badly assembled ones (half the torque, four times the
@@ -149,4 +149,4 @@ def record(rng: np.random.Generator, system: tuple[Array, Array], episodes: int,
 
 
 if __name__ == "__main__":
-    main("outliers", "Outlier scores of good and of bad units, recorded as much as the others and less", run, 120)
+    main("outliers", "Outlier scores of good and of bad units, recorded as much as the others and less", run, 100)

@@ -176,7 +176,9 @@ def test_full_weights_say_how_far_they_are_from_the_cover_in_their_frames_as_ret
     turn = np.array([[0.8, -0.6], [0.6, 0.8]])
     sizes = np.geomspace(1.0, 100.0, 2)
     units = [
-        StateSpace([[0.5 + 0.1 * k]], [[1.0, 0.4]], 0.2 * turn @ np.array([[1.0], [0.01]]), turn @ np.diag(sizes) @ np.diag(rng.random(2)), 1.0)
+        StateSpace(
+            [[0.5 + 0.1 * k]], [[1.0, 0.4]], 0.2 * turn @ np.array([[1.0], [0.01]]), turn @ np.diag(sizes) @ np.diag(rng.random(2)), 1.0
+        )
         for k in range(3)
     ]
     found = quantify(units, "additive", GRID, structure="full", max_order=2)

@@ -20,6 +20,7 @@ Residuals = Callable[[Array], Array]
 
 _TAIL = 16  # points towards DC and Nyquist, four a decade
 _BETWEEN = 3  # steps between known points in which a fit is held up
+_DIP = 10 ** (-3 / 20)
 _SAME = 1e-9  # relative distance of frequencies that are one
 
 
@@ -91,10 +92,10 @@ def joined(freqs_hz: Array, others_hz: Array) -> tuple[Array, Array]:
 
 
 def between_points(E: Array, freqs_hz: Array) -> Residuals:
-    """Return residuals that are known at some frequencies at any frequency.
+    """Return residuals that are known at some frequencies at any frequency, for fits that should not make much of what they do not know.
 
-    Between two points they are those of the nearer one, with the largest on the straight line between both in logarithms; beyond the ends those
-    of the ends. A weight that follows the points and dips between them is below this.
+    Between two points they are those of the nearer one, with the largest 3 dB below the smaller of both: a smooth weight is above that, and one
+    that follows the points and dips between them is not. Beyond the ends they are those of the ends.
 
     Parameters
     ----------
@@ -105,15 +106,10 @@ def between_points(E: Array, freqs_hz: Array) -> Residuals:
 
     def at(asked_hz: Array) -> Array:
         near = nearest(freqs_hz, asked_hz)
-        if len(freqs_hz) == 1:
-            return E[:, near]
-        low = (np.searchsorted(freqs_hz, asked_hz, side="right") - 1).clip(0, len(freqs_hz) - 2)
-        ends = np.log(np.maximum(freqs_hz[[low, low + 1]], _first_positive(freqs_hz)))
-        share = ((np.log(np.maximum(asked_hz, _first_positive(freqs_hz))) - ends[0]) / np.maximum(ends[1] - ends[0], 1e-300)).clip(0, 1)
-        alive = (size[low] > 0) & (size[low + 1] > 0)
-        logs = np.log(np.where(size > 0, size, 1.0))
-        line = (1 - share) * logs[low] + share * logs[low + 1]
-        return np.asarray(E[:, near] * np.where(alive, np.exp(line - logs[near]), 1.0)[:, None, None])
+        other = np.clip(near + np.where(asked_hz > freqs_hz[near], 1, -1), 0, len(freqs_hz) - 1)
+        known = (np.abs(asked_hz - freqs_hz[near]) <= _SAME * freqs_hz[near]) | (other == near) | (size[near] == 0)
+        floor = _DIP * np.minimum(size[near], size[other]) / np.where(size[near] > 0, size[near], 1.0)
+        return np.asarray(E[:, near] * np.where(known, 1.0, floor)[:, None, None])
 
     return at
 
@@ -123,7 +119,3 @@ def nearest(grid: Array, freqs_hz: Array) -> npt.NDArray[np.intp]:
     if len(grid) == 1:
         return np.zeros(len(freqs_hz), np.intp)
     return np.asarray(np.searchsorted((grid[1:] + grid[:-1]) / 2, freqs_hz))
-
-
-def _first_positive(freqs_hz: Array) -> float:
-    return float(freqs_hz[freqs_hz > 0].min(initial=np.inf)) / 10

@@ -235,7 +235,7 @@ def test_the_observer_file_holds_delays_and_input_functions(tmp_path, injection)
 
 def test_observers_refuse_inputs_that_do_not_fit():
     o = observer()
-    with pytest.raises(DimensionError, match="expected the 2 inputs"):
+    with pytest.raises(DimensionError, match="expected inputs"):
         run_observer(o, np.zeros((5, 1, 1)), np.zeros((5, 1, 4)))
     with pytest.raises(DimensionError, match="2 functions of them need as many columns of B, found 2"):
         Observer("x", DELAYED, o.A, o.B[:, :2], (0,), INPUTS, o.controller, Injection.STATE, 0.01)

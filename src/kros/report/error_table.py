@@ -104,7 +104,7 @@ def _cell(rows: Sequence[Mapping[str, Any]]) -> ErrorCell:
         return ErrorCell(nominal, None, None, None, len(others) - len(finite))
     worst = max(finite, key=lambda r: float(r["error_percent"]))
     mean = sum(r["error_percent"] for r in finite) / len(finite)
-    return ErrorCell(nominal, mean, worst["error_percent"], worst["unit"], 0, _mean([r["rms"] for r in finite]))
+    return ErrorCell(nominal, mean, worst["error_percent"], worst["unit"], 0, _mean([r.get("rms") for r in finite]))
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

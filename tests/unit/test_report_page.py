@@ -442,7 +442,7 @@ def test_half_a_run_is_told_by_halves(tmp_path: Path) -> None:
 def test_stopped_run_shows_its_recordings(tmp_path: Path) -> None:
     write_read_stage(tmp_path)
     states, inputs = shown_signals(0)
-    sources = {EpisodeKey("001", c, "1"): np.hstack([states, inputs]) for c in ("load", "noload")}
+    sources = {EpisodeKey("001", c, "1"): size * np.hstack([states, inputs]) for c, size in (("load", 0.9), ("noload", 1.0))}
     write_parquet(Population(CHANNELS, DT, (Unit("001"),), tuple(sources), sources.__getitem__), tmp_path / "recordings")
     drawn = [r.name for r in draw_all(RunFolder(tmp_path)) if r.drawing]
     assert drawn == ["signals"]

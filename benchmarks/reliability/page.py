@@ -39,7 +39,7 @@ def render() -> str:
 
 def _campaign(name: str, result: dict[str, Any]) -> str:
     rows = "".join(_row(tally) for tally in result["tallies"])
-    notes = "".join(f"\n{tally['note']}\n" for tally in result["tallies"] if tally["note"])
+    notes = "".join(f"\n{tally['cases'].capitalize()}: {tally['note'].strip()}\n" for tally in result["tallies"] if tally["note"])
     command = f"`python benchmarks/reliability/{name}.py --seed {result['seed']}`, {result['seconds'] / 60:.1f} minutes on one core"
     head = "| cases | compared with | tried | outcomes | failures | slowest (s) |\n|---|---|---|---|---|---|\n"
     return f"\n## {result['title']}\n\n{command}\n\n{head}{rows}{notes}"

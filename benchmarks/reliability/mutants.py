@@ -25,21 +25,25 @@ ROOT = Path(__file__).parents[2]
 TIMEOUT_S = 120.0
 FAST = f"{sys.executable} -m pytest -q -x -p no:cacheprovider -m 'not slow'"
 TESTS = {
-    "src/kros/synthesis/robust": "tests/oracle/test_synthesis_worst_case.py tests/oracle/test_synthesis_shaping.py",
-    "src/kros/uncertainty/weights": "tests/oracle/test_uncertainty_cover.py tests/oracle/test_uncertainty_certificate.py "
-    "tests/oracle/test_uncertainty_entrywise.py",
-    "src/kros/observer/relift": "tests/oracle/test_observer_relift.py tests/unit/test_observer_relift_study.py",
-    "src/kros/evaluate/errors.py": "tests/oracle/test_evaluate_errors.py tests/oracle/test_evaluate_spectra.py",
+    "src/kros/synthesis/robust": "synthesis_shaping synthesis_worst_case synthesis_forms synthesis_lower_bounds",
+    "src/kros/uncertainty/weights": "uncertainty_weights uncertainty_cover uncertainty_entrywise uncertainty_certificate uncertainty_full",
+    "src/kros/observer/relift": "observer_relift_study observer_relift",
+    "src/kros/evaluate/errors.py": "evaluate_errors evaluate_spectra",
 }
 
 
 def run(count: int, seed: int) -> list[Tally]:
     """Draw mutants, test each, and tell which survived."""
     with tempfile.TemporaryDirectory() as folder:
-        sessions = {place: _session(Path(folder), place, command) for place, command in TESTS.items()}
+        sessions = {place: _session(Path(folder), place, _files(names)) for place, names in TESTS.items()}
         found = [(place, job) for place, session in sessions.items() for job in _jobs(session)]
         chosen = random.Random(seed).sample(found, min(count, len(found)))
         return [_tested(place, session, {job for p, job in chosen if p == place}) for place, session in sessions.items()]
+
+
+def _files(names: str) -> str:
+    found = [str(f.relative_to(ROOT)) for name in names.split() for f in sorted((ROOT / "tests").glob(f"*/test_{name}.py"))]
+    return " ".join(found)
 
 
 def _session(folder: Path, place: str, tests: str) -> Path:

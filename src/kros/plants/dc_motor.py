@@ -10,22 +10,19 @@ velocity and current from noisy sensors. `tanh(velocity)` lifts the Coulomb fric
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError
-from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
-from .recordings import Recordings
-from .simulated import SimulatedPopulation
+from ..data.population import Channel, Role
+from .batch import Batch, runge_kutta
 
 Array = npt.NDArray[np.float64]
 
 SAMPLE_PERIOD_S = 0.002
-SUBSTEPS = 2
-COUNT_RAD = 2 * np.pi / 4096
 VELOCITY_NOISE = 0.1  # rad/s, standard deviation
 CURRENT_NOISE = 0.01  # A, standard deviation
 CURRENT_LIMIT_A = 8.0
@@ -41,7 +38,6 @@ CHANNELS = (
     Channel("current", Role.STATE, "A"),
     Channel("voltage", Role.INPUT, "V"),
 )
-INPUT_STREAM, UNIT_STREAM, OUTLIER_STREAM, NOISE_STREAM = range(4)  # first words of spawn keys
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,19 +77,8 @@ class DcMotorTruth:
         ndarray, shape (3, n_units, n_episodes, n_samples)
             Position, velocity and current, by Runge-Kutta of order four.
         """
-        n_episodes, n_samples = voltage.shape
-        out = np.empty((n_samples, 3, len(self.unit_ids), n_episodes))
-        x, h = np.zeros(out.shape[1:]), SAMPLE_PERIOD_S / SUBSTEPS
-        for k in range(n_samples):
-            out[k] = x
-            for _ in range(SUBSTEPS):
-                k1 = self._rates(x, voltage[:, k])
-                k2 = self._rates(x + 0.5 * h * k1, voltage[:, k])
-                k3 = self._rates(x + 0.5 * h * k2, voltage[:, k])
-                k4 = self._rates(x + h * k3, voltage[:, k])
-                x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-                x[2] = np.clip(x[2], -CURRENT_LIMIT_A, CURRENT_LIMIT_A)
-        return np.moveaxis(out, 0, -1).copy()
+        start = np.zeros((3, len(self.unit_ids), len(voltage)))
+        return runge_kutta(self._rates, start, voltage, SAMPLE_PERIOD_S, _limited)
 
     def steady_velocity(self, voltage: float) -> Array:
         """Velocity at which a constant positive voltage turns the motors, far above `SLIP_RAD_S`; rad/s, shape (n_units,)."""
@@ -113,82 +98,29 @@ class DcMotorTruth:
         return np.stack([w, (k * i - b * w - c * np.tanh(w / SLIP_RAD_S)) / J, (voltage - R * i - k * w) / L])
 
 
-@dataclass(frozen=True)
-class DcMotorPopulation:
-    """Settings of a simulated batch of DC motors.
+class DcMotorPopulation(Batch[DcMotorTruth]):
+    """Settings of a simulated batch of DC motors, see `Batch`; a spread of 1 means 5 to 15 percent, the outlier has a tired magnet and a dry bearing."""
 
-    Parameters
-    ----------
-    n_units : int
-        Units of the population, the outlier not counted.
-    n_episodes : int
-    seconds : float, s
-        Length of an episode.
-    seed : int
-        The same seed gives the same recordings; unit `k` does not depend on `n_units`.
-    spread : float
-        Scales the relative deviations of the parameters; 1 means 5 to 15 percent.
-    outlier : bool
-        Add one unit with a tired magnet and a dry bearing, serial 000, group "outliers".
-    outlier_severity : float
+    plant = "dc-motor"
+    channels, sample_period_s, noise = CHANNELS, SAMPLE_PERIOD_S, (VELOCITY_NOISE, CURRENT_NOISE)
+    nominal, deviation, outlier_log_factors = NOMINAL, DEVIATION, OUTLIER_LOG_FACTORS
 
-    Raises
-    ------
-    ConfigError
-        When a setting is out of its range.
-    """
+    def truth(self, unit_ids: tuple[str, ...], values: Mapping[str, Array]) -> DcMotorTruth:
+        """Return the motors."""
+        return DcMotorTruth(unit_ids, **values)
 
-    n_units: int = 8
-    n_episodes: int = 10
-    seconds: float = 20.0
-    seed: int = 0
-    spread: float = 1.0
-    outlier: bool = False
-    outlier_severity: float = 1.0
+    def reference(self, rng: np.random.Generator, n_samples: int) -> Array:
+        """Voltages of random size, each held for a random time and followed by its opposite for the same time."""
+        pairs = n_samples // (2 * HOLD_SAMPLES[0]) + 1
+        lengths, levels = rng.integers(*HOLD_SAMPLES, size=pairs), rng.uniform(-VOLTAGE_V, VOLTAGE_V, pairs)
+        return np.repeat(np.stack([levels, -levels], axis=1).ravel(), np.repeat(lengths, 2))[:n_samples]
 
-    def __post_init__(self) -> None:
-        low = {"n_units": 1, "n_episodes": 1, "seconds": 1.0, "seed": 0, "spread": 0.0, "outlier_severity": 0.0}
-        for name, least in low.items():
-            if not getattr(self, name) >= least:
-                raise ConfigError(f"DC motor population: {name} = {getattr(self, name)} is out of range; use at least {least}.")
-
-    def simulate(self) -> SimulatedPopulation[DcMotorTruth]:
-        """Simulate all episodes of all units."""
-        units, truth = self._units()
-        n_samples = round(self.seconds / SAMPLE_PERIOD_S)
-        voltage = np.stack([_there_and_back(self._rng(INPUT_STREAM, e), n_samples) for e in range(self.n_episodes)])
-        states = truth.respond(voltage)
-        for u, unit in enumerate(units):
-            for e in range(self.n_episodes):
-                noise = self._rng(NOISE_STREAM, int(unit.id), e).standard_normal((2, n_samples))
-                states[1:, u, e] += np.array([[VELOCITY_NOISE], [CURRENT_NOISE]]) * noise
-        states[0] = np.rint(states[0] / COUNT_RAD) * COUNT_RAD
-        keys = tuple(EpisodeKey(unit.id, DEFAULT_CONDITION, str(e)) for unit in units for e in range(self.n_episodes))
-        inputs = [row[None] for row in voltage]
-        source = Recordings(
-            {key: (states[:, i // self.n_episodes, i % self.n_episodes], inputs[i % self.n_episodes]) for i, key in enumerate(keys)}
-        )
-        population = Population(CHANNELS, SAMPLE_PERIOD_S, units, keys, source, {"plant": "dc-motor"})
-        return SimulatedPopulation(population, population, truth)
-
-    def _units(self) -> tuple[tuple[Unit, ...], DcMotorTruth]:
-        units = [Unit(f"{k + 1:03d}", "population") for k in range(self.n_units)]
-        drawn = [self._draw(self._rng(UNIT_STREAM, k)) for k in range(self.n_units)]
-        if self.outlier:
-            bad = self._draw(self._rng(OUTLIER_STREAM))
-            units.insert(0, Unit("000", OUTLIERS))
-            drawn.insert(0, {n: bad[n] * np.exp(self.outlier_severity * OUTLIER_LOG_FACTORS.get(n, 0.0)) for n in NOMINAL})
-        return tuple(units), DcMotorTruth(tuple(u.id for u in units), **{n: np.array([d[n] for d in drawn]) for n in NOMINAL})
-
-    def _draw(self, rng: np.random.Generator) -> dict[str, float]:
-        return {n: NOMINAL[n] * float(np.exp(self.spread * DEVIATION[n] * rng.standard_normal())) for n in NOMINAL}
-
-    def _rng(self, *stream: int) -> np.random.Generator:
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=stream))
+    def respond(self, truth: DcMotorTruth, inputs: Array) -> Array:
+        """Return position, velocity and current from rest."""
+        return truth.respond(inputs)
 
 
-def _there_and_back(rng: np.random.Generator, n_samples: int) -> Array:
-    """Voltages of random size, each held for a random time and followed by its opposite for the same time."""
-    pairs = n_samples // (2 * HOLD_SAMPLES[0]) + 1
-    lengths, levels = rng.integers(*HOLD_SAMPLES, size=pairs), rng.uniform(-VOLTAGE_V, VOLTAGE_V, pairs)
-    return np.repeat(np.stack([levels, -levels], axis=1).ravel(), np.repeat(lengths, 2))[:n_samples]
+def _limited(x: Array) -> Array:
+    """Keep the current within what the amplifier gives."""
+    x[2] = np.clip(x[2], -CURRENT_LIMIT_A, CURRENT_LIMIT_A)
+    return x

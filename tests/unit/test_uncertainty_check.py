@@ -94,7 +94,13 @@ def test_zeros_of_what_is_inverted_are_peaks(form: str) -> None:
 
 def test_a_magnitude_that_is_infinite_or_zero_at_an_end_has_no_spectral_factor() -> None:
     knots = np.array([0.1, 1.0])
-    for n, d in (([1, 1, 1], [1, 1, 0]), ([1, 1, 0], [1, 1, 1]), ([1, 1, 1], [0, 1, 1]), ([0, 0, 0], [1, 1, 1]), ([1, 1, 1], [1, 1, np.nan])):
+    for n, d in (
+        ([1, 1, 1], [1, 1, 0]),
+        ([1, 1, 0], [1, 1, 1]),
+        ([1, 1, 1], [0, 1, 1]),
+        ([0, 0, 0], [1, 1, 1]),
+        ([1, 1, 1], [1, 1, np.nan]),
+    ):
         with pytest.raises(KrosError):
             spectral_factor(RationalMagnitude(np.array(n, float), np.array(d, float), knots), 1.0)
 

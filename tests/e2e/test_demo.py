@@ -212,3 +212,13 @@ def test_scores_come_with_their_range(metrics):
         assert 0 <= row["agreement"] <= 1
         assert row["freq_hz"] > 0
         assert len(row["entry"]) == 2
+
+
+def test_frequencies_do_not_go_below_what_the_longest_episode_resolves(demo) -> None:
+    """Episodes of 12 s know no frequency below a twelfth of a hertz."""
+    for folder in sorted((demo / "uncertainty").glob("*/uncertain_model.json")):
+        freqs = UncertainModel.load(folder.parent).freqs_hz
+        assert 1 / 12 * 0.999 <= freqs[0] <= 1 / 12 * 1.05
+    assert all(
+        row["freq_hz"] >= 1 / 12 * 0.999 for row in json.loads((demo / "outliers" / "scores.json").read_text())["rows"] if row["freq_hz"]
+    )

@@ -40,7 +40,8 @@ def is_overload(node: Definition) -> bool:
 def parameters(node: Definition) -> list[str]:
     """Parameters of a function, or fields of a class."""
     if isinstance(node, ast.ClassDef):
-        names = [s.target.id for s in node.body if isinstance(s, ast.AnnAssign) and isinstance(s.target, ast.Name)]
+        noted = [s for s in node.body if isinstance(s, ast.AnnAssign) and isinstance(s.target, ast.Name)]
+        names = [s.target.id for s in noted if isinstance(s.target, ast.Name) and "ClassVar" not in ast.unparse(s.annotation)]
         return [n for n in names if not n.startswith("_")]
     arguments = node.args
     named = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]

@@ -382,3 +382,17 @@ def test_channels_that_are_silent_stay_silent():
     channels = Channels(case, design_grid(case), apart=True)
     found = Everywhere(channels).lowered(Shaping(gain([[0.0]], DT), channels.behind, None), channels.average()).filters
     assert not np.any(found.D)
+
+
+@pytest.mark.parametrize("pole", [1.0, 1.02, 3.0])
+def test_a_state_that_grows_but_is_seen_has_a_bound(pole):
+    """One unstable state, measured with noise: the scalar Riccati equation has a closed form, whatever drives the machine."""
+    q, r = 0.3, 0.7  # variances of what drives the state and of the measurement
+    b = r * (1 - pole**2) - q
+    error = (-b + np.sqrt(b**2 + 4 * q * r)) / 2  # p = pole^2 p r / (p + r) + q
+    found = predictor_bound(
+        np.array([[pole]]), np.array([[np.sqrt(q), 0.0]]), np.ones((1, 1)), np.array([[0.0, np.sqrt(r)]]), np.array([[1.0]])
+    )
+    assert found is not None
+    assert found <= error * (1 + 1e-12)
+    assert found == pytest.approx(error, rel=1e-6)

@@ -42,8 +42,7 @@ def predictor_bound(A: Array, B: Array, C: Array, D: Array, Z: Array) -> float |
     n = len(A)
     if not n or not Z.any():
         return None
-    size = np.sqrt(np.maximum(np.diag(_stationary(A, B)), 0.0))
-    size = 2.0 ** np.round(np.log2(np.where(size > 0, size, 1.0)))
+    size = _sizes(A, B)
     A, B, C, Z = A * size / size[:, None], B / size[:, None], C * size, Z * size
     F, W = np.vstack([A, C]), np.vstack([B, D])
     try:
@@ -53,6 +52,8 @@ def predictor_bound(A: Array, B: Array, C: Array, D: Array, Z: Array) -> float |
     M, margin = _inequality(F, W, P)
     margin = margin + 4 * len(F) ** 2 * _EPS * np.abs(np.diag(M))
     load = np.diag(margin[:n]) + (L * margin[n:]) @ L.T
+    if not np.isfinite(load).all():
+        return None
     down = _stationary(A - L @ C, np.linalg.cholesky(load + np.diag(_EPS * np.diag(load) + 1e-300)))
     if not np.isfinite(down).all():
         return None
@@ -64,6 +65,14 @@ def predictor_bound(A: Array, B: Array, C: Array, D: Array, Z: Array) -> float |
             return squared if squared > 0 else None
         factor *= _GROWTH
     return None
+
+
+def _sizes(A: Array, B: Array) -> Array:
+    """Sizes of the states, powers of two; all one where some state does not settle."""
+    power = np.diag(_stationary(A, B)) if np.abs(np.linalg.eigvals(A)).max() < 1 else np.ones(len(A))
+    if not np.isfinite(power).all():
+        return np.ones(len(A))
+    return np.asarray(2.0 ** np.round(np.log2(np.where(power > 0, power, 1.0)) / 2))
 
 
 def _stationary(A: Array, B: Array) -> Array:

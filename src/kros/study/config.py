@@ -100,7 +100,8 @@ class CalibrateConfig(_Section):
 class IdentifyConfig(_Section):
     """Regularisation; ``auto`` is `alpha_factor` times the smallest coefficient that stabilises every model.
 
-    At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the population is finite.
+    At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the population is finite; the factor
+    is doubled until the peak residual around the best nominal unit is at most `largest_residual`, where that can be reached.
     `refine` adds models that are refined on their free-run error, the population first, then each unit, held near the population's model by
     a prior that is never so weak that the peak residual exceeds `largest_residual`. Spectral radii stay below ``1 - margin``.
     """

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
 from ..free_run import free_run
+from ..spread import peak_residual_db
 from .model import TradeOff
 from .pooled import matrices_of
 from .problem import Problem
@@ -150,18 +151,6 @@ class Judge:
         percent = np.median(100 * rms / span, axis=1)
         score = np.mean((rms / self.problem.sigma) ** 2, axis=(1, 2))
         return tuple(
-            TradeOff(float(s), tuple(percent[i].tolist()), float(score[i]), self._peak_db(models.A[i], models.B[i]))
+            TradeOff(float(s), tuple(percent[i].tolist()), float(score[i]), peak_residual_db(models.A[i], models.B[i], *self.scales))
             for i, s in enumerate(strengths)
         )
-
-    def _peak_db(self, A: Array, B: Array) -> float:
-        """Peak residual for the best nominal; the identical models of the pooled row have none."""
-        if len(A) < 2:
-            return float("nan")
-        output, entry = self.scales
-        z = np.exp(1j * np.pi * np.logspace(-6, 0, 200))
-        G = np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j) * entry / output[:, None]
-        inverse = np.linalg.pinv(G)
-        peaks = [np.linalg.norm(inverse @ (G[row] - G), ord=2, axis=(-2, -1)).max() for row in range(len(G))]
-        with np.errstate(divide="ignore"):
-            return float(20 * np.log10(min(peaks)))

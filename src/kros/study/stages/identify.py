@@ -19,6 +19,7 @@ from ...identify import (
     ModelSet,
     Ranges,
     combine,
+    edmd,
     lifted_factor,
     reduce_episode,
     residual_covariance,
@@ -26,12 +27,15 @@ from ...identify import (
 )
 from ...identify.excitation import require_excitation, require_independent
 from ...identify.refine import RefineOptions, refine_population
+from ...identify.spread import peak_residual_db
 from ...lifting import Lifting
 from ..config import IdentifyConfig
 from ..context import Context
 from . import calibrate
 
 log = logging.getLogger(__name__)
+_DOUBLINGS = 12
+_POINTS = 60  # frequencies at which the models of units are compared
 Array = npt.NDArray[np.float64]
 Task = tuple[Population, tuple[EpisodeKey, ...], Lifting]
 
@@ -81,13 +85,10 @@ def identify_models(context: Context, condition: str, units: list[str], factor: 
     if alpha == "auto":
         shared = [(ranges[name].triangles(factors[name].R[rows]), kinds[name].n_lifted) for name in kinds]
         edge = smallest_stabilising_alpha(shared, config.margin)
-        alpha = config.alpha_factor * edge
-        log.info(
-            "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model",
-            condition,
-            alpha,
-            config.alpha_factor,
-        )
+        factor_of_edge = alpha_factor(shared, edge, config) if condition == context.facts.identify_on else config.alpha_factor
+        alpha = factor_of_edge * edge
+        told = "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
+        log.info(told, condition, alpha, factor_of_edge)
     require_excitation(factor, context.population.inputs, units, condition, float(alpha))
     models = [
         fit(
@@ -107,6 +108,20 @@ def identify_models(context: Context, condition: str, units: list[str], factor: 
         for found in models:
             require_stable(found, pooled)
     return models
+
+
+def alpha_factor(shared: list[tuple[Array, int]], edge: float, config: IdentifyConfig) -> float:
+    """Return how many times the smallest stabilising coefficient is taken: doubled until units are near enough for an uncertain set around one of them.
+
+    Where no factor brings them near enough, the configured one stays.
+    """
+    limit = 20 * np.log10(config.largest_residual)
+    for doubled in range(_DOUBLINGS if edge > 0 else 0):
+        factor = config.alpha_factor * 2.0**doubled
+        models = [edmd(R, n, factor * edge) for R, n in shared]
+        if not any(peak_residual_db(m.A, m.B, np.ones(m.B.shape[1]), np.ones(m.B.shape[2]), _POINTS) > limit for m in models):
+            return factor
+    return config.alpha_factor
 
 
 def refine_models(

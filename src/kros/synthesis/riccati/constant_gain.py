@@ -19,7 +19,7 @@ from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm
 from ..assumptions import unreachable_modes
-from ..result import Injection, Status, Synthesis, enclosed
+from ..result import Injection, Status, Synthesis
 from .equations import discrete_gain, solve_riccati
 
 Array = npt.NDArray[Any]
@@ -77,7 +77,7 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
         )
     require_detectable(A, C, "Kalman predictor")
     start = time.perf_counter()
-    L, P = predictor(A, C, Q, R, np.zeros((n, q)), "Kalman predictor")
+    L, _ = predictor(A, C, Q, R, np.zeros((n, q)), "Kalman predictor")
     elapsed = time.perf_counter() - start
     closed = A - L @ C
     radius = float(np.abs(np.linalg.eigvals(closed)).max(initial=0.0))
@@ -88,19 +88,15 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     values, vectors = np.linalg.eigh((Q + Q.T) / 2)
     noise = np.hstack([vectors * np.sqrt(np.maximum(values, 0)), -L @ np.linalg.cholesky(R)])
     norm = h2_norm(StateSpace(closed, noise, np.eye(n), np.zeros((n, n + q)), dt))
-    lower, gap, told = enclosed(norm, float(np.sqrt(max(np.trace(P), 0.0))))
     return Synthesis(
         method="kalman",
         controller=gain(L, dt),
         status=Status.OPTIMAL,
         injection=Injection.STATE,
         h2_norm=norm,
-        lower_bound=lower,
-        gap_percent=gap,
         spectral_radius=radius,
         solve_s=elapsed,
         solver="riccati",
-        notes=told,
     )
 
 

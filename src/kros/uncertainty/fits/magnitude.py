@@ -31,7 +31,7 @@ _LOG = logging.getLogger(__name__)
 _FLOOR = 1e-8  # magnitudes below this fraction of the largest count as this fraction (-160 dB)
 _POINTS = 150  # of the grid in the first programs
 _ROUNDS = 6
-_PROGRAMS = 150  # for one order; more than 200 were never seen to gain anything
+_PROGRAMS = 150  # for one order, half as many while a higher one is allowed; more than 200 were never seen to gain anything
 _TOP = 10.0  # tau beyond which (80 % of Nyquist) no knots are placed
 _EXCHANGE = 10**0.002 - 1  # 0.02 dB of squared magnitude
 _HOPELESS = 2.0  # an order whose overbound is beyond this many tolerances is not polished while a higher one is allowed
@@ -308,7 +308,7 @@ def _minimax(tau: Array, targets: Array, order: int, lower: _Bound | None, hopel
     """
     if order == 0:
         return _Bound(RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0)), float(targets.max() / targets.min()))
-    programs = Programs(_PROGRAMS)
+    programs = Programs(_PROGRAMS if np.isinf(hopeless) else _PROGRAMS // 2)
     best = _exchange(tau, targets, _knots(tau, targets, order, 0.05), lower, hopeless, programs)
     for even in (1.0, 0.3):
         if best is not None and (lower is None or best.ratio < lower.ratio * (1 - 1e-3) or lower.ratio < 1 + _EXCHANGE):

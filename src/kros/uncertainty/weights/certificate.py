@@ -1,7 +1,7 @@
 r"""What a weight promises between grid points: the largest `sigma_max(W_L^-1 E_k W_R^-1)` over all frequencies.
 
-Two methods. **Grid**: residuals known at frequencies only are asked again around every high local maximum, in three rounds, each twenty times
-finer. It finds what the grid shows signs of, and proves nothing. **Level sets**: where units and nominal are systems, so is every
+Two methods. **Grid**: residuals are asked again around every high local maximum, in three rounds, each ten times finer, and in three
+more around the highest. It finds what the grid shows signs of, and proves nothing. **Level sets**: where units and nominal are systems, so is every
 `M_k = W_L^-1 E_k W_R^-1`, and a singular value of it equals gamma exactly where the pencil
 
     [ A - s F     0                B          ]
@@ -43,7 +43,7 @@ _MARGIN = 1e-5
 _LEVELS = 20
 _PROBE = 0.9  # of the peak: the level at which the pencil is tried
 _NEAR = 1e-3  # of its modulus: how far from the imaginary axis an eigenvalue may be
-_MAXIMA, _FINER, _ZOOMS = 40, 20, 3
+_MAXIMA, _FINER, _ZOOMS = 40, 20, (40, 40, 40, 5, 5, 5)  # how many maxima are asked again in every round
 
 
 class Method(str, Enum):
@@ -113,7 +113,8 @@ def _sharpened(ratio: Ratio, freqs_hz: Array, known: Array) -> tuple[float, floa
     tops = tops[np.argsort(-known[tops])[:_MAXIMA]]
     low, high = freqs_hz[np.maximum(tops - 1, 0)], freqs_hz[np.minimum(tops + 1, len(freqs_hz) - 1)]
     best = float(freqs_hz[known.argmax()]), float(known.max())
-    for _ in range(_ZOOMS):
+    for kept in _ZOOMS:
+        low, high = low[:kept], high[:kept]
         points = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, _FINER + 1)
         values = ratio(points.ravel()).max(axis=0).reshape(points.shape)
         rows, columns = np.arange(len(points)), values.argmax(axis=1)
@@ -121,6 +122,8 @@ def _sharpened(ratio: Ratio, freqs_hz: Array, known: Array) -> tuple[float, floa
         if values[row, columns[row]] > best[1]:
             best = float(points[row, columns[row]]), float(values[row, columns[row]])
         low, high = points[rows, np.maximum(columns - 1, 0)], points[rows, np.minimum(columns + 1, _FINER)]
+        highest = np.argsort(-values.max(axis=1), kind="stable")
+        low, high = low[highest], high[highest]
     return best
 
 

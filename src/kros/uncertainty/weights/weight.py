@@ -167,14 +167,15 @@ def fit_weight(
     dense, claimed = checks.grid(freqs_hz, sample_period_s), checks.claimed(freqs_hz, sample_period_s)
     checked = _Checked(dense, residuals(dense))
     fitter = _Fitter(sample_period_s, max_order, tolerance_db, (freqs_hz[0], freqs_hz[-1]))
-    of_fit = checks.of_fit(freqs_hz)
+    of_fit, lowest = checks.of_fit(freqs_hz), 0
     for _ in range(_PROOFS):
-        unscaled = _fit(fitter, residuals, of_fit, structure, checked, poles)
+        unscaled = _fit(fitter, residuals, of_fit, structure, checked, poles, lowest)
         proof = _proof(unscaled, residuals, checks, claimed)
         found = np.array([proof.freq_hz])
         if proof.peak <= _LIFT * max(1.0, float(checked.ratio(unscaled).max(initial=0.0))):
             break
         checked, of_fit = checked.with_points(found, residuals(found)), joined(of_fit, found)[0]
+        lowest = max(max(unscaled.left_orders) - 1, 0)  # further points do not make a lower order better
     weight, best = _finish(unscaled, checked, proof, claimed), optimal_cover(residuals(freqs_hz), structure)
     excess = overbound_db(weight, freqs_hz, best)
     return replace(
@@ -234,23 +235,31 @@ class _Fitter:
 
 
 def _fit(
-    fitter: _Fitter, residuals: Residuals, freqs_hz: Array, structure: Structure, checked: _Checked, poles: npt.ArrayLike | None
+    fitter: _Fitter,
+    residuals: Residuals,
+    freqs_hz: Array,
+    structure: Structure,
+    checked: _Checked,
+    poles: npt.ArrayLike | None,
+    lowest: int,
 ) -> Weight:
     """Fit diagonal or scalar magnitudes; of one entry, diagonal weights are scalar ones."""
     E = residuals(freqs_hz)
     if structure is Structure.DIAGONAL and E.any() and E.shape[2:] != (1, 1):
         return _fit_diagonal(fitter, residuals, freqs_hz, E, optimal_cover(E), checked)
-    return _fit_scalar(fitter, freqs_hz, E, checked, structure, poles)
+    return _fit_scalar(fitter, freqs_hz, E, checked, structure, poles, lowest)
 
 
-def _fit_scalar(fitter: _Fitter, freqs_hz: Array, E: Array, checked: _Checked, structure: Structure, poles: npt.ArrayLike | None) -> Weight:
+def _fit_scalar(
+    fitter: _Fitter, freqs_hz: Array, E: Array, checked: _Checked, structure: Structure, poles: npt.ArrayLike | None, lowest: int
+) -> Weight:
     """One magnitude for the largest singular values, fitted again with the frequencies at which it is exceeded."""
-    dt, p, m, lowest = fitter.sample_period_s, E.shape[2], E.shape[3], 0
+    dt, p, m = fitter.sample_period_s, E.shape[2], E.shape[3]
     options: dict[str, Any] = {"max_order": fitter.max_order, "tolerance_db": fitter.tolerance_db, "poles": poles}
     for _ in range(_ROUNDS):
         size = optimal_cover(E, Structure.SCALAR).left[:, 0]
         fit = fit_magnitude(freqs_hz, size, dt, min_order=lowest, **options)
-        lowest = max(fit.order - 1, 0)  # further points do not make a lower order better
+        lowest = max(fit.order - 1, 0)
         left = block_diagonal([fit.system] * p)
         weight = Weight(left, gain(np.eye(m), dt), (fit.order,) * p, (0,) * m, structure, np.nan, np.nan)
         ratio = checked.ratio(weight).max(axis=0)

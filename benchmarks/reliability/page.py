@@ -34,7 +34,9 @@ def render() -> str:
     tried = sum(tally["tried"] for result in results.values() for tally in result["tallies"])
     failed = sum(sum(tally["failures"].values()) for result in results.values() for tally in result["tallies"])
     summary = f"**{tried} cases in {len(results)} campaigns, {failed} failures.**\n"
-    return INTRODUCTION + summary + "".join(_campaign(name, result) for name, result in results.items())
+    waiting = sorted({path.stem for path in Path(__file__).parent.glob("*.py")} - results.keys() - {"campaign", "page"})
+    missing = f"\nWithout a result in this version: {', '.join(f'`{name}.py`' for name in waiting)}.\n" if waiting else ""
+    return INTRODUCTION + summary + missing + "".join(_campaign(name, result) for name, result in results.items())
 
 
 def _campaign(name: str, result: dict[str, Any]) -> str:

@@ -39,6 +39,11 @@ def test_the_checking_grid_reaches_from_zero_to_nyquist_and_holds_what_is_asked_
     assert np.tan(np.pi * below[0]) == pytest.approx(1e-4 * np.tan(np.pi * 0.01))
     assert np.tan(np.pi * grid[-2]) ** 2 == pytest.approx(1e4 * np.tan(np.pi * 0.2) ** 2)
     np.testing.assert_array_equal(checking_grid(np.array([0.0, 0.5]), 1.0, 1)[[0, -1]], [0.0, 0.5])
+    filled = checking_grid(given, 1.0, 1, filled=True)
+    assert np.isin(given, filled).all()
+    assert np.diff(filled).max() <= 0.0050001
+    inner = filled[filled > 0]
+    assert (inner[1:] / inner[:-1]).max() <= 10 ** (1 / 29)
 
 
 def test_the_nearest_point_stands_for_what_is_beyond_the_ends() -> None:
@@ -77,6 +82,8 @@ def test_only_modes_that_a_grid_passes_over_are_looked_at() -> None:
     width = 1e-4 / (2 * np.pi)
     np.testing.assert_allclose(found, 0.5 / (2 * np.pi) + width * np.array([-3, -1, 0, 1, 3]), rtol=0, atol=0.02 * width)
     assert not peaks_hz(systems, np.linspace(0, 0.5, 200000), 1.0).size
+    inverse = ResidualSystems("inverse_input_multiplicative", dull, units)  # the pole of the unit is a zero of the residual, and a bend
+    assert np.abs(peaks_hz(inverse, coarse, 1.0) - 0.5 / (2 * np.pi)).min() < width / 100
     assert not peaks_hz(systems, coarse[coarse < 0.07], 1.0).size
 
 

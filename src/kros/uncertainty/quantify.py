@@ -157,7 +157,7 @@ class _Axis:
         options: dict[str, Any] = {"structure": structure, "max_order": max_order, "tolerance_db": tolerance_db, "density": density}
         if self.map is None:
             systems, dt = ResidualSystems(form, nominal, units), self.sample_period_s
-            also = peaks_hz(systems, checking_grid(self.freqs_hz, dt, density), dt)
+            also = peaks_hz(systems, checking_grid(self.freqs_hz, dt, density, filled=True), dt)
             return bound_residuals(
                 form, nominal.frequency_response, units.frequency_response, self.freqs_hz, dt, systems, also_hz=also, **options
             )

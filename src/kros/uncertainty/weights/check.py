@@ -20,6 +20,7 @@ Residuals = Callable[[Array], Array]
 
 _TAIL = 16  # points towards DC and Nyquist, four a decade
 _BETWEEN = 3  # steps between known points in which a fit is held up
+_EVEN, _A_DECADE = 101, 30  # frequencies at which a bound is checked at least
 _DIP = 10 ** (-3 / 20)
 _SAME = 1e-9  # relative distance of frequencies that are one
 
@@ -48,7 +49,9 @@ class Checks:
 
     def grid(self, freqs_hz: Array, sample_period_s: float) -> Array:
         """Return the frequencies at which a fit is checked."""
-        return checking_grid(freqs_hz, sample_period_s, _BETWEEN if self.sampled else self.density, self.also_hz)
+        if self.sampled:
+            return checking_grid(freqs_hz, sample_period_s, _BETWEEN)
+        return checking_grid(freqs_hz, sample_period_s, self.density, self.also_hz, filled=True)
 
     def of_fit(self, freqs_hz: Array) -> Array:
         """Return the frequencies that a fit follows: those asked for, and the peaks between them."""
@@ -69,14 +72,21 @@ class Checks:
         return Certificate(Method.GRID, float(known.max()), float(claimed_hz[known.argmax()]), float("nan"))
 
 
-def checking_grid(freqs_hz: Array, sample_period_s: float, density: int, also_hz: Array | None = None) -> Array:
-    """Return a dense grid that goes on from its ends to DC and Nyquist, in decades of tau: a fit is free to bend wherever nobody looks."""
+def checking_grid(freqs_hz: Array, sample_period_s: float, density: int, also_hz: Array | None = None, *, filled: bool = False) -> Array:
+    """Return a dense grid that goes on from its ends to DC and Nyquist, in decades of tau: a fit is free to bend wherever nobody looks.
+
+    A filled one has a hundred evenly spaced frequencies and thirty a decade at least, however few are given.
+    """
     dense = dense_grid(freqs_hz, sample_period_s, density)
     inner = dense[(dense > 0) & (bilinear_squared(dense, sample_period_s) < np.inf)]
     tails = 10.0 ** (np.arange(1, _TAIL + 1) / 4)
     tau = bilinear_squared(inner[[0, -1]], sample_period_s) if inner.size else np.ones(2)
     further = np.append(tau[0] / tails**2, tau[1] * tails)
     dense = np.unique(np.concatenate([dense, np.arctan(np.sqrt(further)) / (np.pi * sample_period_s)]))
+    if filled:
+        top, low = dense[-1], dense[dense > 0][0]
+        decades = np.geomspace(low, top, 2 + int(_A_DECADE * np.log10(top / low)))
+        dense = joined(dense, np.concatenate([decades[1:-1], np.linspace(0.0, top, _EVEN)[1:-1]]))[0]
     return dense if also_hz is None else joined(dense, also_hz)[0]
 
 

@@ -161,7 +161,8 @@ def peaks_hz(systems: ResidualSystems, grid_hz: Array, sample_period_s: float) -
     inverted = inverted or [Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE]
     forms = inverted if form is Form.INVERSE_ADDITIVE else [form]
     residual = ResidualSystems(form, systems.nominal, systems.units)
-    modes = np.concatenate([part.poles() for f in forms for part in _of_units(residual, f)])
+    plants = [to_continuous(s).poles() for s in (systems.nominal, *(systems.units[k] for k in range(systems.units.batch_shape[0])))]
+    modes = np.concatenate([part.poles() for f in forms for part in _of_units(residual, f)] + plants).astype(complex)
     light = modes[(modes.imag > 0) & (np.abs(modes.real) <= _LIGHT * np.abs(modes))]
     place = np.arctan(light.imag) / (np.pi * sample_period_s)
     width = np.abs(light.real) / (1 + light.imag**2) / (np.pi * sample_period_s)

@@ -90,7 +90,7 @@ def test_nothing_is_lost_where_nothing_is_gained() -> None:
     weight, _ = fit_weight(units.frequency_response, GRID, DT, structure="full", systems=systems, **QUICK)
     diagonal, _ = fit_weight(units.frequency_response, GRID, DT, structure="diagonal", systems=systems, **QUICK)
     assert isinstance(weight, FullWeight)
-    assert volume_db(weight, GRID) <= volume_db(diagonal, GRID)
+    assert volume_db(weight, GRID) <= volume_db(diagonal, GRID) + 1e-9  # dB: the same weight, its operations in another order
     assert weight.saved_db < 0.1
 
 

@@ -12,7 +12,7 @@ def episodes(lengths, seed=0):
     """Truth and estimate, shape (n_samples, batch, 2); what is behind an episode's end is wild and must not count."""
     rng = np.random.default_rng(seed)
     shape = (max(lengths), len(lengths), 2)
-    truth, estimate = rng.normal(size=shape) - 0.7, rng.normal(size=shape)
+    truth, estimate = 1e-3 * (rng.normal(size=shape) - 0.7), 1e-3 * rng.normal(size=shape)
     for b, length in enumerate(lengths):
         truth[length:, b], estimate[length:, b] = 1e6, -1e6
     return truth, estimate

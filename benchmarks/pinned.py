@@ -62,16 +62,17 @@ def main() -> None:
     what.add_argument("--save", type=Path)
     what.add_argument("--against", type=Path)
     parser.add_argument("--rtol", type=float, default=1e-9)
+    parser.add_argument("--only", choices=list(STUDIES), nargs="+", default=list(STUDIES), help="compare with these alone")
     options = parser.parse_args()
     folder = options.save or options.against
     if options.save:
         record(folder)
     with tempfile.TemporaryDirectory() as scratch:
-        results = {name: study(folder, Path(scratch) / name, name) for name in STUDIES}
+        results = {name: study(folder, Path(scratch) / name, name) for name in options.only}
     if options.save:
         (folder / "results.json").write_text(json.dumps(results, indent=1))
         return
-    before = json.loads((folder / "results.json").read_text())
+    before = {name: found for name, found in json.loads((folder / "results.json").read_text()).items() if name in options.only}
     changes = sorted(differences(before, results, options.rtol), key=lambda c: -c[0])
     for size, text in changes[:60]:
         print(f"{size:.2g}  {text}")

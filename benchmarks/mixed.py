@@ -31,7 +31,7 @@ from kros.study.executors import open_executor
 from kros.study.makers import Task, make_mixed, open_loop
 from kros.study.stages.synthesize import tasks_of
 from kros.study.store import Store
-from kros.synthesis.robust.certificate import certify
+from kros.synthesis.worst_case.certificate import certify
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from campaign import Tally, main
 
 from kros.core import StateSpace, SynthesisError, gain, hinf_norm
 from kros.synthesis import Injection, ObserverProblem, Synthesis, worst_case_h2
-from kros.synthesis.robust.certificate import certify
+from kros.synthesis.worst_case.certificate import certify
 from kros.uncertainty.forms import Form
 
 Array = npt.NDArray[Any]

@@ -5,7 +5,7 @@ import pytest
 
 from kros.core import StateSpace, block_diagonal, gain, h2_norm
 from kros.synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, worst_case_h2
-from kros.synthesis.robust.certificate import certify
+from kros.synthesis.worst_case.certificate import certify
 
 DT = 1e-2
 

@@ -10,9 +10,9 @@ from kros.evaluate import Candidate, Contractions, sample_errors
 from kros.evaluate.monte_carlo import draw_members
 from kros.synthesis import Injection, ObserverProblem, worst_case_h2
 from kros.synthesis.problem.perturbation import PLACES
-from kros.synthesis.robust.causal import perturbed
-from kros.synthesis.robust.certificate import certify
-from kros.synthesis.robust.unit_check import unit_error
+from kros.synthesis.worst_case.causal import perturbed
+from kros.synthesis.worst_case.certificate import certify
+from kros.synthesis.worst_case.unit_check import unit_error
 from kros.uncertainty import Form
 
 DT = 0.01

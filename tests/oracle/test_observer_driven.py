@@ -22,7 +22,7 @@ from kros.observer import (
     run_observer,
     with_memory,
 )
-from kros.synthesis.residual.shaping import Bank
+from kros.synthesis.residual_shaped.shaping import Bank
 
 DT, SIZES, UNITS = 0.01, (1.0, 0.5), list("aabbcc")
 

@@ -16,7 +16,7 @@ from kros.observer import (
     tune_observer,
 )
 from kros.synthesis import Injection, kalman
-from kros.synthesis.residual.shaping import Bank
+from kros.synthesis.residual_shaped.shaping import Bank
 
 DT = 0.01
 LIFTING = Lifting(("p", "c"), ("sin(5*p + phase)",), ("phase",))

@@ -8,7 +8,7 @@ from kros.observer import Observer, Past, observer_with_memory, run_observer, tu
 from kros.observer.memory.blocks import blocks_of, joined
 from kros.observer.memory.tuning import _slowing
 from kros.synthesis import Injection, kalman
-from kros.synthesis.residual.shaping import Bank
+from kros.synthesis.residual_shaped.shaping import Bank
 
 DT = 0.01
 

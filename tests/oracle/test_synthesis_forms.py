@@ -7,10 +7,10 @@ from scipy.linalg import expm
 from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import Injection, ObserverProblem, check_units, worst_case_h2, worst_case_hinf
 from kros.synthesis.problem.perturbation import PLACES
-from kros.synthesis.robust.causal import causal_h2, perturbed
-from kros.synthesis.robust.certificate import certify, density
-from kros.synthesis.robust.robust_gain import robust_gain
-from kros.synthesis.robust.unit_check import unit_error
+from kros.synthesis.worst_case.causal import causal_h2, perturbed
+from kros.synthesis.worst_case.certificate import certify, density
+from kros.synthesis.worst_case.robust_gain import robust_gain
+from kros.synthesis.worst_case.unit_check import unit_error
 from kros.uncertainty import Form, quantify, rebuild, residual
 
 DT, N, M = 0.05, 3, 2

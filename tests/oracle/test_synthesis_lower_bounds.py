@@ -12,11 +12,11 @@ from kros.core import StateSpace, SynthesisError, block_diagonal, gain
 from kros.synthesis import Injection, ObserverProblem, Status, Synthesis, reduce_controller, worst_case_h2, worst_case_hinf
 from kros.synthesis.result import enclosed
 from kros.synthesis.riccati.filter_bound import predictor_bound
-from kros.synthesis.robust.arcs import Enclosure, least_ratio
-from kros.synthesis.robust.certificate import certify
-from kros.synthesis.robust.disturbance import Channels, Shaping, design_grid
-from kros.synthesis.robust.everywhere import Everywhere
-from kros.synthesis.robust.robust_gain import robust_gain
+from kros.synthesis.worst_case.arcs import Enclosure, least_ratio
+from kros.synthesis.worst_case.certificate import certify
+from kros.synthesis.worst_case.disturbance import Channels, Shaping, design_grid
+from kros.synthesis.worst_case.everywhere import Everywhere
+from kros.synthesis.worst_case.robust_gain import robust_gain
 
 DT = 1.0
 FULL = StateSpace([[0.6]], [[1.0, 0.3]], [[0.1], [0.05]], [[0.2, 0.1], [0.0, 0.2]], DT)

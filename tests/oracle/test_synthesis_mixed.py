@@ -10,7 +10,6 @@ from scipy.linalg import expm
 
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, h2, mixed
-from kros.synthesis.low_order.reduction import truncate
 from kros.synthesis.mixed_norms.balance import balance
 from kros.synthesis.mixed_norms.candidates import by_inequalities
 from kros.synthesis.mixed_norms.channels import part, scaled, verify
@@ -18,7 +17,8 @@ from kros.synthesis.mixed_norms.inequalities import MixedInequalities
 from kros.synthesis.mixed_norms.solvers import Program, solve
 from kros.synthesis.mixed_norms.youla import hinf_lower_bound, youla_bound
 from kros.synthesis.problem.paper_plant import paper_plant, reduced_plant
-from kros.synthesis.robust.certificate import certify
+from kros.synthesis.reduction.reduction import truncate
+from kros.synthesis.worst_case.certificate import certify
 
 DT = 1e-3
 

@@ -8,11 +8,11 @@ from scipy.optimize import brentq, minimize_scalar
 
 from kros.core import ConfigError, StateSpace, SynthesisError, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, h2, polish
-from kros.synthesis.low_order.affine_loop import AffineLoop
-from kros.synthesis.low_order.bounded_cost import BoundedCost
-from kros.synthesis.low_order.certified_cost import CertifiedCost
-from kros.synthesis.low_order.descent import bfgs
-from kros.synthesis.robust.certificate import certify
+from kros.synthesis.reduction.affine_loop import AffineLoop
+from kros.synthesis.reduction.bounded_cost import BoundedCost
+from kros.synthesis.reduction.certified_cost import CertifiedCost
+from kros.synthesis.reduction.descent import bfgs
+from kros.synthesis.worst_case.certificate import certify
 
 
 def random_plant(rng, n=4, dt=1.0, **parts):

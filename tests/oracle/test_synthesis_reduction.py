@@ -8,10 +8,10 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 
 from kros.core import ConfigError, StateSpace, SynthesisError, block_diagonal, gain, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, h2, reduce_controller, worst_case_h2
-from kros.synthesis.low_order.balancing import Balancing, gramian_root
-from kros.synthesis.low_order.certified_cost import CertifiedCost
-from kros.synthesis.low_order.purpose import ForPlant
-from kros.synthesis.robust.certificate import certify
+from kros.synthesis.reduction.balancing import Balancing, gramian_root
+from kros.synthesis.reduction.certified_cost import CertifiedCost
+from kros.synthesis.reduction.purpose import ForPlant
+from kros.synthesis.worst_case.certificate import certify
 
 DT = 1e-3
 

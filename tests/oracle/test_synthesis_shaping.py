@@ -10,7 +10,7 @@ import pytest
 
 from kros.core import StateSpace, block_diagonal, gain
 from kros.synthesis import ObserverProblem
-from kros.synthesis.robust.disturbance import Channels, Spectrum, design_grid
+from kros.synthesis.worst_case.disturbance import Channels, Spectrum, design_grid
 from kros.uncertainty import fit_magnitude
 
 Array = npt.NDArray[Any]

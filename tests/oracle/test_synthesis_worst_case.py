@@ -7,10 +7,10 @@ from scipy.optimize import least_squares, minimize
 
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm
 from kros.synthesis import Injection, ObserverProblem, Status, worst_case_h2
-from kros.synthesis.robust.ball import Ball, spread
-from kros.synthesis.robust.certificate import certify, density
-from kros.synthesis.robust.dual_bound import dual_bound
-from kros.synthesis.robust.quadrature import circle_mean
+from kros.synthesis.worst_case.ball import Ball, spread
+from kros.synthesis.worst_case.certificate import certify, density
+from kros.synthesis.worst_case.dual_bound import dual_bound
+from kros.synthesis.worst_case.quadrature import circle_mean
 
 DT = 1e-3
 

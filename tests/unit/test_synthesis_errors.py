@@ -23,7 +23,7 @@ from kros.synthesis import (
 )
 from kros.synthesis.problem.paper_plant import paper_plant
 from kros.synthesis.riccati.constant_gain import luenberger
-from kros.synthesis.robust.certificate import certify
+from kros.synthesis.worst_case.certificate import certify
 
 DT = 1e-3
 

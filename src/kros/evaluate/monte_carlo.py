@@ -32,7 +32,7 @@ import numpy.typing as npt
 from ..core.lti import StateSpace
 from ..core.norms import h2_norm
 from ..synthesis import Injection, ObserverProblem
-from ..synthesis.robust.causal import perturbed
+from ..synthesis.worst_case.causal import perturbed
 from .contractions import Contractions
 
 Array = npt.NDArray[Any]

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from ..core.errors import DataError
 from ..core.linalg import least_squares
 from ..lifting import Lifting
-from ..synthesis.residual.shaped import promised_errors
+from ..synthesis.residual_shaped.shaped import promised_errors
 from .residual import mean_error_dynamics, one_step_residual, residual_spectra
 
 Array = npt.NDArray[np.float64]

@@ -15,7 +15,7 @@ from ..core.lti import StateSpace, block_diagonal, gain
 from ..identify import ModelSet
 from ..observer import Observer, noise_covariances
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, reduce_controller, worst_case_h2, worst_case_hinf
-from ..synthesis.robust.causal import causal_h2
+from ..synthesis.worst_case.causal import causal_h2
 from ..uncertainty import fit_magnitude
 from .baselines import kalman_tuned, make_luenberger
 from .config import MemoryConfig

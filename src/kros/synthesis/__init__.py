@@ -13,38 +13,38 @@ from ..core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .generalized_plant import GeneralizedPlant
-    from .low_order.polishing import polish
-    from .low_order.reduction import reduce_controller
     from .mixed_norms.optimal import mixed
     from .mixed_norms.youla import YoulaBound, youla_bound
     from .problem.observer_problem import ObserverProblem
-    from .residual.shaped import residual_h2
-    from .residual.shaping import Bank, shaping_filter
+    from .reduction.polishing import polish
+    from .reduction.reduction import reduce_controller
+    from .residual_shaped.shaped import residual_h2
+    from .residual_shaped.shaping import Bank, shaping_filter
     from .result import Injection, Status, Synthesis
     from .riccati.constant_gain import kalman, luenberger
     from .riccati.h2_optimal import h2
     from .riccati.hinf_optimal import hinf
-    from .robust.robust_gain import RobustGain, robust_gain
-    from .robust.unit_check import UnitCheck, check_units
-    from .robust.worst_case import worst_case_h2
-    from .robust.worst_case_hinf import worst_case_hinf
     from .structured.blocks import Block
     from .structured.bounds import MuBounds, mu_bounds, mu_lower, mu_upper
     from .structured.dk import dk_iteration
+    from .worst_case.robust_gain import RobustGain, robust_gain
+    from .worst_case.unit_check import UnitCheck, check_units
+    from .worst_case.worst_case import worst_case_h2
+    from .worst_case.worst_case_hinf import worst_case_hinf
 
 _HOME = {
-    "Bank": "residual.shaping",
+    "Bank": "residual_shaped.shaping",
     "Block": "structured.blocks",
     "GeneralizedPlant": "generalized_plant",
     "Injection": "result",
     "MuBounds": "structured.bounds",
     "ObserverProblem": "problem.observer_problem",
-    "RobustGain": "robust.robust_gain",
+    "RobustGain": "worst_case.robust_gain",
     "Status": "result",
     "Synthesis": "result",
-    "UnitCheck": "robust.unit_check",
+    "UnitCheck": "worst_case.unit_check",
     "YoulaBound": "mixed_norms.youla",
-    "check_units": "robust.unit_check",
+    "check_units": "worst_case.unit_check",
     "dk_iteration": "structured.dk",
     "h2": "riccati.h2_optimal",
     "hinf": "riccati.hinf_optimal",
@@ -54,13 +54,13 @@ _HOME = {
     "mu_bounds": "structured.bounds",
     "mu_lower": "structured.bounds",
     "mu_upper": "structured.bounds",
-    "polish": "low_order.polishing",
-    "reduce_controller": "low_order.reduction",
-    "residual_h2": "residual.shaped",
-    "robust_gain": "robust.robust_gain",
-    "shaping_filter": "residual.shaping",
-    "worst_case_h2": "robust.worst_case",
-    "worst_case_hinf": "robust.worst_case_hinf",
+    "polish": "reduction.polishing",
+    "reduce_controller": "reduction.reduction",
+    "residual_h2": "residual_shaped.shaped",
+    "robust_gain": "worst_case.robust_gain",
+    "shaping_filter": "residual_shaped.shaping",
+    "worst_case_h2": "worst_case.worst_case",
+    "worst_case_hinf": "worst_case.worst_case_hinf",
     "youla_bound": "mixed_norms.youla",
 }
 

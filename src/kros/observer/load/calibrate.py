@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from ...core.errors import DataError, DimensionError
 from ...lifting import Lifting
-from ...synthesis.residual.shaping import Bank
+from ...synthesis.residual_shaped.shaping import Bank
 from ..memory import Past
 from .signals import low_passed, without_level
 

@@ -12,7 +12,7 @@ from scipy.linalg import null_space
 from ...core.linalg import least_squares
 from ...core.lti import gain
 from ...lifting import Lifting
-from ...synthesis.residual.shaping import Bank
+from ...synthesis.residual_shaped.shaping import Bank
 from ...synthesis.result import Injection
 from ..observer import Observer
 from .blocks import Array, Model

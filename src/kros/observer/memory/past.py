@@ -32,7 +32,7 @@ from ...core.errors import DataError, DimensionError
 from ...core.linalg import least_squares
 from ...core.norms import gramian
 from ...lifting import Lifting
-from ...synthesis.residual.shaping import Bank
+from ...synthesis.residual_shaped.shaping import Bank
 
 Array = npt.NDArray[np.float64]
 DELAYS = 40

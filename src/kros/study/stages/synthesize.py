@@ -18,7 +18,7 @@ from ...data.scaled import scale_population
 from ...identify import ModelSet
 from ...observer import Observer, in_sizes
 from ...synthesis import Injection, ObserverProblem, Synthesis, check_units
-from ...synthesis.robust.certificate import certify
+from ...synthesis.worst_case.certificate import certify
 from ...uncertainty import Structure, UncertainModel
 from ..context import Context
 from ..makers import Product, Task, produce

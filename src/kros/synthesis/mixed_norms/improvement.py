@@ -23,7 +23,7 @@ from scipy.optimize import minimize
 from ...core.lti import StateSpace
 from ...core.norms import h2_norm, hinf_norm
 from ..generalized_plant import GeneralizedPlant
-from ..low_order.affine_loop import AffineLoop
+from ..reduction.affine_loop import AffineLoop
 
 Array = npt.NDArray[Any]
 

@@ -24,7 +24,7 @@ from ...core.norms import gramian, hinf_norm
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
-from ..robust.certificate import certify
+from ..worst_case.certificate import certify
 from .attainable import require_reachable
 from .candidates import by_inequalities
 from .channels import Verified

@@ -23,7 +23,7 @@ from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
 from ..generalized_plant import GeneralizedPlant
-from ..low_order.balancing import Balancing, gramian_root
+from ..reduction.balancing import Balancing, gramian_root
 from .equations import solve_riccati
 from .h2_optimal import absorb_feedthrough
 from .hinf_central import normalise

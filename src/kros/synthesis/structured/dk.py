@@ -27,7 +27,7 @@ from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.norms import h2_norm, hinf_norm
 from ...uncertainty.fits.magnitude import invert
 from ..generalized_plant import GeneralizedPlant
-from ..low_order.balancing import Balancing, gramian_root
+from ..reduction.balancing import Balancing, gramian_root
 from ..result import Status, Synthesis
 from ..riccati.h2_optimal import stability_margin
 from ..riccati.hinf_optimal import hinf

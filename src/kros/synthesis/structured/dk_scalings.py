@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...uncertainty.fits.magnitude import fit_magnitude, invert
-from ..low_order.descent import bfgs
+from ..reduction.descent import bfgs
 from .blocks import Structure
 from .scalings import scalings
 

@@ -21,7 +21,7 @@ from ...core.norms import hinf_norm
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..result import Synthesis
-from ..robust.certificate import certify
+from ..worst_case.certificate import certify
 from .affine_loop import AffineLoop
 from .bounded_cost import BoundedCost
 from .certified_cost import CertifiedCost

@@ -15,7 +15,7 @@ from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis, enclosed
 from ..riccati.h2_optimal import stability_margin
-from ..robust.certificate import certify
+from ..worst_case.certificate import certify
 from .balancing import Balancing, gramian_root
 from .certified_cost import CertifiedCost
 

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from ...core.linalg import qr_triangle
 from ...core.lti import StateSpace
 from ..problem.observer_problem import ObserverProblem
-from ..robust.disturbance import uncertain_ball
+from ..worst_case.disturbance import uncertain_ball
 from .affine_loop import AffineLoop, typical
 
 Array = npt.NDArray[Any]
@@ -70,7 +70,7 @@ class CertifiedCost:
     port, state : slice
         Inputs of the loop at which the perturbation and the remainder act.
     W_L, center, left : ndarray
-        Responses of the left weight and of the ball (`kros.synthesis.robust.ball`).
+        Responses of the left weight and of the ball (`kros.synthesis.worst_case.ball`).
     q : ndarray, shape (f, any)
         Singular values of ``R_r M``.
     ratio : ndarray, shape (f,)

@@ -24,16 +24,7 @@ from kros.evaluate import EpisodeBatch
 from kros.evaluate.errors import error_spectrum
 from kros.identify import PhaseSpec, find_segments, resolve_branches, unit_phase
 from kros.lifting import Lifting
-from kros.observer import (
-    Observer,
-    noise_covariances,
-    observer_with_memory,
-    one_step_residual,
-    one_step_rows,
-    relift_certificate,
-    run_observer,
-)
-from kros.observer.load import (
+from kros.motor_drive import (
     AngleLoad,
     calibrate_load,
     calibrate_torque,
@@ -45,6 +36,15 @@ from kros.observer.load import (
     low_passed,
     ripple_power,
     without_level,
+)
+from kros.observer import (
+    Observer,
+    noise_covariances,
+    observer_with_memory,
+    one_step_residual,
+    one_step_rows,
+    relift_certificate,
+    run_observer,
 )
 from kros.plants import HarmonicDrivePopulation
 from kros.plants.harmonic_drive.control import COUNT_RAD

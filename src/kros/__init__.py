@@ -18,6 +18,7 @@ _SUBPACKAGES = (
     "identify",
     "interop",
     "lifting",
+    "motor_drive",
     "observer",
     "plants",
     "report",

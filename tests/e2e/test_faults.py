@@ -10,7 +10,7 @@ import numpy as np
 from kros.data import read_parquet
 from kros.identify import PhaseCalibration
 from kros.observer import Observer, run_observer, sample_status
-from kros.observer.relift.error import error_system
+from kros.observer.certificate.error import error_system
 
 AT, GOOD = 3000, 2000
 

@@ -27,8 +27,8 @@ from kros.observer import (
     start_covariance,
     track_parameter,
 )
-from kros.observer.relift.error import error_system
-from kros.observer.relift.status import ReliftStatus
+from kros.observer.certificate.error import error_system
+from kros.observer.certificate.status import ReliftStatus
 from kros.study.estimators import Baseline
 from kros.synthesis import Injection
 

@@ -7,8 +7,7 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.lifting import Lifting
-from kros.observer import Observer, one_step_residual, relift_certificate, run_observer
-from kros.observer.load import (
+from kros.motor_drive import (
     AngleLoad,
     calibrate_load,
     calibrate_torque,
@@ -22,6 +21,7 @@ from kros.observer.load import (
     ripple_power,
     without_level,
 )
+from kros.observer import Observer, one_step_residual, relift_certificate, run_observer
 from kros.plants import HarmonicDrivePopulation
 
 DT = 1e-3

@@ -5,8 +5,8 @@ import pytest
 
 from kros.lifting import Lifting
 from kros.observer import Observer, Past, observer_with_memory, run_observer, tune_memory
-from kros.observer.memory.blocks import blocks_of, joined
-from kros.observer.memory.tuning import _slowing
+from kros.observer.predictor.blocks import blocks_of, joined
+from kros.observer.predictor.tuning import _slowing
 from kros.synthesis import Injection, kalman
 from kros.synthesis.residual_shaped.shaping import Bank
 

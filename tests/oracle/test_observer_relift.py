@@ -12,15 +12,15 @@ from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.lifting import Lifting
 from kros.observer import Observer, one_step_residual, run_observer
-from kros.observer.relift.adversary import attack, attack_running
-from kros.observer.relift.certificate import ReliftCertificate, relift_certificate
-from kros.observer.relift.error import ErrorSystem, ReliftScales, error_system
-from kros.observer.relift.ladder import growing_sequence
-from kros.observer.relift.multipliers import best_multipliers
-from kros.observer.relift.proof import margin, proven
-from kros.observer.relift.rows import relift_report
-from kros.observer.relift.sdp import sdp_proposal
-from kros.observer.relift.status import Dropped, ReliftStatus
+from kros.observer.certificate.adversary import attack, attack_running
+from kros.observer.certificate.certificate import ReliftCertificate, relift_certificate
+from kros.observer.certificate.error import ErrorSystem, ReliftScales, error_system
+from kros.observer.certificate.multipliers import best_multipliers
+from kros.observer.certificate.proof import margin, proven
+from kros.observer.certificate.report import relift_report
+from kros.observer.certificate.sdp import sdp_proposal
+from kros.observer.certificate.search import growing_sequence
+from kros.observer.certificate.status import Dropped, ReliftStatus
 from kros.synthesis import Injection
 
 
@@ -138,7 +138,7 @@ def test_one_slope_is_certified_up_to_the_circle_criterion_and_not_beyond() -> N
     def steeper(factor: float) -> ErrorSystem:
         return ErrorSystem(plain.A, plain.L, plain.B, plain.M * factor / through, plain.D, plain.C, plain.dt)
 
-    from kros.observer.relift.riccati import riccati_proposals
+    from kros.observer.certificate.riccati import riccati_proposals
 
     inside = next(riccati_proposals(steeper(0.99)))
     assert proven(inside.roots, steeper(0.99).corners(), plain.C, inside.gain)
@@ -271,7 +271,7 @@ def test_exact_and_floating_margins_agree(seed: int) -> None:
     A = rng.standard_normal((6, 6))
     A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
     system = StateSpace(A, rng.standard_normal((6, 2)), rng.standard_normal((2, 6)), np.zeros((2, 2)), 1.0)
-    from kros.observer.relift.riccati import lyapunov_factor
+    from kros.observer.certificate.riccati import lyapunov_factor
 
     error = ErrorSystem(A, np.zeros((6, 0)), system.B, np.zeros((0, 6)), np.zeros((0, 2)), system.C, 1.0)
     norm = hinf_norm(system)

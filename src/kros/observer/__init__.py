@@ -4,20 +4,20 @@ from .baselines.difference import FilteredDifference, cutoffs_hz, followed, rate
 from .baselines.extended_kalman import ExtendedKalman, start_covariance
 from .baselines.kalman import kalman_candidates, like_measurement_noise, luenberger_candidates, noise_covariances
 from .baselines.learned import Features, Learned, Moments
-from .driven import driven_coordinates, refit_measured_rows, with_memory
-from .memory import Past, observer_with_memory, remembering_observer, tune_memory
+from .certificate.adversary import Attack, attack, attack_running
+from .certificate.certificate import ReliftCertificate, relift_certificate
+from .certificate.error import ReliftScales
+from .certificate.report import ReliftRow, relift_report
+from .certificate.status import Dropped, ReliftStatus
 from .observer import Observer
-from .phase_lock import Tracked, track_parameter
-from .relift.adversary import Attack, attack, attack_running
-from .relift.certificate import ReliftCertificate, relift_certificate
-from .relift.error import ReliftScales
-from .relift.rows import ReliftRow, relift_report
-from .relift.status import Dropped, ReliftStatus
-from .residual import mean_error_dynamics, one_step_residual, residual_spectra
-from .residual_design import ResidualModel, one_step_rows, residual_models
+from .predictor import Past, observer_with_memory, remembering_observer, tune_memory
+from .predictor.driven import driven_coordinates, refit_measured_rows, with_memory
+from .residual.models import ResidualModel, one_step_rows, residual_models
+from .residual.one_step import mean_error_dynamics, one_step_residual, residual_spectra
 from .runtime import Estimate, Runtime
 from .screen import SampleStatus, Seen, sample_status
 from .simulate import run_observer, run_observers
+from .tracking import Tracked, track_parameter
 from .tune import Tuned, tune_observer
 from .units import in_sizes
 

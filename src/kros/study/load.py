@@ -20,8 +20,7 @@ from ..core.errors import ConfigError, KrosError
 from ..data.population import EpisodeKey
 from ..evaluate import EpisodeBatch
 from ..lifting import Lifting
-from ..observer import Observer, run_observer
-from ..observer.load import (
+from ..motor_drive import (
     AngleLoad,
     LoadCalibration,
     calibrate_load,
@@ -32,6 +31,7 @@ from ..observer.load import (
     load_observer,
     low_passed,
 )
+from ..observer import Observer, run_observer
 from .config import LoadConfig
 from .context import Context
 from .stages import calibrate

@@ -23,8 +23,8 @@ from ..observer import Observer
 from ..simulate import run_observer
 from .certificate import ReliftCertificate
 from .error import ErrorSystem, require_covered
-from .ladder import frozen_gain
-from .rows import first_error
+from .report import first_error
+from .search import frozen_gain
 
 Array = npt.NDArray[np.float64]
 _BATCH = 16

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DimensionError
+from ..core.errors import DimensionError
 
 Array = npt.NDArray[np.float64]
 

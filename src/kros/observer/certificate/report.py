@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DimensionError
-from ..driven import with_memory
 from ..observer import Observer
-from ..residual import one_step_residual
+from ..predictor.driven import with_memory
+from ..residual.one_step import one_step_residual
 from ..simulate import run_observer
 from .certificate import ReliftCertificate
 from .error import ErrorSystem

@@ -26,7 +26,7 @@ from scipy.linalg import block_diag
 
 from ...core.errors import DataError
 from .blocks import Array, Block, Model, blocks_of, joined
-from .past import Past, hidden_of, seen_by
+from .moments import Past, hidden_of, seen_by
 
 _DAMPING = (1e-7, 1e-3, 1e4)
 _THIN, _SIDE_BY_SIDE = 8, 4  # episodes: keeps derivatives in some ten megabytes

@@ -25,10 +25,10 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DimensionError
-from ..core.linalg import least_squares
-from ..core.norms import gramian
-from .observer import Observer
+from ...core.errors import DimensionError
+from ...core.linalg import least_squares
+from ...core.norms import gramian
+from ..observer import Observer
 
 Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, npt.ArrayLike]

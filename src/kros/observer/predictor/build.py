@@ -16,7 +16,7 @@ from ...synthesis.residual_shaped.shaping import Bank
 from ...synthesis.result import Injection
 from ..observer import Observer
 from .blocks import Array, Model
-from .past import DELAYS, SHORT, SKIP, THIN, Past, hidden_of, seen_by
+from .moments import DELAYS, SHORT, SKIP, THIN, Past, hidden_of, seen_by
 from .tuning import tune_memory
 
 DEVIATION = 0.4

@@ -18,8 +18,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError, DimensionError
-from ..lifting import Lifting
+from ...core.errors import DataError, DimensionError
+from ...lifting import Lifting
 
 Array = npt.NDArray[np.float64]
 SEGMENT = 4096

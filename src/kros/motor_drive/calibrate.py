@@ -16,10 +16,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DataError, DimensionError
-from ...lifting import Lifting
-from ...synthesis.residual_shaped.shaping import Bank
-from ..memory import Past
+from ..core.errors import DataError, DimensionError
+from ..lifting import Lifting
+from ..observer.predictor import Past
+from ..synthesis.residual_shaped.shaping import Bank
 from .signals import low_passed, without_level
 
 Array = npt.NDArray[np.float64]

@@ -18,11 +18,11 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DataError, DimensionError
-from ...core.lti import gain
-from ...synthesis.result import Injection
-from ...synthesis.riccati.constant_gain import kalman
-from ..observer import Observer
+from ..core.errors import DataError, DimensionError
+from ..core.lti import gain
+from ..observer.observer import Observer
+from ..synthesis.result import Injection
+from ..synthesis.riccati.constant_gain import kalman
 from .calibrate import LOAD
 
 Array = npt.NDArray[np.float64]

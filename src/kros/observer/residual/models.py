@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError
-from ..core.linalg import least_squares
-from ..lifting import Lifting
-from ..synthesis.residual_shaped.shaped import promised_errors
-from .residual import mean_error_dynamics, one_step_residual, residual_spectra
+from ...core.errors import DataError
+from ...core.linalg import least_squares
+from ...lifting import Lifting
+from ...synthesis.residual_shaped.shaped import promised_errors
+from .one_step import mean_error_dynamics, one_step_residual, residual_spectra
 
 Array = npt.NDArray[np.float64]
 _MOST_HIDDEN = 3  # beyond it, all hidden states or none are refitted

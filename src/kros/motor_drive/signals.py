@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import butter, lfilter, sosfiltfilt
 
-from ...core.errors import ConfigError
+from ..core.errors import ConfigError
 
 Array = npt.NDArray[np.float64]
 _ORDER = 4

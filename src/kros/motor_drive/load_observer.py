@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ..memory import tune_memory
-from ..memory.made import embedded
-from ..memory.past import hidden_of
-from ..observer import Observer
+from ..observer.observer import Observer
+from ..observer.predictor import tune_memory
+from ..observer.predictor.build import embedded
+from ..observer.predictor.moments import hidden_of
 from .calibrate import LoadCalibration
 
 _OTHERS = 0.1  # weight of the recorded states' errors beside the load's

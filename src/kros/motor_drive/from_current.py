@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DataError
+from ..core.errors import DataError
 from .signals import low_passed
 
 Array = npt.NDArray[np.float64]

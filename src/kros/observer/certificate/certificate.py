@@ -30,7 +30,7 @@ from ...core.loading import loader
 from ..observer import Observer
 from ..units import factors
 from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, UncoveredRuntimeError, error_system, without_measurement
-from .ladder import MOST_CORNERS, frozen_gain, mismatch_gain, prove
+from .search import MOST_CORNERS, frozen_gain, mismatch_gain, prove
 from .status import Dropped, ReliftStatus
 
 Array = npt.NDArray[np.float64]

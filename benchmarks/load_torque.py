@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kros.data import EpisodeKey
-from kros.evaluate import EpisodeBatch
+from kros.data import EpisodeBatch, EpisodeKey
 from kros.evaluate.errors import error_spectrum
 from kros.identify import PhaseSpec, find_segments, resolve_branches, unit_phase
 from kros.lifting import Lifting

@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 
 from kros.core.artifacts import read_json, write_json
-from kros.data import read_parquet
-from kros.evaluate import EpisodeBatch
+from kros.data import EpisodeBatch, read_parquet
 from kros.observer import Observer, ReliftScales, attack, attack_running, one_step_residual, relift_certificate, relift_report
 from kros.study import run_study, validate_config
 from kros.study.config import Stage

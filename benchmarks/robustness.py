@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from kros.core.errors import KrosError
-from kros.data import Population
-from kros.evaluate import EpisodeBatch, Kind, error_percent, severity_of_growth
+from kros.data import EpisodeBatch, Population
+from kros.evaluate import Kind, error_percent, severity_of_growth
 from kros.observer import run_observers
 from kros.plants import HarmonicDrivePopulation
 from kros.report.disturbances import AXES, curves
@@ -107,8 +107,8 @@ def errors_on(context: Context, population: Population, condition: str) -> dict[
     assert calibration is not None
     units = {u: {calibration.spec.parameter: calibration.units[u].phase_rad} for u in context.facts.pooled}
     last = {k.unit: k for k in population.episodes if k.condition == condition and k.unit in units}
-    batch = EpisodeBatch.read(population, tuple(last.values()))
-    parameters, states = batch.parameters(units), population.states
+    batch = EpisodeBatch.read(population, tuple(last.values()), parameters=units)
+    parameters, states = batch.parameters, population.states
     rows = [states.index(c) for c in HIDDEN]
     found: dict[str, list[float]] = {}
 

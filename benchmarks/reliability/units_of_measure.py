@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from campaign import Tally, main
 
-from kros.data import Population, write_parquet
-from kros.evaluate import EpisodeBatch
+from kros.data import EpisodeBatch, Population, write_parquet
 from kros.identify import PhaseCalibration
 from kros.observer import Observer
 from kros.plants import PLANTS

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from kros.core.artifacts import load_artifact
-from kros.data import Population, read_parquet, split_episodes
-from kros.evaluate import EpisodeBatch, error_percent, unit_interval
+from kros.data import EpisodeBatch, Population, read_parquet, split_episodes
+from kros.evaluate import error_percent, unit_interval
 from kros.identify import ModelSet
 from kros.lifting import Lifting
 from kros.observer import Observer, observer_with_memory, relift_certificate, run_observer

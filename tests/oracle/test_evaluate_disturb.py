@@ -6,8 +6,9 @@ import pytest
 from kros.core.errors import ConfigError
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import gramian
+from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey
-from kros.evaluate import Disturbance, DisturbedEpisodes, EpisodeBatch, Kind, Measured, hold_missing, robustness_rows, standard_disturbances
+from kros.evaluate import Disturbance, DisturbedEpisodes, Kind, Measured, hold_missing, robustness_rows, standard_disturbances
 from kros.lifting import Lifting
 from kros.observer import Estimate, ExtendedKalman, Observer, run_observers
 from kros.observer.careful import run_carefully
@@ -152,7 +153,7 @@ def test_holding_takes_the_last_measurement_that_arrived():
 def test_errors_against_severity_do_not_depend_on_how_many_run_at_once(monkeypatch):
     x, u = plant(600)
     keys = tuple(EpisodeKey(unit, "default", "0") for unit in "aabb")
-    batch = EpisodeBatch(keys, np.array([600, 600, 500, 600]), x, u)
+    batch = EpisodeBatch(keys, np.array([600, 600, 500, 600]), x, u, 0.01)
     disturbances = tuple(standard_disturbances([Kind.DROPPED, Kind.NOISE, Kind.DELAY]))
     episodes = DisturbedEpisodes(batch, (0,), {"phase": np.zeros(4)}, 0.01, disturbances)
     observers = [observer(LIFTED), observer(LIFTED, 0.5 * L)]

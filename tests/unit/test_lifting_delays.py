@@ -7,8 +7,7 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError, DimensionError, IdentificationError
 from kros.core.lti import StateSpace
-from kros.data import Channel, Role, from_arrays
-from kros.evaluate import EpisodeBatch
+from kros.data import Channel, EpisodeBatch, Role, from_arrays
 from kros.identify import ModelSet, combine, edmd, free_run, lifted_factor, reduce_episode
 from kros.identify.excitation import require_excitation, require_independent
 from kros.identify.factors import Factor
@@ -280,11 +279,11 @@ def test_free_runs_start_from_the_first_recorded_samples():
     values = {str(i): rng.normal(size=(length, 4)) for i, length in enumerate((30, 20))}
     population = from_arrays({"1": {"default": values}}, channels, 0.01)
     batch = EpisodeBatch.read(population, population.episodes)
-    np.testing.assert_array_equal(batch.first_states(DELAYED)[1], values["1"][:4, :2])
-    np.testing.assert_array_equal(batch.first_states(Lifting(STATES)), batch.states[0])
+    np.testing.assert_array_equal(batch.first_states(DELAYED.history)[1], values["1"][:4, :2])
+    np.testing.assert_array_equal(batch.first_states(), batch.states[0])
     short = EpisodeBatch.read(population, population.episodes, 3)
     with pytest.raises(DataError, match=r"episode 0 of unit 1 .*: needs 4 samples for delays of up to 3, found 3"):
-        short.first_states(DELAYED)
+        short.first_states(DELAYED.history)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,8 @@ import pytest
 
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import StateSpace
-from kros.evaluate import EpisodeBatch, summarise
+from kros.data import EpisodeBatch
+from kros.evaluate import summarise
 from kros.lifting import Lifting
 from kros.observer import Observer, kalman_candidates, noise_covariances, run_observer
 from kros.synthesis import Injection

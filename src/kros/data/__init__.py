@@ -4,6 +4,7 @@ folder or arrays ── reader ── Population ── prepare ── check ─
 """
 
 from . import steps
+from .batch import EpisodeBatch
 from .checks import check_episode, check_population, scan_population
 from .population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Role, Split, Unit, split_episodes
 from .prepare import prepare
@@ -29,6 +30,7 @@ __all__ = [
     "READERS",
     "Channel",
     "CsvMapping",
+    "EpisodeBatch",
     "EpisodeKey",
     "GroupRecord",
     "Population",

@@ -1,6 +1,5 @@
 """Evaluation: errors and spectra of estimates and free runs against recordings, also of disturbed ones; Monte Carlo over uncertain sets."""
 
-from .batch import EpisodeBatch
 from .bootstrap import draw_interval, unit_interval
 from .contractions import Contractions
 from .disturb import SEVERITIES, Disturbance, Kind, Measured, hold_missing, standard_disturbances
@@ -15,7 +14,6 @@ __all__ = [
     "Contractions",
     "Disturbance",
     "DisturbedEpisodes",
-    "EpisodeBatch",
     "ErrorSummary",
     "Kind",
     "Measured",

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DimensionError
-from .batch import EpisodeBatch
+from ..data.batch import EpisodeBatch
 from .disturb import Disturbance, Measured
 from .errors import error_percent
 

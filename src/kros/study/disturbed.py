@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
+from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..evaluate import (
     Disturbance,
     DisturbedEpisodes,
-    EpisodeBatch,
     Kind,
     Measured,
     draw_interval,
@@ -63,8 +63,8 @@ class Trial:
 
     def episodes(self) -> DisturbedEpisodes:
         """Read the episodes."""
-        batch = EpisodeBatch.read(self.population, self.keys, self.samples)
-        return DisturbedEpisodes(batch, self.measured, batch.parameters(self.units), self.population.sample_period_s, self.disturbances)
+        batch = EpisodeBatch.read(self.population, self.keys, self.samples, self.units)
+        return DisturbedEpisodes(batch, self.measured, batch.parameters, self.population.sample_period_s, self.disturbances)
 
     def errors_of_observers(self, observers: Sequence[Observer]) -> list[Array]:
         """Return the errors of observers that can run side by side, each of shape (1 + disturbance, episode, n)."""

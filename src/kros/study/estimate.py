@@ -11,9 +11,8 @@ import numpy as np
 
 from ..core.errors import ConfigError, DataError, IdentificationError
 from ..core.files import read_toml
-from ..data import Population, open_population, split_episodes
+from ..data import EpisodeBatch, Population, open_population, split_episodes
 from ..data.population import EpisodeKey
-from ..evaluate import EpisodeBatch
 from ..identify import PhaseCalibration
 from ..observer import Observer, run_observer
 from .config import Stage, StudyConfig, validate_config
@@ -131,8 +130,8 @@ def _write(out: Path, population: Population, observer: Observer, units: dict[st
         with parquet.ParquetWriter(temporary, schema, write_page_checksum=True) as writer:
             for start in range(0, len(population.episodes), _BATCH):
                 keys = population.episodes[start : start + _BATCH]
-                batch = EpisodeBatch.read(population, keys)
-                values = batch.parameters(units) if observer.lifting.parameters else None
+                batch = EpisodeBatch.read(population, keys, parameters=units)
+                values = batch.parameters if observer.lifting.parameters else None
                 estimate = run_observer(observer, batch.states[..., list(observer.measured)], batch.inputs, values)[..., : len(names)]
                 for i, key in enumerate(keys):
                     table = _table(key, estimate[: batch.lengths[i], i], schema)

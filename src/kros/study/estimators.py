@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, SynthesisError
+from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
-from ..evaluate import EpisodeBatch, error_percent, hold_missing
+from ..evaluate import error_percent, hold_missing
 from ..identify import ModelSet
 from ..lifting import Lifting
 from ..observer import (

@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.errors import ConfigError, KrosError
+from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
-from ..evaluate import EpisodeBatch
 from ..lifting import Lifting
 from ..motor_drive import (
     AngleLoad,
@@ -130,8 +130,8 @@ class LoadStudy:
     def read(self, keys: list[EpisodeKey]) -> EpisodeBatch:
         """Read episodes, all cut to the shortest."""
         population = self.context.population
-        batch = EpisodeBatch.read(population, keys)
-        return batch if np.all(batch.lengths == batch.lengths[0]) else EpisodeBatch.read(population, keys, int(batch.lengths.min()))
+        batch = EpisodeBatch.read(population, keys, parameters=self.units)
+        return batch if np.all(batch.lengths == batch.lengths[0]) else batch.head(int(batch.lengths.min()))
 
     @property
     def places(self) -> tuple[int, int]:
@@ -165,7 +165,7 @@ class LoadStudy:
     def parameters(self, made: Observer | Lifting, batch: EpisodeBatch) -> dict[str, Array] | None:
         """Lifting parameters of a batch, where a lifting has any."""
         lifting = made.lifting if isinstance(made, Observer) else made
-        return batch.parameters(self.units) if lifting.parameters else None
+        return batch.parameters if lifting.parameters else None
 
     def calibration(self, lifting: Lifting) -> LoadCalibration:
         """What the known load says."""

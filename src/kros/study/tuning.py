@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
-from ..evaluate import EpisodeBatch, error_percent
+from ..evaluate import error_percent
 from ..observer import Observer, Seen, run_observer, run_observers
 
 Array = npt.NDArray[np.float64]
@@ -31,8 +32,8 @@ class TuningSet:
     def read(self) -> Judge:
         """Read the episodes."""
         limit = round(TUNING_S / self.population.sample_period_s)
-        batch = EpisodeBatch.read(self.population, self.keys, limit)
-        return Judge(batch, batch.parameters(self.parameters))
+        batch = EpisodeBatch.read(self.population, self.keys, limit, self.parameters)
+        return Judge(batch)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,19 +41,19 @@ class Judge:
     """Training episodes in memory."""
 
     batch: EpisodeBatch
-    parameters: dict[str, Array]
+
+    @property
+    def parameters(self) -> dict[str, Array]:
+        """Lifting parameters, shape (batch,) each."""
+        return self.batch.parameters
 
     def first(self, n_samples: float) -> Judge:
         """Return the same episodes, cut to so many samples."""
-        cut, b = round(n_samples), self.batch
-        short = EpisodeBatch(b.keys, np.minimum(b.lengths, cut), b.states[:cut], np.ascontiguousarray(b.inputs[:cut]))
-        return Judge(short, self.parameters)
+        return Judge(self.batch.head(round(n_samples)))
 
     def part(self, rows: Sequence[int]) -> Judge:
         """Return some of the episodes."""
-        b, rows = self.batch, list(rows)
-        batch = EpisodeBatch(tuple(b.keys[i] for i in rows), b.lengths[rows], b.states[:, rows], np.ascontiguousarray(b.inputs[:, rows]))
-        return Judge(batch, {name: values[rows] for name, values in self.parameters.items()})
+        return Judge(self.batch.take(rows))
 
     def measurements(self, measured: Sequence[int]) -> Array:
         """Return the measured states, shape (n_samples, batch, q)."""

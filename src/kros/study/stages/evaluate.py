@@ -13,8 +13,9 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import KrosError
+from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
-from ...evaluate import EpisodeBatch, ErrorSummary, summarise
+from ...evaluate import ErrorSummary, summarise
 from ...identify import ModelSet, free_run
 from ...observer import Observer, run_observers
 from ..context import Context
@@ -59,8 +60,8 @@ def evaluate_observers(
     observers: Sequence[Observer], population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
 ) -> list[Outcome]:
     """Run observers that `alike` puts together on test episodes, as many at a time as fit into memory."""
-    batch, first = EpisodeBatch.read(population, keys), observers[0]
-    y, parameters = batch.states[..., list(first.measured)], batch.parameters(units) if first.lifting.parameters else None
+    batch, first = EpisodeBatch.read(population, keys, parameters=units), observers[0]
+    y, parameters = batch.states[..., list(first.measured)], batch.parameters if first.lifting.parameters else None
     together = max(1, _SAMPLES_AT_ONCE // batch.states.size)
     found = []
     for start in range(0, len(observers), together):
@@ -99,8 +100,8 @@ def evaluate_baseline(
         baseline = make()
     except KrosError as error:
         return str(error)
-    batch = EpisodeBatch.read(population, keys)
-    outcome = _outcome(baseline.run(batch, batch.parameters(units)), batch, population.sample_period_s, shown)
+    batch = EpisodeBatch.read(population, keys, parameters=units)
+    outcome = _outcome(baseline.run(batch, batch.parameters), batch, population.sample_period_s, shown)
     disturbed = None if trial is None else trial.errors_of_baseline(baseline)
     return replace(outcome, facts=baseline.facts, estimated=baseline.estimated, disturbed=disturbed)
 
@@ -109,11 +110,16 @@ def evaluate_model(
     models: ModelSet, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
 ) -> Outcome:
     """Run every unit's own model freely from the true first state, with delays from the first recorded ones."""
-    batch = EpisodeBatch.read(population, keys)
+    batch = EpisodeBatch.read(population, keys, parameters=units)
     rows = [models.index(k.unit) for k in keys]
-    parameters = batch.parameters(units) if models.lifting.parameters else {}
+    parameters = batch.parameters if models.lifting.parameters else {}
     states = free_run(
-        models.A[rows], models.B[rows], models.lifting, parameters, batch.first_states(models.lifting), np.swapaxes(batch.inputs, 0, 1)
+        models.A[rows],
+        models.B[rows],
+        models.lifting,
+        parameters,
+        batch.first_states(models.lifting.history),
+        np.swapaxes(batch.inputs, 0, 1),
     )
     return _outcome(np.swapaxes(states, 0, 1), batch, population.sample_period_s, shown)
 

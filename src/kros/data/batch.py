@@ -1,0 +1,102 @@
+"""Episodes side by side: one array for all, shorter episodes held at their last sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError
+from .population import EpisodeKey, Population
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeBatch:
+    """Episodes of one population, time first.
+
+    Parameters
+    ----------
+    keys : tuple of EpisodeKey
+    lengths : ndarray, shape (batch,)
+    states : ndarray, shape (n_samples, batch, n)
+    inputs : ndarray, shape (n_samples, batch, m)
+    sample_period_s : float
+    parameters : dict of str to ndarray, shape (batch,)
+        Lifting parameters of every episode's unit.
+    """
+
+    keys: tuple[EpisodeKey, ...]
+    lengths: npt.NDArray[np.int64]
+    states: Array
+    inputs: Array
+    sample_period_s: float
+    parameters: dict[str, Array] = field(default_factory=dict)
+
+    @classmethod
+    def read(
+        cls,
+        population: Population,
+        keys: Sequence[EpisodeKey],
+        max_samples: int | None = None,
+        parameters: Mapping[str, Mapping[str, float]] | None = None,
+    ) -> EpisodeBatch:
+        """Read episodes, each cut to at most `max_samples`; `parameters` are lifting parameters by unit and name, kept where all units have them."""
+        if not keys:
+            raise DataError("Reading a batch of episodes: no episodes were named; check the split.")
+        episodes = [population.read(key)[:max_samples] for key in keys]
+        lengths = np.array([len(e) for e in episodes])
+        n = len(population.states)
+        values = np.empty((lengths.max(), len(keys), len(population.channels)))
+        for i, episode in enumerate(episodes):
+            values[: len(episode), i] = episode
+            values[len(episode) :, i] = episode[-1]
+        rows = [(parameters or {}).get(k.unit, {}) for k in keys]
+        own = {name: np.array([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
+        return cls(tuple(keys), lengths, values[..., :n], np.ascontiguousarray(values[..., n:]), population.sample_period_s, own)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of every episode."""
+        return tuple(k.unit for k in self.keys)
+
+    def head(self, n_samples: int) -> EpisodeBatch:
+        """Return the same episodes, cut to so many samples."""
+        lengths, inputs = np.minimum(self.lengths, n_samples), np.ascontiguousarray(self.inputs[:n_samples])
+        return replace(self, lengths=lengths, states=self.states[:n_samples], inputs=inputs)
+
+    def take(self, rows: Sequence[int]) -> EpisodeBatch:
+        """Return some of the episodes."""
+        rows = list(rows)
+        return replace(
+            self,
+            keys=tuple(self.keys[i] for i in rows),
+            lengths=self.lengths[rows],
+            states=self.states[:, rows],
+            inputs=np.ascontiguousarray(self.inputs[:, rows]),
+            parameters={name: values[rows] for name, values in self.parameters.items()},
+        )
+
+    def first_states(self, history: int = 0) -> Array:
+        """Return what a free run starts from: the first states of every episode, and those that a lifting's delays of up to `history` need.
+
+        Returns
+        -------
+        ndarray, shape (batch, n), or (batch, history + 1, n) for a lifting with delays
+
+        Raises
+        ------
+        DataError
+            When an episode is shorter than the history.
+        """
+        if not history:
+            return self.states[0]
+        for key, length in zip(self.keys, self.lengths, strict=True):
+            if length < history + 1:
+                raise DataError(
+                    f"Free run over {key}: needs {history + 1} samples for delays of up to {history}, found {length}; leave the episode out."
+                )
+        return np.swapaxes(self.states[: history + 1], 0, 1)

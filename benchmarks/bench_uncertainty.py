@@ -13,7 +13,7 @@ import numpy as np
 
 from kros.core import StateSpace
 from kros.core.frequency import log_grid
-from kros.uncertainty import all_bounds, choose_nominals, fit_magnitude, misfit, optimal_cover, quantify, residual, score_outliers
+from kros.uncertainty import all_bounds, choose_nominals, fit_magnitude, misfit, optimal_cover, quantify_systems, residual, score_outliers
 
 UNITS, STATES, INPUTS, DT = 38, 4, 2, 1e-3
 
@@ -51,7 +51,7 @@ def main() -> None:
     fit_magnitude(freqs[::100], target[::100], DT, order=1)  # imports SciPy's solver and mpmath
     report("one magnitude fit, order 4", lambda: fit_magnitude(freqs, target, DT, order=4))
     report("outlier scores", lambda: score_outliers(G, freqs))
-    model = report("quantify, inverse input multiplicative", lambda: quantify(units))
+    model = report("quantify, inverse input multiplicative", lambda: quantify_systems(units))
     print(
         f"cover_max {model.cover_max:.9f}, overbound {model.overbound_db_max:.2f} dB, orders {model.weight.left_orders} {model.weight.right_orders}"
     )

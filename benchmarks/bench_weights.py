@@ -36,8 +36,8 @@ from kros.uncertainty import (
     fit_magnitude,
     fit_weight,
     optimal_cover,
-    quantify,
     quantify_responses,
+    quantify_systems,
     residual,
     scale_system,
 )
@@ -208,7 +208,7 @@ def print_peaks(limit_s: float) -> None:
         response = units.frequency_response(omega / (2 * np.pi))[:, :, 0, 0]
         return np.abs(response - response[0]).max(axis=0)
 
-    model = quantify(units, "additive", OMEGA / (2 * np.pi), nominal=0, max_order=6)
+    model = quantify_systems(units, "additive", OMEGA / (2 * np.pi), nominal=0, max_order=6)
     ratio = largest(dense) / np.abs(model.weight.left.frequency_response(dense / (2 * np.pi))[:, 0, 0])
     print(f"peaks between grid points: kros {ratio.max():.4f}", end="")
     if HAS_DKPY:

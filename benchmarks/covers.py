@@ -27,7 +27,7 @@ from kros.identify import ModelSet
 from kros.study import run_study, validate_config
 from kros.study.config import Stage
 from kros.study.demo import simulate_to
-from kros.uncertainty import Form, UncertainModel, quantify
+from kros.uncertainty import Form, UncertainModel, quantify_systems
 from kros.uncertainty.weights.weight import Weight
 
 Array = npt.NDArray[Any]
@@ -75,7 +75,7 @@ def row(models: ModelSet, form: str, structure: str, name: str, population: str,
     """Quantify, verify, and return a row."""
     grid, limits = log_grid(models.sample_period_s), {"max_order": options.max_order, "tolerance_db": options.tolerance_db}
     start = time.process_time()
-    found = quantify(models, form, grid, structure=structure, **limits)
+    found = quantify_systems(models, form, grid, structure=structure, **limits)
     seconds = time.process_time() - start
     ratio = independent_cover_max(found, models.systems())
     weight: Weight = found.weight

@@ -1,4 +1,4 @@
-"""Random populations through `quantify`, and their sampled responses through `quantify_responses`.
+"""Random populations through `quantify_systems`, and their sampled responses through `quantify_responses`.
 
 The truth is computed here, from the matrices of the units and the formulas of the forms: responses by linear solves, residuals by
 pseudo-inverses, ratios on a dense grid that looks around every pole of units, nominal and weights, then three times more finely around the
@@ -20,7 +20,7 @@ import numpy as np
 from campaign import LONGEST_S, Tally, main
 
 from kros.core import KrosError, StateSpace
-from kros.uncertainty import Form, quantify, quantify_responses
+from kros.uncertainty import Form, quantify_responses, quantify_systems
 
 Array = np.ndarray[Any, Any]
 KINDS = ("generic", "lightly damped", "stiff", "nearly identical", "identical", "static", "delayed")
@@ -226,9 +226,9 @@ def limited(seconds: float) -> Iterator[None]:
 
 
 def models(case: Case) -> tuple[str, bool]:
-    """Judge `quantify`: the bound between grid points, that of the remainder, and the statement about the tolerance."""
+    """Judge `quantify_systems`: the bound between grid points, that of the remainder, and the statement about the tolerance."""
     options: dict[str, Any] = {"structure": case.structure, "max_order": case.max_order, "tolerance_db": case.tolerance_db}
-    found = quantify(case.units, case.form, case.freqs_hz, density=4, **options)
+    found = quantify_systems(case.units, case.form, case.freqs_hz, density=4, **options)
     nominal, weight, remainder = found.scaled_nominal(), found.weight, found.remainder
     shown = [weight.left, weight.right] + ([remainder.left, remainder.right] if remainder else [])
 

@@ -16,7 +16,7 @@ from kros.interop import KoopmanRegressor
 from kros.plants import PendulumPopulation
 from kros.synthesis import Block, GeneralizedPlant, dk_iteration, h2, mu_bounds, reduce_controller
 from kros.synthesis.problem.interconnect import interconnect
-from kros.uncertainty import quantify
+from kros.uncertainty import quantify_systems
 
 DT, REFERENCE_RAD = 0.01, 0.25
 GRID_HZ = np.geomspace(0.002, 49.0, 50)
@@ -35,7 +35,7 @@ def main() -> None:
     options = parser.parse_args()
     simulated = PendulumPopulation(options.units, 10, 20.0, options.seed, options.spread).simulate()
     models = identify(simulated.population)
-    uncertain = quantify(models, "additive", np.geomspace(1e-3, 50.0, 300))
+    uncertain = quantify_systems(models, "additive", np.geomspace(1e-3, 50.0, 300))
     facts = {
         "units": options.units,
         "uncertainty": {"peak_db": round(uncertain.peak_db[uncertain.form], 2), "cover_max": round(uncertain.cover_max, 4)},

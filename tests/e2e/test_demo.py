@@ -14,7 +14,7 @@ from kros.study.executors import open_executor
 from kros.study.pipeline import load_run
 from kros.study.resampling import resampled_models
 from kros.uncertainty import Tightness, UncertainModel, VariationAndNoise
-from kros.uncertainty.population.unit_residuals import UnitResiduals
+from kros.uncertainty.unit_residuals import UnitResiduals
 
 STAGES = ["read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report"]
 FORMS = {

@@ -13,7 +13,7 @@ from kros.data import Channel, EpisodeKey, Role, from_arrays
 from kros.identify import ModelSet
 from kros.interop import AdoptedModel, KoopmanRegressor, from_pykoop, models_from_pykoop
 from kros.lifting import Lifting
-from kros.uncertainty import quantify
+from kros.uncertainty import quantify_systems
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -253,7 +253,7 @@ def test_one_pipeline_for_each_unit_gives_the_models_of_a_population() -> None:
         assert np.allclose(np.concatenate([models.A[i], models.B[i]], axis=1), coefficients, rtol=1e-12)
         lifted = models.lifting.lift(X[:, :2])
         assert np.all(np.abs(lifted).max(axis=0) <= models.output_scale)
-    assert quantify(models, form="additive").cover_max <= 1
+    assert quantify_systems(models, form="additive").cover_max <= 1
 
 
 def test_lifted_inputs_are_inputs_of_the_models() -> None:

@@ -11,7 +11,7 @@ from kros.synthesis.worst_case.causal import causal_h2, perturbed
 from kros.synthesis.worst_case.certificate import certify, density
 from kros.synthesis.worst_case.robust_gain import robust_gain
 from kros.synthesis.worst_case.unit_check import unit_error
-from kros.uncertainty import Form, quantify, rebuild, residual
+from kros.uncertainty import Form, quantify_systems, rebuild, residual
 
 DT, N, M = 0.05, 3, 2
 FREQS = np.array([0.0, 0.03, 0.7, 3.0, 9.9])
@@ -308,7 +308,9 @@ def drives(spread, n_units=6):
 def test_every_simulated_drive_is_below_the_bounds(spread, form):
     """Weights as the uncertainty stage makes them, remainder included: no drive has a larger error than the certificate says."""
     units = drives(spread)
-    uncertain = quantify(units, form, freqs_hz=np.geomspace(1e-2, 499, 80), structure="scalar", max_order=2, tolerance_db=3.0, density=3)
+    uncertain = quantify_systems(
+        units, form, freqs_hz=np.geomspace(1e-2, 499, 80), structure="scalar", max_order=2, tolerance_db=3.0, density=3
+    )
     rest = uncertain.remainder
     case = ObserverProblem(
         nominal=units[uncertain.nominal],

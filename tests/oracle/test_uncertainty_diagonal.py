@@ -11,7 +11,7 @@ import pytest
 
 from kros.core import StateSpace
 from kros.core.errors import ConfigError
-from kros.uncertainty import Form, fit_weight, quantify
+from kros.uncertainty import Form, fit_weight, quantify_systems
 from kros.uncertainty.fits.sections import Sections
 
 DT = 1e-3
@@ -117,7 +117,7 @@ def test_bounds_hold_by_the_means_of_the_benchmark(form: str) -> None:
     A = np.array([[0.9, 0.05], [-0.1, 0.7]]) * (1 + 0.01 * rng.normal(size=(4, 2, 2)))
     B = np.array([[0.1, 0.02], [0.0, 0.3]]) * (1 + 0.05 * rng.normal(size=(4, 2, 2)))
     units = StateSpace(A, B, np.broadcast_to(np.eye(2), A.shape), np.zeros(A.shape), DT)
-    found = quantify(units, Form(form), np.geomspace(0.1, 500.0, 60), max_order=2, tolerance_db=2.0)
+    found = quantify_systems(units, Form(form), np.geomspace(0.1, 500.0, 60), max_order=2, tolerance_db=2.0)
     covers = benchmark()
     assert covers.independent_cover_max(found, units) <= 1 + 1e-6
     lowered = found.weight.mapped(lambda s: StateSpace(s.A, s.B, 0.9 * s.C, 0.9 * s.D, s.dt))

@@ -18,7 +18,7 @@ from kros.uncertainty import (
     Structure,
     UncertainModel,
     fit_weight,
-    quantify,
+    quantify_systems,
     residual,
 )
 from kros.uncertainty.weights.pencils import ratio_systems
@@ -114,7 +114,7 @@ def test_realisations_of_entries(form: str) -> None:
 
 def test_models_keep_their_weights_and_synthesis_refuses_them(tmp_path: Path) -> None:
     units = lags(1 + 0.1 * np.random.default_rng(4).normal(size=(3, 2, 2)) + np.eye(2), np.full((3, 2, 2), 5.0))
-    model = quantify(units, freqs_hz=GRID, structure="entrywise", max_order=2, tolerance_db=3.0, density=2)
+    model = quantify_systems(units, freqs_hz=GRID, structure="entrywise", max_order=2, tolerance_db=3.0, density=2)
     model.save(tmp_path)
     loaded = UncertainModel.load(tmp_path).weight
     assert isinstance(loaded, EntrywiseWeight)
@@ -131,7 +131,7 @@ def test_continuous_models() -> None:
     poles = np.array([-1.0, -1.3, -0.8])[:, None, None] * np.eye(2)
     coupled = np.array([[1.0, 0.4], [-0.2, 1.0]])
     units = StateSpace(poles, np.broadcast_to(coupled, (3, 2, 2)), np.broadcast_to(np.eye(2), (3, 2, 2)), np.zeros((3, 2, 2)), 0.0)
-    model = quantify(units, "additive", np.geomspace(0.01, 10, 60), structure="entrywise", max_order=2, tolerance_db=3.0, density=2)
+    model = quantify_systems(units, "additive", np.geomspace(0.01, 10, 60), structure="entrywise", max_order=2, tolerance_db=3.0, density=2)
     freqs = np.geomspace(0.01, 10, 500)
     E = residual("additive", units[model.nominal].frequency_response(freqs), units.frequency_response(freqs))
     assert isinstance(model.weight, EntrywiseWeight)

@@ -10,10 +10,20 @@ import pytest
 from scipy.optimize import check_grad
 
 from kros.core.lti import StateSpace, block_diagonal, gain
-from kros.uncertainty import FullWeight, Method, Perturbation, ResidualSystems, Structure, UncertainModel, fit_weight, quantify, residual
-from kros.uncertainty.small import entries_first
+from kros.uncertainty import (
+    FullWeight,
+    Method,
+    Perturbation,
+    ResidualSystems,
+    Structure,
+    UncertainModel,
+    fit_weight,
+    quantify_systems,
+    residual,
+)
+from kros.uncertainty.small_matrices import entries_first
 from kros.uncertainty.weights.full import volume_db
-from kros.uncertainty.weights.full_frames import _Search, best_frames, unit_triangular, with_floor
+from kros.uncertainty.weights.full_multipliers import _Search, best_frames, unit_triangular, with_floor
 from kros.uncertainty.weights.pencils import ratio_systems
 
 DT = 1e-3
@@ -163,7 +173,7 @@ def test_models_keep_their_weights_in_both_times(dt: float, tmp_path: Path) -> N
     B = T @ np.diag([1.0, 1.0]) @ SKEWED * (1 + 0.02 * rng.normal(size=(4, 1, 1)))
     units = StateSpace(A, B * (1.0 if dt == 0 else 0.01), np.broadcast_to(ROTATED.T, (4, 2, 2)), np.zeros((4, 2, 2)), dt)
     freqs = np.geomspace(0.01, 10, 60) if dt == 0 else GRID
-    model = quantify(units, "additive", freqs, structure="full", max_order=2, tolerance_db=3.0, density=2)
+    model = quantify_systems(units, "additive", freqs, structure="full", max_order=2, tolerance_db=3.0, density=2)
     E = residual("additive", units[model.nominal].frequency_response(freqs), units.frequency_response(freqs))
     assert isinstance(model.weight, FullWeight)
     assert model.weight.left.dt == dt

@@ -11,7 +11,7 @@ from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.linalg import qr_triangle
 from kros.identify import KoopmanMatrices, ModelSamples, bootstrap_edmd, episode_weights
 from kros.uncertainty import Form
-from kros.uncertainty.population.noise import VariationAndNoise, variation_and_noise
+from kros.uncertainty.variation import VariationAndNoise, variation_and_noise
 
 DT = 1e-2
 FREQS = np.geomspace(0.1, 40.0, 12)

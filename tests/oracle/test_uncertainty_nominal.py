@@ -8,8 +8,8 @@ import pytest
 from kros.core import StateSpace
 from kros.core.errors import ConfigError, DimensionError
 from kros.uncertainty import Form, all_bounds, choose_nominal, choose_nominals, optimal_cover, residual
-from kros.uncertainty.population.nominal import frequency_weights
-from kros.uncertainty.small import condition_number, lower_factor, triangle
+from kros.uncertainty.nominal.choice import frequency_weights
+from kros.uncertainty.small_matrices import condition_number, lower_factor, triangle
 from kros.uncertainty.weights.cover_search import cost_from_below_db, couplings
 
 FORMS = list(Form)

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from kros.uncertainty import Form, score_outliers
-from kros.uncertainty.outlying.groups import excess, separate
-from kros.uncertainty.outlying.tail import (
+from kros.uncertainty.outliers.groups import excess, separate
+from kros.uncertainty.outliers.tail import (
     SHAPE,
     exceedance,
     group_factors,

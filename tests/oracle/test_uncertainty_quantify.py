@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from kros.core import StateSpace
 from kros.core.errors import ConfigError, DataError, DimensionError
-from kros.uncertainty import Form, UncertainModel, quantify
+from kros.uncertainty import Form, UncertainModel, quantify_systems
 
 DT = 1e-3
 
@@ -71,7 +71,7 @@ def slow_ratio(model: UncertainModel, units: StateSpace, freqs: np.ndarray) -> f
 @pytest.mark.parametrize("form", ["inverse_input_multiplicative", "additive"])
 def test_weights_of_drives_are_sound_and_tight(form: str) -> None:
     units = drives(10, 1)
-    model = quantify(units, form, np.geomspace(1e-1, 500.0, 150), output_scale=[1, 3, 1], input_scale=[1, 3])
+    model = quantify_systems(units, form, np.geomspace(1e-1, 500.0, 150), output_scale=[1, 3, 1], input_scale=[1, 3])
     off_grid = np.random.default_rng(0).uniform(np.log(1e-1), np.log(500.0), 50)
     assert slow_ratio(model, units, np.concatenate([np.exp(off_grid), [1e-6, 500.0]])) <= 1 + 1e-6
     assert model.cover_max <= 1
@@ -85,14 +85,14 @@ def test_weights_of_drives_are_sound_and_tight(form: str) -> None:
 @pytest.mark.parametrize("form", list(Form))
 def test_weights_of_random_tall_systems_are_sound(form: Form) -> None:
     units = random_population(4, 2)
-    model = quantify(units, form, np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
+    model = quantify_systems(units, form, np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
     assert slow_ratio(model, units, np.linspace(1.0, 500.0, 41)) <= 1 + 1e-6
     assert model.cover_max <= 1
 
 
 def test_remainder_covers_what_the_form_leaves_out() -> None:
     units = random_population(4, 3)
-    model = quantify(units, "inverse_input_multiplicative", np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
+    model = quantify_systems(units, "inverse_input_multiplicative", np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
     assert model.misfit_max > 0.01
     assert model.remainder is not None
     for f in np.linspace(2.0, 490.0, 23):
@@ -102,7 +102,7 @@ def test_remainder_covers_what_the_form_leaves_out() -> None:
             gp = response(units[k], z)
             rest = gp - g @ np.linalg.inv(np.eye(2) - np.linalg.pinv(gp) @ (gp - g))
             assert np.linalg.norm(np.linalg.solve(left, rest) @ np.linalg.inv(right), 2) <= 1 + 1e-6
-    additive = quantify(units, "additive", np.geomspace(1.0, 500.0, 20), max_order=1, tolerance_db=20.0, density=1)
+    additive = quantify_systems(units, "additive", np.geomspace(1.0, 500.0, 20), max_order=1, tolerance_db=20.0, density=1)
     assert additive.remainder is None
     assert additive.misfit_max < 1e-12
 
@@ -111,7 +111,7 @@ def test_scalar_first_order_population_has_the_residual_of_the_textbook() -> Non
     """Lags `(1 - a) / (z - a)`: inverse input residual `1 - G / Gp` is exact, zero at DC, and the gain ratio at Nyquist is known."""
     poles = np.array([0.88, 0.9, 0.92])[:, None, None]
     units = StateSpace(poles, 1 - poles, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), DT)
-    model = quantify(units, freqs_hz=np.geomspace(1e-3, 500.0, 300))
+    model = quantify_systems(units, freqs_hz=np.geomspace(1e-3, 500.0, 300))
     assert model.nominal == 1
     at_top = max(abs(1 - (0.1 / 1.9) / ((1 - a) / (1 + a))) for a in (0.88, 0.92))
     np.testing.assert_allclose(model.bounds[model.form][-1], at_top, rtol=1e-10)
@@ -127,10 +127,10 @@ def test_units_of_measure_and_order_of_units_do_not_matter(seed: int, exponents:
     units, freqs = drives(5, seed), np.geomspace(1.0, 500.0, 24)
     out, into = 10.0 ** np.array(exponents[:3]), 10.0 ** np.array(exponents[3:])
     options = {"tolerance_db": 20.0, "density": 1, "max_order": 1}
-    plain = quantify(units, "input_multiplicative", freqs, **options)
+    plain = quantify_systems(units, "input_multiplicative", freqs, **options)
     other = StateSpace(units.A, units.B / into, units.C * out[:, None], units.D, DT)
-    scaled = quantify(other, "input_multiplicative", freqs, output_scale=out, input_scale=into, **options)
-    shuffled = quantify(units[[3, 1, 4, 0, 2]], "input_multiplicative", freqs, **options)
+    scaled = quantify_systems(other, "input_multiplicative", freqs, output_scale=out, input_scale=into, **options)
+    shuffled = quantify_systems(units[[3, 1, 4, 0, 2]], "input_multiplicative", freqs, **options)
     for form, peak in plain.peak_db.items():
         assert scaled.peak_db[form] == pytest.approx(peak, rel=1e-6)
         assert shuffled.peak_db[form] == pytest.approx(peak, rel=1e-9)
@@ -142,7 +142,7 @@ def test_units_of_measure_and_order_of_units_do_not_matter(seed: int, exponents:
 def test_identical_units_have_no_uncertainty() -> None:
     one = drives(1, 4)
     units = StateSpace(*(np.repeat(getattr(one, x), 3, axis=0) for x in "ABCD"), DT)
-    model = quantify(units, freqs_hz=np.geomspace(1.0, 500.0, 20))
+    model = quantify_systems(units, freqs_hz=np.geomspace(1.0, 500.0, 20))
     assert model.cover_max == 0
     assert model.peak_db[model.form] == -np.inf
     assert not model.weight.left.D.any()
@@ -151,9 +151,9 @@ def test_identical_units_have_no_uncertainty() -> None:
 def test_nominal_may_be_named_or_brought_along(tmp_path: Path) -> None:
     units, freqs = drives(4, 5), np.geomspace(1.0, 500.0, 30)
     ids = ("a", "b", "c", "d")
-    assert quantify(units, freqs_hz=freqs, unit_ids=ids, nominal="c", max_order=1).nominal == 2
+    assert quantify_systems(units, freqs_hz=freqs, unit_ids=ids, nominal="c", max_order=1).nominal == 2
     mean = StateSpace(units.A.mean(axis=0), units.B.mean(axis=0), np.eye(3), np.zeros((3, 2)), DT)
-    pooled = quantify(units, freqs_hz=freqs, unit_ids=ids, nominal=mean, max_order=1)
+    pooled = quantify_systems(units, freqs_hz=freqs, unit_ids=ids, nominal=mean, max_order=1)
     assert (pooled.nominal, pooled.nominal_id) == (-1, "pooled")
     assert slow_ratio(pooled, units, np.array([1.3, 40.0, 333.0])) <= 1 + 1e-6
     pooled.save(tmp_path)
@@ -164,59 +164,59 @@ def test_nominal_may_be_named_or_brought_along(tmp_path: Path) -> None:
     np.testing.assert_array_equal(loaded.weight.left.A, pooled.weight.left.A)
     np.testing.assert_array_equal(loaded.misfit, pooled.misfit)
     with pytest.raises(ConfigError, match="'z'"):
-        quantify(units, freqs_hz=freqs, unit_ids=ids, nominal="z")
+        quantify_systems(units, freqs_hz=freqs, unit_ids=ids, nominal="z")
     with pytest.raises(ConfigError, match="range"):
-        quantify(units, freqs_hz=freqs, nominal=9)
+        quantify_systems(units, freqs_hz=freqs, nominal=9)
 
 
 def test_bad_input_is_refused() -> None:
     units = drives(3, 6)
     with pytest.raises(DataError, match="two units"):
-        quantify(units[[0]])
+        quantify_systems(units[[0]])
     with pytest.raises(DimensionError, match="unit axis"):
-        quantify(units[0])
+        quantify_systems(units[0])
     with pytest.raises(ConfigError, match="Nyquist"):
-        quantify(units, freqs_hz=[1.0, 600.0])
+        quantify_systems(units, freqs_hz=[1.0, 600.0])
     with pytest.raises(ConfigError, match="unknown"):
-        quantify(units, "nonsense")
+        quantify_systems(units, "nonsense")
     with pytest.raises(ConfigError, match="diagonal"):
-        quantify(units, freqs_hz=[1.0, 2.0], structure="block")
+        quantify_systems(units, freqs_hz=[1.0, 2.0], structure="block")
     with pytest.raises(DimensionError, match="output_scale"):
-        quantify(units, output_scale=[1, 2])
+        quantify_systems(units, output_scale=[1, 2])
     with pytest.raises(DimensionError, match="differ"):
-        quantify([units[0], StateSpace(units.A[1], units.B[1], np.eye(3), np.zeros((3, 2)), 2 * DT)])
+        quantify_systems([units[0], StateSpace(units.A[1], units.B[1], np.eye(3), np.zeros((3, 2)), 2 * DT)])
     unstable = StateSpace(np.stack([units.A[0], 1.2 * np.eye(3)]), units.B[:2], units.C[:2], units.D[:2], DT)
     with pytest.raises(DataError, match="unstable"):
-        quantify(unstable, unit_ids=("a", "b"))
+        quantify_systems(unstable, unit_ids=("a", "b"))
     broken = StateSpace(units.A * np.array([1, np.nan, 1])[:, None, None], units.B, units.C, units.D, DT)
     with pytest.raises(DataError, match="unit 1 has NaN"):
-        quantify(broken)
+        quantify_systems(broken)
     with pytest.raises(DataError, match="largest real part of a pole"):
-        quantify(StateSpace(np.abs(units.A), units.B, units.C, units.D, 0.0))
+        quantify_systems(StateSpace(np.abs(units.A), units.B, units.C, units.D, 0.0))
 
 
 def test_the_nominal_may_be_sought_by_other_criteria_and_among_models_that_are_no_units() -> None:
     units, freqs = drives(5, 7), np.geomspace(1.0, 500.0, 30)
     mean = StateSpace(units.A.mean(axis=0), units.B.mean(axis=0), np.eye(3), np.zeros((3, 2)), DT)
     options = {"tolerance_db": 20.0, "density": 1, "max_order": 1}
-    peak = quantify(units, "additive", freqs, extra={"mean": mean}, **options)
-    alone = quantify(units, "additive", freqs, **options)
+    peak = quantify_systems(units, "additive", freqs, extra={"mean": mean}, **options)
+    alone = quantify_systems(units, "additive", freqs, **options)
     assert (peak.nominal, peak.nominal_id) == (-1, "mean")
     assert peak.peak_db[Form.ADDITIVE] < alone.peak_db[Form.ADDITIVE]
     assert peak.cover.left.shape == alone.cover.left.shape
     for criterion in ("area", "cost"):
-        found = quantify(units, "additive", freqs, criterion=criterion, **options)
+        found = quantify_systems(units, "additive", freqs, criterion=criterion, **options)
         scores = []
         for k in range(5):
-            model = quantify(units, "additive", freqs, nominal=k, **options)
+            model = quantify_systems(units, "additive", freqs, nominal=k, **options)
             log_bound = np.log(model.bounds[Form.ADDITIVE]) if criterion == "area" else model.cover.cost_db()
             scores.append(np.average(log_bound, weights=np.gradient(np.log(freqs))))
         assert found.nominal == np.argmin(scores)
-    assert quantify(units, "additive", freqs, extra={"mean": mean}, nominal="mean", **options).nominal_id == "mean"
+    assert quantify_systems(units, "additive", freqs, extra={"mean": mean}, nominal="mean", **options).nominal_id == "mean"
     with pytest.raises(ConfigError, match="name of a unit"):
-        quantify(units, "additive", freqs, extra={"0": mean}, **options)
+        quantify_systems(units, "additive", freqs, extra={"0": mean}, **options)
     with pytest.raises(DataError, match="the model of candidate bad is unstable"):
-        quantify(units, "additive", freqs, extra={"bad": StateSpace(2 * np.eye(3), mean.B, mean.C, mean.D, DT)}, **options)
+        quantify_systems(units, "additive", freqs, extra={"bad": StateSpace(2 * np.eye(3), mean.B, mean.C, mean.D, DT)}, **options)
 
 
 @pytest.mark.parametrize(
@@ -232,13 +232,13 @@ def test_the_nominal_may_be_sought_by_other_criteria_and_among_models_that_are_n
 def test_options_out_of_range_are_refused(options, message):
     units = [StateSpace([[p]], [[1.0]], [[1.0]], [[0.0]], 0.01) for p in (0.9, 0.91)]
     with pytest.raises(ConfigError, match=message):
-        quantify(units, **options)
+        quantify_systems(units, **options)
 
 
 def test_an_unstable_nominal_is_refused_and_foreign_systems_are_read():
     units = [SimpleNamespace(A=[[p]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt=0.01) for p in (0.9, 0.91)]
-    assert quantify(units, "additive").cover_max <= 1
+    assert quantify_systems(units, "additive").cover_max <= 1
     with pytest.raises(DataError, match="the nominal is unstable"):
-        quantify(units, nominal=StateSpace([[1.1]], [[1.0]], [[1.0]], [[0.0]], 0.01))
+        quantify_systems(units, nominal=StateSpace([[1.1]], [[1.0]], [[1.0]], [[0.0]], 0.01))
     with pytest.raises(DimensionError, match="found int"):
-        quantify(3)
+        quantify_systems(3)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kros.core import StateSpace
-from kros.uncertainty import EntrywiseWeight, FullWeight, Structure, optimal_cover, quantify, quantify_responses
+from kros.uncertainty import EntrywiseWeight, FullWeight, Structure, optimal_cover, quantify_responses, quantify_systems
 
 Array = np.ndarray[Any, Any]
 
@@ -49,7 +49,7 @@ GRID = np.geomspace(1e-4, 0.4999, 30)
 
 
 def test_peaks_between_the_points_of_a_grid_are_covered_and_not_at_the_price_of_all_others() -> None:
-    found = quantify(LIGHT, "additive", GRID, max_order=3, density=2)
+    found = quantify_systems(LIGHT, "additive", GRID, max_order=3, density=2)
     freqs = around([*LIGHT, found.weight.left])
     G = response(found.nominal_system, freqs)
     E = np.array([response(u, freqs) - G for u in LIGHT])
@@ -63,7 +63,7 @@ def test_peaks_between_the_points_of_a_grid_are_covered_and_not_at_the_price_of_
 @pytest.mark.parametrize(("angles", "radius", "order"), [((0.3, 0.309, 0.288), 0.999, 5), ((2.0, 2.01, 1.99), 0.9995, 4)])
 def test_lightly_damped_units_of_any_order_get_a_weight(angles: tuple[float, ...], radius: float, order: int) -> None:
     units = [single(radius, angle, 1 + 0.1 * k) for k, angle in enumerate(angles)]
-    found = quantify(units, "additive", np.geomspace(1e-4, 0.4999, 60), max_order=order, tolerance_db=3.0)
+    found = quantify_systems(units, "additive", np.geomspace(1e-4, 0.4999, 60), max_order=order, tolerance_db=3.0)
     assert found.weight.left.is_stable()
     assert max(found.weight.left_orders) <= order
     assert found.cover_max <= 1
@@ -120,7 +120,7 @@ def test_remainders_are_covered_between_the_points_of_a_grid(form: str, wide: bo
     if wide:
         form = form.replace("input", "output")
         units = [StateSpace(u.A.T, u.C.T, u.B.T, u.D.T, u.dt) for u in units]
-    found = quantify(units, form, np.geomspace(1e-3, 0.49, 16), max_order=1, density=2)
+    found = quantify_systems(units, form, np.geomspace(1e-3, 0.49, 16), max_order=1, density=2)
     weight = found.remainder
     assert weight is not None
     if form != "inverse_additive":
@@ -147,7 +147,7 @@ def test_remainders_are_covered_between_the_points_of_a_grid(form: str, wide: bo
 @pytest.mark.parametrize(("structure", "kind"), [("entrywise", EntrywiseWeight), ("full", FullWeight)])
 def test_one_entry_has_the_weight_of_the_structure_asked_for(structure: str, kind: type) -> None:
     units = [single(0.9, 0.5), single(0.88, 0.5, 1.2)]
-    found = quantify(units, "additive", GRID, structure=structure)
+    found = quantify_systems(units, "additive", GRID, structure=structure)
     assert isinstance(found.weight, kind)
     assert found.weight.structure is Structure(structure)
 
@@ -155,7 +155,7 @@ def test_one_entry_has_the_weight_of_the_structure_asked_for(structure: str, kin
 @pytest.mark.parametrize("structure", [s.value for s in Structure])
 def test_every_structure_has_a_matrix_that_bounds_entries(structure: str) -> None:
     units = [single(0.9, 0.5), single(0.88, 0.5, 1.2), single(0.92, 0.45, 0.9)]
-    found = quantify(units, "additive", GRID, structure=structure)
+    found = quantify_systems(units, "additive", GRID, structure=structure)
     freqs = np.geomspace(1e-5, 0.5, 500)
     E = np.array([response(u, freqs) - response(found.nominal_system, freqs) for u in units])
     ratio = np.abs(E).max(axis=0) / np.abs(response(found.weight.matrix(), freqs))
@@ -165,10 +165,10 @@ def test_every_structure_has_a_matrix_that_bounds_entries(structure: str) -> Non
 def test_identical_units_and_single_frequencies_get_weights() -> None:
     units = [single(0.9, 0.5)] * 3
     for structure in Structure:
-        assert quantify(units, "additive", GRID, structure=structure).cover_max == 0
+        assert quantify_systems(units, "additive", GRID, structure=structure).cover_max == 0
     pair = [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 1.1)]
     for freqs in ([0.1], [0.0, 0.5], [0.5]):
-        assert quantify(pair, "additive", freqs, max_order=2).cover_max <= 1
+        assert quantify_systems(pair, "additive", freqs, max_order=2).cover_max <= 1
 
 
 def test_full_weights_say_how_far_they_are_from_the_cover_in_their_frames_as_returned() -> None:
@@ -181,7 +181,7 @@ def test_full_weights_say_how_far_they_are_from_the_cover_in_their_frames_as_ret
         )
         for k in range(3)
     ]
-    found = quantify(units, "additive", GRID, structure="full", max_order=2)
+    found = quantify_systems(units, "additive", GRID, structure="full", max_order=2)
     used = found.weight.magnitudes(GRID)
     excess = (used.cost_db() - found.cover.cost_db()).max()
     assert found.overbound_db_max == pytest.approx(excess, abs=1e-9)
@@ -190,7 +190,7 @@ def test_full_weights_say_how_far_they_are_from_the_cover_in_their_frames_as_ret
 
 def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
     units = [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 1.1), tall(0.85, 0.4, 0.8)]
-    found = quantify(units, "additive", GRID, structure="diagonal", max_order=1, tolerance_db=0.1)
+    found = quantify_systems(units, "additive", GRID, structure="diagonal", max_order=1, tolerance_db=0.1)
     E = np.array([response(u, GRID) - response(found.nominal_system, GRID) for u in units])
     excess = (found.weight.magnitudes(GRID).cost_db() - optimal_cover(E).cost_db()).max()
     assert found.overbound_db_max == pytest.approx(excess, abs=1e-6)

@@ -59,7 +59,7 @@ def test_import_loads_no_subpackage() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["core.h2_norm", "core.hinf_norm", "synthesis.h2", "synthesis.mixed", "uncertainty.quantify", "report.plot"]
+    "name", ["core.h2_norm", "core.hinf_norm", "synthesis.h2", "synthesis.mixed", "uncertainty.quantify_systems", "report.plot"]
 )
 def test_public_names_resolve_by_attribute(name: str) -> None:
     assert run_fresh(f"import kros; print(callable(kros.{name}))").strip() == "True"

@@ -52,11 +52,11 @@ from kros.uncertainty import (
     UncertainModel,
     VariationAndNoise,
     cover_ratio,
-    quantify,
+    quantify_systems,
     residual,
     score_outliers,
 )
-from kros.uncertainty.population.unit_residuals import UnitResiduals
+from kros.uncertainty.unit_residuals import UnitResiduals
 
 DT = 0.001
 UNITS = ("000000", "001", "002", "003", "0<b>4")
@@ -92,7 +92,9 @@ def models(name: str, condition: str, seed: int) -> ModelSet:
 def uncertain() -> dict[str, UncertainModel]:
     found = {}
     for name in ("koopman_edmd", "linear_edmd"):
-        found[name] = quantify(models(name, "noload", 1), freqs_hz=np.geomspace(0.1, 500, 60), unit_ids=UNITS[1:], max_order=2, density=3)
+        found[name] = quantify_systems(
+            models(name, "noload", 1), freqs_hz=np.geomspace(0.1, 500, 60), unit_ids=UNITS[1:], max_order=2, density=3
+        )
     return found
 
 
@@ -193,7 +195,7 @@ def scores(condition: str) -> OutlierModel:
 
 def beside_others(name: str) -> UnitResiduals:
     found = models(name, "load", 2)
-    covered = quantify(found, freqs_hz=np.geomspace(0.1, 500, 40), unit_ids=UNITS[1:], max_order=2, density=3, structure="scalar")
+    covered = quantify_systems(found, freqs_hz=np.geomspace(0.1, 500, 40), unit_ids=UNITS[1:], max_order=2, density=3, structure="scalar")
     inside = beside(covered, found)
     outer = np.concatenate([3 * inside.entries[:1], inside.entries]), np.concatenate([3 * inside.ratio[:1], inside.ratio])
     return dataclasses.replace(inside, unit_ids=UNITS, outside=UNITS[:1], entries=outer[0], ratio=outer[1])

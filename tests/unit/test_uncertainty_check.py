@@ -8,7 +8,7 @@ import pytest
 from kros.core import KrosError, StateSpace
 from kros.core.errors import ConfigError
 from kros.core.frequency import log_grid
-from kros.uncertainty import ResidualSystems, quantify
+from kros.uncertainty import ResidualSystems, quantify_systems
 from kros.uncertainty.fits.sections import Sections
 from kros.uncertainty.fits.spectral import RationalMagnitude, cascade, roots, spectral_factor
 from kros.uncertainty.responses import unresolved_peaks
@@ -154,6 +154,6 @@ def test_models_from_recordings_are_quantified_from_their_lowest_frequency() -> 
         def systems(self, units: tuple[str, ...]) -> list[StateSpace]:
             return [pair(0.7, 1.0), pair(0.7, 1.0, 1.2)]
 
-    found = quantify(Recorded(), "additive", max_order=1, tolerance_db=20.0, density=1)
+    found = quantify_systems(Recorded(), "additive", max_order=1, tolerance_db=20.0, density=1)
     assert found.freqs_hz[0] == pytest.approx(0.02)
     assert found.freqs_hz[-1] == 0.5

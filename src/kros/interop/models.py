@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.lti import StateSpace
-from ..uncertainty import Form, ResponseUncertainty, UncertainModel, quantify, quantify_responses
+from ..uncertainty import Form, ResponseUncertainty, UncertainModel, quantify_responses, quantify_systems
 from .control import to_control  # before python-control, for its message where that is missing
 
 control = import_module("control")
@@ -78,7 +78,7 @@ def quantify_models(
     extra : mapping of str to systems or responses, optional
         Further candidates for the nominal.
     **options
-        Of `kros.uncertainty.quantify` or `quantify_responses`: ``criterion``, ``output_scale``, ``input_scale``, ``structure``, ``max_order``,
+        Of `kros.uncertainty.quantify_systems` or `quantify_responses`: ``criterion``, ``output_scale``, ``input_scale``, ``structure``, ``max_order``,
         ``tolerance_db`` and others. Weights act on scaled signals.
 
     Returns
@@ -136,7 +136,7 @@ def _of_systems(
     systems = [to_system(model, f"model {k}") for k, model in enumerate(models)]
     base = to_system(nominal, "nominal") if _kind(nominal) == "systems" else nominal
     others = {name: to_system(model, f"candidate {name!r}") for name, model in extra.items()}
-    model = quantify(systems, form, freqs_hz, nominal=base, extra=others, **options)
+    model = quantify_systems(systems, form, freqs_hz, nominal=base, extra=others, **options)
     certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
     if model.sample_period_s == 0:
         end = model.freqs_hz[-1]

@@ -26,7 +26,7 @@ from ..synthesis.result import Synthesis
 
 if TYPE_CHECKING:
     from ..uncertainty import OutlierModel, Tightness, UncertainModel, VariationAndNoise
-    from ..uncertainty.population.unit_residuals import UnitResiduals
+    from ..uncertainty.unit_residuals import UnitResiduals
 
 Array = npt.NDArray[Any]
 T = TypeVar("T")
@@ -187,7 +187,7 @@ class RunFolder:
     @cached_property
     def unit_residuals(self) -> dict[str, UnitResiduals]:
         """Residuals of all units beside the weights, by kind of model."""
-        from ..uncertainty.population.unit_residuals import UnitResiduals
+        from ..uncertainty.unit_residuals import UnitResiduals
 
         folders = self._folders("uncertainty", "units/*.json", "the residuals of the units were not kept")
         return _in_order({f.name: UnitResiduals.load(f / "units") for f in folders})
@@ -195,7 +195,7 @@ class RunFolder:
     @cached_property
     def others(self) -> tuple[str, dict[str, UnitResiduals]]:
         """Condition of the highest outlier score, and there the residuals of all units beside the cover of the others, by kind of model."""
-        from ..uncertainty.population.unit_residuals import UnitResiduals
+        from ..uncertainty.unit_residuals import UnitResiduals
 
         folders = self._folders(
             "outliers", "others/*.json", "no unit was compared with the cover of the others; it takes two others in a condition"

@@ -28,7 +28,7 @@ from ..uncertainty import (
     residual,
     variation_and_noise,
 )
-from ..uncertainty.population.unit_residuals import UnitResiduals, unit_residuals
+from ..uncertainty.unit_residuals import UnitResiduals, unit_residuals
 from .config import UncertaintyConfig
 from .context import Context
 from .resampling import resampled_models

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core.lti import StateSpace, gain
 from ..synthesis import Injection, ObserverProblem, mixed
-from ..uncertainty import EntrywiseWeight, Structure, quantify
+from ..uncertainty import EntrywiseWeight, Structure, quantify_systems
 
 if TYPE_CHECKING:
     from .makers import Made, Task
@@ -38,7 +38,7 @@ def make_paper(task: Task) -> Made:
 def entrywise_weight(task: Task) -> EntrywiseWeight:
     """Return bounds of all entries of the residuals of the units that the study's own set covers."""
     models = task.models
-    found = quantify(
+    found = quantify_systems(
         models.systems(task.covered),
         task.require_problem().form,
         unit_ids=task.covered,

@@ -4,14 +4,14 @@ from .fits.magnitude import FittedMagnitude, Side, fit_magnitude, invert
 from .fits.tightness import Tightness, magnitude_tightness, weight_tightness
 from .forms import Form, existence, rebuild, residual, residual_shape
 from .model import UncertainModel, scale_system
-from .outlying.outliers import OutlierModel, score_outliers
-from .outlying.score import OutlierScore, Status
-from .population.noise import VariationAndNoise, variation_and_noise
-from .population.nominal import Criterion, NominalChoice, choose_nominal, choose_nominals
+from .nominal.choice import Criterion, NominalChoice, choose_nominal, choose_nominals
+from .outliers.model import OutlierModel, score_outliers
+from .outliers.score import OutlierScore, Status
 from .quantified import Quantified
-from .quantify import quantify
 from .residuals import all_bounds, bounds, completion, misfit, sigma_max
 from .responses import ResponseUncertainty, quantify_responses
+from .systems import quantify_systems
+from .variation import VariationAndNoise, variation_and_noise
 from .weights.certificate import Method, certify
 from .weights.cover import Cover, Perturbation, Structure, cover_ratio, optimal_cover, optimal_left
 from .weights.entrywise import EntrywiseWeight
@@ -56,8 +56,8 @@ __all__ = [
     "misfit",
     "optimal_cover",
     "optimal_left",
-    "quantify",
     "quantify_responses",
+    "quantify_systems",
     "rebuild",
     "residual",
     "residual_shape",

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
-from .small import condition_number, entries_first, entries_last, multiply, pseudo_inverse_first
+from .small_matrices import condition_number, entries_first, entries_last, multiply, pseudo_inverse_first
 
 Array = npt.NDArray[Any]
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .forms import Form
-from .population.nominal import NominalChoice
+from .nominal.choice import NominalChoice
 from .weights.bounded import Bounded
 from .weights.cover import Cover
 from .weights.weight import Weight

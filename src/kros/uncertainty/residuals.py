@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from .forms import MAX_CONDITION, Form, as_form, inverted_matrix, rebuild, residual
-from .small import condition_number, entries_first, lower_factor, multiply, pseudo_inverse_first, sigma_max_first
+from .small_matrices import condition_number, entries_first, lower_factor, multiply, pseudo_inverse_first, sigma_max_first
 
 Array = npt.NDArray[Any]
 

@@ -14,11 +14,11 @@ from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.frequency import check_grid
 from .bilinear import BilinearAxis, check_continuous_grid
 from .forms import Form, as_form
-from .given_models import check_fit, check_scale
-from .population.nominal import Criterion, as_criterion
+from .nominal.choice import Criterion, as_criterion
 from .quantified import Quantified, findings
-from .quantify import bound_continuous, choose_by
 from .residuals import check_responses
+from .systems import bound_continuous, choose_by
+from .validation import check_fit, check_scale
 from .weights.bounded import bound_residuals
 from .weights.check import nearest
 from .weights.cover import Structure, as_structure

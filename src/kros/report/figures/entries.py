@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ...identify import ModelSet
 from ...uncertainty import Form
-from ...uncertainty.population.unit_residuals import UnitResiduals
+from ...uncertainty.unit_residuals import UnitResiduals
 from ..canvas import decibel, frequency_axis, grid, legend
 from ..names import model_label, shorten
 from ..theme import Tone

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...uncertainty.population.unit_residuals import UnitResiduals
+from ...uncertainty.unit_residuals import UnitResiduals
 from ..canvas import decibel, grid, legend
 from ..names import condition_label, form_label, model_label, number
 from ..run_folder import RunFolder

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ...core.errors import ConfigError
 from ...identify import ModelSet
 from ...uncertainty import UncertainModel
-from ...uncertainty.population.unit_residuals import UnitResiduals, unit_residuals
+from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
 from ..canvas import decibel, end_labels, frequency_axis, grid, thin_log
 from ..names import form_label
 from ..theme import Tone

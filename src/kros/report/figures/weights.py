@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...uncertainty import Cover, Form, Structure, UncertainModel, sigma_max
-from ...uncertainty.population.unit_residuals import UnitResiduals
+from ...uncertainty.unit_residuals import UnitResiduals
 from ..canvas import decibel, frequency_axis, grid, thin_log
 from ..names import best_models, model_label, number
 from ..run_folder import NotShownError, RunFolder

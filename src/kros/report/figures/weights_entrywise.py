@@ -5,7 +5,7 @@ Needs: residuals of the units, models.
 
 from __future__ import annotations
 
-from ...uncertainty.population.unit_residuals import UnitResiduals
+from ...uncertainty.unit_residuals import UnitResiduals
 from ..names import best_models, form_label, model_label, number
 from ..run_folder import RunFolder
 from .drawing import Drawing

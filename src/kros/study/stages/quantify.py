@@ -13,7 +13,7 @@ from ...core.artifacts import save_artifact, write_json
 from ...core.errors import IdentificationError
 from ...core.norms import hinf_norm
 from ...identify import ModelSet
-from ...uncertainty import Form, OutlierScore, UncertainModel, choose_nominals, quantify, residual, score_outliers, sigma_max
+from ...uncertainty import Form, OutlierScore, UncertainModel, choose_nominals, quantify_systems, residual, score_outliers, sigma_max
 from ..config import UncertaintyConfig
 from ..context import Context
 from ..diagnostics import diagnose
@@ -65,7 +65,7 @@ def quantify_models(models: ModelSet, units: list[str], config: UncertaintyConfi
     """
 
     def attempt(structure: str) -> UncertainModel:
-        return quantify(
+        return quantify_systems(
             models.systems(units),
             config.form,
             models.frequencies(config.n_freqs),

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError
-from ..small import adjoint, entries_first, multiply, sigma_max_first, squared
+from ..small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
 
 Array = npt.NDArray[Any]
 

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..forms import Form, residual
-from ..population.search import Found, first_best
-from ..small import entries_first, sigma_max_first
+from ..nominal.search import Found, first_best
+from ..small_matrices import entries_first, sigma_max_first
 from .cover import Structure, optimal_cover
 
 Array = npt.NDArray[Any]

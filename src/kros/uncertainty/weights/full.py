@@ -2,7 +2,7 @@ r"""Full weights: diagonal filters in frames that turn with the residuals, for a
 
     W_L = A^-1 F_L,   W_R = F_R B^-1,   sigma_max(W_L^-1 E_k W_R^-1) <= 1
 
-F_L, F_R are the diagonal weights of `A E_k B` (`weights`), A and B the frames of `full_frames`, with determinants of one: the mean log
+F_L, F_R are the diagonal weights of `A E_k B` (`weights`), A and B the multipliers of `full_multipliers`, with determinants of one: the mean log
 singular values of W_L and W_R are those of the filters. The diagonal weights of the residuals themselves are one candidate, so that nothing is
 lost where no frame helps: frames are used when the weights, as certified, have less volume.
 """
@@ -23,7 +23,7 @@ from ..fits.magnitude import invert
 from .certificate import Method
 from .check import Checks, Residuals
 from .cover import Cover, Structure
-from .full_frames import Frames, best_frames, with_floor
+from .full_multipliers import Frames, best_frames, with_floor
 from .pencils import ResidualSystems
 from .weight import Weight, fit_weight, overbound_db, overbound_entry_db, scaled
 

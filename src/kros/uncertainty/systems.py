@@ -13,10 +13,10 @@ from ..core.frequency import check_grid, dense_grid, log_grid
 from ..core.lti import StateSpace
 from .bilinear import BilinearAxis, beyond, check_continuous_grid, continuous_grid
 from .forms import Form, as_form
-from .given_models import check_fit, find_nominal, read_candidates, read_models
 from .model import UncertainModel, scale_system
-from .population.nominal import Criterion, NominalChoice, as_criterion, choose_nominal, choose_nominals
+from .nominal.choice import Criterion, NominalChoice, as_criterion, choose_nominal, choose_nominals
 from .quantified import findings
+from .validation import check_fit, find_nominal, read_candidates, read_models
 from .weights.bounded import Bounded, Responder, bound_residuals
 from .weights.check import checking_grid
 from .weights.cover import Structure, as_structure
@@ -25,7 +25,7 @@ from .weights.pencils import ResidualSystems, peaks_hz
 Array = npt.NDArray[Any]
 
 
-def quantify(
+def quantify_systems(
     models: Any,
     form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE,
     freqs_hz: npt.ArrayLike | None = None,
@@ -96,10 +96,10 @@ def quantify(
     --------
     >>> import numpy as np
     >>> from kros.core import StateSpace
-    >>> from kros.uncertainty import quantify
+    >>> from kros.uncertainty import quantify_systems
     >>> poles = np.array([0.88, 0.9, 0.91])[:, None, None]
     >>> units = StateSpace(poles, 1 - poles, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
-    >>> model = quantify(units, "inverse_input_multiplicative")
+    >>> model = quantify_systems(units, "inverse_input_multiplicative")
     >>> model.nominal, model.cover_max <= 1
     (1, True)
     """

@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact, save_artifact
-from ...core.errors import DimensionError
-from ...core.loading import check_shapes, loader
-from ..fits.magnitude import fit_magnitude
-from ..forms import Form, residual
-from ..residuals import sigma_max
-from ..weights.cover import Cover, Structure, cover_ratio
-from ..weights.weight import Weight
+from ..core.artifacts import load_artifact, save_artifact
+from ..core.errors import DimensionError
+from ..core.loading import check_shapes, loader
+from .fits.magnitude import fit_magnitude
+from .forms import Form, residual
+from .residuals import sigma_max
+from .weights.cover import Cover, Structure, cover_ratio
+from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 

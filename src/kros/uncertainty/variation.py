@@ -22,15 +22,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact, save_artifact
-from ...core.errors import ConfigError, DataError, DimensionError
-from ...core.frequency import check_grid
-from ...core.loading import check_shapes, loader
-from ...core.lti import StateSpace
-from ...identify import KoopmanMatrices, ModelSamples
-from ..forms import Form, as_form, residual
-from ..residuals import sigma_max
-from ..small import squared
+from ..core.artifacts import load_artifact, save_artifact
+from ..core.errors import ConfigError, DataError, DimensionError
+from ..core.frequency import check_grid
+from ..core.loading import check_shapes, loader
+from ..core.lti import StateSpace
+from ..identify import KoopmanMatrices, ModelSamples
+from .forms import Form, as_form, residual
+from .residuals import sigma_max
+from .small_matrices import squared
 
 Array = npt.NDArray[Any]
 

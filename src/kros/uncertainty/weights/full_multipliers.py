@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace
-from ..small import adjoint, entries_first, multiply, sigma_max_first
+from ..small_matrices import adjoint, entries_first, multiply, sigma_max_first
 
 Array = npt.NDArray[Any]
 

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..forms import Form
-from ..small import entries_first, multiply, pseudo_inverse_first, sigma_max_first, triangle
+from ..small_matrices import entries_first, multiply, pseudo_inverse_first, sigma_max_first, triangle
 
 Array = npt.NDArray[Any]
 Score = Callable[[Array], Array]

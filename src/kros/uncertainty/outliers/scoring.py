@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..forms import Form
-from .chance import Others
 from .detectable import change_levels, smallest_change
 from .distances import Distances, largest_entries
 from .groups import excess, held
+from .noise import Others
 from .score import LARGEST_RISE_DB, OutlierScore, Status, room_db
 from .tail import leave_one_out_bounds
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..forms import Form, residual
-from ..small import entries_first, sigma_max_first, squared
+from ..small_matrices import entries_first, sigma_max_first, squared
 
 Array = npt.NDArray[Any]
 

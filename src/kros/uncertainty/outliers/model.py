@@ -33,11 +33,11 @@ from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.loading import check_shapes, loader
 from ..forms import Form, as_form
 from ..residuals import check_responses
-from .chance import AS_GOOD, Others, spread, times_noisier
 from .distances import balance, distances
 from .groups import separate
-from .judging import Nominals, margins_of, scores_of, with_noise
+from .noise import AS_GOOD, Others, spread, times_noisier
 from .score import OutlierScore
+from .scoring import Nominals, margins_of, scores_of, with_noise
 
 Array = npt.NDArray[Any]
 

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+
+
+def adjoint(matrices: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return the Hermitian transposes of matrices, shape (..., n, m)."""
+    return np.asarray(np.conj(np.swapaxes(matrices, -1, -2)))
 
 
 def radius_text(value: float) -> str:

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.errors import ConfigError, DimensionError
 from ..core.frequency import check_grid
+from ..core.linalg import adjoint
 from ..core.loading import check_shapes, loader
 from ..core.lti import StateSpace
 from .bootstrap import ModelSamples
@@ -149,7 +150,7 @@ def _largest_gain(G: Complex) -> Array:
     """Largest singular value, from the Gram matrix of the shorter side: deviations are far above rounding."""
     tall = G if G.shape[-2] >= G.shape[-1] else np.swapaxes(G, -1, -2)
     size = np.maximum(np.abs(tall).max(axis=(-1, -2), keepdims=True), np.finfo(float).tiny)
-    gram = np.swapaxes(tall.conj(), -1, -2) / size @ (tall / size)
+    gram = adjoint(tall) / size @ (tall / size)
     return np.asarray(np.sqrt(np.linalg.eigvalsh(gram)[..., -1]) * size[..., 0, 0])
 
 

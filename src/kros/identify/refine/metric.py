@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.linalg import adjoint
+
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[Any]
 _DECADES_BELOW_NYQUIST = 6
@@ -74,13 +76,13 @@ class ResponsePrior:
         size = np.sum(np.abs(E) ** 2, axis=(-1, -2)) / self.level**2  # (unit, frequency)
         slope = self.weight * (1 + size) ** (self.power - 1) / size.shape[1]
         units, rows, columns = V.shape
-        by_row = (np.swapaxes(a.conj(), -1, -2) @ a) * slope[..., None, None]
+        by_row = (adjoint(a) @ a) * slope[..., None, None]
         by_column = Z.conj() @ np.swapaxes(Z, -1, -2)
         form = (
             by_row.reshape(*size.shape, -1).transpose(0, 2, 1) @ by_column.reshape(*size.shape, -1)
         ).real  # (unit, rows rows, columns columns)
         H = form.reshape(units, rows, rows, columns, columns).transpose(0, 1, 3, 2, 4).reshape(units, rows * columns, -1)
-        pull = np.swapaxes(a.conj(), -1, -2) @ (E * slope[..., None, None]) @ np.swapaxes(Z.conj(), -1, -2)
+        pull = adjoint(a) @ (E * slope[..., None, None]) @ adjoint(Z)
         g = -pull.real.sum(axis=1).reshape(units, -1)
         out = np.empty((units, H.shape[-1] + 1, H.shape[-1] + 1))
         out[:, :-1, :-1], out[:, :-1, -1], out[:, -1, :-1] = H, g, g

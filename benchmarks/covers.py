@@ -25,8 +25,8 @@ from kros.core import StateSpace
 from kros.core.frequency import log_grid, nyquist_hz
 from kros.identify import ModelSet
 from kros.study import run_study, validate_config
+from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
-from kros.study.demo import simulate_to
 from kros.uncertainty import Form, UncertainModel, quantify_systems
 from kros.uncertainty.weights.weight import Weight
 

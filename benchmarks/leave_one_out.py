@@ -30,10 +30,10 @@ from kros.core.artifacts import write_json
 from kros.report.left_out_table import PAPER, LeftOutCell, LeftOutTable, left_out_tables
 from kros.report.names import BASELINES, minus, number, split_observer
 from kros.study import load_config, run_study
+from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage, SynthesisConfig
-from kros.study.demo import simulate_to
-from kros.study.executors import available_cores
-from kros.study.progress import Lines
+from kros.study.engine.executors import available_cores
+from kros.study.engine.progress import Lines
 
 HOME, HIDDEN, LEARNED, ENTRYWISE = "noload", ("velocity", "current"), "learned", "koopman_edmd/paper"
 SHOWN = (

@@ -24,13 +24,13 @@ import numpy as np
 from kros.core import KrosError, gain
 from kros.core.artifacts import read_json
 from kros.study import run_study, validate_config
+from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
-from kros.study.context import Context, Silent
-from kros.study.demo import simulate_to
-from kros.study.executors import open_executor
+from kros.study.engine.context import Context, Silent
+from kros.study.engine.executors import open_executor
+from kros.study.engine.store import Store
 from kros.study.makers import Task, make_mixed, open_loop
 from kros.study.stages.synthesize import tasks_of
-from kros.study.store import Store
 from kros.synthesis.worst_case.certificate import certify
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from kros.study import run_study, validate_config
-from kros.study.demo import simulate_to
+from kros.study.commands.demo import simulate_to
 
 PLANTED = "000000"
 

@@ -22,12 +22,12 @@ from kros.core.norms import hinf_norm
 from kros.identify import KoopmanMatrices, ModelSet, free_run
 from kros.identify.refine import RefinedModels
 from kros.study import run_study, validate_config
+from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
-from kros.study.context import Context, Silent
-from kros.study.demo import simulate_to
-from kros.study.executors import open_executor
+from kros.study.engine.context import Context, Silent
+from kros.study.engine.executors import open_executor
+from kros.study.engine.store import Store
 from kros.study.stages import calibrate
-from kros.study.store import Store
 from kros.uncertainty import UncertainModel
 
 

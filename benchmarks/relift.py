@@ -25,14 +25,14 @@ from kros.core.artifacts import read_json, write_json
 from kros.data import EpisodeBatch, read_parquet
 from kros.observer import Observer, ReliftScales, attack, attack_running, one_step_residual, relift_certificate, relift_report
 from kros.study import run_study, validate_config
+from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
-from kros.study.context import Context, Silent
-from kros.study.demo import simulate_to
-from kros.study.executors import open_executor
+from kros.study.engine.context import Context, Silent
+from kros.study.engine.executors import open_executor
+from kros.study.engine.store import Store
 from kros.study.makers import produce
 from kros.study.stages import calibrate
 from kros.study.stages.synthesize import tasks_of
-from kros.study.store import Store
 
 KINDS = ("koopman", "linear")
 STUDY: dict[str, Any] = {

@@ -29,12 +29,12 @@ from kros.observer import run_observers
 from kros.plants import HarmonicDrivePopulation
 from kros.report.disturbances import AXES, curves
 from kros.study import run_study, validate_config
-from kros.study.context import Context, Silent
-from kros.study.demo import simulate_to
-from kros.study.executors import open_executor
+from kros.study.commands.demo import simulate_to
+from kros.study.engine.context import Context, Silent
+from kros.study.engine.executors import open_executor
+from kros.study.engine.store import Store
 from kros.study.stages import calibrate
 from kros.study.stages.evaluate import alike, baseline_makers, load_observers
-from kros.study.store import Store
 
 UNITS, EPISODES, SECONDS = 12, 10, 20.0
 HIDDEN = ("velocity", "current")

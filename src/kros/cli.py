@@ -32,7 +32,7 @@ Seed = Annotated[int, typer.Option(min=0)]
 
 
 def _count(workers: int | None) -> int:
-    from .study.executors import available_cores
+    from .study.engine.executors import available_cores
 
     return available_cores() if workers is None else workers
 
@@ -62,8 +62,8 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a population with one badly assembled drive and run the whole study on it."""
-    from .study.demo import run_demo
-    from .study.progress import make_progress
+    from .study.commands.demo import run_demo
+    from .study.engine.progress import make_progress
 
     with make_progress(quiet) as progress:
         result = run_demo(out, units, episodes, seconds, seed, _count(workers), progress)
@@ -84,7 +84,7 @@ def simulate(
     format_: Annotated[str, typer.Option("--format", help="parquet or raw, the paper's layout.")] = "parquet",
 ) -> None:
     """Simulate a population with known truth."""
-    from .study.demo import simulate_to
+    from .study.commands.demo import simulate_to
 
     simulate_to(out, plant, units, episodes, seconds, seed, spread, loop, outlier, format_)
     _say(f"recordings in {out}")
@@ -99,8 +99,8 @@ def convert(
     workers: Workers = None,
 ) -> None:
     """Convert any supported recording to Parquet."""
-    from .study.convert import convert_recordings
-    from .study.progress import make_progress
+    from .study.commands.convert import convert_recordings
+    from .study.engine.progress import make_progress
 
     with make_progress(False) as progress:
         population = convert_recordings(source, out, reader, mapping, _count(workers), progress)
@@ -121,7 +121,7 @@ def run(
 ) -> None:
     """Run a study: recordings to verified observer and report."""
     from .study import Stage, load_config, run_study
-    from .study.progress import make_progress
+    from .study.engine.progress import make_progress
 
     with make_progress(quiet) as progress:
         if until not in [s.value for s in Stage]:
@@ -136,7 +136,7 @@ def _finish(result: Any, quiet: bool) -> None:
     if quiet:
         typer.echo(json.dumps(result.metrics, indent=1, ensure_ascii=False))
     else:
-        from .study.summary import summary_lines
+        from .study.commands.summary import summary_lines
 
         for line in summary_lines(result):
             typer.echo(line)
@@ -154,7 +154,7 @@ def check(
     quiet: Annotated[bool, typer.Option("--json", help="Print scores as JSON and nothing else.")] = False,
 ) -> None:
     """Score new units against a finished study; exit code 3 when one is flagged."""
-    from .study.check import check_line, check_units
+    from .study.commands.check import check_line, check_units
 
     scores = check_units(run_folder, data, _count(workers))
     if quiet:
@@ -173,7 +173,7 @@ def estimate(
     out: Annotated[Path, typer.Argument(help="Parquet file to write.")],
 ) -> None:
     """Write the deployed observer's estimates on recordings."""
-    from .study.estimate import estimate_recordings
+    from .study.commands.estimate import estimate_recordings
 
     count = estimate_recordings(run_folder, data, out)
     _say(f"estimates of {count} episodes in {out}")
@@ -200,7 +200,7 @@ def figures(run_folder: Annotated[Path, typer.Argument(metavar="RUN")], out: Pat
 @app.command()
 def doctor() -> None:
     """Tell versions, solvers and what is missing."""
-    from .study.doctor import diagnose
+    from .study.commands.doctor import diagnose
 
     for line in diagnose():
         typer.echo(line)

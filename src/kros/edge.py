@@ -37,7 +37,7 @@ class EdgeGroup(TyperGroup):
 @contextlib.contextmanager
 def edge() -> Iterator[None]:
     """Turn any exception into one message on standard error and an exit code."""
-    from .study.stop import Stopped, stoppable
+    from .study.engine.stop import Stopped, stoppable
 
     try:
         with stoppable():

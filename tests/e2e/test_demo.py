@@ -9,10 +9,10 @@ import pytest
 
 from kros.identify import ModelSet
 from kros.identify.refine import RefinedModels
-from kros.study.context import Context, Silent
-from kros.study.executors import open_executor
+from kros.study.engine.context import Context, Silent
+from kros.study.engine.executors import open_executor
 from kros.study.pipeline import load_run
-from kros.study.resampling import resampled_models
+from kros.study.stages.resampling import resampled_models
 from kros.uncertainty import Tightness, UncertainModel, VariationAndNoise
 from kros.uncertainty.unit_residuals import UnitResiduals
 

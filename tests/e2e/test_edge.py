@@ -74,13 +74,13 @@ def test_any_exception_becomes_one_message(kros, tmp_path, monkeypatch, command,
     places = {
         "run": "kros.study.load_config",
         "report": "kros.study.stages.report.render_run",
-        "check": "kros.study.check.check_units",
-        "estimate": "kros.study.estimate.estimate_recordings",
+        "check": "kros.study.commands.check.check_units",
+        "estimate": "kros.study.commands.estimate.estimate_recordings",
         "figures": "kros.study.stages.report.write_figures",
-        "convert": "kros.study.convert.convert_recordings",
-        "simulate": "kros.study.demo.simulate_to",
-        "demo": "kros.study.demo.run_demo",
-        "doctor": "kros.study.doctor.diagnose",
+        "convert": "kros.study.commands.convert.convert_recordings",
+        "simulate": "kros.study.commands.demo.simulate_to",
+        "demo": "kros.study.commands.demo.run_demo",
+        "doctor": "kros.study.commands.doctor.diagnose",
     }
     arguments = {"run": 1, "report": 1, "check": 2, "estimate": 3, "figures": 2, "convert": 2, "simulate": 1}
     monkeypatch.setattr(places[command], fail)

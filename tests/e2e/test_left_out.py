@@ -15,12 +15,12 @@ from kros.identify import ModelSet
 from kros.observer import Observer, run_observer
 from kros.report.left_out_table import PAPER, left_out_tables
 from kros.study import load_config, run_study
+from kros.study.commands.estimate import load_calibration, unit_parameters
 from kros.study.config import Stage
-from kros.study.context import Context, Silent
-from kros.study.estimate import load_calibration, unit_parameters
-from kros.study.executors import SerialExecutor
+from kros.study.engine.context import Context, Silent
+from kros.study.engine.executors import SerialExecutor
+from kros.study.engine.store import Store
 from kros.study.stages.left_out import held_parameters, without
-from kros.study.store import Store
 
 UNITS = ("001", "002", "003", "004")
 FAST = (

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from kros.core.errors import KrosError
-from kros.study.executors import open_executor
+from kros.study.engine.executors import open_executor
 
 
 def square(x: int) -> int:

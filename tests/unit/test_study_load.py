@@ -12,9 +12,9 @@ from kros.observer import Observer, Seen
 from kros.plants import HarmonicDrivePopulation
 from kros.report.figures import load_torque
 from kros.study.config import LoadConfig
-from kros.study.context import Facts
-from kros.study.load import load_metrics, run_load
-from kros.study.store import Store
+from kros.study.engine.context import Facts
+from kros.study.engine.store import Store
+from kros.study.stages.load import load_metrics, run_load
 
 POPULATION = HarmonicDrivePopulation(n_units=2, n_episodes=3, seconds=3.0, seed=0, loop="soft").simulate().population
 

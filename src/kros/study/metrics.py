@@ -14,10 +14,10 @@ from ..evaluate import interval_rows
 from ..synthesis.result import Synthesis
 from ..uncertainty import Tightness, UncertainModel, VariationAndNoise
 from .config import Stage
-from .context import Context
-from .load import load_metrics
+from .engine.context import Context
+from .engine.store import Store
 from .stages import calibrate, left_out
-from .store import Store
+from .stages.load import load_metrics
 
 
 def collect_metrics(context: Context, until: Stage, total_s: float | None) -> dict[str, Any]:

@@ -10,14 +10,15 @@ from typing import Any
 from ..core.artifacts import read_json
 from ..core.errors import ConfigError
 from .config import Stage, StudyConfig
-from .context import Context, Progress, Silent
-from .executors import open_executor
+from .engine.context import Context, Progress, Silent
+from .engine.executors import open_executor
+from .engine.run_folder import load_run as load_run  # where readers of runs look for it
+from .engine.run_folder import open_run, require_own
+from .engine.steps import Step, run_steps
+from .engine.store import Store
+from .learning import LEARNING
 from .metrics import collect_metrics
-from .run_folder import load_run as load_run  # where readers of runs look for it
-from .run_folder import open_run, require_own
 from .stages import evaluate, left_out, read, report
-from .steps import LEARNING, Step, run_steps
-from .store import Store
 
 STEPS = (
     *LEARNING,

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from ..core.artifacts import load_artifact
 from ..identify import Factor, ModelSet, combine, lifted_factor
 from ..uncertainty import OutlierScore, Status
-from .store import Store
+from .engine.store import Store
 
 Array = npt.NDArray[Any]
 

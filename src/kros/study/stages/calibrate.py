@@ -7,7 +7,7 @@ import logging
 from ...core.errors import IdentificationError
 from ...data.population import EpisodeKey, Population
 from ...identify import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
-from ..context import Context
+from ..engine.context import Context
 
 log = logging.getLogger(__name__)
 Task = tuple[Population, tuple[EpisodeKey, ...], PhaseSpec]

@@ -18,12 +18,12 @@ from ...data.population import EpisodeKey, Population
 from ...evaluate import ErrorSummary, summarise
 from ...identify import ModelSet, free_run
 from ...observer import Observer, run_observers
-from ..context import Context
-from ..disturbed import Trial, make_trial, run_disturbed
+from ..engine.context import Context
 from ..estimators import Baseline, make_difference, make_extended, make_learned
-from ..load import run_load
 from ..presets import gearbox_band_hz
 from . import calibrate
+from .disturbed import Trial, make_trial, run_disturbed
+from .load import run_load
 from .synthesize import measurement_noise, tuning_set
 
 log = logging.getLogger(__name__)

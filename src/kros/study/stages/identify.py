@@ -30,7 +30,7 @@ from ...identify.refine import RefineOptions, refine_population
 from ...identify.spread import peak_residual_db
 from ...lifting import Lifting
 from ..config import IdentifyConfig
-from ..context import Context
+from ..engine.context import Context
 from . import calibrate
 
 log = logging.getLogger(__name__)

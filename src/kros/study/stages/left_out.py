@@ -17,8 +17,9 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
 from ...data.population import OUTLIERS, Population
 from ..config import RequireConfig, Stage, StudyConfig
-from ..context import Context, Progress
-from ..steps import LEARNING, Step, run_steps
+from ..engine.context import Context, Progress
+from ..engine.steps import Step, run_steps
+from ..learning import LEARNING
 from . import calibrate
 from .evaluate import Outcome, UnitParameters, band_hz, error_rows, estimation, facts_of, outcomes
 

@@ -15,10 +15,10 @@ from ...core.norms import hinf_norm
 from ...identify import ModelSet
 from ...uncertainty import Form, OutlierScore, UncertainModel, choose_nominals, quantify_systems, residual, score_outliers, sigma_max
 from ..config import UncertaintyConfig
-from ..context import Context
-from ..diagnostics import diagnose
+from ..engine.context import Context
 from ..responses import scaled_responses
 from ..scoring import Recorded
+from .diagnose import diagnose
 
 log = logging.getLogger(__name__)
 _LARGEST_PRODUCT = 0.7  # of |W_R W_L|: an amplification by 3.3

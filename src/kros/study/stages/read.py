@@ -27,7 +27,7 @@ from ...data.copies import Print, refuse_copies
 from ...data.population import DEFAULT_CONDITION
 from ...data.writers import GroupRecord
 from ..config import StudyConfig
-from ..context import Context
+from ..engine.context import Context
 from ..presets import resolve_lifting, resolve_phase
 
 log = logging.getLogger(__name__)

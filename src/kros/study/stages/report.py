@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ...core.artifacts import read_json
 from ..config import Stage
-from ..context import Context
-from ..run_folder import open_finished
+from ..engine.context import Context
+from ..engine.run_folder import open_finished
 
 REPORT = "report.html"
 _SHOWN = [stage for stage in Stage if stage is not Stage.REPORT]

@@ -20,7 +20,7 @@ from ...observer import Observer, in_sizes
 from ...synthesis import Injection, ObserverProblem, Synthesis, check_units
 from ...synthesis.worst_case.certificate import certify
 from ...uncertainty import Structure, UncertainModel
-from ..context import Context
+from ..engine.context import Context
 from ..makers import Product, Task, produce
 from ..methods import preferred, slowest_first, suitable
 from ..relift import LOST, Running, certify_running, save_running

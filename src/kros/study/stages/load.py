@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, save_artifact
-from ..core.errors import ConfigError, KrosError
-from ..data import EpisodeBatch
-from ..data.population import EpisodeKey
-from ..lifting import Lifting
-from ..motor_drive import (
+from ...core.artifacts import load_artifact, save_artifact
+from ...core.errors import ConfigError, KrosError
+from ...data import EpisodeBatch
+from ...data.population import EpisodeKey
+from ...lifting import Lifting
+from ...motor_drive import (
     AngleLoad,
     LoadCalibration,
     calibrate_load,
@@ -31,10 +31,10 @@ from ..motor_drive import (
     load_observer,
     low_passed,
 )
-from ..observer import Observer, run_observer
-from .config import LoadConfig
-from .context import Context
-from .stages import calibrate
+from ...observer import Observer, run_observer
+from ..config import LoadConfig
+from ..engine.context import Context
+from . import calibrate
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]

@@ -19,11 +19,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ..core import records
-from ..core.artifacts import plain, write_json
-from ..core.errors import ConfigError, DataError
-from ..core.locks import NAME as LOCK
-from ..core.records import OWN, Record
+from ...core import records
+from ...core.artifacts import plain, write_json
+from ...core.errors import ConfigError, DataError
+from ...core.locks import NAME as LOCK
+from ...core.records import OWN, Record
 
 log = logging.getLogger(__name__)
 
@@ -248,6 +248,6 @@ def source_key(source: Path) -> str:
 @cache
 def code_key() -> str:
     """Return a hash of kros's own source."""
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     files = sorted(f for pattern in ("*.py", "*.jinja", "*.html", "*.css", "*.json") for f in root.rglob(pattern))
     return hash_of([[str(f.relative_to(root)), records.digest(f)] for f in files])

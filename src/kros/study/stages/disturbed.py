@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, save_artifact
-from ..data import EpisodeBatch
-from ..data.population import EpisodeKey, Population
-from ..evaluate import (
+from ...core.artifacts import load_artifact, save_artifact
+from ...data import EpisodeBatch
+from ...data.population import EpisodeKey, Population
+from ...evaluate import (
     Disturbance,
     DisturbedEpisodes,
     Kind,
@@ -23,11 +23,11 @@ from ..evaluate import (
     standard_disturbances,
     unit_interval,
 )
-from ..observer import Observer, run_observers
-from .config import EvaluateConfig
-from .context import Context
-from .estimators import Baseline
-from .uncertain_members import member_work
+from ...observer import Observer, run_observers
+from ..config import EvaluateConfig
+from ..engine.context import Context
+from ..estimators import Baseline
+from .members import member_work
 
 Array = npt.NDArray[np.float64]
 FEW_UNITS, FEW_S, ALL_S = 3, 3.0, 10.0
@@ -116,7 +116,7 @@ def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, di
 
 def noise_draws(context: Context, keys: Sequence[EpisodeKey], measured: Sequence[int]) -> tuple[Disturbance, ...]:
     """Return realisations of the noise that the study assumes, as declared or that of the quantisation; the largest share of a largest value counts."""
-    from .stages.synthesize import measurement_noise
+    from .synthesize import measurement_noise
 
     noise = measurement_noise(context, context.models(context.model_names[0]))
     y = np.concatenate([context.population.read_parts(k)[0][:, list(measured)] for k in keys])
@@ -134,7 +134,7 @@ def run_disturbed(
     """
     if trial is None:
         return
-    from .stages.evaluate import alike
+    from .evaluate import alike
 
     config, folder = context.config.evaluate, context.store.draft("disturbed")
     chosen = {name: observer for name, observer in observers.items() if name in trial.names}

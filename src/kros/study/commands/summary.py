@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..report.caveats import confounded_text
-from .pipeline import RunResult
+from ...report.caveats import confounded_text
+from ..pipeline import RunResult
 
 
 def summary_lines(result: RunResult) -> list[str]:

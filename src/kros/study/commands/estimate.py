@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import ConfigError, DataError, IdentificationError
-from ..core.files import read_toml
-from ..data import EpisodeBatch, Population, open_population, split_episodes
-from ..data.population import EpisodeKey
-from ..identify import PhaseCalibration
-from ..observer import Observer, run_observer
-from .config import Stage, StudyConfig, validate_config
-from .run_folder import open_finished
-from .stages.calibrate import segments_of
-from .store import Store
+from ...core.errors import ConfigError, DataError, IdentificationError
+from ...core.files import read_toml
+from ...data import EpisodeBatch, Population, open_population, split_episodes
+from ...data.population import EpisodeKey
+from ...identify import PhaseCalibration
+from ...observer import Observer, run_observer
+from ..config import Stage, StudyConfig, validate_config
+from ..engine.run_folder import open_finished
+from ..engine.store import Store
+from ..stages.calibrate import segments_of
 
 log = logging.getLogger(__name__)
 _BATCH = 64
@@ -112,7 +112,7 @@ def estimate_recordings(run: Path, data: Path, out: Path) -> int:
 
 
 def _identify_on(store: Store) -> str:
-    from .context import Facts
+    from ..engine.context import Facts
 
     return Facts.load(store.path("population")).identify_on
 

@@ -7,10 +7,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from ..core.artifacts import read_json
-from ..core.errors import ConfigError, DataError, DimensionError
-from ..core.locks import locked
-from .config import Stage, StudyConfig, stored_config
+from ...core.artifacts import read_json
+from ...core.errors import ConfigError, DataError, DimensionError
+from ...core.locks import locked
+from ..config import Stage, StudyConfig, stored_config
 from .store import BOOKKEEPING, Store
 
 STUDY = "study.json"

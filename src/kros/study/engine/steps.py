@@ -7,9 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from .config import Stage, StudyConfig
+from ..config import Stage, StudyConfig
 from .context import Context
-from .stages import calibrate, identify, quantify, read, synthesize
 from .store import code_key, hash_of, source_key
 
 log = logging.getLogger(__name__)
@@ -28,16 +27,6 @@ class Step:
     run: Callable[[Context], None]
     sections: tuple[str, ...]
     wanted: Callable[[StudyConfig], bool] = always
-
-
-LEARNING = (
-    Step(Stage.READ, read.run, ("data", "split")),
-    Step(Stage.CALIBRATE, calibrate.run, ("calibrate", "lifting")),
-    Step(Stage.IDENTIFY, identify.run, ("identify", "lifting")),
-    Step(Stage.QUANTIFY, quantify.run, ("uncertainty",)),
-    Step(Stage.SYNTHESIZE, synthesize.run, ("synthesis", "observer", "require")),
-)
-"""From recordings to observers."""
 
 
 def run_steps(context: Context, steps: Sequence[Step], until: Stage) -> None:

@@ -6,15 +6,15 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ..core.artifacts import write_json
-from ..core.errors import ConfigError
-from ..data import write_parquet, write_raw
-from .config import Stage, validate_config
-from .context import Progress
-from .pipeline import RunResult, require_usable, run_in
-from .presets import HARMONIC_DRIVE
-from .run_folder import open_run
-from .store import Store, code_key, hash_of
+from ...core.artifacts import write_json
+from ...core.errors import ConfigError
+from ...data import write_parquet, write_raw
+from ..config import Stage, validate_config
+from ..engine.context import Progress
+from ..engine.run_folder import open_run
+from ..engine.store import Store, code_key, hash_of
+from ..pipeline import RunResult, require_usable, run_in
+from ..presets import HARMONIC_DRIVE
 
 FORMATS = ("parquet", "raw")
 _STAGE, _RECORDINGS = "simulate", "simulated"
@@ -30,7 +30,7 @@ def simulate_to(
     dict
         The truth that was written.
     """
-    from ..plants import PLANTS
+    from ...plants import PLANTS
 
     for name, value, allowed in (("--plant", plant, tuple(PLANTS)), ("--format", format_, FORMATS), ("--loop", loop, ("stiff", "soft"))):
         if value not in allowed:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..core.files import read_toml
-from ..data import Population, check_population, open_population, read_parquet, write_group, write_index
-from ..data.folders import whole_folder
-from ..data.readers import detect_reader
-from ..data.writers import GroupRecord
-from .context import Progress
-from .executors import open_executor
+from ...core.files import read_toml
+from ...data import Population, check_population, open_population, read_parquet, write_group, write_index
+from ...data.folders import whole_folder
+from ...data.readers import detect_reader
+from ...data.writers import GroupRecord
+from ..engine.context import Progress
+from ..engine.executors import open_executor
 
 Task = tuple[Population, str, str, Path]
 

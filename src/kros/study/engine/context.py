@@ -10,13 +10,13 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from ..core.artifacts import load_artifact
-from ..core.loading import loader
-from ..data.population import OUTLIERS, EpisodeKey, Population
-from ..identify import ModelSet, PhaseSpec
-from ..lifting import Lifting
-from ..observer import Seen
-from .config import StudyConfig
+from ...core.artifacts import load_artifact
+from ...core.loading import loader
+from ...data.population import OUTLIERS, EpisodeKey, Population
+from ...identify import ModelSet, PhaseSpec
+from ...lifting import Lifting
+from ...observer import Seen
+from ..config import StudyConfig
 from .executors import Executor
 from .store import Store
 
@@ -78,7 +78,7 @@ class Context:
     @cached_property
     def population(self) -> Population:
         """The prepared recordings of the units that take part."""
-        from ..data import read_parquet
+        from ...data import read_parquet
 
         return read_parquet(self.recordings).select(self.facts.groups)
 
@@ -104,14 +104,14 @@ class Context:
     @cached_property
     def lifting(self) -> Lifting:
         """The Koopman lifting of the study; without functions where none is declared and none suits the plant."""
-        from .presets import resolve_lifting
+        from ..presets import resolve_lifting
 
         return resolve_lifting(self.config, self.population)
 
     @cached_property
     def phase_spec(self) -> PhaseSpec | None:
         """What is calibrated, if anything."""
-        from .presets import resolve_phase
+        from ..presets import resolve_phase
 
         return resolve_phase(self.config, self.population, self.lifting)
 

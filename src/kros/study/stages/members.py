@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact
-from ..core.lti import StateSpace
-from ..evaluate import Candidate, sample_errors
-from ..synthesis import ObserverProblem, Synthesis
-from ..uncertainty import UncertainModel
-from .context import Context
-from .makers import IDENTITY, Surroundings
+from ...core.artifacts import load_artifact
+from ...core.lti import StateSpace
+from ...evaluate import Candidate, sample_errors
+from ...synthesis import ObserverProblem, Synthesis
+from ...uncertainty import UncertainModel
+from ..engine.context import Context
+from ..makers import IDENTITY, Surroundings
 
 Array = npt.NDArray[np.float64]
 Members = dict[str, tuple[dict[str, Any], dict[str, Array]]]
@@ -24,7 +24,7 @@ _SHARES = (0.05, 0.5, 0.95)
 
 def member_work(context: Context, model: str, members: int) -> Callable[[], Members]:
     """Return the work of running the certified observers of one kind of model on random members of its set; it finds nothing where nothing is certified."""
-    from .stages.synthesize import measurement_noise, usable_problem
+    from .synthesize import measurement_noise, usable_problem
 
     record = load_artifact(context.store.path("observers"), "observers")[0]
     bounds = {

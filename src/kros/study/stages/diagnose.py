@@ -16,9 +16,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..core.errors import KrosError
-from ..identify import ModelSet
-from ..uncertainty import (
+from ...core.errors import KrosError
+from ...identify import ModelSet
+from ...uncertainty import (
     Form,
     Tightness,
     UncertainModel,
@@ -28,11 +28,11 @@ from ..uncertainty import (
     residual,
     variation_and_noise,
 )
-from ..uncertainty.unit_residuals import UnitResiduals, unit_residuals
-from .config import UncertaintyConfig
-from .context import Context
+from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
+from ..config import UncertaintyConfig
+from ..engine.context import Context
+from ..responses import scaled_responses
 from .resampling import resampled_models
-from .responses import scaled_responses
 
 log = logging.getLogger(__name__)
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..core.artifacts import plain
-from ..core.errors import ConfigError, DataError
-from ..data import Population, check_population
-from ..identify import ModelSet
-from ..observer import Observer
-from ..uncertainty import OutlierModel, Status
-from .config import Stage, StudyConfig
+from ...core.artifacts import plain
+from ...core.errors import ConfigError, DataError
+from ...data import Population, check_population
+from ...identify import ModelSet
+from ...observer import Observer
+from ...uncertainty import OutlierModel, Status
+from ..config import Stage, StudyConfig
+from ..engine.executors import Executor, open_executor
+from ..engine.run_folder import open_finished
+from ..engine.store import Store
+from ..scoring import Evidence, Recorded
+from ..stages.identify import reduce_episodes
+from ..stages.quantify import score_row
 from .estimate import check_channels, load_calibration, open_data, training_keys, unit_parameters
-from .executors import Executor, open_executor
-from .run_folder import open_finished
-from .scoring import Evidence, Recorded
-from .stages.identify import reduce_episodes
-from .stages.quantify import score_row
-from .store import Store
 
 
 def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]:
@@ -106,6 +106,6 @@ def check_line(row: dict[str, Any]) -> str:
 
 
 def _identify_on(store: Store) -> str:
-    from .context import Facts
+    from ..engine.context import Facts
 
     return Facts.load(store.path("population")).identify_on

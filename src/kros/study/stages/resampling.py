@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact
-from ..core.errors import DataError
-from ..data.scaled import scale_population
-from ..identify import (
+from ...core.artifacts import load_artifact
+from ...core.errors import DataError
+from ...data.scaled import scale_population
+from ...identify import (
     Factor,
     KoopmanMatrices,
     ModelSamples,
@@ -26,10 +26,10 @@ from ..identify import (
     episode_weights,
     lifted_factor,
 )
-from ..identify.refine import RefinedModels
-from ..identify.refine.episodes import episode_normals
-from .context import Context
-from .stages.identify import refine_options
+from ...identify.refine import RefinedModels
+from ...identify.refine.episodes import episode_normals
+from ..engine.context import Context
+from .identify import refine_options
 
 Array = npt.NDArray[np.float64]
 

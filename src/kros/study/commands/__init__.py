@@ -1,0 +1,1 @@
+"""What the commands of `kros` beside `kros run` do, one file each."""

@@ -1,0 +1,1 @@
+"""What carries a study: run folder, records of its stages, executors, progress."""

@@ -1,10 +1,9 @@
 """Evaluation: errors and spectra of estimates and free runs against recordings, also of disturbed ones; Monte Carlo over uncertain sets."""
 
-from .bootstrap import draw_interval, unit_interval
 from .contractions import Contractions
 from .disturb import SEVERITIES, Disturbance, Kind, Measured, hold_missing, standard_disturbances
 from .errors import ErrorSummary, error_percent, error_rms, error_spectrum, summarise
-from .intervals import interval_rows, mean_intervals
+from .intervals import draw_interval, interval_rows, mean_intervals, unit_interval
 from .monte_carlo import Candidate, MonteCarlo, sample_errors
 from .robustness import DisturbedEpisodes, robustness_rows, severity_of_growth
 

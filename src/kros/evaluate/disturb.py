@@ -1,8 +1,8 @@
 """Disturbed measurements: what an observer gets when the sensor, the line or the calibration is worse than in the recordings.
 
-Many disturbances side by side: the batch of episodes is repeated for every disturbance, disturbance outermost, so that observers run on
-all of them in one pass. Disturbances of one kind share their random draws (the samples that are lost at 5 % are lost at 10 %, too), so that errors
-over severity are smooth. Estimates are compared with the recordings as they are.
+The batch of episodes is repeated for every disturbance, disturbance outermost, so that observers run on all of them in one pass. Disturbances
+of one kind share their random draws (the samples that are lost at 5 % are lost at 10 %, too), so that errors over severity are smooth.
+Estimates are compared with the recordings as they are.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Kind(str, Enum):
     PHASE
         The machine's lifting parameter is wrong, by so much in its own unit, rad for a phase.
     DELAY
-        Measurements come late by so many samples, and nobody tells the observer.
+        Measurements are delayed by so many samples, unknown to the observer.
     """
 
     DROPPED = "dropped"
@@ -120,12 +120,13 @@ class Measured:
                 f"Measurements {self.y.shape} should be (n_samples, batch, q), with a range for each, found {self.size.shape}."
             )
 
-    def under(self, disturbances: Sequence[Disturbance], seed: int = 0) -> Measured:
+    def under(self, disturbances: Sequence[Disturbance | None], seed: int = 0) -> Measured:
         """Return the measurements under every disturbance, side by side.
 
         Parameters
         ----------
-        disturbances : sequence of Disturbance
+        disturbances : sequence of Disturbance or None
+            None for the measurements as recorded.
         seed : int
 
         Returns
@@ -138,12 +139,14 @@ class Measured:
         y = np.empty((n_samples, len(disturbances), batch, q))
         parameters = {name: np.repeat(values[None], len(disturbances), axis=0) for name, values in self.parameters.items()}
         for i, disturbance in enumerate(disturbances):
-            rng = np.random.default_rng([seed, list(Kind).index(disturbance.kind), disturbance.draw])
+            y[:, i] = self.y
+            if disturbance is None:
+                continue
             if disturbance.kind is Kind.PHASE:
-                y[:, i] = self.y
                 for values in parameters.values():
                     values[i] += disturbance.severity
             else:
+                rng = np.random.default_rng([seed, list(Kind).index(disturbance.kind), disturbance.draw])
                 y[:, i] = _CHANGES[disturbance.kind](self, disturbance.severity, rng)
         flat = {name: values.reshape(-1) for name, values in parameters.items()}
         return Measured(y.reshape(n_samples, -1, q), flat, self.sample_period_s, self.size)

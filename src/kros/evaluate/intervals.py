@@ -1,4 +1,7 @@
-"""Mean errors over units with their confidence intervals, for all observers at once: the same resampled units for every one."""
+"""How sure a mean error over units is: bootstrap over units, not samples, since units are what differs.
+
+Source: B. Efron and R. J. Tibshirani, An Introduction to the Bootstrap, Chapman & Hall 1993, chapter 13.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,76 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from .bootstrap import unit_interval
+from ..core.errors import DataError
 
+Array = npt.NDArray[np.float64]
 Cell = tuple[str, str, str]
+_ENDS = (0.025, 0.975)
 _FEWEST = 3  # units: of two there are three resamples
 
 
+def unit_interval(values: npt.ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[Array, Array]:
+    """Return the 95 % percentile bootstrap interval of the mean over units.
+
+    Parameters
+    ----------
+    values : array_like, shape (unit, ...)
+        One number a unit, such as its mean error.
+    draws, seed : int
+
+    Returns
+    -------
+    lower, upper : ndarray, shape (...)
+
+    Raises
+    ------
+    DataError
+        With fewer than two units, where nothing can be resampled.
+    """
+    values = np.asarray(values, dtype=float)
+    if values.ndim < 1 or len(values) < 2:
+        raise DataError(f"Bootstrap over units: needs at least 2 units, found values of shape {values.shape}.")
+    rows = np.random.default_rng(seed).integers(len(values), size=(draws, len(values)))
+    places = rows + len(values) * np.arange(draws)[:, None]
+    counts = np.bincount(places.ravel(), minlength=draws * len(values)).reshape(draws, len(values)) / len(values)
+    return _interval(np.tensordot(counts, values, 1))
+
+
+def draw_interval(values: npt.ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[Array, Array]:
+    """Return the 95 % interval of the mean over resampled units, each with one of its noise realisations.
+
+    Parameters
+    ----------
+    values : array_like, shape (realisation, unit, ...)
+    draws, seed : int
+
+    Returns
+    -------
+    lower, upper : ndarray, shape (...)
+        Wider than `unit_interval` of the means over realisations by what realisations differ.
+
+    Raises
+    ------
+    DataError
+        With fewer than two units or realisations.
+    """
+    values = np.asarray(values, dtype=float)
+    if values.ndim < 2 or min(values.shape[:2]) < 2:
+        raise DataError(f"Bootstrap over units and noise: needs at least 2 realisations of 2 units, found values of shape {values.shape}.")
+    rng = np.random.default_rng(seed)
+    n_draws, n_units = values.shape[:2]
+    return _interval(values[rng.integers(n_draws, size=(draws, n_units)), rng.integers(n_units, size=(draws, n_units))].mean(axis=1))
+
+
+def _interval(means: Array) -> tuple[Array, Array]:
+    lower, upper = np.quantile(means, _ENDS, axis=0)
+    return np.asarray(lower), np.asarray(upper)
+
+
 def mean_intervals(rows: Sequence[Mapping[str, Any]], role: str = "off_nominal") -> dict[Cell, tuple[float, float]]:
-    """Return the 95 % interval of the mean error over units, by observer, condition and channel.
+    """Return the 95 % interval of the mean error over units, by observer, condition and channel; the same resampled units for all.
 
     Parameters
     ----------

@@ -66,11 +66,10 @@ class DisturbedEpisodes:
         batch, given = self.batch, self.given
         n, pieces = batch.states.shape[-1], []
         together = max(1, _AT_ONCE // (estimators * batch.states.size))
-        none: list[Disturbance | None] = [None]
-        for start in range(0, 1 + len(self.disturbances), together):
-            wanted = (none + list(self.disturbances))[start : start + together]
-            part = _stacked(given, wanted, self.seed)
-            estimates = run(part, np.tile(batch.inputs, (1, len(wanted), 1)))
+        everything = (None, *self.disturbances)
+        for start in range(0, len(everything), together):
+            wanted = everything[start : start + together]
+            estimates = run(given.under(wanted, self.seed), np.tile(batch.inputs, (1, len(wanted), 1)))
             pieces.append([self._percent(estimate[..., :n], len(wanted)) for estimate in estimates])
         return np.concatenate([np.array(piece) for piece in pieces], axis=1)
 
@@ -80,14 +79,6 @@ class DisturbedEpisodes:
             raise DimensionError(f"Disturbed episodes: expected estimates of {count * width} episodes, found {estimate.shape}.")
         parts = [estimate[:, i * width : (i + 1) * width] for i in range(count)]
         return np.stack([error_percent(part, self.batch.states, self.batch.lengths) for part in parts])
-
-
-def _stacked(given: Measured, wanted: Sequence[Disturbance | None], seed: int) -> Measured:
-    if wanted[0] is not None:
-        return given.under([d for d in wanted if d is not None], seed)
-    rest = given.under([d for d in wanted[1:] if d is not None], seed)
-    parameters = {name: np.concatenate([values, rest.parameters[name]]) for name, values in given.parameters.items()}
-    return Measured(np.concatenate([given.y, rest.y], axis=1), parameters, given.sample_period_s, given.size)
 
 
 def robustness_rows(
@@ -111,23 +102,17 @@ def robustness_rows(
         ``disturbance`` is "none" and ``severity`` 0 for the measurements as they are; errors are None where an estimate diverged.
     """
     keys, rows = episodes.batch.keys, []
-    told = [(0, "none", 0.0)] + [(i, d.kind.value, float(d.severity)) for i, d in enumerate(episodes.disturbances, 1) if not d.draw]
+    severities = [(0, "none", 0.0)] + [(i, d.kind.value, float(d.severity)) for i, d in enumerate(episodes.disturbances, 1) if not d.draw]
     for condition in dict.fromkeys(k.condition for k in keys):
         units = {u: [i for i, k in enumerate(keys) if (k.unit, k.condition) == (u, condition)] for u in dict.fromkeys(k.unit for k in keys)}
         per_unit = np.stack([errors[:, chosen].mean(axis=1) for chosen in units.values() if chosen])  # (unit, 1 + disturbance, n)
-        for i, kind, severity in told:
+        for i, kind, severity in severities:
             for j in range(len(channels)) if estimated is None else estimated:
                 values = per_unit[:, i, j]
                 known = bool(np.isfinite(values).all())
+                error = {"mean": float(values.mean()) if known else None, "worst": float(values.max()) if known else None}
                 row = {"observer": name, "disturbance": kind, "severity": severity, "condition": condition, "channel": channels[j]}
-                rows.append(
-                    row
-                    | {
-                        "error_percent": {"mean": float(values.mean()), "worst": float(values.max())}
-                        if known
-                        else {"mean": None, "worst": None}
-                    }
-                )
+                rows.append(row | {"error_percent": error})
     return rows
 
 

@@ -153,9 +153,9 @@ def test_holding_takes_the_last_measurement_that_arrived():
 def test_errors_against_severity_do_not_depend_on_how_many_run_at_once(monkeypatch):
     x, u = plant(600)
     keys = tuple(EpisodeKey(unit, "default", "0") for unit in "aabb")
-    batch = EpisodeBatch(keys, np.array([600, 600, 500, 600]), x, u, 0.01)
+    batch = EpisodeBatch(keys, np.array([600, 600, 500, 600]), x, u, 0.01, {"phase": np.zeros(4)})
     disturbances = tuple(standard_disturbances([Kind.DROPPED, Kind.NOISE, Kind.DELAY]))
-    episodes = DisturbedEpisodes(batch, (0,), {"phase": np.zeros(4)}, 0.01, disturbances)
+    episodes = DisturbedEpisodes(batch, (0,), disturbances)
     observers = [observer(LIFTED), observer(LIFTED, 0.5 * L)]
 
     def run(given, inputs):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,18 +26,14 @@ class DisturbedEpisodes:
     Parameters
     ----------
     batch : EpisodeBatch
+        With the calibrated lifting parameters of the machine behind every episode.
     measured : tuple of int
-    parameters : mapping of str to ndarray, shape (batch,)
-        Calibrated lifting parameters of the machine behind every episode.
-    sample_period_s : float
     disturbances : tuple of Disturbance
     seed : int
     """
 
     batch: EpisodeBatch
     measured: tuple[int, ...]
-    parameters: Mapping[str, Array]
-    sample_period_s: float
     disturbances: tuple[Disturbance, ...]
     seed: int = 0
 
@@ -45,7 +41,7 @@ class DisturbedEpisodes:
     def given(self) -> Measured:
         """Measurements as recorded; their range is the largest value of all episodes."""
         y = np.ascontiguousarray(self.batch.states[..., list(self.measured)])
-        return Measured(y, self.parameters, self.sample_period_s, np.abs(y).max(axis=(0, 1)))
+        return Measured(y, self.batch.parameters, self.batch.sample_period_s, np.abs(y).max(axis=(0, 1)))
 
     def errors(self, run: Run, estimators: int = 1) -> Array:
         """Run estimators on all episodes under all disturbances.

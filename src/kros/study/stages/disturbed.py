@@ -64,7 +64,7 @@ class Trial:
     def episodes(self) -> DisturbedEpisodes:
         """Read the episodes."""
         batch = EpisodeBatch.read(self.population, self.keys, self.samples, self.units)
-        return DisturbedEpisodes(batch, self.measured, batch.parameters, self.population.sample_period_s, self.disturbances)
+        return DisturbedEpisodes(batch, self.measured, self.disturbances)
 
     def errors_of_observers(self, observers: Sequence[Observer]) -> list[Array]:
         """Return the errors of observers that can run side by side, each of shape (1 + disturbance, episode, n)."""

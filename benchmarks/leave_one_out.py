@@ -31,7 +31,7 @@ from kros.report.left_out_table import PAPER, LeftOutCell, LeftOutTable, left_ou
 from kros.report.names import BASELINES, minus, number, split_observer
 from kros.study import load_config, run_study
 from kros.study.commands.demo import simulate_to
-from kros.study.config import Stage, SynthesisConfig
+from kros.study.config import Stage, SynthesisSettings
 from kros.study.engine.executors import available_cores
 from kros.study.engine.progress import Lines
 
@@ -93,10 +93,10 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
             recordings, "harmonic-drive", options.units, options.episodes, options.seconds, options.seed, spread, loop, False, "parquet"
         )
     study = folder / "study.toml"
-    methods = json.dumps(["paper", *SynthesisConfig().methods])
+    methods = json.dumps(["paper", *SynthesisSettings().methods])
     study.write_text(
         f'[data]\nsource = "recordings"\nreader = "parquet"\n[synthesis]\nmethods = {methods}\n'
-        "[memory]\nsteps = 25\nepisodes = 2\nimportance = {velocity = 16}\n"
+        "[predictor]\nsteps = 25\nepisodes = 2\nimportance = {velocity = 16}\n"
         f"[evaluate]\nfolds = {options.folds}\nrobustness = false\nmonte_carlo = 0\n"
     )
     config = load_config(study, options.set)

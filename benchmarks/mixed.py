@@ -23,13 +23,14 @@ import numpy as np
 
 from kros.core import KrosError, gain
 from kros.core.artifacts import read_json
+from kros.core.work import Work
+from kros.design.task import Task, make_mixed, open_loop
 from kros.study import run_study, validate_config
 from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
-from kros.study.engine.context import Context, Silent
+from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.engine.store import Store
-from kros.study.makers import Task, make_mixed, open_loop
 from kros.study.stages.synthesize import tasks_of
 from kros.synthesis.worst_case.certificate import certify
 
@@ -80,7 +81,7 @@ def tasks(folder: Path) -> list[Task]:
     """Return a synthesis task for every kind of model of a run."""
     config = validate_config(read_json(folder / "study.json"), folder)
     with open_executor(1) as executor:
-        context = Context(config, Store(folder), executor, Silent())
+        context = Context(config, Store(folder), Work(executor))
         return [replace(tasks_of(context, name)[0], name=f"{name}/mixed", method="mixed") for name in context.model_names]
 
 

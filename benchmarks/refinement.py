@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 
 from kros.core.norms import hinf_norm
+from kros.core.work import Work
 from kros.identify import KoopmanMatrices, ModelSet, free_run
 from kros.identify.refine import RefinedModels
 from kros.study import run_study, validate_config
 from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
-from kros.study.engine.context import Context, Silent
+from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.engine.store import Store
 from kros.study.stages import calibrate
@@ -56,7 +57,7 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
     config = validate_config(raw, folder)
     metrics = run_study(config, out, until=Stage.QUANTIFY, workers=options.workers).metrics
     with open_executor(1) as executor:
-        return facts(Context(config, Store(out), executor, Silent()), metrics)
+        return facts(Context(config, Store(out), Work(executor)), metrics)
 
 
 def facts(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:

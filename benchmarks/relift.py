@@ -22,15 +22,16 @@ from typing import Any
 import numpy as np
 
 from kros.core.artifacts import read_json, write_json
+from kros.core.work import Work
 from kros.data import EpisodeBatch, read_parquet
+from kros.design.task import produce
 from kros.observer import Observer, ReliftScales, attack, attack_running, one_step_residual, relift_certificate, relift_report
 from kros.study import run_study, validate_config
 from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
-from kros.study.engine.context import Context, Silent
+from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.engine.store import Store
-from kros.study.makers import produce
 from kros.study.stages import calibrate
 from kros.study.stages.synthesize import tasks_of
 
@@ -83,7 +84,7 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
         config = validate_config({**STUDY, "data": {"source": str(recordings.absolute()), "reader": "parquet"}}, folder)
         run_study(config, run, until=Stage.QUANTIFY, workers=options.workers)
         with open_executor(options.workers) as executor:
-            context = Context(config, Store(run), executor, Silent())
+            context = Context(config, Store(run), Work(executor))
             tasks = [task for kind in KINDS for task in tasks_of(context, kind)]
             made = []
             for task, product in zip(tasks, context.map("synthesize", produce, tasks), strict=True):
@@ -98,7 +99,7 @@ def certified(folder: Path, run: Path, options: argparse.Namespace) -> dict[str,
     """Certify and attack every observer of one population."""
     config = validate_config({**STUDY, "data": {"source": str((folder / "recordings").absolute()), "reader": "parquet"}}, folder)
     with open_executor(1) as executor:
-        context = Context(config, Store(run), executor, Silent())
+        context = Context(config, Store(run), Work(executor))
         facts, calibration, population = context.facts, calibrate.load(context), read_parquet(folder / "recordings")
         keys = [facts.keys("train", unit, facts.identify_on)[0] for unit in facts.pooled]
         batch = EpisodeBatch.read(population, keys)

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from kros.core.errors import KrosError
+from kros.core.work import Work
 from kros.data import EpisodeBatch, Population
 from kros.evaluate import Kind, error_percent, severity_of_growth
 from kros.observer import run_observers
@@ -30,7 +31,7 @@ from kros.plants import HarmonicDrivePopulation
 from kros.report.disturbances import AXES, curves
 from kros.study import run_study, validate_config
 from kros.study.commands.demo import simulate_to
-from kros.study.engine.context import Context, Silent
+from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.engine.store import Store
 from kros.study.stages import calibrate
@@ -91,7 +92,7 @@ def study(folder: Path, loop: str, options: argparse.Namespace) -> tuple[dict[st
     config = validate_config(raw, folder)
     metrics = run_study(config, out).metrics
     with open_executor(1) as executor:
-        context = Context(config, Store(out), executor, Silent())
+        context = Context(config, Store(out), Work(executor))
         heavy = HeavyPopulation(options.units, EPISODES, SECONDS, options.seed, loop=loop, conditions=("load",)).simulate().population
         loads = {
             "none": errors_on(context, context.population, "noload"),

@@ -81,7 +81,7 @@ def study(plant: str, population: Population, factors: Factors, folder: Path, *,
             "methods": ["worst_case_h2", "residual_h2", "memory"] if refine else ["residual_h2", "memory"],
             "noise": {"position": NOISE[plant] * factors.get("position", 1.0)},
         },
-        "memory": {"states": 3, "steps": 2},
+        "predictor": {"states": 3, "steps": 2},
         "evaluate": {"robustness": False, "monte_carlo": 0},
     }
     if plant == "harmonic-drive":

@@ -21,13 +21,13 @@ import numpy as np
 
 from kros.core.artifacts import load_artifact
 from kros.data import EpisodeBatch, Population, read_parquet, split_episodes
+from kros.design.estimators import make_difference, make_extended, make_learned
+from kros.design.validation import TuningSet
 from kros.evaluate import error_percent, unit_interval
 from kros.identify import ModelSet
 from kros.lifting import Lifting
 from kros.observer import Observer, observer_with_memory, relift_certificate, run_observer
 from kros.study import Stage, StudyConfig, load_config, run_study
-from kros.study.estimators import make_difference, make_extended, make_learned
-from kros.study.tuning import TuningSet
 
 HERE = Path(__file__).parent
 STILL_RAD = 0.05  # a drive that moves less stands still, and percent of its noise say nothing

@@ -13,6 +13,7 @@ from typing import Any
 _SUBPACKAGES = (
     "core",
     "data",
+    "design",
     "evaluate",
     "export",
     "identify",

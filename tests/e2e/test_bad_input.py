@@ -69,7 +69,7 @@ def test_unknown_reader(kros, study, tmp_path):
         ("[nonsense]\na = 1", ("nonsense", "unknown key")),
         ("[lifting]\nfunctions = ['sin(positoin)']", ("positoin", "position")),
         ("[lifting]\nfunctions = ['__import__(\"os\").abort()']", ("not allowed",)),
-        ("[memory]\nimportance = {speed = 4}", ("speed", "velocity, current")),
+        ("[predictor]\nimportance = {speed = 4}", ("speed", "velocity, current")),
         ("[calibrate]\nangle = 'theta'", ("theta", "position")),
         ("[split]\ntest = ['0', '1', '2', '3']", ("split.test",)),
         ("[data.csv]\nfiles = 1\n[data.x]", ("data.x",)),

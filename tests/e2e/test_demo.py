@@ -7,9 +7,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from kros.core.work import Work
 from kros.identify import ModelSet
 from kros.identify.refine import RefinedModels
-from kros.study.engine.context import Context, Silent
+from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.pipeline import load_run
 from kros.study.stages.resampling import resampled_models
@@ -184,7 +185,7 @@ def test_resampled_models_surround_the_stored_ones(demo, name):
     units = list(reversed(models.unit_ids[1:]))
     rows = [models.index(u) for u in units]
     with open_executor(1, None) as executor:
-        samples = resampled_models(Context(config, store, executor, Silent()), name, units)
+        samples = resampled_models(Context(config, store, Work(executor)), name, units)
     assert samples.unit_ids == tuple(units)
     np.testing.assert_allclose(samples.estimate.A, models.A[rows], atol=1e-9)
     np.testing.assert_allclose(samples.estimate.B, models.B[rows], atol=1e-9)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from kros.core.artifacts import read_arrays, read_json
+from kros.core.work import Work
 from kros.data import read_parquet, split_episodes, write_parquet
 from kros.evaluate import unit_interval
 from kros.identify import ModelSet
@@ -17,8 +18,7 @@ from kros.report.left_out_table import PAPER, left_out_tables
 from kros.study import load_config, run_study
 from kros.study.commands.estimate import load_calibration, unit_parameters
 from kros.study.config import Stage
-from kros.study.engine.context import Context, Silent
-from kros.study.engine.executors import SerialExecutor
+from kros.study.engine.context import Context
 from kros.study.engine.store import Store
 from kros.study.stages.left_out import held_parameters, without
 
@@ -154,7 +154,7 @@ def test_a_unit_that_is_left_out_is_calibrated_as_a_new_one(kros, tmp_path):
     fold, whole = tmp_path / "fold", tmp_path / "whole"
     run_study(config, fold, until=Stage.CALIBRATE)
     run_study(load_config(study(tmp_path, tmp_path / "drives")), whole, until=Stage.CALIBRATE)
-    contexts = [Context(config, Store(folder), SerialExecutor(), Silent()) for folder in (whole, fold)]
+    contexts = [Context(config, Store(folder), Work()) for folder in (whole, fold)]
     phases = held_parameters(contexts[0], ["001003"], contexts[1])
     assert phases == unit_parameters(
         contexts[0].population.select(["001003"]), load_calibration(Store(fold)), contexts[1].facts.identify_on

@@ -49,7 +49,7 @@ def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
         "identify": {"refine": False, "alpha": alpha},
         "uncertainty": {"n_freqs": 50, "max_order": 1, "structure": "scalar"},
         "synthesis": {"input_weight": 3.0, "methods": ["worst_case_h2", "residual_h2", "memory"], "noise": {"position": 4e-4 * factors[0]}},
-        "memory": {"states": 2, "steps": 1},
+        "predictor": {"states": 2, "steps": 1},
         "evaluate": {"robustness": False, "monte_carlo": 0},
     }
     metrics = run_study(validate_config(raw, folder), folder / "run", until=until).metrics

@@ -10,6 +10,7 @@ import pytest
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
 from kros.data.population import EpisodeKey
+from kros.design.estimators import Baseline
 from kros.lifting import Lifting
 from kros.observer import (
     ExtendedKalman,
@@ -29,7 +30,6 @@ from kros.observer import (
 )
 from kros.observer.certificate.error import error_system
 from kros.observer.certificate.status import ReliftStatus
-from kros.study.estimators import Baseline
 from kros.synthesis import Injection
 
 DT, N, AT = 0.001, 2700, 200

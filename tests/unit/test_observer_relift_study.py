@@ -12,13 +12,13 @@ import pytest
 from kros.core.errors import DimensionError, SynthesisError
 from kros.core.lti import gain
 from kros.data.population import EpisodeKey
+from kros.design.certificates import Running, certify, first_episodes, save_running
+from kros.design.validation import TuningSet
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certificate, relift_report
 from kros.report.run_folder import RunFolder
 from kros.report.sections.relift import section
-from kros.study.relift import Running, certify, first_episodes, save_running
 from kros.study.stages.synthesize import choose_deployed, robust_of
-from kros.study.tuning import TuningSet
 from kros.synthesis import Injection
 
 

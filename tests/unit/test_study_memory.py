@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from kros.data.population import EpisodeKey
+from kros.design.certificates import certify_running
+from kros.design.predictor import on_the_circle
+from kros.design.residual_shaped import OwnModel, tuned
+from kros.design.settings import PredictorSettings
+from kros.design.task import Task, produce
+from kros.design.tuned import held_out, tuned_where_better
+from kros.design.validation import TuningSet
 from kros.lifting import Lifting
 from kros.observer import observer_with_memory, relift_certificate
 from kros.plants import PLANTS
 from kros.report.verdict import verdict
-from kros.study.config import MemoryConfig
-from kros.study.makers import Task, produce
-from kros.study.memory_maker import on_the_circle
-from kros.study.population_tuning import held_out, tuned_where_better
-from kros.study.relift import certify_running
-from kros.study.residual_maker import OwnModel, tuned
 from kros.study.stages.synthesize import certificate
-from kros.study.tuning import TuningSet
 from kros.synthesis import kalman
 
 STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "target_velocity")
@@ -52,7 +52,7 @@ def task(tuning, lifting=DRIVE, measured=(0,), name="koopman/memory", method="me
         "time_limit_s": 1.0,
         "max_order": 2,
         "max_states": None,
-        "memory": MemoryConfig(states=4),
+        "memory": PredictorSettings(states=4),
         **settings,
     }
     return Task(name, method, models, "001001", None, "there is no set", np.array([1e-5]), tuning, **options)
@@ -189,7 +189,7 @@ def test_the_verdict_claims_no_set_for_it():
 
 
 def test_an_observer_that_loses_the_machine_is_not_made(made, monkeypatch):
-    monkeypatch.setattr("kros.study.memory_maker.LOST", 0.0)
+    monkeypatch.setattr("kros.design.predictor.LOST", 0.0)
     product = produce(made[0])
     assert product.synthesis is None
     assert "loses the machine" in product.facts["reason"]

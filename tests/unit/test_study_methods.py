@@ -2,8 +2,8 @@
 
 import logging
 
-from kros.study.makers import MAKERS
-from kros.study.methods import METHODS, preferred, slowest_first, suitable
+from kros.design.methods import METHODS, preferred, slowest_first, suitable
+from kros.design.task import MAKERS
 
 
 def test_every_method_of_the_table_has_a_maker():
@@ -12,7 +12,7 @@ def test_every_method_of_the_table_has_a_maker():
 
 
 def test_what_does_not_suit_refined_models_is_left_out_with_the_reason(caplog):
-    caplog.set_level(logging.INFO, logger="kros.study.methods")
+    caplog.set_level(logging.INFO, logger="kros.design.methods")
     wanted = ("mixed", "worst_case_h2", "open_loop", "filtered_difference")
     assert [m.name for m in suitable(wanted, "koopman_edmd", refined=False)] == ["open_loop", "mixed", "worst_case_h2"]
     assert not caplog.records

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kros.core.lti import StateSpace, gain
-from kros.study.paper_maker import as_published, entrywise_weight, make_paper
+from kros.design.published import as_published, entrywise_weight, make_paper
 from kros.synthesis import Injection, ObserverProblem
 from kros.synthesis.problem.paper_plant import reduced_plant
 from kros.uncertainty import residual

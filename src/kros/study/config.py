@@ -6,24 +6,18 @@ import tomllib
 from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from ..core.errors import ConfigError
 from ..core.files import parse_toml, read_toml, shortened
-from ..lifting import check_family
+from ..core.settings import Settings
+from ..design.settings import ObserverSettings, PredictorSettings, SynthesisSettings
+from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
+from ..uncertainty.settings import UncertaintySettings
 
-FORMS = Literal[
-    "additive",
-    "input_multiplicative",
-    "output_multiplicative",
-    "inverse_additive",
-    "inverse_input_multiplicative",
-    "inverse_output_multiplicative",
-]
-METHODS = Literal["mixed", "paper", "worst_case_h2", "worst_case_hinf", "residual_h2", "memory"]
-BASELINES = Literal["open_loop", "kalman_white", "kalman_tuned", "luenberger", "ekf", "filtered_difference", "learned"]
+RENAMED = {"memory": "predictor"}  # sections of a study, old and new
 
 
 class Stage(str, Enum):
@@ -39,11 +33,7 @@ class Stage(str, Enum):
     REPORT = "report"
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class DataConfig(_Section):
+class DataConfig(Settings):
     """Where the recordings are and how they are prepared; units that `exclude` names take no part in anything."""
 
     source: Path
@@ -62,126 +52,13 @@ class DataConfig(_Section):
         return value
 
 
-class SplitConfig(_Section):
+class SplitConfig(Settings):
     """Which episodes are held out."""
 
     test: tuple[str, ...] | None = None
 
 
-class LiftingConfig(_Section):
-    """Lifted functions of the Koopman model; where none are declared, those that suit the plant that the reader names.
-
-    `families` are tables, each with a ``kind``, whose formulas stand behind `functions`; `input_functions` are further inputs of the model.
-    """
-
-    functions: tuple[str, ...] | None = None
-    families: tuple[dict[str, Any], ...] = ()
-    input_functions: tuple[str, ...] = ()
-    parameters: tuple[str, ...] | None = None
-
-    @field_validator("families")
-    @classmethod
-    def _known(cls, value: tuple[dict[str, Any], ...]) -> tuple[dict[str, Any], ...]:
-        for table in value:
-            check_family(table)
-        return value
-
-
-class CalibrateConfig(_Section):
-    """Phase calibration; ``None`` takes what suits the plant that the reader names."""
-
-    angle: str | None = None
-    ratio: float | None = Field(None, gt=0)
-    reference: str | None = None
-    measured: str | None = None
-    settle_s: float = Field(0.1, ge=0)
-
-
-class IdentifyConfig(_Section):
-    """Regularisation; ``auto`` is `alpha_factor` times the smallest coefficient that stabilises every model.
-
-    At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the population is finite; the factor
-    is doubled until the peak residual around the best nominal unit is at most `largest_residual`, where that can be reached.
-    `refine` adds models that are refined on their free-run error, the population first, then each unit, held near the population's model by
-    a prior that is never so weak that the peak residual exceeds `largest_residual`. Spectral radii stay below ``1 - margin``.
-    """
-
-    alpha: float | Literal["auto"] = "auto"
-    alpha_factor: float = Field(4.0, ge=1)
-    refine: bool = True
-    largest_residual: float = Field(0.5, gt=0)
-    margin: float = Field(0.0, ge=0, lt=1)
-
-    @field_validator("alpha")
-    @classmethod
-    def _not_negative(cls, value: float | str) -> float | str:
-        if isinstance(value, float) and value < 0:
-            raise ValueError("alpha should be 'auto' or a number of at least 0")
-        return value
-
-
-class UncertaintyConfig(_Section):
-    """Uncertainty model and outlier scores."""
-
-    form: FORMS = "inverse_input_multiplicative"
-    nominal: str | None = None
-    structure: Literal["auto", "diagonal", "scalar", "full", "entrywise"] = "auto"
-    n_freqs: int = Field(1000, ge=50)
-    max_order: int = Field(4, ge=1, le=8)
-    tolerance_db: float = Field(1.0, gt=0)
-    drop_outliers: bool = False
-    outlier_form: FORMS = "additive"
-    false_alarm_rate: float = Field(3e-3, gt=0, lt=1)
-
-
-class SynthesisConfig(_Section):
-    """Observer synthesis."""
-
-    methods: tuple[METHODS, ...] = ("mixed", "worst_case_h2", "residual_h2", "memory")
-    injection: Literal["state", "input"] = "state"
-    input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
-    noise: dict[str, float] = Field(default_factory=dict, description="standard deviation of the measurement noise per measured channel")
-    penalty: float = Field(1e-3, gt=0)
-    max_states: int | None = Field(
-        None, ge=0, description="most states of the filter of worst_case_h2; reduced and polished where it has more"
-    )
-    tune: bool = Field(False, description="whether residual_h2 is tuned on training episodes, which takes some seconds a kind of model")
-    time_limit_s: float = Field(60.0, gt=0)
-
-
-class MemoryConfig(_Section):
-    """The observer with a memory.
-
-    As many tuning `steps` as these, on so many `episodes` of every unit, keep a study short; 25 and 2 take half a minute, and are what an observer that
-    goes into machines is worth. `importance` weights the logarithmic errors of states that are not measured, by name; one where none is given.
-    """
-
-    states: int = Field(12, ge=1, description="states besides the recorded ones")
-    steps: int = Field(4, ge=0)
-    episodes: int = Field(1, ge=1)
-    importance: dict[str, float] = Field(default_factory=dict)
-
-    @field_validator("importance")
-    @classmethod
-    def _positive(cls, value: dict[str, float]) -> dict[str, float]:
-        for name, weight in value.items():
-            if not 0 < weight < float("inf"):
-                raise ValueError(f"memory.importance.{name} should be a positive number")
-        return value
-
-
-class ObserverConfig(_Section):
-    """Which observers are compared, and which one is handed over.
-
-    The extended Kalman filter runs on the first lifted model (on a linear one it is the tuned Kalman filter); ``filtered_difference`` and
-    ``learned`` need no model.
-    """
-
-    baselines: tuple[BASELINES, ...] = get_args(BASELINES)
-    deployed: str | None = None
-
-
-class EvaluateConfig(_Section):
+class EvaluateConfig(Settings):
     """Evaluation on units that took no part, on disturbed measurements, and on machines that might be.
 
     With `folds` the pooled units are parted into so many folds, and for each the study is made once more on all other units; 0 leaves that out.
@@ -201,7 +78,7 @@ class EvaluateConfig(_Section):
         return value
 
 
-class LoadConfig(_Section):
+class LoadConfig(Settings):
     """Load torque: what is mounted on `units` in a condition; without `moment` nothing is done about it.
 
     The load is ``moment sin(angle - angle_rad) + inertia angle''``, both divided by the torque constant: in units of current. Without `units`
@@ -220,26 +97,26 @@ class LoadConfig(_Section):
     level_s: float = Field(10.0, gt=0)
 
 
-class RequireConfig(_Section):
+class RequireConfig(Settings):
     """Requirements whose violation ends the run with exit code 3."""
 
     robust: bool = False
     no_outliers: bool = False
 
 
-class StudyConfig(_Section):
+class StudyConfig(Settings):
     """A whole study."""
 
     name: str = "study"
     data: DataConfig
     split: SplitConfig = SplitConfig()
-    lifting: LiftingConfig = LiftingConfig()
-    calibrate: CalibrateConfig = CalibrateConfig()
-    identify: IdentifyConfig = IdentifyConfig()
-    uncertainty: UncertaintyConfig = UncertaintyConfig()
-    synthesis: SynthesisConfig = SynthesisConfig()
-    memory: MemoryConfig = MemoryConfig()
-    observer: ObserverConfig = ObserverConfig()
+    lifting: LiftingSettings = LiftingSettings()
+    calibrate: CalibrationSettings = CalibrationSettings()
+    identify: IdentifySettings = IdentifySettings()
+    uncertainty: UncertaintySettings = UncertaintySettings()
+    synthesis: SynthesisSettings = SynthesisSettings()
+    predictor: PredictorSettings = PredictorSettings()
+    observer: ObserverSettings = ObserverSettings()
     evaluate: EvaluateConfig = EvaluateConfig()
     load: LoadConfig = LoadConfig()
     require: RequireConfig = RequireConfig()
@@ -288,22 +165,10 @@ def stored_config(raw: Any, path: Path) -> StudyConfig:
 
 def _validated(raw: Any, origin: str) -> StudyConfig:
     """Validate, with every problem in one message."""
-    try:
-        return StudyConfig.model_validate(raw)
-    except ValidationError as error:
-        problems = "; ".join(f"{'.'.join(str(p) for p in e['loc'])}: {_explain(e)}" for e in error.errors())
-        raise ConfigError(f"{origin}: {shortened(problems, 2000)}.") from error
-    except (TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, RecursionError) as error:  # of a family's arguments
-        raise ConfigError(
-            f"{origin}: {type(error).__name__}: {shortened(str(error))}; check the values of [[lifting.families]]."
-        ) from error
-
-
-def _explain(error: Any) -> str:
-    if error["type"] == "extra_forbidden":
-        return "unknown key; check the spelling against the documentation"
-    found = error.get("input")
-    return f"{error['msg'].lower()}, found {shortened(repr(found))}" if not isinstance(found, dict) else error["msg"].lower()
+    for old, new in RENAMED.items():
+        if isinstance(raw, dict) and old in raw:
+            raise ConfigError(f"{origin}: [{old}] is called [{new}] since version 0.2; rename it.")
+    return StudyConfig.of(raw, origin)
 
 
 def _apply(raw: dict[str, Any], override: str) -> None:

@@ -9,8 +9,9 @@ from typing import Any
 
 from ..core.artifacts import read_json
 from ..core.errors import ConfigError
+from ..core.work import Progress, Silent, Work
 from .config import Stage, StudyConfig
-from .engine.context import Context, Progress, Silent
+from .engine.context import Context
 from .engine.executors import open_executor
 from .engine.run_folder import load_run as load_run  # where readers of runs look for it
 from .engine.run_folder import open_run, require_own
@@ -90,7 +91,7 @@ def run_in(
     """Run a study in its run folder, which is open."""
     began = time.perf_counter()
     with open_executor(workers, scheduler) as executor:
-        context = Context(config, store, executor, progress or Silent())
+        context = Context(config, store, Work(executor, progress or Silent()))
         run_steps(context, STEPS, until)
         metrics = kept_metrics(store, collect_metrics(context, until, time.perf_counter() - began))
     return RunResult(store.folder, metrics, violations(config, metrics))

@@ -7,12 +7,13 @@ from typing import Any
 
 from ...core.artifacts import plain
 from ...core.errors import ConfigError, DataError
+from ...core.work import Executor
 from ...data import Population, check_population
 from ...identify import ModelSet
 from ...observer import Observer
 from ...uncertainty import OutlierModel, Status
 from ..config import Stage, StudyConfig
-from ..engine.executors import Executor, open_executor
+from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
 from ..scoring import Evidence, Recorded

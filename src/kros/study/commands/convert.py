@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from ...core.files import read_toml
+from ...core.work import Progress
 from ...data import Population, check_population, open_population, read_parquet, write_group, write_index
 from ...data.folders import whole_folder
 from ...data.readers import detect_reader
 from ...data.writers import GroupRecord
-from ..engine.context import Progress
 from ..engine.executors import open_executor
 
 Task = tuple[Population, str, str, Path]

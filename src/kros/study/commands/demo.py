@@ -8,9 +8,9 @@ from typing import Any
 
 from ...core.artifacts import write_json
 from ...core.errors import ConfigError
+from ...core.work import Progress
 from ...data import write_parquet, write_raw
 from ..config import Stage, validate_config
-from ..engine.context import Progress
 from ..engine.run_folder import open_run
 from ..engine.store import Store, code_key, hash_of
 from ..pipeline import RunResult, require_usable, run_in

@@ -2,51 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from ...core.artifacts import load_artifact
 from ...core.loading import loader
+from ...core.work import Work
 from ...data.population import OUTLIERS, EpisodeKey, Population
 from ...identify import ModelSet, PhaseSpec
 from ...lifting import Lifting
 from ...observer import Seen
 from ..config import StudyConfig
-from .executors import Executor
 from .store import Store
-
-T = TypeVar("T")
-
-
-class Progress(Protocol):
-    """Told which stage runs and how far it is."""
-
-    def start(self, stage: str, total: int | None) -> None:
-        """A stage (or a part of one) begins."""
-
-    def advance(self) -> None:
-        """One of its steps is done."""
-
-    def finish(self, stage: str, seconds: float, skipped: bool) -> None:
-        """A stage is done, or was found done."""
-
-
-class Silent:
-    """A progress listener that ignores everything."""
-
-    def start(self, stage: str, total: int | None) -> None:
-        """Ignore."""
-
-    def advance(self) -> None:
-        """Ignore."""
-
-    def finish(self, stage: str, seconds: float, skipped: bool) -> None:
-        """Ignore."""
 
 
 @dataclass(frozen=True)
@@ -55,20 +26,7 @@ class Context:
 
     config: StudyConfig
     store: Store
-    executor: Executor
-    progress: Progress
-
-    def map(self, title: str, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
-        """Map a function over tasks, in order, telling the progress listener."""
-        tasks = list(tasks)
-        self.progress.start(title, len(tasks))
-        for result in self.executor.map(function, tasks):
-            self.progress.advance()
-            yield result
-
-    def run(self, title: str, work: Iterable[Callable[[], T]]) -> list[T]:
-        """Run independent pieces of work, in order, telling the progress listener."""
-        return list(self.map(title, _call, work))
+    work: Work
 
     @cached_property
     def facts(self) -> Facts:
@@ -143,10 +101,6 @@ class Context:
         from urllib.parse import quote
 
         return f"{name}@{quote(str(condition), safe='')}"
-
-
-def _call(work: Callable[[], T]) -> T:
-    return work()
 
 
 @dataclass(frozen=True)

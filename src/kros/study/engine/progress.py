@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from .context import Progress, Silent
+from ...core.work import Progress, Silent
 
 
 class Lines:

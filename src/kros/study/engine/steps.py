@@ -58,16 +58,16 @@ def _run_step(context: Context, steps: Sequence[Step], upstream: str) -> str:
     key = _key(context, steps[0], upstream)
     if context.store.is_current(stage, key):
         record = context.store.record(stage)
-        context.progress.finish(stage.value, record.seconds if record is not None else 0.0, skipped=True)
+        context.work.progress.finish(stage.value, record.seconds if record is not None else 0.0, skipped=True)
         return _next_key(context, stage, key)
     began = time.perf_counter()
-    context.progress.start(stage.value, None)
+    context.work.progress.start(stage.value, None)
     with context.store.drafting() as draft:
         steps[0].run(replace(context, store=draft))
         seconds = time.perf_counter() - began
         _outdate(context, steps)
         draft.commit(stage, key, seconds)
-    context.progress.finish(stage.value, seconds, skipped=False)
+    context.work.progress.finish(stage.value, seconds, skipped=False)
     log.info("%s: %.2f s", stage.value, seconds)
     return _next_key(context, stage, key)
 

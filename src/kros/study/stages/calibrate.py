@@ -39,7 +39,7 @@ def run(context: Context) -> None:
         return
     tasks = [(context.population.select([u]), calibration_keys(context, u), spec) for u in facts.groups]
     units: dict[str, UnitPhase] = {}
-    for unit, segments in zip(facts.groups, context.map("calibrate", segments_of, tasks), strict=True):
+    for unit, segments in zip(facts.groups, context.work.map("calibrate", segments_of, tasks), strict=True):
         try:
             units[unit] = unit_phase(segments, unit)
         except IdentificationError as error:

@@ -28,8 +28,8 @@ from ...uncertainty import (
     residual,
     variation_and_noise,
 )
+from ...uncertainty.settings import UncertaintySettings
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
-from ..config import UncertaintyConfig
 from ..engine.context import Context
 from ..responses import scaled_responses
 from .resampling import resampled_models
@@ -70,7 +70,7 @@ def diagnose(context: Context, units: list[str], found: Mapping[str, UncertainMo
     for name in context.model_names[: len(context.edmd_names)]:  # the pair that figures compare
         work.append((folder / name / "units", partial(beside_weights, context.models(name), found[name], config)))
     work += _others(context, rows)
-    results = context.run("quantify (diagnose)", [partial(_attempt, place.parent.name, task) for place, task in work])
+    results = context.work.run("quantify (diagnose)", [partial(_attempt, place.parent.name, task) for place, task in work])
     for (place, _), result in zip(work, results, strict=True):
         if result is not None:
             result.save(place)
@@ -116,7 +116,7 @@ def order_curve(uncertain: UncertainModel, highest: int) -> Tightness:
     return magnitude_tightness(uncertain.freqs_hz[::every], bound, uncertain.sample_period_s, range(1, highest + 1))
 
 
-def beside_weights(models: ModelSet, uncertain: UncertainModel, config: UncertaintyConfig) -> UnitResiduals:
+def beside_weights(models: ModelSet, uncertain: UncertainModel, config: UncertaintySettings) -> UnitResiduals:
     """Return the residuals of all covered units beside the weights of a study."""
     every = max(1, len(uncertain.freqs_hz) // _POINTS)
     freqs = uncertain.freqs_hz[::every]
@@ -162,7 +162,7 @@ def most_conspicuous(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | N
     return max(scored, key=lambda r: (bool(r["outlier"]), float(r["score"])), default=None)
 
 
-def against_others(models: ModelSet, others: list[str], outside: list[str], nominal: str, config: UncertaintyConfig) -> UnitResiduals:
+def against_others(models: ModelSet, others: list[str], outside: list[str], nominal: str, config: UncertaintySettings) -> UnitResiduals:
     """Return the residuals of all units beside the smallest diagonal cover of `others`, frequency by frequency, and beside fits to their entries."""
     freqs, form, row = models.frequencies(_POINTS), Form(config.form), others.index(nominal)
     everyone = [*others, *outside]

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ...core.artifacts import load_artifact, save_artifact
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
+from ...design.estimators import Baseline
 from ...evaluate import (
     Disturbance,
     DisturbedEpisodes,
@@ -26,7 +27,6 @@ from ...evaluate import (
 from ...observer import Observer, run_observers
 from ..config import EvaluateConfig
 from ..engine.context import Context
-from ..estimators import Baseline
 from .members import member_work
 
 Array = npt.NDArray[np.float64]
@@ -142,7 +142,7 @@ def run_disturbed(
     kinds = list(dict.fromkeys(name.rpartition("/")[0] for name in chosen)) if config.monte_carlo else []
     work: list[Callable[[], Any]] = [partial(trial.errors_of_observers, group) for group in groups]
     work += [member_work(context, kind, config.monte_carlo) for kind in kinds]
-    done = context.run("disturb", work)
+    done = context.work.run("disturb", work)
     by_name = {o.name: found for group, errors in zip(groups, done, strict=False) for o, found in zip(group, errors, strict=True)}
     errors = {name: (by_name[observer.name], None) for name, observer in chosen.items()} | dict(baselines)
     members = {name: found for of_kind in done[len(groups) :] for name, found in of_kind.items()}

@@ -15,11 +15,11 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import KrosError
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
+from ...design.estimators import Baseline, make_difference, make_extended, make_learned
 from ...evaluate import ErrorSummary, summarise
 from ...identify import ModelSet, free_run
 from ...observer import Observer, run_observers
 from ..engine.context import Context
-from ..estimators import Baseline, make_difference, make_extended, make_learned
 from ..presets import gearbox_band_hz
 from . import calibrate
 from .disturbed import Trial, make_trial, run_disturbed
@@ -190,7 +190,7 @@ def estimation(
 def outcomes(context: Context, work: Sequence[Piece]) -> dict[str, Outcome | str]:
     """Do the work; return outcomes by name, observers of the study first, in its order."""
     found: dict[str, Outcome | str] = {}
-    for piece, result in zip(work, context.run("evaluate", [piece.work for piece in work]), strict=True):
+    for piece, result in zip(work, context.work.run("evaluate", [piece.work for piece in work]), strict=True):
         found |= dict(zip(piece.names, result if isinstance(result, list) else [result], strict=True))
     return {name: found[name] for name in dict.fromkeys((*load_observers(context), *found))}
 

@@ -27,9 +27,9 @@ from ...identify import (
 )
 from ...identify.excitation import require_excitation, require_independent
 from ...identify.refine import RefineOptions, refine_population
+from ...identify.settings import IdentifySettings
 from ...identify.spread import peak_residual_db
 from ...lifting import Lifting
-from ..config import IdentifyConfig
 from ..engine.context import Context
 from . import calibrate
 
@@ -60,7 +60,7 @@ def run(context: Context) -> None:
     for condition in sorted({k.condition for k in facts.train}, key=lambda c: c != facts.identify_on):
         units = [u for u in known if facts.keys("train", u, condition)]
         tasks = [(context.population.select([u], [condition]), facts.keys("train", u, condition), lifting) for u in units]
-        episodes = list(context.map(f"identify ({condition})", reduce_episodes, tasks))
+        episodes = list(context.work.map(f"identify ({condition})", reduce_episodes, tasks))
         _save_factors(context, condition, units, episodes)
         whole = [combine(f) for f in episodes]
         factor = Factor.stack(whole)
@@ -110,7 +110,7 @@ def identify_models(context: Context, condition: str, units: list[str], factor: 
     return models
 
 
-def alpha_factor(shared: list[tuple[Array, int]], edge: float, config: IdentifyConfig) -> float:
+def alpha_factor(shared: list[tuple[Array, int]], edge: float, config: IdentifySettings) -> float:
     """Return how many times the smallest stabilising coefficient is taken: doubled until units are near enough for an uncertain set around one of them.
 
     Where no factor brings them near enough, the configured one stays.
@@ -148,14 +148,14 @@ def refine_models(
         )
         for start in starts
     ]
-    refined = context.run("identify (refine)", work)
+    refined = context.work.run("identify (refine)", work)
     models = [with_matrices(start, found.units, factor, context, parameters) for start, found in zip(starts, refined, strict=True)]
     for start, found in zip(models, refined, strict=True):
         found.save(context.store.draft("refinement", start.name))
     return models
 
 
-def refine_options(config: IdentifyConfig) -> RefineOptions:
+def refine_options(config: IdentifySettings) -> RefineOptions:
     """Return the options of the refinement that a study asks for."""
     return RefineOptions(margin=max(config.margin, RefineOptions().margin), largest_residual=config.largest_residual)
 

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
+from ...core.work import Progress
 from ...data.population import OUTLIERS, Population
 from ..config import RequireConfig, Stage, StudyConfig
-from ..engine.context import Context, Progress
+from ..engine.context import Context
 from ..engine.steps import Step, run_steps
 from ..learning import LEARNING
 from . import calibrate
@@ -75,8 +76,8 @@ def run(context: Context) -> None:
 
 def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> dict[str, Any]:
     """Make the study without some units, and run its observers on these; a fold that fails is a result too, with its reason."""
-    progress = Fold(whole.progress, f"{number + 1}/{folds} ")
-    context = Context(without(whole, held), whole.store.nested(FOLDER, str(number)), whole.executor, progress)
+    progress = Fold(whole.work.progress, f"{number + 1}/{folds} ")
+    context = Context(without(whole, held), whole.store.nested(FOLDER, str(number)), replace(whole.work, progress=progress))
     steps = (*LEARNING, Step(Stage.EVALUATE, partial(estimate_held, whole, held), ()))
     try:
         run_steps(context, steps, Stage.EVALUATE)
@@ -127,7 +128,7 @@ def held_parameters(whole: Context, held: Sequence[str], context: Context) -> Un
     if calibration is None:
         return {unit: {} for unit in held}
     tasks = [(whole.population.select([u]), calibrate.calibration_keys(whole, u), calibration.spec) for u in held]
-    segments = context.map("calibrate", calibrate.segments_of, tasks)
+    segments = context.work.map("calibrate", calibrate.segments_of, tasks)
     return {u: {calibration.spec.parameter: calibration.calibrate(found, u).phase_rad} for u, found in zip(held, segments, strict=True)}
 
 

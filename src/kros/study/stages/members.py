@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact
 from ...core.lti import StateSpace
+from ...design.task import IDENTITY, Surroundings
 from ...evaluate import Candidate, sample_errors
 from ...synthesis import ObserverProblem, Synthesis
 from ...uncertainty import UncertainModel
 from ..engine.context import Context
-from ..makers import IDENTITY, Surroundings
 
 Array = npt.NDArray[np.float64]
 Members = dict[str, tuple[dict[str, Any], dict[str, Array]]]

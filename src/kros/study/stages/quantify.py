@@ -14,7 +14,7 @@ from ...core.errors import IdentificationError
 from ...core.norms import hinf_norm
 from ...identify import ModelSet
 from ...uncertainty import Form, OutlierScore, UncertainModel, choose_nominals, quantify_systems, residual, score_outliers, sigma_max
-from ..config import UncertaintyConfig
+from ...uncertainty.settings import UncertaintySettings
 from ..engine.context import Context
 from ..responses import scaled_responses
 from ..scoring import Recorded
@@ -39,7 +39,7 @@ def run(context: Context) -> None:
     first = next(iter(sets.values()))
     nominal = choose_nominal(first, units, context.config.uncertainty)
     tasks = [partial(quantify_models, models, units, context.config.uncertainty, nominal) for models in sets.values()]
-    found = context.run("quantify", tasks)
+    found = context.work.run("quantify", tasks)
     for name, uncertain in zip(sets, found, strict=True):
         uncertain.save(folder / name)
     choice = {"nominal": nominal, "worst_off_nominal": worst_off_nominal(first, found[0]), "dropped": sorted(dropped)}
@@ -47,7 +47,7 @@ def run(context: Context) -> None:
     diagnose(context, units, dict(zip(sets, found, strict=True)), scores)
 
 
-def choose_nominal(models: ModelSet, units: list[str], config: UncertaintyConfig) -> str:
+def choose_nominal(models: ModelSet, units: list[str], config: UncertaintySettings) -> str:
     """Return the nominal unit: the one asked for, else the best of the first kind of models, which all others share as in the paper."""
     if config.nominal is None:
         responses = scaled_responses(models, units, models.frequencies(config.n_freqs))
@@ -57,7 +57,7 @@ def choose_nominal(models: ModelSet, units: list[str], config: UncertaintyConfig
     return config.nominal
 
 
-def quantify_models(models: ModelSet, units: list[str], config: UncertaintyConfig, nominal: str) -> UncertainModel:
+def quantify_models(models: ModelSet, units: list[str], config: UncertaintySettings, nominal: str) -> UncertainModel:
     """Quantify one kind of model over the pooled units.
 
     Diagonal weights are tighter than scalar ones channel by channel, but their product can be larger, for which inverse forms pay by

@@ -81,8 +81,10 @@ def check_source(config: StudyConfig, single_allowed: bool) -> None:
             "declare measured = true for at least one."
         )
     hidden = [name for name in population.states if name not in population.measured]
-    if unknown := sorted(set(config.memory.importance) - set(hidden)):
-        raise ConfigError(f"memory.importance: {', '.join(unknown)} should be among the states that are not measured, {', '.join(hidden)}.")
+    if unknown := sorted(set(config.predictor.importance) - set(hidden)):
+        raise ConfigError(
+            f"predictor.importance: {', '.join(unknown)} should be among the states that are not measured, {', '.join(hidden)}."
+        )
 
 
 def read_group(task: GroupTask) -> GroupFacts:
@@ -118,7 +120,7 @@ def run(context: Context) -> None:
     if folder is not None:
         folder.mkdir(parents=True)
     tasks = [GroupTask(population.select([u], [c]), u, c, folder, config.data.on_nan) for u, c, _ in population.groups()]
-    found = list(context.map("read", read_group, tasks))
+    found = list(context.work.map("read", read_group, tasks))
     if folder is not None:
         records = [f.record for f in found if f.record is not None]
         write_index(population, records, folder)

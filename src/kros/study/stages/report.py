@@ -21,7 +21,7 @@ def run(context: Context) -> None:
     from ..metrics import collect_metrics
 
     metrics = collect_metrics(context, Stage.LEFT_OUT, None)
-    render(context.store.folder, metrics, partial(context.map, "report"), context.store.draft(REPORT))
+    render(context.store.folder, metrics, partial(context.work.map, "report"), context.store.draft(REPORT))
 
 
 def render_run(folder: Path) -> Path:

@@ -15,17 +15,17 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import SynthesisError
 from ...data.population import EpisodeKey
 from ...data.scaled import scale_population
+from ...design.certificates import LOST, Running, certify_running, save_running
+from ...design.methods import preferred, slowest_first, suitable
+from ...design.residual_shaped import OwnModel
+from ...design.task import Product, Task, produce
+from ...design.validation import TUNING_EPISODES, TUNING_UNITS, TuningSet
 from ...identify import ModelSet
 from ...observer import Observer, in_sizes
 from ...synthesis import Injection, ObserverProblem, Synthesis, check_units
 from ...synthesis.worst_case.certificate import certify
 from ...uncertainty import Structure, UncertainModel
 from ..engine.context import Context
-from ..makers import Product, Task, produce
-from ..methods import preferred, slowest_first, suitable
-from ..relift import LOST, Running, certify_running, save_running
-from ..residual_maker import OwnModel
-from ..tuning import TUNING_EPISODES, TUNING_UNITS, TuningSet
 from . import calibrate
 
 log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ def run(context: Context) -> None:
     tasks = [task for name in context.model_names for task in tasks_of(context, name)]
     products = produced(context, tasks)
     facts = {}
-    certificates = iter(context.run("certify", certificates_of(tasks, products)))
+    certificates = iter(context.work.run("certify", certificates_of(tasks, products)))
     for task, product in zip(tasks, products, strict=True):
         facts[task.name] = dict(product.facts)
         if product.synthesis is None:
@@ -50,7 +50,7 @@ def run(context: Context) -> None:
             save(context, task, product.synthesis)
     made = [p.name for p in products if p.synthesis is not None]
     folder = context.store.draft("observers")
-    running = [r for found in context.run("certify as it runs", as_it_runs(tasks, products)) for r in found]
+    running = [r for found in context.work.run("certify as it runs", as_it_runs(tasks, products)) for r in found]
     save_running(folder, running)
     eligible = robust_of(running, facts) if context.config.require.robust else running
     deployed = choose_deployed(context.config.observer.deployed, made, eligible)
@@ -63,7 +63,7 @@ def run(context: Context) -> None:
 def produced(context: Context, tasks: list[Task]) -> list[Product]:
     """Make the observers of all tasks; those that take longest start first, so that no worker waits for them in the end."""
     order = slowest_first([task.method for task in tasks])
-    made = dict(zip(order, context.map("synthesize", produce, [tasks[i] for i in order]), strict=True))
+    made = dict(zip(order, context.work.map("synthesize", produce, [tasks[i] for i in order]), strict=True))
     return [made[i] for i in range(len(tasks))]
 
 
@@ -123,7 +123,7 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     methods = suitable(config.observer.baselines + config.synthesis.methods, name, refined=name not in context.edmd_names)
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings |= {"max_order": config.uncertainty.max_order, "max_states": config.synthesis.max_states, "covered": uncertain.unit_ids}
-    settings |= {"memory": config.memory, "tune": config.synthesis.tune}
+    settings |= {"memory": config.predictor, "tune": config.synthesis.tune}
     return [Task(f"{name}/{method.name}", method.name, models, unit, problem, refusal, noise, tuning, **settings) for method in methods]
 
 

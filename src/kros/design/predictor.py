@@ -13,13 +13,13 @@ from ..core.errors import KrosError, SynthesisError
 from ..lifting import Lifting
 from ..observer import Observer, driven_coordinates, observer_with_memory
 from ..synthesis import Status
-from .population_tuning import tuned_where_better
-from .relift import LOST
-from .residual_maker import OwnModel
-from .tuning import Judge, hidden_mean
+from .certificates import LOST
+from .residual_shaped import OwnModel
+from .tuned import tuned_where_better
+from .validation import Judge, hidden_mean
 
 if TYPE_CHECKING:
-    from .makers import Made, Task
+    from .task import Made, Task
 
 _CIRCLE = {"sin": "cos", "cos": "sin"}
 _REASON = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"

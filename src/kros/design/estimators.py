@@ -30,8 +30,8 @@ from ..observer import (
     start_covariance,
 )
 from ..observer.screen import Screen, started_anew
-from .baselines import EQUAL, RESIDUAL
-from .tuning import TuningSet, rank
+from .gains import EQUAL, RESIDUAL
+from .validation import TuningSet, rank
 
 Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, Array]

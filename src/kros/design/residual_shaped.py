@@ -12,11 +12,11 @@ from ..core.errors import SynthesisError
 from ..lifting import Lifting
 from ..observer import Observer, ResidualModel, residual_models, tune_observer
 from ..synthesis import Synthesis, residual_h2
-from .population_tuning import tuned_where_better
-from .tuning import Judge, rank
+from .tuned import tuned_where_better
+from .validation import Judge, rank
 
 if TYPE_CHECKING:
-    from .makers import Made, Task
+    from .task import Made, Task
 
 Array = npt.NDArray[np.float64]
 MAX_ORDER = 12

@@ -11,10 +11,10 @@ from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, gain
 from ..observer import kalman_candidates, luenberger_candidates
 from ..synthesis import Synthesis
-from .tuning import rank
+from .validation import rank
 
 if TYPE_CHECKING:
-    from .makers import Made, Task
+    from .task import Made, Task
 
 T = TypeVar("T")
 EQUAL, RESIDUAL = "equal share of every range", "one-step residuals"

@@ -12,7 +12,7 @@ from ..synthesis import Injection, ObserverProblem, mixed
 from ..uncertainty import EntrywiseWeight, Structure, quantify_systems
 
 if TYPE_CHECKING:
-    from .makers import Made, Task
+    from .task import Made, Task
 
 
 def make_paper(task: Task) -> Made:

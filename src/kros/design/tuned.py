@@ -11,11 +11,11 @@ import numpy as np
 from ..core.errors import DataError, KrosError
 from ..data.population import EpisodeKey
 from ..observer import Observer, relift_certificate
-from .relift import LOST, blind_percent, scales_of
-from .tuning import Judge, hidden_mean
+from .certificates import LOST, blind_percent, scales_of
+from .validation import Judge, hidden_mean
 
 if TYPE_CHECKING:
-    from .makers import Task
+    from .task import Task
 
 log = logging.getLogger(__name__)
 

@@ -17,12 +17,12 @@ from ..observer import Observer, noise_covariances
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis, kalman, mixed, reduce_controller, worst_case_h2, worst_case_hinf
 from ..synthesis.worst_case.causal import causal_h2
 from ..uncertainty import fit_magnitude
-from .baselines import kalman_tuned, make_luenberger
-from .config import MemoryConfig
-from .memory_maker import make_memory
-from .paper_maker import make_paper
-from .residual_maker import OwnModel, make_residual_h2
-from .tuning import TuningSet, rank
+from .gains import kalman_tuned, make_luenberger
+from .predictor import make_memory
+from .published import make_paper
+from .residual_shaped import OwnModel, make_residual_h2
+from .settings import PredictorSettings
+from .validation import TuningSet, rank
 
 Array = npt.NDArray[np.float64]
 IDENTITY, TUNED = "identity", "tuned"
@@ -51,7 +51,7 @@ class Task:
     max_order: int
     max_states: int | None
     covered: tuple[str, ...] = ()
-    memory: MemoryConfig = field(default_factory=MemoryConfig)
+    memory: PredictorSettings = field(default_factory=PredictorSettings)
     tune: bool = False
 
     def observer(self, synthesis: Synthesis) -> Observer:

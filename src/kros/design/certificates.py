@@ -25,10 +25,10 @@ from ..observer import (
     run_observers,
     with_memory,
 )
-from .tuning import Judge, TuningSet, hidden_mean
+from .validation import Judge, TuningSet, hidden_mean
 
 if TYPE_CHECKING:
-    from .makers import Product, Task
+    from .task import Product, Task
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]

@@ -1,0 +1,41 @@
+"""Settings: what a function takes beside its data, with defaults and limits in one place for Python and TOML alike."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from .errors import ConfigError
+from .files import shortened
+
+
+class Settings(BaseModel):
+    """Base of all settings: unknown names are errors, values do not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @classmethod
+    def of(cls, raw: Any, asked: str) -> Self:
+        """Validate, with every problem in one message that begins with what was asked.
+
+        Raises
+        ------
+        ConfigError
+            When there are unknown names or values out of range.
+        """
+        try:
+            return cls.model_validate(raw)
+        except ValidationError as error:
+            problems = "; ".join(f"{'.'.join(str(p) for p in e['loc'])}: {_explain(e)}" for e in error.errors())
+            raise ConfigError(f"{asked}: {shortened(problems, 2000)}.") from error
+        except (TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, RecursionError) as error:  # of a family's arguments
+            found = f"{type(error).__name__}: {shortened(str(error))}"
+            raise ConfigError(f"{asked}: {found}; check the values of [[lifting.families]].") from error
+
+
+def _explain(error: Any) -> str:
+    if error["type"] == "extra_forbidden":
+        return "unknown key; check the spelling against the documentation"
+    found = error.get("input")
+    return f"{error['msg'].lower()}, found {shortened(repr(found))}" if not isinstance(found, dict) else str(error["msg"]).lower()

@@ -1,0 +1,59 @@
+"""Settings of observer design: which methods, what they assume, and which observer is deployed."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+from pydantic import Field, field_validator
+
+from ..core.settings import Settings
+
+METHODS = Literal["mixed", "paper", "worst_case_h2", "worst_case_hinf", "residual_h2", "memory"]
+BASELINES = Literal["open_loop", "kalman_white", "kalman_tuned", "luenberger", "ekf", "filtered_difference", "learned"]
+
+
+class SynthesisSettings(Settings):
+    """Observer synthesis."""
+
+    methods: tuple[METHODS, ...] = ("mixed", "worst_case_h2", "residual_h2", "memory")
+    injection: Literal["state", "input"] = "state"
+    input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
+    noise: dict[str, float] = Field(default_factory=dict, description="standard deviation of the measurement noise per measured channel")
+    penalty: float = Field(1e-3, gt=0)
+    max_states: int | None = Field(
+        None, ge=0, description="most states of the filter of worst_case_h2; reduced and polished where it has more"
+    )
+    tune: bool = Field(False, description="whether residual_h2 is tuned on training episodes, which takes some seconds a kind of model")
+    time_limit_s: float = Field(60.0, gt=0)
+
+
+class PredictorSettings(Settings):
+    """The observer with a memory.
+
+    As many tuning `steps` as these, on so many `episodes` of every unit, keep a study short; 25 and 2 take half a minute, and are what an observer that
+    goes into machines is worth. `importance` weights the logarithmic errors of states that are not measured, by name; one where none is given.
+    """
+
+    states: int = Field(12, ge=1, description="states besides the recorded ones")
+    steps: int = Field(4, ge=0)
+    episodes: int = Field(1, ge=1)
+    importance: dict[str, float] = Field(default_factory=dict)
+
+    @field_validator("importance")
+    @classmethod
+    def _positive(cls, value: dict[str, float]) -> dict[str, float]:
+        for name, weight in value.items():
+            if not 0 < weight < float("inf"):
+                raise ValueError(f"predictor.importance.{name} should be a positive number")
+        return value
+
+
+class ObserverSettings(Settings):
+    """Which observers are compared, and which one is handed over.
+
+    The extended Kalman filter runs on the first lifted model (on a linear one it is the tuned Kalman filter); ``filtered_difference`` and
+    ``learned`` need no model.
+    """
+
+    baselines: tuple[BASELINES, ...] = get_args(BASELINES)
+    deployed: str | None = None

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kros.data import EpisodeKey, Population, Unit, open_population, write_parquet, write_raw
+from kros.data import EpisodeKey, Population, Unit, read, write_parquet, write_raw
 from kros.plants.harmonic_drive import HarmonicDrivePopulation
 
 UNITS = int(os.environ.get("KROS_BENCH_UNITS", "4"))
@@ -42,7 +42,7 @@ def drives() -> Population:
 def folder(drives: Population, tmp_path_factory: pytest.TempPathFactory) -> Any:
     root = tmp_path_factory.mktemp("bench")
     write_raw(drives, root / "raw")
-    write_parquet(open_population("motor-drive-raw", root / "raw"), root / "parquet")
+    write_parquet(read(root / "raw", "motor-drive-raw"), root / "parquet")
     yield root
     shutil.rmtree(root)
 
@@ -54,14 +54,14 @@ def test_write_raw(benchmark: Any, drives: Population, tmp_path: Path) -> None:
 
 
 def test_open_raw(benchmark: Any, folder: Path) -> None:
-    population = benchmark(open_population, "motor-drive-raw", folder / "raw")
+    population = benchmark(read, folder / "raw", "motor-drive-raw")
     assert len(population.episodes) == UNITS * 2 * EPISODES
 
 
 def test_convert_raw_to_parquet(benchmark: Any, folder: Path, tmp_path: Path) -> None:
-    population = open_population("motor-drive-raw", folder / "raw")
+    population = read(folder / "raw", "motor-drive-raw")
     benchmark.pedantic(write_parquet, args=(population, tmp_path / "out"), kwargs={"overwrite": True}, rounds=2)
-    converted = open_population("parquet", tmp_path / "out")
+    converted = read(tmp_path / "out", "parquet")
     for key in population.episodes[::37]:
         np.testing.assert_array_equal(converted.read(key), population.read(key))
     shutil.rmtree(tmp_path / "out")
@@ -69,7 +69,7 @@ def test_convert_raw_to_parquet(benchmark: Any, folder: Path, tmp_path: Path) ->
 
 def test_read_parquet(benchmark: Any, folder: Path) -> None:
     def read_all() -> int:
-        population = open_population("parquet", folder / "parquet")
+        population = read(folder / "parquet", "parquet")
         return sum(len(population.read(key)) for key in population.episodes)
 
     assert benchmark(read_all) == UNITS * 2 * EPISODES * 19_000

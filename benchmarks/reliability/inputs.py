@@ -28,7 +28,7 @@ from kros.core.artifacts import CHECKSUM, load_artifact, plain, read_json, save_
 from kros.core.errors import KrosError
 from kros.core.lti import StateSpace
 from kros.core.records import read_record
-from kros.data import Channel, Role, check_population, from_arrays, from_frame, from_pykoop, open_population, write_parquet
+from kros.data import Channel, Role, check_population, from_arrays, from_frame, from_pykoop, read, write_parquet
 from kros.data.checks import scan_prints
 from kros.identify import ModelSet
 from kros.lifting import Lifting
@@ -314,19 +314,19 @@ def recordings_targets(root: Path) -> list[Target]:
         folder_target(
             "reader csv",
             root / "csv",
-            lambda p: recorded(open_population("csv", p, csv=plain_csv)),
+            lambda p: recorded(read(p, "csv", mapping=plain_csv)),
             lambda _, c, r: mutate_text(c, r),
             False,
         ),
         folder_target(
             "reader motor-drive-raw",
             raw,
-            lambda p: recorded(open_population("motor-drive-raw", p)),
+            lambda p: recorded(read(p, "motor-drive-raw")),
             lambda _, c, r: mutate_text(c, r),
             False,
         ),
-        folder_target("reader parquet", root / "parquet", lambda p: recorded(open_population("parquet", p)), mutate_file, True),
-        toml_target("CSV mapping", root / "mapping.toml", MAPPING, lambda p: recorded(open_population("csv", root / "csv", csv=p))),
+        folder_target("reader parquet", root / "parquet", lambda p: recorded(read(p, "parquet")), mutate_file, True),
+        toml_target("CSV mapping", root / "mapping.toml", MAPPING, lambda p: recorded(read(root / "csv", "csv", mapping=p))),
     ]
 
 

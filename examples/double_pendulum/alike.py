@@ -16,7 +16,7 @@ import numpy as np
 
 from kros.core import StateSpace
 from kros.core.frequency import log_grid
-from kros.data import open_population, split_episodes
+from kros.data import read, split_episodes
 from kros.identify import Factor, combine, edmd, lifted_factor, reduce_episode, smallest_stabilising_alpha
 from kros.lifting import Lifting
 from kros.study import load_config
@@ -38,7 +38,7 @@ def main() -> None:
     if "KROS_DATA" not in os.environ:
         sys.exit("Set KROS_DATA to the folder that holds dfki_double_pendulum; study.toml says where it is published.")
     data = load_config(HERE / "study.toml", [f"data.source={Path(os.environ['KROS_DATA']) / 'dfki_double_pendulum'}"]).data
-    population = open_population(data.reader, data.source, csv=data.csv, prepare=data.prepare)
+    population = read(data.source, data.reader, mapping=data.csv, prepare=data.prepare)
     sys.stdout.write(f"{'':8s} {'inputs':22s} {'factor':>7s} " + " ".join(f"{g:>24s}" for g in GROUPS) + f" {'condition':>10s}\n")
     split = split_episodes(population)
     episodes = {unit: [population.read_parts(key) for key in split[unit, "default"].train] for unit in population.unit_ids}

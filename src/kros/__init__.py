@@ -28,13 +28,17 @@ _SUBPACKAGES = (
     "uncertainty",
 )
 
-__all__ = ["__version__", *_SUBPACKAGES]
+_VERBS = {"read": "data", "from_arrays": "data", "from_frame": "data"}  # name -> subpackage
+
+__all__ = ["__version__", *_SUBPACKAGES, *_VERBS]
 
 
 def __getattr__(name: str) -> Any:
-    """Load a subpackage, or look up the version, on first use (PEP 562)."""
+    """Load a subpackage or a function, or look up the version, on first use (PEP 562)."""
     if name in _SUBPACKAGES:
         return import_module(f"{__name__}.{name}")
+    if name in _VERBS:
+        return getattr(import_module(f"{__name__}.{_VERBS[name]}"), name)
     if name == "__version__":
         from importlib.metadata import version
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import EpisodeKey, check_population, open_population, prepare, split_episodes, steps
+from kros.data import EpisodeKey, check_population, prepare, read, split_episodes, steps
 
 PENDULUM_SIGNALS = [
     ("position", "state", "pos_meas", "rad"),
@@ -49,7 +49,7 @@ PNEUMATIC: dict[str, Any] = {
 
 def test_geared_drives_two_to_a_file_with_jitter(recordings: Path) -> None:
     folder = recordings / "dfki_double_pendulum"
-    population = open_population("csv", folder, csv=PENDULUM)
+    population = read(folder, "csv", mapping=PENDULUM)
     assert population.unit_ids == ("A.0/joint1", "A.0/joint2", "C.0/joint1", "C.0/joint2", "C.1/joint1", "C.1/joint2")
     assert [len(population.keys(u)) for u in population.unit_ids] == [9, 9, 7, 7, 10, 10]
     check_population(population)
@@ -66,7 +66,7 @@ def test_geared_drives_two_to_a_file_with_jitter(recordings: Path) -> None:
 
 
 def test_rotary_pendulum_with_spaces_in_its_header(recordings: Path) -> None:
-    population = open_population("csv", recordings / "quanser_qube", csv=QUBE)
+    population = read(recordings / "quanser_qube", "csv", mapping=QUBE)
     assert population.sample_period_s == 0.002
     assert len(population.episodes) == 12
     assert all(population.read(key).shape == (9500, 4) for key in population.episodes)
@@ -80,7 +80,7 @@ def test_pneumatic_cylinders_without_header(recordings: Path) -> None:
         {"step": "resample", "period_s": 0.02, "max_gap_s": 3.0},
         {"step": "differentiate", "channel": "position", "name": "velocity", "cutoff_hz": 3.0, "unit": "m/s"},
     ]
-    population = open_population("csv", recordings / "pneumatic_cc0", csv=PNEUMATIC, prepare=smooth)
+    population = read(recordings / "pneumatic_cc0", "csv", mapping=PNEUMATIC, prepare=smooth)
     assert len(population.unit_ids) == 9
     assert {"1bar", "3bar", "5bar", "7bar"} <= set(population.conditions)
     assert population.states == ("position", "force", "velocity")
@@ -89,6 +89,6 @@ def test_pneumatic_cylinders_without_header(recordings: Path) -> None:
     # The velocity integrates back to the position.
     travel = np.cumsum(values[:, 2]) * 0.02
     np.testing.assert_allclose(travel - travel[0], values[:, 0] - values[0, 0], atol=2e-3)
-    raw = open_population("csv", recordings / "pneumatic_cc0", csv=PNEUMATIC)
+    raw = read(recordings / "pneumatic_cc0", "csv", mapping=PNEUMATIC)
     with pytest.raises(DataError, match="uneven time"):
         raw.read(raw.episodes[0])

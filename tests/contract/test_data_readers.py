@@ -15,8 +15,8 @@ from kros.data import (
     from_arrays,
     from_frame,
     from_pykoop,
-    open_population,
     prepare,
+    read,
     steps,
     to_pykoop,
     write_parquet,
@@ -63,19 +63,19 @@ ALIGNED = {key: values[:-1] for key, values in RAW.items()}  # the raw layout do
 
 def by_raw(folder: Path) -> Population:
     write_raw(from_arrays(RAW, CHANNELS, PERIOD), folder / "raw")
-    return open_population("motor-drive-raw", folder / "raw")
+    return read(folder / "raw", "motor-drive-raw")
 
 
 def by_parquet(folder: Path) -> Population:
     write_parquet(from_arrays(ALIGNED, CHANNELS, PERIOD), folder / "parquet")
-    return prepare(open_population("parquet", folder / "parquet"), PREPARATION)
+    return prepare(read(folder / "parquet", "parquet"), PREPARATION)
 
 
 def by_csv(folder: Path) -> Population:
     for key, values in ALIGNED.items():
         columns = [f"time [ms],{','.join(NAMES)}", *(f"{k},{','.join(repr(float(1e3 * v)) for v in row)}" for k, row in enumerate(values))]
         (folder / f"{key.unit}-{key.condition}-{key.episode}.csv").write_text("\n".join(columns))
-    return open_population("csv", folder, csv=MAPPING, prepare=PREPARATION)
+    return read(folder, "csv", mapping=MAPPING, prepare=PREPARATION)
 
 
 def by_arrays(folder: Path) -> Population:
@@ -146,7 +146,7 @@ def test_arrays_given_away_are_protected() -> None:
 def test_conversion_to_parquet_is_exact(read: Callable[[Path], Population], tmp_path: Path) -> None:
     population = read(tmp_path)
     write_parquet(population, tmp_path / "converted")
-    converted = open_population("parquet", tmp_path / "converted")
+    converted = read(tmp_path / "converted", "parquet")
     assert (converted.channels, converted.units, converted.episodes) == (population.channels, population.units, population.episodes)
     assert converted.metadata == population.metadata
     for key in KEYS:
@@ -157,10 +157,10 @@ def test_simulated_drives_come_back_from_the_raw_layout(tmp_path: Path) -> None:
     """The simulator prepares its population by its own code; the reader has to arrive at the same."""
     simulated = HarmonicDrivePopulation(n_units=2, n_episodes=2, seconds=3.0, outlier=True).simulate()
     write_raw(simulated.raw, tmp_path / "raw")
-    read = open_population("motor-drive-raw", tmp_path / "raw")
+    back = read(tmp_path / "raw", "motor-drive-raw")
     expected = simulated.population
-    assert (read.channels, read.units, read.episodes) == (expected.channels, expected.units, expected.episodes)
-    assert (read.sample_period_s, dict(read.metadata)) == (expected.sample_period_s, dict(expected.metadata))
+    assert (back.channels, back.units, back.episodes) == (expected.channels, expected.units, expected.episodes)
+    assert (back.sample_period_s, dict(back.metadata)) == (expected.sample_period_s, dict(expected.metadata))
     for key in expected.episodes:
-        worst = np.abs(read.read(key) - expected.read(key)).max(axis=0)
+        worst = np.abs(back.read(key) - expected.read(key)).max(axis=0)
         assert np.all(worst < [1e-9, 1e-9, 1e-6, 1e-9, 1e-9])

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import kros
 from kros.core.errors import DataError, MissingDependencyError
 from kros.data import Channel, EpisodeKey, Role, Unit, from_arrays, from_frame, from_pykoop, to_pykoop
 
@@ -43,6 +44,35 @@ def test_pairs_lists_and_column_order() -> None:
     ):
         assert population.channels == CHANNELS
         np.testing.assert_array_equal(population.read(EpisodeKey("a", "default", "0")), whole)
+
+
+NAMES: dict[str, Any] = {"states": ["x", "v"], "inputs": ["u"], "measured": ["x"], "sample_period_s": 0.1}
+
+
+def test_names_in_place_of_channels() -> None:
+    by_name = dict(zip(("u", "v", "x", "temperature"), (values(0)[:, 2], values(0)[:, 1], values(0)[:, 0], values(1)[:, 0]), strict=True))
+    for data in ({"a": [by_name]}, {"a": {"0": by_name}}, {"a": {"default": [by_name]}}, {"a": [values(0)]}):
+        population = kros.from_arrays(data, **NAMES)
+        assert (population.states, population.inputs, population.measured) == (("x", "v"), ("u",), ("x",))
+        np.testing.assert_array_equal(population.read(EpisodeKey("a", "default", "0")), values(0))
+    assert repr(population) == "Population(1 unit, 1 condition, 1 episode every 0.1 s; states x (measured), v; inputs u)"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"measured": []}, r"measured should name the states that a running observer will be given, found \[\]"),
+        ({"measured": ["u"]}, r"measured should name .*found \['u'\] for the states \['x', 'v'\]"),
+        ({"states": "x"}, r"states should be a list of names, found the text 'x'; write \['x'\]"),
+        ({"states": []}, "give the names of states, inputs and measured, or channels"),
+        ({"channels": CHANNELS}, "give the names of states, inputs and measured, or channels"),
+        ({"inputs": ["w"]}, r"Episode 0 of unit a \(default\): channel 'w' is missing, found \['x', 'v', 'u'\]"),
+        ({"sample_period_s": None}, "should be a number of seconds above zero, found None"),
+    ],
+)
+def test_names_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        kros.from_arrays({"a": [dict(zip("xvu", values(0).T, strict=True))]}, **{**NAMES, **changes})
 
 
 def test_units_and_metadata() -> None:
@@ -90,6 +120,7 @@ def test_frame() -> None:
     assert population.sample_period_s == 0.1
     assert [k.episode for k in population.episodes] == ["2", "10", "2"]
     np.testing.assert_array_equal(population.read(EpisodeKey("a", "hot", "10")), values(1))
+    assert kros.from_frame(frame(), states=["x", "v"], inputs=["u"], measured=["x"], time="t").measured == ("x",)
 
 
 def test_frame_with_defaults_and_renamed_columns() -> None:

@@ -23,8 +23,8 @@ from kros.data import (
     from_arrays,
     from_frame,
     from_pykoop,
-    open_population,
     prepare,
+    read,
     read_parquet,
     scan_population,
     steps,
@@ -46,7 +46,7 @@ def samples(seed: int, n: int = 80) -> np.ndarray:
 
 
 def scan(folder: Path, **mapping: Any) -> Any:
-    return scan_population(open_population("csv", folder, csv={**MAPPING, **mapping}))
+    return scan_population(read(folder, "csv", mapping={**MAPPING, **mapping}))
 
 
 # ------------------------------------------------------------------------------------------------------------------------- files of text
@@ -149,7 +149,7 @@ def test_recordings_that_are_no_files(tmp_path: Path, layout: str, kind: str) ->
         assert scan(tmp_path).unit_ids == ("b",)  # a folder is looked into, not read
         return
     with pytest.raises(DataError, match=r"regular file|no such file"):
-        open_population(layout, tmp_path, csv=MAPPING if layout == "csv" else None)
+        read(tmp_path, layout, mapping=MAPPING if layout == "csv" else None)
 
 
 def test_names_that_no_table_can_show(tmp_path: Path) -> None:
@@ -174,11 +174,11 @@ def test_periods_that_are_none(period: Any) -> None:
 )
 def test_numbers_of_a_mapping(tmp_path: Path, key: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=key):
-        open_population("csv", tmp_path.parent, csv={**MAPPING, key: value})
+        read(tmp_path.parent, "csv", mapping={**MAPPING, key: value})
     without = {k: v for k, v in MAPPING.items() if k != "time"}
     for period in (0, -1.0, float("nan"), float("inf")):
         with pytest.raises(ConfigError, match="sample_period_s"):
-            open_population("csv", tmp_path.parent, csv={**without, "sample_period_s": period})
+            read(tmp_path.parent, "csv", mapping={**without, "sample_period_s": period})
 
 
 @pytest.mark.parametrize("cutoff", [0.0, -1.0, 50.0, 51.0, float("nan"), float("inf")])

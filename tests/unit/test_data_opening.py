@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError
-from kros.data import Channel, Role, detect_reader, from_arrays, open_population, read_parquet, write_parquet, write_raw
+from kros.data import Channel, Role, detect_reader, from_arrays, read, read_parquet, write_parquet, write_raw
 from kros.data.readers.motor_drive_raw import CHANNELS, STEPS
 
 MAPPING: dict[str, Any] = {
@@ -44,8 +44,8 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_fitting_reader_is_found_and_used(folders: Path, name: str) -> None:
     mapping = MAPPING if name == "csv" else None
     assert detect_reader(folders / name) == name
-    named = open_population(name, folders / name, csv=mapping)
-    found = open_population(None, folders / name, csv=mapping)
+    named = read(folders / name, name, mapping=mapping)
+    found = read(folders / name, None, mapping=mapping)
     assert len(named.unit_ids) == 2
     assert found.episodes == named.episodes
     assert named.read(named.episodes[0]).shape[1] == len(named.channels)
@@ -67,40 +67,40 @@ def test_nothing_fits(folders: Path, name: str) -> None:
 )
 def test_wrong_reader(folders: Path, reader: str, folder: str, found: str) -> None:
     with pytest.raises(DataError, match=rf"{folder} as {reader}: .*{found}"):
-        open_population(reader, folders / folder)
+        read(folders / folder, reader)
 
 
 @pytest.mark.parametrize("reader", ["motor-drive-raw", "parquet", "csv", None])
 def test_missing_empty_and_useless_folders(folders: Path, reader: str | None) -> None:
     mapping = MAPPING if reader == "csv" else None
     with pytest.raises(DataError, match=r"missing: there is no such folder; check data\.source"):
-        open_population(reader, folders / "missing", csv=mapping)
+        read(folders / "missing", reader, mapping=mapping)
     with pytest.raises(DataError, match="empty: the folder is empty"):
-        open_population(reader, folders / "empty", csv=mapping)
+        read(folders / "empty", reader, mapping=mapping)
     with pytest.raises(DataError, match=r"this is a file"):
-        open_population(reader, folders / "other" / "photo.jpg", csv=mapping)
+        read(folders / "other" / "photo.jpg", reader, mapping=mapping)
     with pytest.raises(DataError, match="no reader fits" if reader != "csv" else "no file matches"):
-        open_population(reader, folders / "other", csv=mapping)
+        read(folders / "other", reader, mapping=mapping)
 
 
 def test_unknown_reader_and_options(folders: Path) -> None:
     with pytest.raises(ConfigError, match="one of motor-drive-raw, parquet, csv, found 'hdf5'"):
-        open_population("hdf5", folders / "csv")
+        read(folders / "csv", "hdf5")
     with pytest.raises(ConfigError, match="needs a mapping of columns"):
-        open_population("csv", folders / "csv")
+        read(folders / "csv", "csv")
     with pytest.raises(ConfigError, match="a CSV mapping is given"):
-        open_population("parquet", folders / "parquet", csv=MAPPING)
+        read(folders / "parquet", "parquet", mapping=MAPPING)
     with pytest.raises(ConfigError, match=r"data\.on_nan"):
-        open_population("parquet", folders / "parquet", on_nan="")
+        read(folders / "parquet", "parquet", on_nan="")
     with pytest.raises(ConfigError, match=r"data\.prepare\[0\] \(step 'trim'\): unknown key"):
-        open_population("parquet", folders / "parquet", prepare=[{"step": "trim", "from": 3}])
+        read(folders / "parquet", "parquet", prepare=[{"step": "trim", "from": 3}])
 
 
 @pytest.mark.parametrize("name", ["motor-drive-raw", "parquet", "csv"])
 def test_declared_steps_come_after_the_readers_own(folders: Path, name: str) -> None:
     mapping = MAPPING if name == "csv" else None
-    whole = open_population(name, folders / name, csv=mapping)
-    trimmed = open_population(name, folders / name, csv=mapping, prepare=[{"step": "trim", "start": 2}])
+    whole = read(folders / name, name, mapping=mapping)
+    trimmed = read(folders / name, name, mapping=mapping, prepare=[{"step": "trim", "start": 2}])
     np.testing.assert_array_equal(trimmed.read(whole.episodes[0]), whole.read(whole.episodes[0])[2:])
 
 
@@ -108,9 +108,9 @@ def test_dropping_episodes_at_opening(folders: Path, tmp_path: Path) -> None:
     for path in (folders / "csv").iterdir():
         (tmp_path / path.name).write_text(path.read_text())
     (tmp_path / "a_2.csv").write_text("t,x\n0,1\n0.1,\n0.2,3\n")
-    assert len(open_population("csv", tmp_path, csv=MAPPING).episodes) == 3
-    assert len(open_population("csv", tmp_path, csv=MAPPING, on_nan="drop_episode").episodes) == 2
+    assert len(read(tmp_path, "csv", mapping=MAPPING).episodes) == 3
+    assert len(read(tmp_path, "csv", mapping=MAPPING, on_nan="drop_episode").episodes) == 2
 
 
 def test_paths_may_be_text(folders: Path) -> None:
-    assert open_population("parquet", str(folders / "parquet")).episodes == read_parquet(str(folders / "parquet")).episodes
+    assert read(str(folders / "parquet"), "parquet").episodes == read_parquet(str(folders / "parquet")).episodes

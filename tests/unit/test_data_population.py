@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, prepare, split_episodes, steps, write_parquet
 from kros.data.population import natural_key
-from kros.data.prepare import Recorded, assemble
-from kros.data.recording import Recording
+from kros.data.prepare import assemble
+from kros.data.readers.arrays import ArrayRecordings
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("u", Role.INPUT))
 
@@ -109,6 +109,6 @@ def test_order_of_what_is_given_does_not_matter(tmp_path: Path) -> None:
 
 
 def test_inputs_before_states_are_refused_where_columns_are_fixed() -> None:
-    recorded = Recorded(CHANNELS[::-1], [Unit("a")], [EpisodeKey("a", "hot", "0")], lambda key: Recording(key, np.ones((5, 2))), 0.1)
+    recordings = ArrayRecordings({EpisodeKey("a", "hot", "0"): (np.ones((5, 2)), None)})
     with pytest.raises(DataError, match="Channels should list states before inputs"):
-        assemble(recorded)
+        assemble(recordings, CHANNELS[::-1], sample_period_s=0.1)

@@ -316,6 +316,6 @@ def test_population_travels_to_another_process_and_stays_small(raw: Path) -> Non
     population = read_motor_drive_raw(raw)
     one = population.select(units=["001011"], conditions=["load"])
     assert len(pickle.dumps(one)) < len(pickle.dumps(population))
-    assert set(one.source.recordings.files) == set(one.episodes)
+    assert set(one.source.recordings.places) == set(one.episodes)
     copy = pickle.loads(pickle.dumps(one))
     np.testing.assert_array_equal(copy.read(copy.episodes[0]), population.read(copy.episodes[0]))

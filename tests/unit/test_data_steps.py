@@ -7,7 +7,7 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError
 from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, from_frame, prepare, steps
-from kros.data.filters import lowpass, resample_even
+from kros.data.steps.filtered import lowpass, resample_even
 
 KEY = EpisodeKey("a", "default", "0")
 CHANNELS = (Channel("x", Role.STATE, "deg", measured=True), Channel("y", Role.STATE), Channel("u", Role.INPUT))

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from kros.core.errors import ConfigError, DataError
 from kros.core.locks import locked
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, read_parquet, write_group, write_index, write_parquet
-from kros.data.writers import group_file
+from kros.data.writers.parquet import group_file
 
 CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("y/z", Role.STATE), Channel("u", Role.INPUT, "V"))
 
@@ -131,7 +131,7 @@ def broken() -> Population:
     bad = population()
     samples = values(7)
     samples[4, 1] = np.nan
-    bad.source.recordings.values[EpisodeKey("b", "warm", "1")] = samples  # type: ignore[attr-defined]
+    bad.source.recordings.places[EpisodeKey("b", "warm", "1")] = samples, None  # type: ignore[attr-defined]
     return bad
 
 

@@ -15,14 +15,13 @@ from .readers import (
     from_arrays,
     from_frame,
     from_pykoop,
-    open_population,
+    read,
     read_csv_folder,
     read_motor_drive_raw,
     read_parquet,
     to_pykoop,
 )
-from .write_raw import write_raw
-from .writers import GroupRecord, write_group, write_index, write_parquet
+from .writers import GroupRecord, write_group, write_index, write_parquet, write_raw
 
 __all__ = [
     "DEFAULT_CONDITION",
@@ -43,8 +42,8 @@ __all__ = [
     "from_arrays",
     "from_frame",
     "from_pykoop",
-    "open_population",
     "prepare",
+    "read",
     "read_csv_folder",
     "read_motor_drive_raw",
     "read_parquet",

@@ -93,7 +93,7 @@ class Split:
     test: tuple[EpisodeKey, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Population:
     """Recordings of nominally identical machines.
 
@@ -117,6 +117,13 @@ class Population:
     episodes: tuple[EpisodeKey, ...]
     source: EpisodeSource
     metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Say how much was recorded of what."""
+        counts = {"unit": len(self.units), "condition": len(self.conditions), "episode": len(self.episodes)}
+        sizes = ", ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items())
+        states = ", ".join(f"{s} (measured)" if s in self.measured else s for s in self.states)
+        return f"Population({sizes} every {self.sample_period_s:g} s; states {states}; inputs {', '.join(self.inputs) or 'none'})"
 
     @property
     def states(self) -> tuple[str, ...]:

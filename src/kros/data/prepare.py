@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,8 @@ import numpy.typing as npt
 from ..core.errors import DataError
 from .checks import check_episode, check_period, check_structure
 from .population import Channel, EpisodeKey, EpisodeSource, Population, Role, Unit, natural_key, restrict
-from .recording import TIME_TOLERANCE, Recording, RecordingSource, check_even, estimate_period
-from .steps import Resample, Step
+from .recording import TIME_TOLERANCE, Recording, Recordings, check_even, estimate_period
+from .steps import Step
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class EvenRecordings:
 
 @dataclass(frozen=True, eq=False)
 class PreparedSource:
-    """Read a recording, check its time, apply the steps, check the result. Can be pickled when `recordings` can.
+    """Read a recording, check its time, apply the steps, check the result.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class PreparedSource:
         Largest deviation of one time step, in sampling periods.
     """
 
-    recordings: RecordingSource
+    recordings: Recordings | EvenRecordings
     channels: tuple[Channel, ...]
     period_s: float
     reference: EpisodeKey
@@ -59,7 +59,7 @@ class PreparedSource:
     def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
         """Return one prepared episode, shape (n_samples, n_channels)."""
         recording = self.recordings(key)
-        if not any(isinstance(step, Resample) for step in self.steps):
+        if not any(step.makes_even for step in self.steps):
             check_even(recording, self.period_s, self.reference, self.tolerance)
         channels, period = self.channels, self.period_s
         for step in self.steps:
@@ -73,48 +73,41 @@ class PreparedSource:
         return replace(self, recordings=restrict(self.recordings, keys))
 
 
-@dataclass(frozen=True, eq=False)
-class Recorded:
-    """What a reader found: the population before its preparation."""
-
-    channels: tuple[Channel, ...]
-    units: Sequence[Unit]
-    episodes: Sequence[EpisodeKey]
-    recordings: RecordingSource
-    sample_period_s: float | None = None  # None: from the time column of the first episode
-    metadata: Mapping[str, Any] = field(default_factory=dict)
-    tolerance: float = TIME_TOLERANCE
-
-
 def episode_order(key: EpisodeKey) -> tuple[Any, ...]:
     """Sort key of episodes: natural order of unit, condition and episode, and no ties."""
     return natural_key(key.unit), key.unit, natural_key(key.condition), key.condition, natural_key(key.episode), key.episode
 
 
-def assemble(recorded: Recorded, steps: Iterable[Step] = ()) -> Population:
-    """Make the population: natural order, one sampling period, steps declared, names checked.
+def assemble(
+    recordings: Recordings,
+    channels: tuple[Channel, ...],
+    units: Iterable[Unit] = (),
+    sample_period_s: float | None = None,
+    metadata: Mapping[str, Any] | None = None,
+    *,
+    steps: Iterable[Step] = (),
+    tolerance: float = TIME_TOLERANCE,
+) -> Population:
+    """Make the population that a reader found: natural order, one sampling period, steps declared, names checked.
 
-    Reads at most the first episode, for the sampling period.
+    Reads at most the first episode, for the sampling period where none is given. `units` are facts; a unit without any is known by its id.
 
     Raises
     ------
     DataError
         Empty, duplicate episodes or channels, no state, inputs before states.
     """
-    check_structure(recorded.channels, recorded.episodes)
-    roles = [c.role for c in recorded.channels]
+    check_structure(channels, list(recordings.places))
+    roles = [c.role for c in channels]
     if roles != sorted(roles, key=lambda role: role is Role.INPUT):
-        raise DataError(
-            f"Channels should list states before inputs, found {[(c.name, c.role.value) for c in recorded.channels]}; reorder them."
-        )
-    episodes = tuple(sorted(recorded.episodes, key=episode_order))
-    with_episodes = {key.unit for key in episodes}
-    units = tuple(sorted((u for u in recorded.units if u.id in with_episodes), key=lambda u: (natural_key(u.id), u.id)))
+        raise DataError(f"Channels should list states before inputs, found {[(c.name, c.role.value) for c in channels]}; reorder them.")
+    episodes = tuple(sorted(recordings.places, key=episode_order))
+    facts = {unit.id: unit for unit in units}
+    found = [facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes)]
     first = episodes[0]
-    period = recorded.sample_period_s if recorded.sample_period_s is not None else estimate_period(recorded.recordings(first))
-    period = check_period(period, "Population")
-    source = PreparedSource(recorded.recordings, recorded.channels, period, first, tolerance=recorded.tolerance)
-    return prepare(Population(recorded.channels, period, units, episodes, source, recorded.metadata), steps)
+    period = check_period(sample_period_s if sample_period_s is not None else estimate_period(recordings(first)), "Population")
+    source = PreparedSource(recordings, channels, period, first, tolerance=tolerance)
+    return prepare(Population(channels, period, tuple(found), episodes, source, dict(metadata or {})), steps)
 
 
 def prepare(population: Population, steps: Iterable[Step]) -> Population:

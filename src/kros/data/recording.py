@@ -5,9 +5,9 @@ reader ── Recording ── steps ── Recording ── checks ── sampl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,7 @@ from .population import EpisodeKey
 TIME_TOLERANCE = 1e-3  # largest deviation of one time step, in sampling periods
 PERIOD_TOLERANCE = 1e-4  # largest relative difference of the sampling periods of two episodes
 
-Float1D = npt.NDArray[np.float64]
-Float2D = npt.NDArray[np.float64]
+Float = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,20 +34,35 @@ class Recording:
     """
 
     key: EpisodeKey
-    values: Float2D
-    time_s: Float1D | None = None
+    values: Float
+    time_s: Float | None = None
 
 
-RecordingSource = Callable[[EpisodeKey], Recording]
-Place = TypeVar("Place")
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """Episodes as a reader found them, read one at a time; what reads a format overrides `read`. Can be pickled when `places` can.
 
+    Parameters
+    ----------
+    places : mapping of EpisodeKey
+        Where each episode is.
+    """
 
-def look_up(places: Mapping[EpisodeKey, Place], key: EpisodeKey) -> Place:
-    """Return where an episode is, or say that this source does not have it."""
-    try:
-        return places[key]
-    except KeyError as error:
-        raise DataError(f"Asked for {key}; this source has {len(places)} other episodes; take keys from population.episodes.") from error
+    places: Mapping[EpisodeKey, Any]
+
+    def read(self, key: EpisodeKey, place: Any) -> Recording:
+        """Return one episode as recorded."""
+        raise NotImplementedError
+
+    def __call__(self, key: EpisodeKey) -> Recording:
+        """Return one episode, or say that this source does not have it."""
+        if key not in self.places:
+            raise DataError(f"Asked for {key}; this source has {len(self.places)} other episodes; take keys from population.episodes.")
+        return self.read(key, self.places[key])
+
+    def restricted(self, keys: Iterable[EpisodeKey]) -> Self:
+        """Return the same for fewer episodes, cheaper to send to another process."""
+        return replace(self, places={key: self.places[key] for key in keys})
 
 
 def title(key: EpisodeKey) -> str:
@@ -92,7 +106,7 @@ def check_increasing(recording: Recording) -> None:
         )
 
 
-def check_even(recording: Recording, period_s: float, reference: EpisodeKey, tolerance: float = TIME_TOLERANCE) -> None:
+def check_even(recording: Recording, period_s: float, reference: EpisodeKey, tolerance: float) -> None:
     """Check that an episode is sampled evenly, at the population's period.
 
     Parameters

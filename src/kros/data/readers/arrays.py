@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,38 +12,59 @@ from ...core.errors import DataError
 from ...core.files import shortened
 from ..checks import check_period
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit
-from ..prepare import Recorded, assemble
-from ..recording import Recording, look_up, title
+from ..prepare import assemble
+from ..recording import Recording, Recordings, title
 
 
-@dataclass(frozen=True, eq=False)
-class ArrayRecordings:
-    """Episodes held in memory, columns already in the order of the channels; the arrays are made read-only."""
-
-    values: Mapping[EpisodeKey, npt.NDArray[np.float64]]
-    times: Mapping[EpisodeKey, npt.NDArray[np.float64]] | None = None
+class ArrayRecordings(Recordings):
+    """Episodes held in memory, with their times or None, columns in the order of the channels; the arrays are made read-only."""
 
     def __post_init__(self) -> None:
         """Protect the samples, which every reader of the population shares."""
-        for values in self.values.values():
+        for values, _ in self.places.values():
             values.flags.writeable = False
 
-    def __call__(self, key: EpisodeKey) -> Recording:
+    def read(self, key: EpisodeKey, place: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64] | None]) -> Recording:
         """Return one episode."""
-        return Recording(key, look_up(self.values, key), None if self.times is None else self.times[key])
+        return Recording(key, *place)
 
-    def restricted(self, keys: Iterable[EpisodeKey]) -> ArrayRecordings:
-        """Return the same for fewer episodes, cheaper to send to another process."""
-        wanted = tuple(keys)
-        times = None if self.times is None else {key: self.times[key] for key in wanted}
-        return ArrayRecordings({key: self.values[key] for key in wanted}, times)
+
+def declare_channels(
+    channels: Sequence[Channel] | None, states: Sequence[str], inputs: Sequence[str], measured: Sequence[str], what: str
+) -> tuple[Channel, ...]:
+    """Return the channels as given, or those that the names declare.
+
+    Raises
+    ------
+    DataError
+        Both are given, or none; a measured name that is no state.
+    """
+    if (channels is None) != bool(states):
+        raise DataError(
+            f"{what}: give the names of states, inputs and measured, or channels, found states = {list(states)} and channels = {channels!r}."
+        )
+    if channels is not None:
+        return tuple(channels)
+    for name, value in {"states": states, "inputs": inputs, "measured": measured}.items():
+        if isinstance(value, str):
+            raise DataError(f"{what}: {name} should be a list of names, found the text {value!r}; write [{value!r}].")
+    unknown = [name for name in measured if name not in states]
+    if unknown or not measured:
+        raise DataError(
+            f"{what}: measured should name the states that a running observer will be given, found {list(measured)} for the states "
+            f"{list(states)}; name one of them at least."
+        )
+    return (*(Channel(s, Role.STATE, measured=s in measured) for s in states), *(Channel(u, Role.INPUT) for u in inputs))
 
 
 def from_arrays(
     data: Any,
-    channels: Sequence[Channel],
-    sample_period_s: float,
+    channels: Sequence[Channel] | None = None,
+    sample_period_s: float | None = None,
     *,
+    states: Sequence[str] = (),
+    inputs: Sequence[str] = (),
+    measured: Sequence[str] = (),
     units: Iterable[Unit] = (),
     metadata: Mapping[str, Any] | None = None,
 ) -> Population:
@@ -53,12 +73,17 @@ def from_arrays(
     Parameters
     ----------
     data : mapping or sequence
-        One of: ``{EpisodeKey: episode}``; ``{unit: [episode, ...]}``; ``{unit: {condition: [episode, ...]}}``; the same with a mapping from
-        episode id in place of a list; or a list in place of the outer mapping, which numbers the units from zero. An episode is an array
-        of shape (n_samples, n_channels), columns as in `channels`, or a pair (states, inputs).
-    channels : sequence of Channel
-        In the order of the columns; states are moved before inputs.
-    sample_period_s : float
+        One of: ``{unit: [episode, ...]}``; ``{unit: {condition: [episode, ...]}}``; the same with a mapping from episode id in place of a list;
+        ``{EpisodeKey: episode}``; or a list in place of the outer mapping, which numbers the units from zero. An episode is an array of shape
+        (n_samples, n_channels) with states, then inputs, as columns; a pair (states, inputs); or a mapping from the name of a channel to its
+        samples, shape (n_samples,).
+    channels : sequence of Channel, optional
+        In place of `states`, `inputs` and `measured`, with units of measure, in the order of the columns; states are moved before inputs.
+    sample_period_s : float, s
+    states, inputs : sequence of str
+        Names of the columns.
+    measured : sequence of str
+        The states that a running observer will be given.
     units : iterable of Unit
         Group and metadata, where known.
     metadata : mapping, optional
@@ -76,20 +101,19 @@ def from_arrays(
     Examples
     --------
     >>> import numpy as np
-    >>> from kros.data import Channel, Role, from_arrays
-    >>> channels = (Channel("x", Role.STATE, measured=True), Channel("u", Role.INPUT))
-    >>> from_arrays({"a": [np.eye(4, 2)], "b": [np.eye(4, 2)]}, channels, 0.01).unit_ids
-    ('a', 'b')
+    >>> from kros.data import from_arrays
+    >>> angle, rate, torque = np.random.default_rng(1).standard_normal((3, 500))
+    >>> episode = {"angle": angle, "rate": rate, "torque": torque}
+    >>> from_arrays({"a": [episode]}, states=["angle", "rate"], inputs=["torque"], measured=["angle"], sample_period_s=0.01)
+    Population(1 unit, 1 condition, 1 episode every 0.01 s; states angle (measured), rate; inputs torque)
     """
     check_period(sample_period_s, "from_arrays")
-    order = sorted(range(len(channels)), key=lambda i: channels[i].role is Role.INPUT)
-    pairs = list(_episodes(data))
-    values = {key: np.ascontiguousarray(_samples(key, episode, channels)[:, order]) for key, episode in pairs}
-    facts = {unit.id: unit for unit in units}
-    names = dict.fromkeys(key.unit for key, _ in pairs)
-    found = [facts.get(name, Unit(name)) for name in names]
-    ordered = tuple(channels[i] for i in order)
-    return assemble(Recorded(ordered, found, [key for key, _ in pairs], ArrayRecordings(values), sample_period_s, dict(metadata or {})))
+    declared = declare_channels(channels, states, inputs, measured, "from_arrays")
+    order = sorted(range(len(declared)), key=lambda i: declared[i].role is Role.INPUT)
+    found = {
+        key: (np.ascontiguousarray(_samples(key, e, declared)[:, order]), None) for key, e in _episodes(data, {c.name for c in declared})
+    }
+    return assemble(ArrayRecordings(found), tuple(declared[i] for i in order), units, sample_period_s, metadata)
 
 
 def as_numbers(values: Any) -> npt.NDArray[np.float64]:
@@ -116,11 +140,16 @@ def _named(items: Any) -> Iterator[tuple[Any, Any]]:
         raise DataError(f"from_arrays needs mappings or lists of episodes, found {shortened(repr(items))}; see its documentation.")
 
 
-def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
+def _episodes(data: Any, channels: set[str]) -> Iterator[tuple[EpisodeKey, Any]]:
+    """Yield every episode; a mapping is an episode where it names a channel."""
+
+    def holds_episodes(item: Any) -> bool:
+        return isinstance(item, list) or (isinstance(item, Mapping) and not channels & set(item))
+
     for unit, of_unit in _named(data):
         if isinstance(unit, EpisodeKey):
             yield unit, of_unit
-        elif isinstance(of_unit, Mapping) and any(isinstance(v, (Mapping, list)) for v in of_unit.values()):
+        elif isinstance(of_unit, Mapping) and any(holds_episodes(v) for v in of_unit.values()):
             for condition, episodes in of_unit.items():
                 yield from ((EpisodeKey(str(unit), str(condition), str(name)), episode) for name, episode in _named(episodes))
         else:
@@ -128,16 +157,22 @@ def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
 
 
 def _samples(key: EpisodeKey, episode: Any, channels: Sequence[Channel]) -> npt.NDArray[np.float64]:
+    names = [c.name for c in channels]
+    if isinstance(episode, Mapping):
+        missing = [name for name in names if name not in episode]
+        if missing:
+            raise DataError(f"{title(key)}: channel {missing[0]!r} is missing, found {list(episode)}; add it, or correct the names.")
+        episode = tuple(episode[name] for name in names)
     try:
         parts = [as_numbers(part) for part in (episode if isinstance(episode, tuple) else (episode,))]
-        values = parts[0] if len(parts) == 1 else np.column_stack(parts)
+        values = parts[0] if len(parts) == 1 and not isinstance(episode, tuple) else np.column_stack(parts)
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(
             f"{title(key)}: needs numbers of shape (n_samples, {len(channels)}), found something else ({error}); correct the array."
         ) from error
     if values.ndim != 2 or values.shape[1] != len(channels):
         raise DataError(
-            f"{title(key)}: needs shape (n_samples, {len(channels)}) for the channels {[c.name for c in channels]}, "
-            f"found {values.shape}; transpose or correct the array."
+            f"{title(key)}: needs shape (n_samples, {len(channels)}) for the channels {names}, found {values.shape}; transpose or correct "
+            "the array."
         )
     return values

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,11 @@ import numpy as np
 
 from ...core.errors import DataError
 from ..checks import check_names
-from ..csvfile import Dialect, first_fields, read_columns
 from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Unit
-from ..prepare import Recorded, assemble
-from ..recording import Recording, look_up
-from ..steps import Step
+from ..prepare import assemble
+from ..recording import Recording, Recordings
 from .csv_mapping import Column, CsvMapping, UnitMapping, load_mapping
+from .csvfile import Dialect, first_fields, read_columns
 
 ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz")
 DEFAULT_UNIT = "unit"
@@ -35,27 +34,21 @@ class FilePlace:
 
 
 @dataclass(frozen=True, eq=False)
-class CsvRecordings:
-    """Reads one file at a time."""
+class CsvRecordings(Recordings):
+    """Reads one file at a time; without `time_scale` there is no column of time."""
 
-    places: Mapping[EpisodeKey, FilePlace]
     dialect: Dialect
-    time_scale: float | None  # None: no column of time
+    time_scale: float | None
 
-    def __call__(self, key: EpisodeKey) -> Recording:
+    def read(self, key: EpisodeKey, place: FilePlace) -> Recording:
         """Return one episode as recorded."""
-        place = look_up(self.places, key)
         columns = read_columns(Path(place.path), place.names, place.wanted, self.dialect)
         if self.time_scale is None:
             return Recording(key, np.ascontiguousarray(columns.T))
         return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0] * self.time_scale)
 
-    def restricted(self, keys: Iterable[EpisodeKey]) -> CsvRecordings:
-        """Return the same for fewer episodes, cheaper to send to another process."""
-        return replace(self, places={key: self.places[key] for key in keys})
 
-
-def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str, prepare: Iterable[Step] = ()) -> Population:
+def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str) -> Population:
     """Read a folder of CSV files (also gzip-compressed).
 
     Parameters
@@ -63,8 +56,6 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
     source : Path
     mapping : CsvMapping, mapping or Path
         See `CsvMapping`; a path names a TOML file.
-    prepare : iterable of Step
-        Further steps, after those of the mapping.
 
     Returns
     -------
@@ -104,8 +95,8 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
         raise DataError(f"Reading {source} as csv: no file matches files = {chosen.files!r}{_sample(source)}; correct the expression.")
     recordings = CsvRecordings(places, dialect, None if chosen.time is None else chosen.time_scale)
     units = [Unit(unit, group) for unit, group in groups.items()]
-    recorded = Recorded(chosen.channels, units, list(places), recordings, chosen.sample_period_s, chosen.metadata, chosen.time_tolerance)
-    return assemble(recorded, (*chosen.steps, *prepare))
+    period, tolerance = chosen.sample_period_s, chosen.time_tolerance
+    return assemble(recordings, chosen.channels, units, period, chosen.metadata, steps=chosen.steps, tolerance=tolerance)
 
 
 def csv_files(source: Path) -> Iterator[tuple[Path, str]]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -11,14 +11,17 @@ import numpy.typing as npt
 
 from ...core.errors import DataError, MissingDependencyError
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit
-from ..prepare import Recorded, assemble
-from .arrays import ArrayRecordings, as_numbers
+from ..prepare import assemble
+from .arrays import ArrayRecordings, as_numbers, declare_channels
 
 
 def from_frame(
     frame: Any,
-    channels: Sequence[Channel],
+    channels: Sequence[Channel] | None = None,
     *,
+    states: Sequence[str] = (),
+    inputs: Sequence[str] = (),
+    measured: Sequence[str] = (),
     time: str | None = None,
     sample_period_s: float | None = None,
     unit: str = "unit",
@@ -33,8 +36,12 @@ def from_frame(
     ----------
     frame : pandas.DataFrame
         Rows of an episode in order of time.
-    channels : sequence of Channel
-        Their names are columns; states are moved before inputs.
+    channels : sequence of Channel, optional
+        In place of `states`, `inputs` and `measured`, with units of measure.
+    states, inputs : sequence of str
+        Names of columns.
+    measured : sequence of str
+        The states that a running observer will be given.
     time : str, optional
         Column of time, s; or give `sample_period_s`.
     sample_period_s : float, optional
@@ -58,39 +65,29 @@ def from_frame(
     _require_frame(frame)
     if (time is None) == (sample_period_s is None):
         raise DataError(f"from_frame needs one of time and sample_period_s, found time = {time!r}, sample_period_s = {sample_period_s!r}.")
-    ordered = tuple(sorted(channels, key=lambda c: c.role is Role.INPUT))
+    ordered = tuple(sorted(declare_channels(channels, states, inputs, measured, "from_frame"), key=lambda c: c.role is Role.INPUT))
     required = [unit, *([] if time is None else [time]), *(c.name for c in ordered)]
     columns = list(frame.columns)
     missing = [name for name in required if name not in columns]
     if missing:
-        raise DataError(
-            f"from_frame: column {missing[0]!r} is missing, found {list(frame.columns)}; rename a column or correct the channels."
-        )
+        raise DataError(f"from_frame: column {missing[0]!r} is missing, found {columns}; rename a column or correct the channels.")
     twice = [name for name in (*required, condition, episode) if name is not None and columns.count(name) > 1]
     if twice:
         raise DataError(f"from_frame: column {twice[0]!r} occurs {columns.count(twice[0])} times in {columns}; rename or drop the others.")
-    n = len(frame)
-    ids = (
-        np.column_stack([_ids(frame, unit, ""), _ids(frame, condition, DEFAULT_CONDITION), _ids(frame, episode, "0")])
-        if n
-        else np.empty((0, 3), object)
-    )
+    ids = zip(_ids(frame, unit, ""), _ids(frame, condition, DEFAULT_CONDITION), _ids(frame, episode, "0"), strict=True)
     numbers = _numbers(frame, [c.name for c in ordered])
     times = None if time is None else _numbers(frame, [time])[:, 0]
-    rows: dict[EpisodeKey, slice] = {}
-    for key, at in _runs(ids):
-        if key in rows:
+    found: dict[EpisodeKey, tuple[npt.NDArray[np.float64], npt.NDArray[np.float64] | None]] = {}
+    start = 0
+    for names, run in groupby(ids):
+        key, rows = EpisodeKey(*names), slice(start, start := start + sum(1 for _ in run))
+        if key in found:
             raise DataError(
                 f"from_frame: the rows of {key} are not together; sort the frame by unit, condition, episode and time, "
                 "or rename the copies."
             )
-        rows[key] = at
-    recordings = ArrayRecordings(
-        {k: numbers[at] for k, at in rows.items()}, None if times is None else {k: times[at] for k, at in rows.items()}
-    )
-    facts = {u.id: u for u in units}
-    found = [facts.get(name, Unit(name)) for name in dict.fromkeys(key.unit for key in rows)]
-    return assemble(Recorded(ordered, found, list(rows), recordings, sample_period_s, dict(metadata or {})))
+        found[key] = numbers[rows], None if times is None else times[rows]
+    return assemble(ArrayRecordings(found), ordered, units, sample_period_s, metadata)
 
 
 def _require_frame(frame: Any) -> None:
@@ -104,9 +101,9 @@ def _require_frame(frame: Any) -> None:
         raise DataError(f"from_frame needs a pandas DataFrame, found {type(frame).__name__}; use from_arrays for arrays.")
 
 
-def _ids(frame: Any, column: str | None, default: str) -> npt.NDArray[np.object_]:
+def _ids(frame: Any, column: str | None, default: str) -> list[str]:
     if column is None or column not in frame.columns:
-        return np.full(len(frame), default, dtype=object)
+        return [default] * len(frame)
     values = frame[column].to_numpy(dtype=object)
     bad = next((v for v in values if isinstance(v, bool) or not isinstance(v, (str, int, np.integer))), None)
     if bad is not None:
@@ -114,12 +111,10 @@ def _ids(frame: Any, column: str | None, default: str) -> npt.NDArray[np.object_
             f"from_frame: column {column!r} should hold text or whole numbers, found {bad!r}; convert it with "
             "astype(str), keeping leading zeros."
         )
-    return np.array([str(v) for v in values], dtype=object)
+    return [str(v) for v in values]
 
 
 def _numbers(frame: Any, names: list[str]) -> npt.NDArray[np.float64]:
-    if not names:
-        return np.empty((len(frame), 0))
     return np.column_stack([_column(frame[name], name) for name in names])
 
 
@@ -132,12 +127,3 @@ def _column(column: Any, name: str) -> npt.NDArray[np.float64]:
         return np.asarray(column.to_numpy(dtype=float, na_value=np.nan))
     except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"from_frame: column {name!r} should hold numbers ({error}); convert it.") from error
-
-
-def _runs(ids: npt.NDArray[np.object_]) -> Iterator[tuple[EpisodeKey, slice]]:
-    """Yield each run of equal ids with its rows."""
-    if not len(ids):
-        return
-    starts = np.concatenate([[0], np.flatnonzero(np.any(ids[1:] != ids[:-1], axis=1)) + 1, [len(ids)]])
-    for start, stop in pairwise(starts.tolist()):
-        yield EpisodeKey(*ids[start]), slice(start, stop)

@@ -12,18 +12,18 @@ import logging
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ...core.errors import DataError
-from ..csvfile import first_fields, read_columns
 from ..population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
-from ..prepare import Recorded, assemble, episode_order
-from ..recording import Recording, estimate_period, look_up
+from ..prepare import assemble, episode_order
+from ..recording import Recording, Recordings, estimate_period
 from ..steps import Offset, Scale, Shift, Step, Trim
+from .csvfile import first_fields, read_columns
 
 logger = logging.getLogger(__name__)
 
@@ -55,20 +55,15 @@ FOLDER = re.compile(r"\d{8}T\d{6}_(?P<unit>\d{6})_(?P<condition>load|noload)")
 
 
 @dataclass(frozen=True, eq=False)
-class RawRecordings:
+class RawRecordings(Recordings):
     """Reads one raw file at a time."""
 
-    files: Mapping[EpisodeKey, str]
     time_scale: float = 1.0
 
-    def __call__(self, key: EpisodeKey) -> Recording:
+    def read(self, key: EpisodeKey, place: str) -> Recording:
         """Return one episode as recorded."""
-        columns = read_columns(Path(look_up(self.files, key)), COLUMNS, COLUMNS)
+        columns = read_columns(Path(place), COLUMNS, COLUMNS)
         return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0] * self.time_scale)
-
-    def restricted(self, keys: Iterable[EpisodeKey]) -> RawRecordings:
-        """Return the same for fewer episodes, cheaper to send to another process."""
-        return RawRecordings({key: self.files[key] for key in keys}, self.time_scale)
 
 
 def find_root(source: Path) -> Path | None:
@@ -79,15 +74,13 @@ def find_root(source: Path) -> Path | None:
     return None
 
 
-def read_motor_drive_raw(source: Path | str, prepare: Iterable[Step] = ()) -> Population:
+def read_motor_drive_raw(source: Path | str) -> Population:
     """Read the paper's raw layout.
 
     Parameters
     ----------
     source : Path
         The folder that holds ``batch_b``, or the one that holds ``population`` and ``outliers``.
-    prepare : iterable of Step
-        Further steps, after `STEPS`.
 
     Returns
     -------
@@ -123,7 +116,7 @@ def read_motor_drive_raw(source: Path | str, prepare: Iterable[Step] = ()) -> Po
     if not files:
         raise DataError(f"Reading {source} as motor-drive-raw: found {len(groups)} folders of units and no .csv in them; check the path.")
     recordings = RawRecordings(files, _time_scale(RawRecordings(files)(min(files, key=episode_order))))
-    return assemble(Recorded(CHANNELS, units, list(files), recordings, metadata=METADATA), (*STEPS, *prepare))
+    return assemble(recordings, CHANNELS, units, metadata=METADATA, steps=STEPS)
 
 
 def _time_scale(first: Recording) -> float:

@@ -9,6 +9,7 @@ from typing import Any
 from ...core.errors import ConfigError, DataError
 from ..checks import OnNan, parse_on_nan, scan_population
 from ..population import Population
+from ..prepare import prepare as prepared
 from ..steps import Step, parse_steps
 from .csv_folder import csv_files, read_csv_folder
 from .csv_mapping import CsvMapping
@@ -38,25 +39,25 @@ def detect_reader(source: Path | str) -> str | None:
     return "csv" if any(True for _ in csv_files(source)) else None
 
 
-def open_population(
-    reader: str | None,
+def read(
     source: Path | str,
-    *,
-    csv: CsvMapping | Mapping[str, Any] | Path | str | None = None,
+    reader: str | None = None,
+    mapping: CsvMapping | Mapping[str, Any] | Path | str | None = None,
     prepare: Iterable[Step | Mapping[str, Any]] = (),
+    *,
     on_nan: str = "error",
 ) -> Population:
     """Open a folder of recordings; episodes are read on demand.
 
     Parameters
     ----------
+    source : Path
     reader : str, optional
         ``motor-drive-raw``, ``parquet`` or ``csv``; None: the one that fits.
-    source : Path
-    csv : CsvMapping, mapping or Path, optional
-        Mapping for the reader ``csv``: a TOML file or the table ``[data.csv]``.
+    mapping : CsvMapping, mapping or Path, optional
+        How CSV files map to a population: a TOML file or the table ``[data.csv]``.
     prepare : iterable of Step or mapping
-        Further steps, as in ``[[data.prepare]]``.
+        Further steps, as in ``[[data.prepare]]``, after those of the mapping.
     on_nan : {"error", "drop_episode"}
         With ``drop_episode`` every episode is read once here, and those with NaN or infinity are left out and logged. To save that pass
         keep ``error`` here and give the option to `write_parquet`.
@@ -75,18 +76,21 @@ def open_population(
     steps, policy = parse_steps(prepare), parse_on_nan(on_nan)
     if reader is not None and reader not in READERS:
         raise ConfigError(f"data.reader should be one of {', '.join(READERS)}, found {reader!r}; correct it.")
-    chosen = _fitting(reader, Path(source), csv is not None)
+    chosen = _fitting(reader, Path(source), mapping is not None)
     if chosen == "csv":
-        if csv is None:
-            raise ConfigError(f"Reading {source} as csv needs a mapping of columns; give --mapping FILE or the table [data.csv].")
-        population = read_csv_folder(source, csv, steps)
-    elif csv is not None:
+        if mapping is None:
+            raise ConfigError(
+                f"Reading {source} as csv needs a mapping of columns; give mapping=, --mapping FILE or the table [data.csv] (kros init writes one)."
+            )
+        population = read_csv_folder(source, mapping)
+    elif mapping is not None:
         raise ConfigError(
             f"Reading {source} as {chosen}: a CSV mapping is given, which only the reader 'csv' uses; remove it or set "
             'data.reader = "csv".'
         )
     else:
-        population = read_parquet(source, steps) if chosen == "parquet" else read_motor_drive_raw(source, steps)
+        population = read_parquet(source) if chosen == "parquet" else read_motor_drive_raw(source)
+    population = prepared(population, steps)
     return population if policy is OnNan.ERROR else scan_population(population, on_nan=policy)
 
 

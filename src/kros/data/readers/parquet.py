@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,25 +17,23 @@ from ...core.files import require_regular, shortened
 from ..arrow import fill
 from ..checks import check_period
 from ..population import Channel, EpisodeKey, Population, Role, Unit
-from ..prepare import Recorded, assemble
-from ..recording import Recording, look_up
-from ..steps import Step
+from ..prepare import assemble
+from ..recording import Recording, Recordings
 
 INDEX = "population"  # kind of the artifact, hence population.json
 KEYS = ("unit", "condition", "episode")
 
 
 @dataclass(frozen=True, eq=False)
-class ParquetRecordings:
-    """Reads one row group at a time."""
+class ParquetRecordings(Recordings):
+    """Reads one row group at a time; a place is a file, its row group and the number of samples."""
 
     folder: str
-    places: Mapping[EpisodeKey, tuple[str, int, int]]  # file, row group, samples
     columns: tuple[str, ...]
 
-    def __call__(self, key: EpisodeKey) -> Recording:
+    def read(self, key: EpisodeKey, place: tuple[str, int, int]) -> Recording:
         """Return one episode."""
-        name, group, samples = look_up(self.places, key)
+        name, group, samples = place
         path = Path(self.folder) / name
         require_regular(path, sys.maxsize)
         try:
@@ -51,10 +49,6 @@ class ParquetRecordings:
         except (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError, MemoryError) as error:  # and Arrow's own
             raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; convert the recordings again.") from error
         return Recording(key, values)
-
-    def restricted(self, keys: Iterable[EpisodeKey]) -> ParquetRecordings:
-        """Return the same for fewer episodes, cheaper to send to another process."""
-        return replace(self, places={key: self.places[key] for key in keys})
 
 
 def _read_group(path: Path, group: int, samples: int, columns: list[str]) -> Any:
@@ -88,14 +82,13 @@ def _check_label(column: Any, name: str, expected: str, path: Path) -> None:
         )
 
 
-def read_parquet(folder: Path | str, prepare: Iterable[Step] = ()) -> Population:
+def read_parquet(folder: Path | str) -> Population:
     """Read a population that `write_parquet` wrote.
 
     Parameters
     ----------
     folder : Path
         Holds `population.json`.
-    prepare : iterable of Step
 
     Returns
     -------
@@ -112,10 +105,8 @@ def read_parquet(folder: Path | str, prepare: Iterable[Step] = ()) -> Population
         channels = tuple(Channel(c["name"], Role(c["role"]), _text(c["unit"]), c["measured"] is True) for c in content["channels"])
         units = [Unit(_text(u["id"]), _text(u["group"]), dict(u["metadata"])) for u in content["units"]]
         places = _places(content["groups"])
-        period, metadata = (
-            check_period(content["sample_period_s"], f"Reading {Path(folder) / 'population.json'}"),
-            dict(content["metadata"]),
-        )
+        period = check_period(content["sample_period_s"], f"Reading {Path(folder) / 'population.json'}")
+        metadata = dict(content["metadata"])
     except DataError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError) as error:
@@ -125,8 +116,7 @@ def read_parquet(folder: Path | str, prepare: Iterable[Step] = ()) -> Population
     missing = sorted({name for name, _, _ in places.values() if not (Path(folder) / name).is_file()})
     if missing:
         raise DataError(f"Reading {folder}: {len(missing)} files are missing, the first {missing[0]}; convert the recordings again.")
-    recordings = ParquetRecordings(str(folder), places, tuple(c.name for c in channels))
-    return assemble(Recorded(channels, units, list(places), recordings, period, metadata), prepare)
+    return assemble(ParquetRecordings(places, str(folder), tuple(c.name for c in channels)), channels, units, period, metadata)
 
 
 def _places(groups: Iterable[Mapping[str, Any]]) -> dict[EpisodeKey, tuple[str, int, int]]:

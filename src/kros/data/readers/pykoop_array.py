@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError
-from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit
-from .arrays import as_numbers, from_arrays
+from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Unit
+from .arrays import as_numbers, declare_channels, from_arrays
 
 log = logging.getLogger(__name__)
 _EXACT = 2.0**53
@@ -74,7 +74,8 @@ def from_pykoop(
             f"from_pykoop: needs arrays (n_samples, {int(episode_feature)} + states + {n_inputs}) of one width, found "
             f"{shapes[:5]}; check n_inputs."
         )
-    named = tuple(channels) if channels is not None else _default_channels(n_columns - n_inputs, n_inputs)
+    states, inputs = ([f"{letter}{i}" for i in range(count)] for letter, count in (("x", n_columns - n_inputs), ("u", n_inputs)))
+    named = channels if channels is not None else declare_channels(None, states, inputs, states, "from_pykoop")
     episodes = {EpisodeKey(u, condition, name): part for u, x in arrays.items() for name, part in _split(u, x, episode_feature)}
     return from_arrays(episodes, named, sample_period_s, units=units, metadata=metadata)
 
@@ -106,11 +107,6 @@ def to_pykoop(population: Population, unit: str | None = None, condition: str | 
         )
     parts = [population.read(key) for key in keys]
     return np.concatenate([np.column_stack([np.full(len(part), float(i)), part]) for i, part in enumerate(parts)])
-
-
-def _default_channels(n_states: int, n_inputs: int) -> tuple[Channel, ...]:
-    states = (Channel(f"x{i}", Role.STATE, measured=True) for i in range(n_states))
-    return (*states, *(Channel(f"u{i}", Role.INPUT) for i in range(n_inputs)))
 
 
 def _split(unit: str, x: npt.NDArray[Any], episode_feature: bool) -> Iterable[tuple[str, npt.NDArray[np.float64]]]:

@@ -7,10 +7,9 @@ from typing import Any
 
 from ...core.files import read_toml
 from ...core.work import Progress
-from ...data import Population, check_population, open_population, read_parquet, write_group, write_index
-from ...data.folders import whole_folder
+from ...data import Population, check_population, read, read_parquet, write_group, write_index
 from ...data.readers import detect_reader
-from ...data.writers import GroupRecord
+from ...data.writers import GroupRecord, whole_folder
 from ..engine.executors import open_executor
 
 Task = tuple[Population, str, str, Path]
@@ -31,7 +30,7 @@ def convert_recordings(source: Path, out: Path, reader: str | None, mapping: Pat
     """Convert recordings; the output folder appears whole or not at all."""
     csv = read_mapping(mapping) if mapping is not None else None
     chosen = reader or ("csv" if csv is not None else detect_reader(source))
-    population = open_population(chosen, source, csv=csv)
+    population = read(source, chosen, mapping=csv)
     check_population(population, allow_single=True)
     groups = [(u, c) for u, c, _ in population.groups()]
     progress.start("convert", len(groups))

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...core.errors import ConfigError, DataError, IdentificationError
 from ...core.files import read_toml
-from ...data import EpisodeBatch, Population, open_population, split_episodes
+from ...data import EpisodeBatch, Population, read, split_episodes
 from ...data.population import EpisodeKey
 from ...identify import PhaseCalibration
 from ...observer import Observer, run_observer
@@ -33,7 +33,7 @@ def open_data(config: StudyConfig, data: Path) -> Population:
         section = validate_config({"data": raw.get("data", {})}, data.parent, str(data)).data
     else:
         section = section.model_copy(update={"source": data})
-    return open_population(section.reader, section.source, prepare=section.prepare, csv=section.csv)
+    return read(section.source, section.reader, prepare=section.prepare, mapping=section.csv)
 
 
 def check_channels(population: Population, observer: Observer) -> None:

@@ -15,7 +15,7 @@ from ...data import (
     EpisodeKey,
     Population,
     check_population,
-    open_population,
+    read,
     read_parquet,
     split_episodes,
     write_group,
@@ -61,7 +61,7 @@ class GroupFacts:
 def open_source(config: StudyConfig) -> Population:
     """Open the study's recordings, lazily, without the units that are excluded."""
     data = config.data
-    population = open_population(data.reader, data.source, prepare=data.prepare, csv=data.csv)
+    population = read(data.source, data.reader, prepare=data.prepare, mapping=data.csv)
     unknown = [unit for unit in data.exclude if unit not in population.unit_ids]
     if unknown:
         raise ConfigError(f"data.exclude: the recordings have no unit {', '.join(unknown)}, only {', '.join(population.unit_ids)}.")

@@ -1,28 +1,18 @@
-"""Preparation as declared steps: small frozen objects, applied to each episode in the order given.
-
-Each step tells what it does to the channels and the sampling period (`channels_after`, `period_after`), so that a population
-can be described before anything is read, and does it to one recording at a time (`apply`). No step changes its argument.
-In TOML a step is a table with its name under `step`: ``[[data.prepare]] step = "trim" start = 1000``.
-"""
+"""Preparation steps that scale, shift and cut."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from ..core.errors import ConfigError, DataError
-from .checks import check_finite
-from .population import Channel
-from .recording import Recording, title
-from .resampling import Differentiate, Resample
+from ...core.errors import ConfigError, DataError
+from ..checks import check_finite
+from ..population import Channel
+from ..recording import Recording, title
 from .step import Step
-from .tables import build
-
-__all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim", "parse_steps"]
 
 
 @dataclass(frozen=True)
@@ -140,31 +130,3 @@ class Trim(Step):
             )
         keep = slice(self.start, stop)
         return replace(recording, values=recording.values[keep], time_s=None if recording.time_s is None else recording.time_s[keep])
-
-
-STEPS: dict[str, type[Step]] = {kind.step: kind for kind in (Scale, Shift, Offset, Trim, Resample, Differentiate)}
-
-
-def parse_steps(tables: Iterable[Step | Mapping[str, Any]], where: str = "data.prepare") -> tuple[Step, ...]:
-    """Return steps from TOML tables (steps pass through).
-
-    Parameters
-    ----------
-    tables : iterable of mapping or Step
-        For example ``[{"step": "trim", "start": 1000}]``.
-    where : str
-        What the messages call the list.
-
-    Raises
-    ------
-    ConfigError
-        An unknown step or key, a missing key, or a value of the wrong type.
-    """
-    return tuple(table if isinstance(table, Step) else _parse_step(table, f"{where}[{i}]") for i, table in enumerate(tables))
-
-
-def _parse_step(table: Mapping[str, Any], where: str) -> Step:
-    name = table.get("step") if isinstance(table, Mapping) else None
-    if not isinstance(name, str) or name not in STEPS:
-        raise ConfigError(f"{where}: step should be one of {list(STEPS)}, found {name!r}; correct it.")
-    return build(STEPS[name], {key: value for key, value in table.items() if key != "step"}, f"{where} (step {name!r})")

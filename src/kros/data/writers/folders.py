@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ..core.errors import DataError
-from ..core.locks import locked
+from ...core.errors import DataError
+from ...core.locks import locked
 
 
 @contextmanager

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError
-from .arrow import from_numpy
+from ...core.errors import DataError
+from ..arrow import from_numpy
+from ..population import OUTLIERS, EpisodeKey, Population
+from ..readers.motor_drive_raw import CHANNELS, MOTOR_DEG_TO_RAD, PERCENT, TARGET_LAG
 from .folders import whole_folder
-from .population import OUTLIERS, EpisodeKey, Population
-from .readers.motor_drive_raw import CHANNELS, MOTOR_DEG_TO_RAD, PERCENT, TARGET_LAG
-from .writers import Progress
+from .parquet import Progress
 
 HEADER = b"time_s,position_deg,velocity_deg_per_s,torque_percent,target_position_deg,target_velocity_deg_per_s\n"
 DECIMALS = (6, 6, 5, 4, 6, 5)  # time, position, velocity, torque, target position, target velocity

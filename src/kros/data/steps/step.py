@@ -6,16 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ..core.errors import ConfigError
-from .population import Channel
-from .recording import Recording
+from ...core.errors import ConfigError
+from ..population import Channel
+from ..recording import Recording
 
 
 @dataclass(frozen=True)
 class Step:
-    """Base of all steps; `step` is the word that selects one in TOML."""
+    """Base of all steps; `step` is the word that selects one in TOML, `makes_even` says that recordings of uneven time may enter."""
 
     step: ClassVar[str] = ""
+    makes_even: ClassVar[bool] = False
 
     def channels_after(self, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
         """Return the channels as this step leaves them."""

@@ -21,14 +21,14 @@ from urllib.parse import quote
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import save_artifact
-from ..core.errors import DataError
-from .arrow import from_numpy, repeated
-from .checks import OnNan, RestWatch, check_structure, parse_on_nan, read_or_drop
-from .copies import Print, print_of, refuse_copies
+from ...core.artifacts import save_artifact
+from ...core.errors import DataError
+from ..arrow import from_numpy, repeated
+from ..checks import OnNan, RestWatch, check_structure, parse_on_nan, read_or_drop
+from ..copies import Print, print_of, refuse_copies
+from ..population import EpisodeKey, Population
+from ..readers.parquet import INDEX, KEYS
 from .folders import whole_folder
-from .population import EpisodeKey, Population
-from .readers.parquet import INDEX, KEYS
 
 logger = logging.getLogger(__name__)
 

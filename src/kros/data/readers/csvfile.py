@@ -15,10 +15,10 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core import limits
-from ..core.errors import DataError
-from ..core.files import require_regular, shortened
-from .arrow import fill
+from ...core import limits
+from ...core.errors import DataError
+from ...core.files import require_regular, shortened
+from ..arrow import fill
 
 BLOCK = 1 << 22  # bytes that Arrow parses at once; a line has to fit into two
 

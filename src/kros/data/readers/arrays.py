@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from ..prepare import assemble
 from ..recording import Recording, Recordings, title
 
 
+@dataclass(frozen=True, eq=False)
 class ArrayRecordings(Recordings):
     """Episodes held in memory, with their times or None, columns in the order of the channels; the arrays are made read-only."""
 

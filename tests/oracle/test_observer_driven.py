@@ -98,7 +98,7 @@ def test_a_memory_that_recordings_would_drive_away_is_turned_until_they_do_not()
         A[1:, 1:], A[:, 0] = F, rng.normal(size=5)
         plain = Lifting(("p", "c", "memory_1", "memory_2", "memory_3"))
         start = Observer.open_loop("o", plain, A, rng.normal(size=(5, 1)), (0,), ("u",), DT)
-        observer = replace(start, controller=replace(start.controller, D=A[:, :1]))
+        observer = replace(start, controller=replace(start.controller, D=A[:, :1]), replaces=True, internal=3)
         assert observer.recorded == ("p", "c")
         found = driven_coordinates(observer, 0.1 * rng.normal(size=(200, 2, 2)), rng.normal(size=(200, 2, 1)), SIZES)
         assert np.abs(np.linalg.eigvals(found.A[2:, 2:])).max() < 1

@@ -142,8 +142,7 @@ def test_first_estimate_at_rest_is_the_same():
     A = np.array([[0.2, 0.3, 0.1, 0.4], [0.1, 0.8, 0.05, 0.3], [0.2, 0.1, 0.7, -0.5], [0.0, 0.0, 0.0, 0.0]])
     lifting = Lifting(("x", "v", "w"), ("sin(x)",))
     D = A[:, [0]]
-    one = Observer("m", lifting, A, np.ones((4, 1)), (0,), ("u",), gain(D, DT), Injection.STATE, DT)
-    assert one.replaces
+    one = Observer("m", lifting, A, np.ones((4, 1)), (0,), ("u",), gain(D, DT), Injection.STATE, DT, replaces=True)
     y, sizes = np.array([[0.7]]), {"x": 1e-9, "v": 1e9, "w": 1e-9}
     np.testing.assert_allclose(in_sizes(one, sizes).initial(y / 1e-9) * [1e-9, 1e9, 1e-9], one.initial(y), rtol=1e-9)
 

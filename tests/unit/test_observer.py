@@ -66,6 +66,21 @@ def test_reset_starts_again():
     np.testing.assert_array_equal(running.step([0.4], [1.0, 2.0]), first)
 
 
+def test_estimates_have_names_and_are_arrays():
+    o = observer()
+    running = o.start([0.5], phase=1.2)
+    estimate = running.step([0.4], [1.0, 2.0])
+    assert running.states == ("position", "velocity", "current") == tuple(estimate)
+    assert [estimate[name] for name in running.states] == np.asarray(estimate).tolist() == list(estimate.values())
+    assert np.asarray(estimate, dtype=np.float32).dtype == np.float32
+    assert repr(estimate).startswith("Estimate(position=")
+    assert repr(o).startswith("<Observer koopman/test: position, velocity, current")
+    np.testing.assert_array_equal(estimate, o.start([0.5], {"phase": 1.2}).step([0.4], [1.0, 2.0]))
+    np.asarray(estimate)[:] = 0.0  # what is done to it leaves the observer alone
+    running.step([0.4], [1.0, 2.0])
+    assert np.asarray(running.estimate).all()
+
+
 @pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
 @pytest.mark.parametrize("order", [0, 2])
 def test_the_file_holds_everything(tmp_path, injection, order):

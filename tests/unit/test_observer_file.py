@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kros.core.errors import DataError
-from kros.core.lti import StateSpace
+from kros.core.errors import DataError, DimensionError
+from kros.core.lti import StateSpace, gain
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime
 from kros.synthesis.result import Injection
@@ -118,7 +118,7 @@ def test_a_changed_file_does_not_fit_its_checksum(tmp_path: Path, change: Callab
         (put("runtim", {}), "unknown key 'runtim'"),
         (put("name", ""), "name should be text"),
         (put("kind", "model"), "not an observer file"),
-        (put("schema", 2), "not an observer file"),
+        (put("schema", 3), "not an observer file"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, change: Callable[[Any], None], found: str) -> None:
@@ -130,3 +130,29 @@ def test_an_observer_that_nobody_could_read_is_not_written(tmp_path: Path) -> No
     with pytest.raises(DataError, match=r"model\.A\[0\]\[0\] should be a finite number"):
         observer(A=np.diag([np.nan, 0.8, 0.1])).save(tmp_path / "o.json")
     assert not (tmp_path / "o.json").exists()
+
+
+def predictor(**changes: Any) -> Observer:
+    """Measurements replace the estimate of the position; the last state is the observer's own."""
+    lifting, A = Lifting(("position", "memory_1"), ("sin(position)",)), np.array([[0.9, 0.1, 0.0], [0.2, 0.5, 0.3], [0.0, 0.0, 0.0]])
+    kinds = {"replaces": True, "internal": 1} | changes
+    return Observer("p", lifting, A, np.ones((3, 1)), (0,), ("torque",), gain(A[:, :1], 0.01), Injection.STATE, 0.01, **kinds)
+
+
+def test_files_of_the_first_schema_tell_their_kind_by_matrices_and_names(tmp_path: Path) -> None:
+    for o, replaces, internal in ((observer(), False, 0), (predictor(), True, 1)):
+        o.save(tmp_path / "o.json")
+        again = Observer.load(tmp_path / "o.json")
+        assert (again.replaces, again.internal) == (o.replaces, o.internal) == (replaces, internal)
+        content = json.loads((tmp_path / "o.json").read_text())
+        first = {k: v for k, v in content.items() if k not in ("checksum", "measurement_replaces_estimate", "internal_states")}
+        (tmp_path / "first.json").write_text(json.dumps(first | {"schema": 1}))
+        old = Observer.load(tmp_path / "first.json")
+        assert (old.replaces, old.internal, old.recorded) == (replaces, internal, o.recorded)
+
+
+def test_a_kind_that_the_matrices_do_not_have_is_refused() -> None:
+    with pytest.raises(DimensionError, match="where measurements replace estimates"):
+        observer(replaces=True)
+    with pytest.raises(DimensionError, match="2 internal states"):
+        predictor(internal=2)

@@ -29,7 +29,8 @@ from ..observer import (
     rates,
     start_covariance,
 )
-from ..observer.screen import Screen, started_anew
+from ..observer.baselines.restarts import restarted
+from ..observer.screen import Screen
 from .gains import EQUAL, RESIDUAL
 from .validation import TuningSet, rank
 
@@ -85,14 +86,14 @@ class Baseline:
         found: Array | None = None
         for name, rows in pieces.items():
             own = {k: v[rows] for k, v in parameters.items()}
-            (part,) = started_anew(partial(self._piece, self.by_unit[name]), samples.of(rows), own)
+            part = restarted(partial(self._piece, self.by_unit[name]), samples.of(rows), own)
             found = np.empty((*y.shape[:2], part.shape[-1])) if found is None else found
             found[:, rows] = part
         assert found is not None
         return found
 
-    def _piece(self, estimator: Estimator, y: Array, u: Array, parameters: Parameters) -> tuple[Array]:
-        return (estimator.run(y if self.bears_missing else hold_missing(y), u, parameters),)
+    def _piece(self, estimator: Estimator, y: Array, u: Array, parameters: Parameters) -> Array:
+        return estimator.run(y if self.bears_missing else hold_missing(y), u, parameters)
 
 
 def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) -> Baseline:

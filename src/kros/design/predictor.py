@@ -48,7 +48,14 @@ def make_memory(task: Task) -> Made:
             "lifted functions that say nearly the same as the measurement do that, take them out of the lifting."
         )
     solve_s = time.perf_counter() - began
-    model: dict[str, Any] = {"A": kept.A, "B": kept.B, "lifting": kept.lifting, "reason": _REASON}
+    model: dict[str, Any] = {
+        "A": kept.A,
+        "B": kept.B,
+        "lifting": kept.lifting,
+        "reason": _REASON,
+        "replaces": kept.replaces,
+        "internal": kept.internal,
+    }
     made = OwnModel("memory", kept.controller, Status.CERTIFIED, kept.injection, solve_s=solve_s, **model)
     return made, {"memory_states": task.memory.states, **facts}, task.problem
 

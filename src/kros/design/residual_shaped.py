@@ -34,6 +34,8 @@ class OwnModel(Synthesis):
     B : ndarray, shape (n_lifted, m)
     lifting : Lifting, optional
         Where it is not that of the nominal model.
+    replaces, internal
+        As in `Observer`.
     reason : str
         Why there is no certificate for the uncertain set.
     """
@@ -41,6 +43,8 @@ class OwnModel(Synthesis):
     A: Array | None = None
     B: Array | None = None
     lifting: Lifting | None = None
+    replaces: bool = False
+    internal: int = 0
     reason: str = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
 
 

@@ -70,6 +70,8 @@ class Task:
             sample_period_s=models.sample_period_s,
             parameters={name: float(values[row]) for name, values in models.parameters.items()},
             seen=self.tuning.seen,
+            replaces=own is not None and own.replaces,
+            internal=0 if own is None else own.internal,
         )
 
     @property

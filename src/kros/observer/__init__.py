@@ -14,9 +14,11 @@ from .predictor import Past, observer_with_memory, remembering_observer, tune_me
 from .predictor.driven import driven_coordinates, refit_measured_rows, with_memory
 from .residual.models import ResidualModel, one_step_rows, residual_models
 from .residual.one_step import mean_error_dynamics, one_step_residual, residual_spectra
-from .runtime import Estimate, Runtime
-from .screen import SampleStatus, Seen, sample_status
-from .simulate import run_observer, run_observers
+from .running import Estimate, RunningObserver
+from .runtime import Runtime, Seen
+from .samples import SampleStatus
+from .screen import sample_status
+from .simulate import EstimateKind, run_observer, run_observers
 from .tracking import Tracked, track_parameter
 from .tune import Tuned, tune_observer
 from .units import in_sizes
@@ -25,6 +27,7 @@ __all__ = [
     "Attack",
     "Dropped",
     "Estimate",
+    "EstimateKind",
     "ExtendedKalman",
     "Features",
     "FilteredDifference",
@@ -37,6 +40,7 @@ __all__ = [
     "ReliftScales",
     "ReliftStatus",
     "ResidualModel",
+    "RunningObserver",
     "Runtime",
     "SampleStatus",
     "Seen",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +23,16 @@ from ..core.loading import as_written
 from ..core.lti import StateSpace
 from ..lifting import Lifting
 from ..synthesis.result import Injection
-from .observer import Observer
-from .runtime import Runtime
-from .screen import Seen
+from .data import ObserverData, measurement_replaces
+from .runtime import Runtime, Seen
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
-SCHEMA, KIND = 1, "observer"
+SCHEMA, KIND = 2, "observer"
+_FIRST = 1  # schema of kros 0.1: matrices and names of states said what `replaces` and `internal` say
 
 
-def observer_content(observer: Observer) -> dict[str, Any]:
+def observer_content(observer: ObserverData) -> dict[str, Any]:
     """Return what the file of an observer holds, without its checksum."""
     lifting = observer.lifting
     content = {
@@ -50,19 +51,21 @@ def observer_content(observer: Observer) -> dict[str, Any]:
         "controller": {key: getattr(observer.controller, key) for key in "ABCD"},
         **observer.runtime.content(),
         **({} if observer.seen is None else {"seen": {"measured": observer.seen.measured, "inputs": observer.seen.inputs}}),
+        "measurement_replaces_estimate": observer.replaces,
+        "internal_states": observer.internal,
     }
     found: dict[str, Any] = plain(content)
     return found
 
 
-def write_observer(observer: Observer, path: Path) -> None:
+def write_observer(observer: ObserverData, path: Path) -> None:
     """Write an observer; one that could not be read again is refused."""
     content = observer_content(observer)
     observer_from(content, f"Writing observer {observer.name} to {path}")
     write_json(path, with_checksum(content))
 
 
-def read_observer(path: Path) -> Observer:
+def read_observer(path: Path) -> ObserverData:
     """Read an observer's file.
 
     Raises
@@ -71,8 +74,10 @@ def read_observer(path: Path) -> Observer:
         See `Observer.load`.
     """
     content = read_json(path)
-    if not isinstance(content, dict) or (content.get("schema"), content.get("kind")) != (SCHEMA, KIND):
-        raise DataError(f"Loading an observer from {path}: not an observer file of schema 1; write it again with this version of kros.")
+    if not isinstance(content, dict) or content.get("kind") != KIND or content.get("schema") not in (_FIRST, SCHEMA):
+        raise DataError(
+            f"Loading an observer from {path}: not an observer file of schema {_FIRST} or {SCHEMA}; write it again with this version of kros."
+        )
     if not check_checksum(content, path):
         log.warning("The observer of %s carries no checksum: it was edited, or written by an earlier version of kros.", path)
     try:
@@ -84,7 +89,7 @@ def read_observer(path: Path) -> Observer:
         raise DataError(f"Loading an observer from {path}: {error}") from error
 
 
-def observer_from(content: Mapping[str, Any], where: str) -> Observer:
+def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
     """Make an observer from the content of a file.
 
     Parameters
@@ -117,7 +122,7 @@ def observer_from(content: Mapping[str, Any], where: str) -> Observer:
     _known(controller, shapes, f"{where}: controller")
     _known(content["model"], "AB", f"{where}: model")
     A, B, C, D = (matrix(controller[key], shapes[key], f"{where}: controller.{key}") for key in "ABCD")
-    observer = Observer(
+    observer = ObserverData(
         content["name"],
         lifting,
         matrix(content["model"]["A"], (n, n), f"{where}: model.A"),
@@ -132,7 +137,20 @@ def observer_from(content: Mapping[str, Any], where: str) -> Observer:
         _seen(content.get("seen"), q, len(content["inputs"]), where),
     )
     _known(content, [*observer_content(observer), "runtime", "lifting_inputs", "input_functions", CHECKSUM], where)
-    return observer
+    if content["schema"] == _FIRST:
+        return replace(observer, replaces=measurement_replaces(observer), internal=_named_memories(lifting.states))
+    replaces, internal = content["measurement_replaces_estimate"], content["internal_states"]
+    if type(replaces) is not bool or type(internal) is not int:
+        raise DataError(
+            f"{where}: measurement_replaces_estimate should be true or false and internal_states a number, found {shortened(repr((replaces, internal)), 60)}; "
+            "correct the file."
+        )
+    return replace(observer, replaces=replaces, internal=internal)
+
+
+def _named_memories(states: Sequence[str]) -> int:
+    """The number of states ``memory_1, ...`` at the end, which schema 1 knew by their names."""
+    return next((k for k in range(len(states), 0, -1) if tuple(states[-k:]) == tuple(f"memory_{i + 1}" for i in range(k))), 0)
 
 
 def matrix(rows: Any, shape: tuple[int, int], where: str) -> Array:

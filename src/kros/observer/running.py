@@ -5,16 +5,42 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
-from .careful import innovation, next_estimate
-from .observer import Observer
-from .screen import LONGEST, Held, SampleStatus, Screen
+from .data import ObserverData
+from .samples import LONGEST, Held, SampleStatus, Screened
+from .screen import Screen
+from .step import Steps
 
 Array = npt.NDArray[np.float64]
+
+
+class Estimate(Mapping[str, float]):
+    """Estimated states by name; ``np.asarray(estimate)`` has shape (n,)."""
+
+    __slots__ = ("_array", "_places")
+
+    def __init__(self, places: Mapping[str, int], array: Array) -> None:
+        self._places, self._array = places, array
+
+    def __getitem__(self, name: str) -> float:
+        return float(self._array[self._places[name]])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        return np.array(self._array, dtype=dtype, copy=copy)
+
+    def __repr__(self) -> str:
+        return f"Estimate({', '.join(f'{name}={self[name]:g}' for name in self)})"
 
 
 class RunningObserver:
@@ -22,18 +48,26 @@ class RunningObserver:
 
     Parameters
     ----------
-    observer : Observer
+    observer : ObserverData
     y : ndarray, shape (q,)
         First measurement.
     parameters : mapping of str to float
         The machine's own lifting parameters; they may be changed between steps.
     """
 
-    def __init__(self, observer: Observer, y: npt.ArrayLike, parameters: Mapping[str, float]) -> None:
+    def __init__(self, observer: ObserverData, y: npt.ArrayLike, parameters: Mapping[str, float]) -> None:
         self.observer = observer
-        self.parameters = parameters
         self._screen = Screen.of(observer)
+        self._steps, self._ahead = Steps([observer], 1, {}), Steps([observer], 1, {})
+        self._places = {name: i for i, name in enumerate(observer.lifting.states)}
+        self._unknown = np.ones((1, len(observer.measured)), dtype=bool)
+        self.parameters = parameters
         self.reset(y)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the estimated states, in order."""
+        return self.observer.lifting.states
 
     @property
     def parameters(self) -> MutableMapping[str, float]:
@@ -43,7 +77,7 @@ class RunningObserver:
     @parameters.setter
     def parameters(self, values: Mapping[str, float]) -> None:
         """Change all of them."""
-        self._parameters = _Checked(self.observer, values)
+        self._parameters = self._steps.values = self._ahead.values = _Checked(self.observer, values)
 
     @property
     def status(self) -> SampleStatus:
@@ -52,25 +86,22 @@ class RunningObserver:
 
     def reset(self, y: npt.ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
-        m = len(self.observer.inputs)
-        first = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, m)))
-        self._status, self._held = SampleStatus(int(first.status[0, 0])), Held.nothing(1, m)
+        first = self._judge(self._measurement(y), np.zeros(len(self.observer.inputs)))
+        self._status, self._held = SampleStatus(int(first.status[0, 0])), Held.nothing(1, len(self.observer.inputs))
         self._fresh = bool(np.isfinite(first.y).any())
-        self._begin(first.y[0, 0])
+        self._begin(first.y[0])
 
     def _begin(self, y: Array) -> None:
-        self._x = self.observer.initial(y, self.parameters)
-        self._x_c = np.zeros(self.observer.controller.n_states)
-        self._earlier: Array | None = None
+        self._steps.begin(y)
         self._inputs: deque[Array] = deque()
 
     @property
-    def estimate(self) -> Array:
-        """One-step prediction: the state at k from what arrived up to k - 1, shape (n,)."""
-        return self._forward(self._x)
+    def estimate(self) -> Estimate:
+        """One-step prediction: the state at k from what arrived up to k - 1."""
+        return self._forward(self._steps.x[0, 0])
 
-    def filter(self, y: npt.ArrayLike) -> Array:
-        """Return the estimate of the state at k from what arrived up to k, shape (n,); nothing moves on.
+    def filter(self, y: npt.ArrayLike) -> Estimate:
+        """Return the estimate of the state at k from what arrived up to k; nothing moves on.
 
         Parameters
         ----------
@@ -80,11 +111,10 @@ class RunningObserver:
         o = self.observer
         if len(self._inputs) < o.runtime.delay:
             return self.estimate
-        taken = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, len(o.inputs)))).y[0, 0]
-        nu = innovation(o, self._x, taken)
-        return self._forward(o.runtime.clip_estimate(self._x + o.filter_gain @ nu))
+        nu = self._steps.innovation(self._judge(self._measurement(y), np.zeros(len(o.inputs))).y[0])[0, 0]
+        return self._forward(o.runtime.clip_estimate(self._steps.x[0, 0] + o.filter_gain @ nu))
 
-    def step(self, y: npt.ArrayLike, u: npt.ArrayLike) -> Array:
+    def step(self, y: npt.ArrayLike, u: npt.ArrayLike) -> Estimate:
         """Take what arrives and the input at k, return the estimate for k + 1.
 
         Parameters
@@ -96,73 +126,67 @@ class RunningObserver:
 
         Returns
         -------
-        ndarray, shape (n,)
+        Estimate
+            By name, ``estimate["velocity"]``, or as an array, ``np.asarray(estimate)``.
 
         Raises
         ------
         DimensionError
             When there are not as many measurements or inputs as the observer has.
         """
-        o, K = self.observer, self.observer.controller
-        y, u = self._take(self._measurement(y), self._input(u))
-        self._inputs.append(u)
-        if len(self._inputs) > o.runtime.delay:
-            held = self._inputs.popleft()
-            nu = innovation(o, self._x, y)
-            window, correction = np.concatenate([self._x, self._before(held)]), K.C @ self._x_c + K.D @ nu
-            self._x = next_estimate(o, window, held, correction, self.parameters)
-            self._x_c = K.A @ self._x_c + K.B @ nu
-            self._earlier = o.lifting.window.advance(window, held)
-            if o.runtime.binds(self._x, correction):
+        measurement, known = self._take(self._measurement(y), self._input(u))
+        self._inputs.append(known)
+        if len(self._inputs) > self.observer.runtime.delay:
+            missing, steps = ~np.isfinite(measurement), self._steps
+            steps.step(measurement, self._inputs.popleft(), missing if missing.any() else None)
+            if steps.correction is not None and self.observer.runtime.binds(steps.x[0, 0], steps.correction):
                 self._status |= SampleStatus.LIMIT
         return self.estimate
 
+    def _judge(self, y: Array, u: Array, held: Held | None = None) -> Screened:
+        return self._screen.take(y[None, None], u[None, None], held)
+
     def _take(self, y: Array, u: Array) -> tuple[Array, Array]:
         """Judge a sample, and start anew where that is due; the first sample is the one that the observer started at."""
-        samples = self._screen.take(y[None, None], u[None, None], self._held)
+        samples = self._judge(y, u, self._held)
         self._status, self._held = SampleStatus(int(samples.status[0, 0])), samples.held
-        y, first = samples.y[0, 0], self._fresh
-        self._fresh = False
+        first, self._fresh = self._fresh, False
         if first and not (samples.held.since > LONGEST).any():
             self._held = replace(samples.held, stale=np.zeros(1, dtype=bool))
         elif samples.starts[0, 0]:
-            self._begin(y)
-        return y, samples.u[0, 0]
+            self._begin(samples.y[0])
+        return samples.y[0], samples.u[0]
 
     def _measurement(self, y: npt.ArrayLike) -> Array:
-        return self._shaped(
-            y, len(self.observer.measured), "measurements", [self.observer.lifting.states[i] for i in self.observer.measured]
-        )
+        return self._shaped(y, "measurements", [self.observer.lifting.states[i] for i in self.observer.measured])
 
     def _input(self, u: npt.ArrayLike) -> Array:
-        return self._shaped(u, len(self.observer.inputs), "inputs", self.observer.inputs)
+        return self._shaped(u, "inputs", self.observer.inputs)
 
-    def _shaped(self, values: npt.ArrayLike, count: int, what: str, names: Sequence[str]) -> Array:
+    def _shaped(self, values: npt.ArrayLike, what: str, names: Sequence[str]) -> Array:
         array = np.atleast_1d(np.asarray(values, dtype=float))
-        if array.shape != (count,):
+        if array.shape != (len(names),):
             raise DimensionError(
-                f"Running observer {self.observer.name}: expected the {count} {what} {', '.join(names)}, shape ({count},), found shape {array.shape}."
+                f"Running observer {self.observer.name}: expected the {len(names)} {what} {', '.join(names)}, shape ({len(names)},), "
+                f"found shape {array.shape}."
             )
         return array
 
-    def _before(self, u: Array) -> Array:
-        """Earlier values; at the start they equal the present ones."""
-        return self.observer.lifting.window.hold(self._x, u) if self._earlier is None else self._earlier
-
-    def _forward(self, x: Array) -> Array:
+    def _forward(self, x: Array) -> Estimate:
         """Predict through the model over the inputs that no measurement has met yet."""
-        if self._inputs:
-            earlier, nothing = self._before(self._inputs[0]), np.zeros(self.observer.controller.n_outputs)
+        if not self._inputs:
+            return Estimate(self._places, x.copy())
+        ahead = self._ahead
+        ahead.place(x[None], self._steps.earlier(self._inputs[0])[0])
         for u in self._inputs:
-            window = np.concatenate([x, earlier])
-            x, earlier = next_estimate(self.observer, window, u, nothing, self.parameters), self.observer.lifting.window.advance(window, u)
-        return x.copy()
+            ahead.step(np.zeros(self._unknown.shape), u, self._unknown)
+        return Estimate(self._places, ahead.x[0, 0].copy())
 
 
 class _Checked(MutableMapping[str, float]):
     """Parameters of one machine; what the lifting does not know, or cannot use, does not get in."""
 
-    def __init__(self, observer: Observer, values: Mapping[str, float]) -> None:
+    def __init__(self, observer: ObserverData, values: Mapping[str, float]) -> None:
         self._observer = observer
         self._values = observer.values(values, ())
 

@@ -1,10 +1,9 @@
-"""What an observer needs to know of the machine it runs on: how late measurements are, and what no estimate may exceed."""
+"""What an observer knows of the machine it runs on: the delay of measurements, limits, and the largest sizes seen in training."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -15,27 +14,46 @@ from ..core.errors import DataError, DimensionError
 Array = npt.NDArray[np.float64]
 
 
-class Estimate(str, Enum):
-    """Which estimate is wanted.
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The largest sizes seen in training.
 
-    PREDICT
-        Of the state at k from what arrived up to k - 1, as in the paper.
-    FILTER
-        Of the state at k from what arrived up to k.
+    Parameters
+    ----------
+    measured : ndarray, shape (q,)
+        Largest absolute value of every measurement; a channel that was always zero has no range.
+    inputs : ndarray, shape (m,)
+        Of every recorded input.
+
+    Raises
+    ------
+    DataError
+        When a size is negative or not finite.
     """
 
-    PREDICT = "predict"
-    FILTER = "filter"
+    measured: Array
+    inputs: Array
+
+    def __post_init__(self) -> None:
+        for name in ("measured", "inputs"):
+            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
+            object.__setattr__(self, name, values)
+            if values.ndim != 1 or not np.isfinite(values).all() or np.any(values < 0):
+                raise DataError(f"Sizes seen in training: {name} should be one finite size of at least 0 a channel, found {values}.")
+
+    def times(self, measured: Array, inputs: Array) -> Seen:
+        """Return the sizes in other units of measure, by the factors of measurements, shape (q,), and inputs, shape (m,)."""
+        return Seen(self.measured * measured, self.inputs * inputs)
 
 
 @dataclass(frozen=True, eq=False)
 class Runtime:
-    """Surroundings of a running observer.
+    """Delay and limits of a running observer.
 
     Parameters
     ----------
     delay : int
-        Samples by which measurements are late: what arrives at k was measured at ``k - delay``. The estimate is corrected as of then and
+        Samples by which measurements are delayed: what arrives at k was measured at ``k - delay``. The estimate is corrected as of then and
         predicted forward through the model.
     lower, upper : ndarray, shape (n,), optional
         Limits of the estimate, state by state.

@@ -20,80 +20,18 @@ does to an observer that watches tracking errors grows with every sample, and a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from enum import IntFlag
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError, DimensionError
-
-if TYPE_CHECKING:
-    from .observer import Observer
+from .data import ObserverData
+from .runtime import Seen
+from .samples import LONGEST, Bits, Flags, Held, SampleStatus, Screened, require_samples
 
 Array = npt.NDArray[np.float64]
-Bits = npt.NDArray[np.uint8]
-Whole = npt.NDArray[np.intp]
-Flags = npt.NDArray[np.bool_]
 BEYOND = 1.5  # times the range: what is further away is not believed
-LONGEST = 5  # samples for which an input may be held without a new start
 _ANY = np.finfo(float).max
-
-
-class SampleStatus(IntFlag):
-    """What was wrong with a sample; bits add up.
-
-    GOOD
-        Nothing.
-    MISSING
-        A measurement is missing or not finite. It corrected nothing.
-    INVALID_INPUT
-        An input is not finite. The last good value stood for it.
-    LIMIT
-        A sample is beyond its limit or 1.5 times its range, or the estimate or the correction met a limit that is declared.
-    UNCERTIFIED
-        Outside what the observer is certified for. Reserved: never set in this version.
-    """
-
-    GOOD = 0
-    MISSING = 1
-    INVALID_INPUT = 2
-    LIMIT = 4
-    UNCERTIFIED = 8
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """The largest sizes seen in training.
-
-    Parameters
-    ----------
-    measured : ndarray, shape (q,)
-        Largest absolute value of every measurement; a channel that was always zero has no range.
-    inputs : ndarray, shape (m,)
-        Of every recorded input.
-
-    Raises
-    ------
-    DataError
-        When a size is negative or not finite.
-    """
-
-    measured: Array
-    inputs: Array
-
-    def __post_init__(self) -> None:
-        for name in ("measured", "inputs"):
-            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            object.__setattr__(self, name, values)
-            if values.ndim != 1 or not np.isfinite(values).all() or np.any(values < 0):
-                raise DataError(f"Sizes seen in training: {name} should be one finite size of at least 0 a channel, found {values}.")
-
-    def times(self, measured: Array, inputs: Array) -> Seen:
-        """Return the sizes in other units of measure, by the factors of measurements, shape (q,), and inputs, shape (m,)."""
-        return Seen(self.measured * measured, self.inputs * inputs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,68 +74,19 @@ def _declared(count: int, lower: Array | None, upper: Array | None, seen: Array 
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
-    """What is remembered from sample to sample.
-
-    Parameters
-    ----------
-    inputs : ndarray, shape (batch, m)
-        Last good ones; zero before the first.
-    since : ndarray of int, shape (batch, m)
-        Samples since then.
-    stale : ndarray of bool, shape (batch,)
-        Whether the observer starts anew at the next sample with a measurement and all inputs.
-    """
-
-    inputs: Array
-    since: Whole
-    stale: Flags
-
-    @classmethod
-    def nothing(cls, batch: int, m: int) -> Held:
-        """Return what is known before the first sample."""
-        return cls(np.zeros((batch, m)), np.full((batch, m), LONGEST + 1), np.ones(batch, dtype=bool))
-
-
-@dataclass(frozen=True, eq=False)
-class Screened:
-    """Samples as an observer takes them.
-
-    Parameters
-    ----------
-    y : ndarray, shape (n_samples, batch, q)
-        NaN where a measurement corrects nothing.
-    u : ndarray, shape (n_samples, batch, m)
-        Finite.
-    status : ndarray of uint8, shape (n_samples, batch)
-        Bits of `SampleStatus`.
-    starts : ndarray of bool, shape (n_samples, batch)
-        Samples at which an observer starts anew.
-    held : Held
-        After the last sample.
-    """
-
-    y: Array
-    u: Array
-    status: Bits
-    starts: Flags
-    held: Held
-
-    def of(self, members: Sequence[int]) -> Screened:
-        """Return the samples of some members of the batch."""
-        held = Held(self.held.inputs[members], self.held.since[members], self.held.stale[members])
-        return Screened(self.y[:, members], self.u[:, members], self.status[:, members], self.starts[:, members], held)
-
-
-@dataclass(frozen=True, eq=False)
 class Screen:
     """Judges samples one by one."""
 
     measured: Bounds
     inputs: Bounds
 
+    def same_as(self, other: Screen) -> bool:
+        """Whether two screens judge alike."""
+        pairs = ((self.measured, other.measured), (self.inputs, other.inputs))
+        return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for a, b in pairs for f in fields(Bounds))
+
     @classmethod
-    def of(cls, observer: Observer) -> Screen:
+    def of(cls, observer: ObserverData) -> Screen:
         """Return the screen of an observer: its declared limits, and the sizes seen in training."""
         at, limits, seen = list(observer.measured), observer.runtime, observer.seen
         lower, upper = (None if side is None else side[at] for side in (limits.lower, limits.upper))
@@ -237,7 +126,7 @@ class Screen:
         return Screened(np.where(believed, kept, np.nan), inputs, status, starts, Held(inputs[-1], since[-1], stale))
 
 
-def sample_status(observer: Observer, y: Array, u: Array) -> Bits:
+def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:
     """Return the bits of `SampleStatus` of every sample, shape (n_samples, batch), as the observer takes them in a batch.
 
     Parameters
@@ -246,52 +135,14 @@ def sample_status(observer: Observer, y: Array, u: Array) -> Bits:
     y : ndarray, shape (n_samples, batch, q)
     u : ndarray, shape (n_samples, batch, m)
     """
-    return Screen.of(observer).take(np.asarray(y, dtype=float), np.asarray(u, dtype=float)).status
+    return screened(observer, y, u).status
 
 
-def started_anew(
-    run: Callable[[Array, Array, Mapping[str, Any]], tuple[Array, ...]],
-    samples: Screened,
-    parameters: Mapping[str, npt.ArrayLike] | None,
-    carried: Callable[[tuple[Array, ...], int, Whole], Mapping[str, Array]] | None = None,
-) -> tuple[Array, ...]:
-    """Run a batch, and every member once more from each sample at which it starts anew to the next.
-
-    Parameters
-    ----------
-    run : callable
-        From measurements, inputs and parameters to arrays of shape (n_samples, batch, ...), row 0 being the start.
-    samples : Screened
-    parameters : mapping of str to array_like, shape (batch,)
-    carried : callable, optional
-        From what was found so far, a sample and members to parameters that a new start goes on with.
-    """
-    values, (n_samples, batch) = dict(parameters or {}), samples.starts.shape
-    found = run(samples.y, samples.u, values)
-    for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:
-        own = np.flatnonzero(samples.starts[begin])
-        again = samples.starts[begin + 1 :, own]
-        lasts = np.where(again.any(axis=0), begin + 1 + again.argmax(axis=0), n_samples - 1) if len(again) else begin
-        rows = slice(begin, int(np.max(lasts)) + 1)
-        part = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[own] for name, v in values.items()}
-        part |= carried(found, int(begin), own) if carried is not None else {}
-        late = run(samples.y[rows, own], samples.u[rows, own], part)
-        for whole, rest in zip(found, late, strict=True):
-            whole[begin + 1 : rows.stop, own] = rest[1:]
-    return found
-
-
-def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:
-    """Refuse measurements and inputs that do not fit together, or to an observer."""
-    if y.ndim != 3 or u.ndim != 3 or y.shape[:2] != u.shape[:2] or not len(y):
-        raise DimensionError(
-            f"Running {who}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch), with a last axis for their channels and at "
-            "least one sample."
-        )
-    if u.shape[2] != len(inputs):
-        raise DimensionError(f"Running {who}: expected inputs {tuple(inputs)} on the last axis of u, found shape {u.shape}.")
-    if y.shape[2] != measured:
-        raise DimensionError(f"Running {who}: expected {measured} measurements on the last axis of y, found shape {y.shape}.")
+def screened(observer: ObserverData, y: npt.ArrayLike, u: npt.ArrayLike) -> Screened:
+    """Return a batch of samples as an observer takes them."""
+    y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
+    require_samples(f"observer {observer.name}", len(observer.measured), observer.inputs, y, u)
+    return Screen.of(observer).take(y, u)
 
 
 def _bit(wrong: Flags, bit: SampleStatus) -> Bits:

@@ -1,43 +1,55 @@
-"""Batched simulation of observers over many episodes at once."""
+"""Observers over many episodes at once."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DimensionError
-from .careful import run_carefully
-from .runtime import Estimate
-from .screen import Screen, Screened, require_samples, started_anew
-
-if TYPE_CHECKING:
-    from .observer import Observer
+from .data import ObserverData
+from .samples import Flags, Screened, Whole
+from .screen import Screen, screened
+from .step import Parameters, Steps
 
 Array = npt.NDArray[np.float64]
+_ROWS = 512  # samples predicted forward at a time
+
+
+class EstimateKind(str, Enum):
+    """Which estimate is wanted.
+
+    PREDICT
+        Of the state at k from what arrived up to k - 1, as in the paper.
+    FILTER
+        Of the state at k from what arrived up to k.
+    """
+
+    PREDICT = "predict"
+    FILTER = "filter"
 
 
 def run_observer(
-    observer: Observer,
+    observer: ObserverData,
     y: Array,
     u: Array,
     parameters: Mapping[str, npt.ArrayLike] | None = None,
-    estimate: Estimate | str = Estimate.PREDICT,
+    estimate: EstimateKind | str = EstimateKind.PREDICT,
 ) -> Array:
     """Run an observer over a batch of episodes, one Python step per sample for the whole batch.
 
     Parameters
     ----------
-    observer : Observer
+    observer : ObserverData
     y : ndarray, shape (n_samples, batch, q)
         Row k is what arrives at k; NaN or infinite where a measurement is missing, which then corrects nothing.
     u : ndarray, shape (n_samples, batch, m)
         Not finite where an input is not known: the last good value stands for it. What is implausible, and where a run starts: see `screen`.
     parameters : mapping of str to array_like, shape (batch,)
         Lifting parameters of the machine behind each episode; the observer's own where absent.
-    estimate : Estimate or "predict" or "filter"
+    estimate : EstimateKind or "predict" or "filter"
         Row k of a prediction is the estimate of the state at k from what arrived up to k - 1; of a filtered estimate, up to k.
 
     Returns
@@ -52,19 +64,15 @@ def run_observer(
     ConfigError
         When a parameter is unknown, missing or not finite.
     """
-    wanted = Estimate(estimate)
-    if wanted is Estimate.PREDICT:
-        return run_observers([observer], y, u, parameters)[0]
-    samples, values = judged(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
-    return started_anew(lambda y, u, values: (run_carefully(observer, y, u, values, wanted),), samples, values)[0]
+    return _run([observer], y, u, parameters, EstimateKind(estimate))[0]
 
 
-def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
     """Run observers of one and the same model, which differ in their corrections, side by side.
 
     Parameters
     ----------
-    observers : sequence of Observer
+    observers : sequence of ObserverData
         Of the same lifting, measured states and inputs; corrections may have different orders.
     y, u, parameters
         As in `run_observer`.
@@ -74,83 +82,78 @@ def run_observers(observers: Sequence[Observer], y: Array, u: Array, parameters:
     ndarray, shape (observer, n_samples, batch, n)
         A view with the samples outermost in memory.
     """
-    observer = observers[0]
-    samples, values = judged(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
-    lifting = observer.lifting
-    if any((o.lifting, o.measured, o.inputs) != (lifting, observer.measured, observer.inputs) for o in observers[1:]):
+    first = observers[0]
+    if any((o.lifting, o.measured, o.inputs) != (first.lifting, first.measured, first.inputs) for o in observers[1:]):
         raise DimensionError(
             f"Running {len(observers)} observers side by side: they differ in lifting, measured states or inputs; run them one by one."
         )
-    if any(o.runtime.delay or o.runtime.limited or _screens(o) != _screens(observer) for o in observers):
-        return np.stack([_alone(o, y, u, parameters) for o in observers])
-    return started_anew(lambda y, u, values: (_together(observers, y, u, values),), samples, values)[0].transpose(2, 0, 1, 3)
+    alone = any(o.runtime.delay or o.runtime.limited or not Screen.of(o).same_as(Screen.of(first)) for o in observers)
+    if alone and len(observers) > 1:
+        return np.stack([_run([o], y, u, parameters, EstimateKind.PREDICT)[0] for o in observers])
+    return _run(observers, y, u, parameters, EstimateKind.PREDICT)
 
 
-def judged(observer: Observer, y: Array, u: Array) -> Screened:
-    """Return a batch of samples as an observer takes them."""
-    y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
-    require_samples(f"observer {observer.name}", len(observer.measured), observer.inputs, y, u)
-    return Screen.of(observer).take(y, u)
+def _run(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Parameters | None, wanted: EstimateKind) -> Array:
+    """Run observers on screened samples, shape (observer, n_samples, batch, n).
 
-
-def _alone(observer: Observer, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
-    if not (observer.runtime.delay or observer.runtime.limited):
-        return run_observers([observer], y, u, parameters)[0]
-    samples, values = judged(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
-    return started_anew(lambda y, u, values: (run_carefully(observer, y, u, values, Estimate.PREDICT),), samples, values)[0]
-
-
-def _screens(observer: Observer) -> tuple[bytes, ...]:
-    screen = Screen.of(observer)
-    return tuple(
-        side.tobytes() for bounds in (screen.measured, screen.inputs) for side in (bounds.lower, bounds.upper, bounds.least, bounds.most)
-    )
-
-
-def _together(observers: Sequence[Observer], y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
-    """Run observers of one model on screened samples; shape (n_samples, batch, observer, n)."""
-    observer, n_samples, batch = observers[0], *y.shape[:2]
-    lifting = observer.lifting
-    n, n_lifted, m, k = lifting.n_states, lifting.n_lifted, observer.B.shape[1], len(observers)
-    order = max(o.controller.n_states for o in observers)
-    step = np.stack([_padded(o, order) for o in observers])
-    # One column a machine, so that each quantity of all machines lies together: [theta, x^c, u, y]. The product gives [x_hat+, x^c+].
-    column = np.zeros((k, step.shape[2], batch))
-    row = np.swapaxes(column, 1, 2)
-    lifted, inflow, measurement = row[..., :n_lifted], row[..., n_lifted + order : n_lifted + order + m], row[..., n_lifted + order + m :]
-    for own, first in zip(row, observers, strict=True):
-        own[..., :n] = first.initial(y[0], values)
-    missing = ~np.isfinite(y)
-    gone = np.atleast_1d(missing.any(axis=(1, 2)))
-    estimates = np.empty((n_samples, k, n, batch))
-    following = np.empty((k, n + order, batch))
-    plain = not (lifting.history or lifting.input_functions)
-    held = np.broadcast_to(u[0], (k, *u[0].shape))
-    earlier = lifting.window.hold(row[..., :n], held)
+    With a delay d, states are those of the time of measurement: at k, ``min(k - start, d)`` samples ago. While the first d samples go by, what arrives was
+    measured before the start and says nothing but where to start. In the end all of them are predicted to k.
+    """
+    observer = observers[0]
+    samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
+    (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
+    steps, missing = Steps(observers, batch, values), ~np.isfinite(samples.y)
+    gone, anew = (np.atleast_1d(flags.any(axis=axes)) for flags, axes in ((missing, (1, 2)), (samples.starts, 1)))
+    pending = _pending(samples.starts, d) if d else None
+    estimates = np.empty((n_samples, len(observers), observer.lifting.n_states, batch))
+    earlier = np.empty((n_samples, batch, len(observer.lifting.window.earlier))) if d else None
+    steps.begin(samples.y[0])
     with np.errstate(over="ignore", invalid="ignore"):
-        for sample in range(n_samples):
-            estimates[sample] = column[:, :n]
-            if plain:
-                lifting.lift_into(lifted, values)
-                inflow[...] = u[sample]
-            else:
-                held = np.broadcast_to(u[sample], held.shape)
-                window = np.concatenate([row[..., :n], earlier], axis=-1)
-                lifting.lift_into(lifted, values, earlier)
-                inflow[...] = lifting.lift_inputs(held, window, values)
-                earlier = lifting.window.advance(window, held)
-            measurement[...] = y[sample]
-            if gone[sample]:  # what is predicted stands for what is missing, so that it corrects nothing
-                np.copyto(measurement, row[..., list(observer.measured)], where=missing[sample])
-            np.matmul(step, column, out=following)
-            column[:, :n] = following[:, :n]
-            column[:, n_lifted : n_lifted + order] = following[:, n:]
-    return estimates.transpose(0, 3, 1, 2)
+        for k in range(n_samples):
+            estimates[k] = steps.x.swapaxes(1, 2)
+            moving = None
+            if earlier is not None and pending is not None:
+                earlier[k] = steps.earlier(samples.u[k - pending[k], np.arange(batch)])[0]
+                moving = (pending[k] == d) & ~samples.starts[k]
+            if anew[k] and k:
+                steps.begin(samples.y[k], samples.starts[k])
+            if moving is None or moving.any():
+                steps.step(samples.y[k], samples.u[k - d], missing[k] if gone[k] else None, moving)
+        found = estimates.transpose(1, 0, 3, 2)
+        if wanted is EstimateKind.FILTER:
+            _filter(observer, found[0], samples.y, pending, d)
+        if earlier is not None and pending is not None:
+            _predict(observer, found[0], earlier, samples, pending, values)
+    return found
 
 
-def _padded(observer: Observer, order: int) -> Array:
-    """The one-step map with silent controller states up to an order."""
-    n, nl, own = observer.lifting.n_states, observer.lifting.n_lifted, observer.controller.n_states
-    missing = order - own
-    step = np.insert(observer.one_step, [nl + own] * missing, 0.0, axis=1)
-    return np.ascontiguousarray(np.insert(step, [n + own] * missing, 0.0, axis=0))
+def _pending(starts: Flags, delay: int) -> Whole:
+    """Samples between a state and the row that it is recorded in, shape (n_samples, batch)."""
+    row = np.arange(len(starts))[:, None]
+    begun = np.maximum.accumulate(np.where(starts, row, 0), axis=0)
+    since = row - np.concatenate([begun[:1] * 0, begun[:-1]])
+    return np.minimum(since, delay)
+
+
+def _filter(observer: ObserverData, x: Array, y: Array, pending: Whole | None, delay: int) -> None:
+    """Correct predictions, shape (n_samples, batch, n), by what has arrived."""
+    nu = np.where(np.isfinite(y), y - x[..., list(observer.measured)], 0.0)
+    filtered = observer.runtime.clip_estimate(x + nu @ observer.filter_gain.T)
+    np.copyto(x, filtered, where=True if pending is None else (pending == delay)[..., None])
+
+
+def _predict(observer: ObserverData, x: Array, earlier: Array, samples: Screened, pending: Whole, values: Parameters) -> None:
+    """Take states, shape (n_samples, batch, n), over the samples that lie between them and their rows, without correction."""
+    batch, machines = x.shape[1], np.arange(x.shape[1])
+    for start in range(0, len(x), _ROWS):
+        rows = slice(start, min(start + _ROWS, len(x)))
+        count, ahead = pending[rows], x[rows]
+        own = {name: np.tile(np.broadcast_to(np.asarray(v, dtype=float), (batch,)), len(count)) for name, v in values.items()}
+        steps = Steps([observer], count.size, own)
+        steps.place(ahead.reshape(count.size, -1), earlier[rows].reshape(count.size, -1))
+        unknown = np.ones((count.size, len(observer.measured)), dtype=bool)
+        for j in range(observer.runtime.delay):
+            at = np.arange(rows.start, rows.stop)[:, None] - count + j
+            u = samples.u[np.minimum(at, len(samples.u) - 1), machines].reshape(count.size, -1)
+            steps.step(np.zeros(unknown.shape), u, unknown, (j < count).ravel())
+        x[rows] = steps.x[0].reshape(ahead.shape)

@@ -25,10 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
-from .careful import innovation, next_estimate
-from .observer import Observer
-from .screen import started_anew
-from .simulate import judged
+from .data import ObserverData
+from .screen import screened
+from .step import Steps
 
 Array = npt.NDArray[np.float64]
 _STEP = 1e-5
@@ -52,7 +51,7 @@ class Tracked:
 
 
 def track_parameter(
-    observer: Observer,
+    observer: ObserverData,
     y: Array,
     u: Array,
     parameters: Mapping[str, npt.ArrayLike] | None = None,
@@ -63,7 +62,7 @@ def track_parameter(
 
     Parameters
     ----------
-    observer : Observer
+    observer : ObserverData
         Without delays in its lifting, delay of the measurement and limits.
     y : ndarray, shape (n_samples, batch, q)
         NaN where a measurement is missing: neither the estimate nor the parameter is corrected then.
@@ -90,44 +89,34 @@ def track_parameter(
             f"Phase-locked loop of observer {observer.name}: needs a lifting of present states with the parameter {name!r} and measurements without delay, "
             f"found parameters {lifting.parameters}, a history of {lifting.history} and a delay of {observer.runtime.delay}."
         )
-    samples, given = judged(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
-    found = started_anew(
-        lambda y, u, values: _followed(observer, y, u, values, name, settle_s),
-        samples,
-        given,
-        lambda found, begin, own: {name: found[1][begin, own]},
-    )
-    return Tracked(*found)
-
-
-def _followed(
-    observer: Observer, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike], name: str, settle_s: float
-) -> tuple[Array, Array]:
-    """Estimates and values of the parameter along screened samples."""
-    lifting, K, n = observer.lifting, observer.controller, observer.lifting.n_states
-    batch, C = y.shape[1], list(observer.measured)
-    values = {k: np.broadcast_to(np.asarray(v, dtype=float), (batch,)).copy() for k, v in parameters.items()}
+    samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
+    y, u, starts = samples.y, samples.u, samples.starts
+    K, n, batch, C = observer.controller, lifting.n_states, y.shape[1], list(observer.measured)
+    values = {k: np.broadcast_to(np.asarray(v, dtype=float), (batch,)).copy() for k, v in values.items()}
     forget = min(observer.sample_period_s / settle_s, 1.0)
     coupling, into = observer.A[:n, n:], observer.into[:n]
-    x, x_c = observer.initial(y[0], values), np.zeros((batch, K.n_states))
-    s, s_c, power = np.zeros((batch, n)), np.zeros((batch, K.n_states)), np.zeros(batch)
+    steps, missing = Steps([observer], batch, values), ~np.isfinite(y)
+    s, s_c, power, age = np.zeros((batch, n)), np.zeros((batch, K.n_states)), np.zeros(batch), np.zeros(batch, dtype=int)
     estimates, followed = np.empty((*y.shape[:2], n)), np.empty(y.shape[:2])
-    there = np.isfinite(y)
-    scale = np.max(y, axis=(0, 1), where=there, initial=-np.inf) - np.min(y, axis=(0, 1), where=there, initial=np.inf)
+    scale = np.max(y, axis=(0, 1), where=~missing, initial=-np.inf) - np.min(y, axis=(0, 1), where=~missing, initial=np.inf)
     scale = np.where(scale > 0, scale, 1.0)
+    steps.begin(y[0])
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for k in range(len(y)):
-            estimates[k], followed[k] = x, values[name]
-            nu, psi = innovation(observer, x, y[k]), s[:, C]
+            estimates[k], followed[k] = steps.x[0], values[name]
+            if k and starts[k].any():  # the parameter stays
+                steps.begin(y[k], starts[k])
+                s[starts[k]], s_c[starts[k]], power[starts[k]], age[starts[k]] = 0.0, 0.0, 0.0, 0
+            age += 1
+            x, nu, psi = steps.x[0].copy(), steps.innovation(y[k])[0], s[:, C]
             by_state = lifting.slopes(x, values)[..., :n]
             ahead, behind = ({**values, name: values[name] + h} for h in (_STEP, -_STEP))
             by_value = (lifting.lift(x, ahead) - lifting.lift(x, behind))[:, n:] / (2 * _STEP)
             power += forget * (np.sum((psi / scale) ** 2, axis=-1) - power)
-            pull = np.sum(psi * nu / scale**2, axis=-1) * (1 - (1 - forget) ** (k + 1))  # over the mean of psi^2 so far
-            x = next_estimate(observer, x, u[k], x_c @ K.C.T + nu @ K.D.T, values)
-            x_c = x_c @ K.A.T + nu @ K.B.T
+            pull = np.sum(psi * nu / scale**2, axis=-1) * (1 - (1 - forget) ** age)  # over the mean of psi^2 so far
+            steps.step(y[k], u[k], missing[k] if missing[k].any() else None)
             moved = ((observer.A[:n, :n] + coupling @ by_state) @ s[..., None])[..., 0] + by_value @ coupling.T
             s, s_c = moved + (s_c @ K.C.T - psi @ K.D.T) @ into.T, s_c @ K.A.T - psi @ K.B.T
             seen = np.divide(pull, power, out=np.zeros(batch), where=(power > 0) & np.isfinite(pull))
             values[name] = values[name] + forget * np.clip(seen, -_MOST, _MOST)
-    return estimates, followed
+    return Tracked(estimates, followed)

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError
 from ...lifting import Lifting
-from ..screen import require_samples
+from ..samples import require_samples
 
 Array = npt.NDArray[np.float64]
 

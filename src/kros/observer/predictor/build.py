@@ -166,7 +166,19 @@ def embedded(
     silent = np.zeros((len(lifting.functions), widened.n_lifted))
     A = np.vstack([np.hstack([own, raw[:, q + m :]]), silent])
     B, D = (np.vstack([M, silent[:, : M.shape[1]]]) for M in (raw[:, q : q + m], raw[:, :q]))
-    return Observer(name, widened, A, B, measured, tuple(inputs), gain(D, sample_period_s), Injection.STATE, sample_period_s)
+    return Observer(
+        name,
+        widened,
+        A,
+        B,
+        measured,
+        tuple(inputs),
+        gain(D, sample_period_s),
+        Injection.STATE,
+        sample_period_s,
+        replaces=True,
+        internal=memories,
+    )
 
 
 def _measured_rows(F: Array, G: Array, z: Array, y: Array) -> Array:

@@ -1,0 +1,207 @@
+"""The observer as data: nominal lifted model, correction, and what it knows of the machine (18)-(21).
+
+      u ──►┌──────────────────────────┐
+           │ x_hat+ = A theta(x_hat)  │──► x_hat ──► C ──► y_hat
+     y^c──►│          + B u + y^c     │                      │ -
+           └──────────────────────────┘                      ▼
+           K: x^c+ = A^c x^c + B^c nu  ◄── nu = y - y_hat ──(+)◄── y
+              y^c  = C^c x^c + D^c nu
+
+The correction enters through the state as drawn, or through the input, ``B (u + y^c)``, as in the paper. The observer is a
+one-step predictor: the estimate for k + 1 uses data up to k. Where the lifting has delays, theta reads earlier estimates and inputs too;
+before the start these are taken to equal the first ones. Where it has input functions, u stands for the lifted inputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError, DimensionError
+from ..core.linalg import solve_balanced
+from ..core.lti import StateSpace
+from ..lifting import Lifting
+from ..synthesis.result import Injection
+from .runtime import Runtime, Seen
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverData:
+    """Nominal lifted model with a correction.
+
+    Parameters
+    ----------
+    name : str
+    lifting : Lifting
+    A : ndarray, shape (n_lifted, n_lifted)
+    B : ndarray, shape (n_lifted, m)
+        With input functions, m counts them.
+    measured : tuple of int
+        Indices of the measured states.
+    inputs : tuple of str
+        Recorded inputs.
+    controller : StateSpace
+        From innovation (q) to correction: (m) for input injection, (n_lifted) for state injection.
+    injection : Injection
+    sample_period_s : float
+    parameters : mapping of str to float
+        Default values of the lifting's parameters, the nominal unit's.
+    runtime : Runtime
+        Delay of the measurement, limits, and the gain of filtered estimates.
+    seen : Seen, optional
+        Largest sizes of measurements and inputs in training, beyond which samples are implausible (see `screen`); none by default.
+    replaces : bool
+        Whether a measurement takes the place of the estimate of the measured state: the correction is a gain, equal to these states' columns of A.
+    internal : int
+        So many states at the end are the observer's own (`predictor`): recordings do not hold them.
+
+    Raises
+    ------
+    DimensionError
+        When sizes do not fit, or the correction is not what `replaces` says.
+    """
+
+    name: str
+    lifting: Lifting
+    A: Array
+    B: Array
+    measured: tuple[int, ...]
+    inputs: tuple[str, ...]
+    controller: StateSpace
+    injection: Injection
+    sample_period_s: float
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    runtime: Runtime = field(default_factory=Runtime)
+    seen: Seen | None = None
+    replaces: bool = False
+    internal: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "injection", Injection(self.injection))
+        if self.B.shape[1] != len(self.inputs) + len(self.lifting.input_functions):
+            raise DimensionError(
+                f"Observer {self.name}: {len(self.inputs)} inputs {self.inputs} and {len(self.lifting.input_functions)} functions of them need as many "
+                f"columns of B, found {self.B.shape[1]}."
+            )
+        width = self.B.shape[1] if self.injection is Injection.INPUT else self.A.shape[0]
+        K, n = self.controller, self.lifting.n_states
+        if (K.n_inputs, K.n_outputs) != (len(self.measured), width):
+            raise DimensionError(
+                f"Observer {self.name}: the controller should map {len(self.measured)} innovations to {width} corrections ({self.injection.value} injection), "
+                f"found {K.n_inputs} to {K.n_outputs}."
+            )
+        self.runtime.require_fit(self.name, n, len(self.measured), width, len(self.inputs))
+        if self.seen is not None and (len(self.seen.measured), len(self.seen.inputs)) != (len(self.measured), len(self.inputs)):
+            raise DimensionError(
+                f"Observer {self.name}: {len(self.measured)} measurements and {len(self.inputs)} inputs need as many sizes seen in training, found "
+                f"{len(self.seen.measured)} and {len(self.seen.inputs)}."
+            )
+        if not 0 <= self.internal <= n or any(i >= n - self.internal for i in self.measured):
+            raise DimensionError(
+                f"Observer {self.name}: {self.internal} internal states at the end of {n} should leave out the measured ones."
+            )
+        if self.replaces and not measurement_replaces(self):
+            raise DimensionError(
+                f"Observer {self.name}: where measurements replace estimates, the correction is a gain equal to the measured states' columns of A."
+            )
+
+    def __repr__(self) -> str:
+        """Say what kind of observer it is, in a line."""
+        states, own = ", ".join(self.recorded), f" + {self.internal} internal" if self.internal else ""
+        functions = f", {len(self.lifting.functions)} lifted functions" if self.lifting.functions else ""
+        y = ", ".join(self.lifting.states[i] for i in self.measured)
+        return f"<Observer {self.name}: {states}{own}{functions} from {y}; correction of order {self.controller.n_states}, {self.sample_period_s:g} s>"
+
+    @property
+    def into(self) -> Array:
+        """Where the correction enters, shape (n_lifted, width)."""
+        return self.B if self.injection is Injection.INPUT else np.eye(self.A.shape[0])
+
+    @property
+    def filter_gain(self) -> Array:
+        """Gain from the innovation to the filtered estimate, ``x_hat(k|k) = x_hat(k) + L_f (y - C x_hat(k))``; shape (n, q).
+
+        As declared in `runtime`; else what the correction says of it. The direct correction of the next estimate is that of this one, carried
+        through the model: ``A_s L_f = (into D^c)_s`` by least squares. For a Kalman predictor of a linear model this is its filter, exactly;
+        states of the correction and slopes of lifted functions are left out.
+        """
+        if self.runtime.filter_gain is not None:
+            return self.runtime.filter_gain
+        n = self.lifting.n_states
+        return solve_balanced(self.A[:n, :n], (self.into @ self.controller.D)[:n], rcond=1e-9)
+
+    @property
+    def one_step(self) -> Array:
+        """The map from [theta, x^c, u, y] to [x_hat+, x^c+], shape (n + n_c, n_lifted + n_c + m + q)."""
+        K, n, into = self.controller, self.lifting.n_states, self.into
+        C = np.eye(self.A.shape[0])[list(self.measured)]
+        plant = np.hstack([self.A - into @ K.D @ C, into @ K.C, self.B, into @ K.D])[:n]
+        controller = np.hstack([-K.B @ C, K.A, np.zeros((K.n_states, self.B.shape[1])), K.B])
+        return np.vstack([plant, controller])
+
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """States that recordings hold: all but the internal ones."""
+        return self.lifting.states[: self.lifting.n_states - self.internal]
+
+    def initial(self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+        """Return the first estimate: the first measurement where there is one, other states zero; shape (..., n).
+
+        Where measurements replace estimates, other states start at rest: where the lifted functions alone hold them, inputs
+        and measurements in balance.
+        """
+        y = np.asarray(y, dtype=float)
+        y = np.where(np.isfinite(y), y, 0.0)
+        n = self.lifting.n_states
+        x = np.zeros((*y.shape[:-1], n))
+        x[..., list(self.measured)] = y
+        if self.replaces and self.lifting.functions and not self.lifting.history:
+            others = [i for i in range(n) if i not in self.measured]
+            held = self.lifting.lift(x, {**self.parameters, **(parameters or {})})[..., n:] @ self.A[others, n:].T
+            still = np.eye(len(others)) - self.A[np.ix_(others, others)]
+            x[..., others] = solve_balanced(still, held.reshape(-1, len(others)).T).T.reshape(held.shape)
+        return x
+
+    def values(self, parameters: Mapping[str, npt.ArrayLike] | None = None, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
+        """Return the lifting's parameters: those that are given, the observer's own for the others.
+
+        Parameters
+        ----------
+        parameters : mapping of str to array_like
+        shape : tuple of int, optional
+            What every value has to broadcast to.
+
+        Raises
+        ------
+        ConfigError
+            When one is unknown, missing or not finite.
+        DimensionError
+            When one has another shape.
+        """
+        known, values = self.lifting.parameters, {**self.parameters, **(parameters or {})}
+        unknown = [name for name in values if name not in known and name not in self.parameters]
+        missing = [name for name in known if values.get(name) is None]
+        wrong = [name for name in known if name not in missing and not np.isfinite(np.asarray(values[name], dtype=float)).all()]
+        for names, what in ((unknown, "unknown"), (missing, "missing"), (wrong, "not finite")):
+            if names:
+                raise ConfigError(
+                    f"Running observer {self.name}: the parameter {', '.join(map(repr, names))} is {what}; its lifting has "
+                    f"{', '.join(known) or 'no parameters'}."
+                )
+        for name in known if shape is not None else ():
+            found = np.shape(values[name])
+            if found not in ((), shape, (1,) * len(shape or ())):
+                raise DimensionError(f"Running observer {self.name}: the parameter {name!r} should have shape {shape}, found {found}.")
+        return values
+
+
+def measurement_replaces(observer: ObserverData) -> bool:
+    """Whether a correction lets measurements take the place of the measured states' estimates."""
+    columns, gain = observer.A[:, list(observer.measured)], observer.into @ observer.controller.D
+    return observer.controller.n_states == 0 and np.allclose(columns, gain, rtol=1e-9, atol=1e-12 * float(np.abs(columns).max(initial=0.0)))

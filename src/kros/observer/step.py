@@ -1,0 +1,126 @@
+"""The step (18)-(21), written once: the state of observers over a batch of machines, and how a sample moves it on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from .data import ObserverData
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+Parameters = Mapping[str, npt.ArrayLike]
+
+
+class Steps:
+    """Observers of one model, side by side over a batch of machines.
+
+    ``[x_hat+; x^c+] = M [theta(x_hat); x^c; u; y]``, one column a machine, so that each quantity of all machines lies together in memory.
+
+    Parameters
+    ----------
+    observers : sequence of ObserverData
+        Of the same lifting, measured states and inputs; more than one only without limits of estimates and corrections.
+    batch : int
+    values : mapping of str to array_like, shape (batch,)
+        Lifting parameters; looked at anew in every step.
+    """
+
+    def __init__(self, observers: Sequence[ObserverData], batch: int, values: Parameters) -> None:
+        observer = observers[0]
+        lifting = observer.lifting
+        n, n_lifted, m = lifting.n_states, lifting.n_lifted, observer.B.shape[1]
+        order = max(o.controller.n_states for o in observers)
+        self.observers, self.lifting, self.values = observers, lifting, values
+        self.map = np.stack([_padded(o, order) for o in observers])
+        self._column = np.zeros((len(observers), self.map.shape[2], batch))
+        self._following = np.empty((len(observers), n + order, batch))
+        row = np.swapaxes(self._column, 1, 2)
+        self.x, self._lifted = row[..., :n], row[..., :n_lifted]
+        self._x_c, self._u = row[..., n_lifted : n_lifted + order], row[..., n_lifted + order : n_lifted + order + m]
+        self._y, self._at = row[..., n_lifted + order + m :], list(observer.measured)
+        self._plain = not (lifting.history or lifting.input_functions)
+        self._earlier = np.zeros((len(observers), batch, len(lifting.window.earlier)))
+        self._fresh = np.ones(batch, dtype=bool)
+        self._limits = observer.runtime if observer.runtime.limited else None
+        self.correction: Array | None = None
+
+    def begin(self, y: Array, machines: Flags | None = None) -> None:
+        """Start all machines, or some, at measurements, shape (batch, q)."""
+        rows = slice(None) if machines is None else machines
+        for own, observer in zip(self.x, self.observers, strict=True):
+            own[rows] = observer.initial(y, self.values)[rows]
+        self._x_c[:, rows] = 0.0
+        self._fresh[rows] = True
+
+    def place(self, x: Array, earlier: Array) -> None:
+        """Put states, shape (batch, n), and earlier values in place; corrections start at rest."""
+        self.x[...], self._x_c[...], self._earlier[...], self._fresh[:] = x, 0.0, earlier, False
+
+    def earlier(self, u: Array) -> Array:
+        """Return the earlier values that the lifting reads, shape (observer, batch, n_earlier); after a start they equal the present ones."""
+        if self._fresh.any():
+            held = self.lifting.window.hold(self.x, np.broadcast_to(u, (*self.x.shape[:2], u.shape[-1])))
+            return np.where(self._fresh[:, None], held, self._earlier)
+        return self._earlier
+
+    def innovation(self, y: Array) -> Array:
+        """Return ``y - C x_hat``, shape (observer, batch, q); zero where a measurement is missing."""
+        predicted = self.x[..., self._at]
+        return np.where(np.isfinite(y), y, predicted) - predicted
+
+    def step(self, y: Array, u: Array, missing: Flags | None = None, moving: Flags | None = None) -> None:
+        """Take measurements, shape (batch, q), and inputs, shape (batch, m).
+
+        Parameters
+        ----------
+        y, u : ndarray
+        missing : ndarray of bool, shape (batch, q), optional
+            Measurements that correct nothing.
+        moving : ndarray of bool, shape (batch,), optional
+            Machines that take the sample; all by default.
+        """
+        lifting, n = self.lifting, self.x.shape[2]
+        following_earlier = None
+        if self._plain:
+            lifting.lift_into(self._lifted, self.values)
+            self._u[...] = u
+        else:
+            u = np.broadcast_to(u, (*self.x.shape[:2], u.shape[-1]))
+            earlier = self.earlier(u)
+            window = np.concatenate([self.x, earlier], axis=-1)
+            lifting.lift_into(self._lifted, self.values, earlier)
+            self._u[...] = lifting.lift_inputs(u, window, self.values)
+            following_earlier = lifting.window.advance(window, u)
+        self._y[...] = y
+        if missing is not None:  # what is predicted stands for what is missing, so that it corrects nothing
+            np.copyto(self._y, self.x[..., self._at], where=missing)
+        np.matmul(self.map, self._column, out=self._following)
+        following = np.swapaxes(self._following, 1, 2)
+        if self._limits is not None:
+            self._limit(following)
+        where = True if moving is None else moving[:, None]
+        np.copyto(self.x, following[..., :n], where=where)
+        np.copyto(self._x_c, following[..., n:], where=where)
+        if following_earlier is not None:
+            np.copyto(self._earlier, following_earlier, where=where)
+            self._fresh &= False if moving is None else ~moving
+
+    def _limit(self, following: Array) -> None:
+        """Keep corrections and estimates within their limits."""
+        assert self._limits is not None
+        observer, n = self.observers[0], self.x.shape[2]
+        K = observer.controller
+        self.correction = self._x_c @ K.C.T + (self._y - self.x[..., self._at]) @ K.D.T
+        clipped = self._limits.clip_correction(self.correction)
+        following[..., :n] = self._limits.clip_estimate(following[..., :n] + (clipped - self.correction) @ observer.into[:n].T)
+
+
+def _padded(observer: ObserverData, order: int) -> Array:
+    """The one-step map with silent controller states up to an order."""
+    n, nl, own = observer.lifting.n_states, observer.lifting.n_lifted, observer.controller.n_states
+    missing = order - own
+    step = np.insert(observer.one_step, [nl + own] * missing, 0.0, axis=1)
+    return np.ascontiguousarray(np.insert(step, [n + own] * missing, 0.0, axis=0))

@@ -102,9 +102,9 @@ def by_pykoop(folder: Path) -> Population:
 READERS = {"raw": by_raw, "parquet": by_parquet, "csv": by_csv, "arrays": by_arrays, "frame": by_frame, "pykoop": by_pykoop}
 
 
-@pytest.mark.parametrize("read", READERS.values(), ids=READERS.keys())
-def test_same_population(read: Callable[[Path], Population], tmp_path: Path) -> None:
-    population = read(tmp_path)
+@pytest.mark.parametrize("opened", READERS.values(), ids=READERS.keys())
+def test_same_population(opened: Callable[[Path], Population], tmp_path: Path) -> None:
+    population = opened(tmp_path)
     assert population.channels == CHANNELS
     assert population.sample_period_s == PERIOD
     assert population.unit_ids == ("000003", "001011")
@@ -118,13 +118,13 @@ def test_same_population(read: Callable[[Path], Population], tmp_path: Path) -> 
         values = population.read(key)
         assert values.dtype == np.float64
         # The raw layout rounds to 1e-6 deg, 1e-5 deg/s (motor side) and 1e-4 %.
-        np.testing.assert_allclose(values, expected, rtol=1e-12, atol=1e-6 if read is by_raw else 1e-15)
-        np.testing.assert_allclose(values[:, [0, 1, 3, 4]], expected[:, [0, 1, 3, 4]], rtol=1e-12, atol=2e-9 if read is by_raw else 1e-15)
+        np.testing.assert_allclose(values, expected, rtol=1e-12, atol=1e-6 if opened is by_raw else 1e-15)
+        np.testing.assert_allclose(values[:, [0, 1, 3, 4]], expected[:, [0, 1, 3, 4]], rtol=1e-12, atol=2e-9 if opened is by_raw else 1e-15)
 
 
-@pytest.mark.parametrize("read", READERS.values(), ids=READERS.keys())
-def test_reading_twice_gives_the_same_and_own_values(read: Callable[[Path], Population], tmp_path: Path) -> None:
-    population = read(tmp_path)
+@pytest.mark.parametrize("opened", READERS.values(), ids=READERS.keys())
+def test_reading_twice_gives_the_same_and_own_values(opened: Callable[[Path], Population], tmp_path: Path) -> None:
+    population = opened(tmp_path)
     first = population.read(KEYS[0])
     second = population.read(KEYS[0])
     np.testing.assert_array_equal(first, second)
@@ -142,9 +142,9 @@ def test_arrays_given_away_are_protected() -> None:
     np.testing.assert_array_equal(population.read(KEYS[0]), episode(KEYS[0]))
 
 
-@pytest.mark.parametrize("read", READERS.values(), ids=READERS.keys())
-def test_conversion_to_parquet_is_exact(read: Callable[[Path], Population], tmp_path: Path) -> None:
-    population = read(tmp_path)
+@pytest.mark.parametrize("opened", READERS.values(), ids=READERS.keys())
+def test_conversion_to_parquet_is_exact(opened: Callable[[Path], Population], tmp_path: Path) -> None:
+    population = opened(tmp_path)
     write_parquet(population, tmp_path / "converted")
     converted = read(tmp_path / "converted", "parquet")
     assert (converted.channels, converted.units, converted.episodes) == (population.channels, population.units, population.episodes)

@@ -72,7 +72,7 @@ def test_every_subpackage_is_listed_and_loads(name: str) -> None:
 
 
 def test_dir_promises_only_what_exists() -> None:
-    assert set(dir(kros)) == {"__version__", *SUBPACKAGES}
+    assert set(dir(kros)) == {"__version__", "from_arrays", "from_frame", "read", *SUBPACKAGES}
 
 
 def test_unknown_attribute_names_what_there_is() -> None:

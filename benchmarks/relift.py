@@ -25,7 +25,7 @@ from kros.core.artifacts import read_json, write_json
 from kros.core.work import Work
 from kros.data import EpisodeBatch, read_parquet
 from kros.design.task import produce
-from kros.observer import Observer, ReliftScales, attack, attack_running, one_step_residual, relift_certificate, relift_report
+from kros.observer import Observer, ReliftScales, one_step_residual, relift_certificate, relift_report
 from kros.study import run_study, validate_config
 from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
@@ -34,6 +34,9 @@ from kros.study.engine.executors import open_executor
 from kros.study.engine.store import Store
 from kros.study.stages import calibrate
 from kros.study.stages.synthesize import tasks_of
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+from adversary import attack, attack_running
 
 KINDS = ("koopman", "linear")
 STUDY: dict[str, Any] = {

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from adversary import attack, attack_running
 
 from kros.core.errors import DimensionError
 from kros.lifting import Lifting
@@ -11,8 +12,6 @@ from kros.observer import (
     Observer,
     Past,
     ReliftScales,
-    attack,
-    attack_running,
     driven_coordinates,
     one_step_residual,
     refit_measured_rows,

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from adversary import attack_running
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
@@ -19,7 +20,6 @@ from kros.observer import (
     Runtime,
     SampleStatus,
     Seen,
-    attack_running,
     relift_certificate,
     relift_report,
     run_observer,

@@ -6,13 +6,13 @@ from itertools import product
 
 import numpy as np
 import pytest
+from adversary import attack, attack_running
 from scipy.optimize import minimize
 
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.lifting import Lifting
 from kros.observer import Observer, one_step_residual, run_observer
-from kros.observer.certificate.adversary import attack, attack_running
 from kros.observer.certificate.certificate import ReliftCertificate, relift_certificate
 from kros.observer.certificate.error import ErrorSystem, ReliftScales, error_system
 from kros.observer.certificate.multipliers import best_multipliers

@@ -4,7 +4,6 @@ from .baselines.difference import FilteredDifference, cutoffs_hz, followed, rate
 from .baselines.extended_kalman import ExtendedKalman, start_covariance
 from .baselines.kalman import kalman_candidates, like_measurement_noise, luenberger_candidates, noise_covariances
 from .baselines.learned import Features, Learned, Moments
-from .certificate.adversary import Attack, attack, attack_running
 from .certificate.certificate import ReliftCertificate, relift_certificate
 from .certificate.error import ReliftScales
 from .certificate.report import ReliftRow, relift_report
@@ -24,7 +23,6 @@ from .tune import Tuned, tune_observer
 from .units import in_sizes
 
 __all__ = [
-    "Attack",
     "Dropped",
     "Estimate",
     "EstimateKind",
@@ -46,8 +44,6 @@ __all__ = [
     "Seen",
     "Tracked",
     "Tuned",
-    "attack",
-    "attack_running",
     "cutoffs_hz",
     "driven_coordinates",
     "followed",

@@ -18,13 +18,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DimensionError
-from ..observer import Observer
-from ..simulate import run_observer
-from .certificate import ReliftCertificate
-from .error import ErrorSystem, require_covered
-from .report import first_error
-from .search import frozen_gain
+from kros.core.errors import DimensionError
+from kros.observer import Observer
+from kros.observer.certificate.certificate import ReliftCertificate
+from kros.observer.certificate.error import ErrorSystem, require_covered
+from kros.observer.certificate.report import first_error
+from kros.observer.certificate.search import frozen_gain
+from kros.observer.simulate import run_observer
 
 Array = npt.NDArray[np.float64]
 _BATCH = 16

@@ -25,7 +25,7 @@ from kros.uncertainty import Form, quantify_responses, quantify_systems
 Array = np.ndarray[Any, Any]
 KINDS = ("generic", "lightly damped", "stiff", "nearly identical", "identical", "static", "delayed")
 SHAPES = ((1, 1),) * 6 + ((2, 1), (1, 2), (2, 2)) * 2 + ((3, 2), (2, 3))
-STRUCTURES = ("scalar", "scalar", "diagonal", "diagonal", "full", "entrywise")
+STRUCTURES = ("auto", "scalar", "scalar", "diagonal", "diagonal", "entrywise")
 ROUNDING = 1e-7  # of the ratio: products and inverses in double precision
 TIGHT_DB = 0.02  # rounding of what is compared with the tolerance
 EPS = 1e-15

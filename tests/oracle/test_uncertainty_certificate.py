@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kros.core.errors import ConfigError
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.uncertainty import cover_ratio, fit_magnitude, residual
 from kros.uncertainty.fits.magnitude import alternation_db
 from kros.uncertainty.weights.certificate import Method, certify
+from kros.uncertainty.weights.fit import fit_weight
 from kros.uncertainty.weights.pencils import ResidualSystems, ratio_systems
-from kros.uncertainty.weights.weight import fit_weight
 
 DT = 1e-3
 GRID = np.geomspace(0.1, 500.0, 60)
@@ -103,19 +102,3 @@ def test_what_no_fit_goes_below_is_below_every_fit_and_met_by_good_ones() -> Non
 def test_alternations_are_counted() -> None:
     assert alternation_db(10 ** (np.array([0.0, 1.0, 0.0, 1.0]) / 20), 4) == pytest.approx(1.0, abs=1e-6)
     assert alternation_db(10 ** (np.array([0.0, 1.0, 0.0, 1.0]) / 20), 5) == pytest.approx(0.0, abs=1e-6)
-
-
-def test_given_poles_are_kept_and_only_zeros_fitted() -> None:
-    freqs = np.geomspace(0.01, 500.0, 300)
-    truth = lag(0.999, 0.9) @ lag(0.7, 0.2)
-    data = np.abs(truth.frequency_response(freqs)[:, 0, 0])
-    fit = fit_magnitude(freqs, data, DT, poles=[0.999, 0.7])
-    assert fit.overbound_db < 1e-3
-    np.testing.assert_allclose(np.sort(fit.system.poles().real), [0.7, 0.999], rtol=1e-9)
-    loose = fit_magnitude(freqs, data, DT, poles=[0.99, 0.7])
-    assert (np.abs(loose.system.frequency_response(freqs)[:, 0, 0]) >= data * (1 - 1e-9)).all()
-    assert loose.overbound_db > 1
-    with pytest.raises(ConfigError, match="unit circle"):
-        fit_magnitude(freqs, data, DT, poles=[1.1])
-    with pytest.raises(ConfigError, match="pairs"):
-        fit_magnitude(freqs, data, DT, poles=[0.5 + 0.1j])

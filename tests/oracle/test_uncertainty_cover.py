@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kros.uncertainty import cover_ratio, optimal_cover, optimal_left
+from kros.uncertainty import cover_ratio, optimal_cover
 
 
 def residuals(seed: int, units: int, freqs: int, p: int, m: int) -> np.ndarray:
@@ -89,14 +89,6 @@ def test_larger_covers_are_optimal(shape: tuple[int, int]) -> None:
         x = minimize(cost, x, method="Nelder-Mead", options={"maxiter": 4000, "xatol": 1e-7, "fatol": 1e-9, "adaptive": True}).x
     gap = optimal_cover(E).cost_db()[0] - 20 * np.log10(np.e) * cost(x)
     assert gap < 0.1
-
-
-def test_best_left_for_the_optimal_right_is_the_optimal_left() -> None:
-    E = residuals(9, 6, 4, 2, 2)
-    found = optimal_cover(E)
-    left = optimal_left(E, found.right)
-    assert (sound(E, left, found.right) <= 1 + 1e-10).all()
-    np.testing.assert_allclose(20 * np.log10(left).mean(axis=1), 20 * np.log10(found.left).mean(axis=1), atol=0.05)
 
 
 def test_entrywise_bounds_are_no_cover() -> None:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from kros.core import StateSpace
-from kros.core.errors import ConfigError
 from kros.uncertainty import Form, fit_weight, quantify_systems
 from kros.uncertainty.fits.sections import Sections
 
@@ -93,14 +92,6 @@ def test_higher_orders_are_taken_where_four_are_not_enough() -> None:
     six, _ = fit_weight(peaks, freqs, DT, density=2, max_order=6)
     assert max(four.left_orders) <= 4 < max(six.left_orders) <= 6
     assert six.overbound_db_max < four.overbound_db_max
-
-
-def test_poles_of_scalar_weights_may_be_given() -> None:
-    weight, _ = fit_weight(lags_and_leads, FREQS, DT, structure="scalar", poles=[0.9, 0.5], density=2)
-    np.testing.assert_allclose(np.sort(weight.left.poles().real), [0.5, 0.5, 0.9, 0.9], atol=1e-9)
-    assert weight.cover_max <= 1
-    with pytest.raises(ConfigError, match="scalar"):
-        fit_weight(lags_and_leads, FREQS, DT, poles=[0.9])
 
 
 def benchmark():

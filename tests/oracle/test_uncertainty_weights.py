@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from kros.core import StateSpace
-from kros.uncertainty import EntrywiseWeight, FullWeight, Structure, optimal_cover, quantify_responses, quantify_systems
+from kros.core.errors import ConfigError
+from kros.uncertainty import EntrywiseWeight, Structure, optimal_cover, quantify_responses, quantify_systems
 
 Array = np.ndarray[Any, Any]
 
@@ -78,7 +79,7 @@ def resonances(freqs: Array) -> Array:
     return np.array(rows)[:, :, None, None]
 
 
-@pytest.mark.parametrize("structure", ["scalar", "diagonal", "full", "entrywise"])
+@pytest.mark.parametrize("structure", ["scalar", "diagonal", "entrywise"])
 @pytest.mark.parametrize("period", [0.0, 1.0])
 def test_weights_of_responses_touch_at_a_given_frequency_and_tell_how_loose_they_are(structure: str, period: float) -> None:
     freqs = np.geomspace(1e-3, 0.4999, 40)
@@ -144,12 +145,22 @@ def test_remainders_are_covered_between_the_points_of_a_grid(form: str, wide: bo
     assert largest(weight, np.array(parts), freqs).max() <= 1 + 1e-8
 
 
-@pytest.mark.parametrize(("structure", "kind"), [("entrywise", EntrywiseWeight), ("full", FullWeight)])
-def test_one_entry_has_the_weight_of_the_structure_asked_for(structure: str, kind: type) -> None:
+def test_one_entry_has_the_weight_of_the_structure_asked_for() -> None:
     units = [single(0.9, 0.5), single(0.88, 0.5, 1.2)]
-    found = quantify_systems(units, "additive", GRID, structure=structure)
-    assert isinstance(found.weight, kind)
-    assert found.weight.structure is Structure(structure)
+    found = quantify_systems(units, "additive", GRID, structure="entrywise")
+    assert isinstance(found.weight, EntrywiseWeight)
+    assert found.weight.structure is Structure.ENTRYWISE
+
+
+def test_automatic_weights_are_scalar_where_diagonal_ones_are_loose() -> None:
+    options = {"max_order": 1, "tolerance_db": 1.0, "density": 2}
+    for units, form in ((LIGHT, "additive"), ([tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 3.0)], "inverse_input_multiplicative")):
+        tried = {s: quantify_systems(units, form, GRID, structure=s, **options) for s in ("auto", "diagonal", "scalar")}
+        same = [s for s in ("diagonal", "scalar") if tried[s].overbound_db_max == tried["auto"].overbound_db_max]
+        assert tried["auto"].weight.structure.value in same
+        assert tried["auto"].overbound_db_max <= tried["diagonal"].overbound_db_max or form.startswith("inverse")
+    with pytest.raises(ConfigError, match="no longer there"):
+        quantify_systems(LIGHT, "additive", GRID, structure="full")
 
 
 @pytest.mark.parametrize("structure", [s.value for s in Structure])
@@ -169,23 +180,6 @@ def test_identical_units_and_single_frequencies_get_weights() -> None:
     pair = [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 1.1)]
     for freqs in ([0.1], [0.0, 0.5], [0.5]):
         assert quantify_systems(pair, "additive", freqs, max_order=2).cover_max <= 1
-
-
-def test_full_weights_say_how_far_they_are_from_the_cover_in_their_frames_as_returned() -> None:
-    rng = np.random.default_rng(3)
-    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
-    sizes = np.geomspace(1.0, 100.0, 2)
-    units = [
-        StateSpace(
-            [[0.5 + 0.1 * k]], [[1.0, 0.4]], 0.2 * turn @ np.array([[1.0], [0.01]]), turn @ np.diag(sizes) @ np.diag(rng.random(2)), 1.0
-        )
-        for k in range(3)
-    ]
-    found = quantify_systems(units, "additive", GRID, structure="full", max_order=2)
-    used = found.weight.magnitudes(GRID)
-    excess = (used.cost_db() - found.cover.cost_db()).max()
-    assert found.overbound_db_max == pytest.approx(excess, abs=1e-9)
-    assert found.weight.within_tolerance == (excess <= 1.0)
 
 
 def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:

@@ -51,10 +51,6 @@ def test_nominal_is_the_middle_of_a_line_of_plants() -> None:
     assert choices[Form.ADDITIVE].index == 2
     assert choices[Form.ADDITIVE].peak_db == pytest.approx(20 * np.log10(0.9))
     assert choices[Form.INPUT_MULTIPLICATIVE].index == 3  # |1 / 2.4 - 1| is smaller than |2.4 / 1.5 - 1|
-    assert choose_nominals(G, candidates=[True, True, False, False])[Form.ADDITIVE].index == 1
-    assert choices[Form.ADDITIVE].runner_up() == 1
-    with pytest.raises(ConfigError, match="at least one"):
-        choose_nominals(G, candidates=[False] * 4)
 
 
 def test_roots_over_many_decades() -> None:

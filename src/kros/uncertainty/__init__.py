@@ -1,23 +1,22 @@
 """Uncertainty of a population: six forms, residuals, nominal, cover and weights, outliers. The stage's result is an `UncertainModel`."""
 
 from .fits.magnitude import FittedMagnitude, Side, fit_magnitude, invert
-from .fits.tightness import Tightness, magnitude_tightness, weight_tightness
+from .fits.tightness import Tightness, magnitude_tightness
 from .forms import Form, existence, rebuild, residual, residual_shape
-from .model import UncertainModel, scale_system
+from .model import ResponseUncertainty, UncertainModel, scale_system
 from .nominal.choice import Criterion, NominalChoice, choose_nominal, choose_nominals
 from .outliers.model import OutlierModel, score_outliers
 from .outliers.score import OutlierScore, Status
-from .quantified import Quantified
-from .residuals import all_bounds, bounds, completion, misfit, sigma_max
-from .responses import ResponseUncertainty, quantify_responses
+from .residuals import bounds, completion, misfit
+from .responses import quantify_responses
+from .small_matrices import sigma_max
 from .systems import quantify_systems
 from .variation import VariationAndNoise, variation_and_noise
 from .weights.certificate import Method, certify
-from .weights.cover import Cover, Perturbation, Structure, cover_ratio, optimal_cover, optimal_left
-from .weights.entrywise import EntrywiseWeight
-from .weights.full import FullWeight
+from .weights.cover import Cover, Perturbation, Structure, cover_ratio, optimal_cover
+from .weights.fit import fit_weight
 from .weights.pencils import ResidualSystems
-from .weights.weight import Weight, fit_weight
+from .weights.weight import EntrywiseWeight, Weight
 
 __all__ = [
     "Cover",
@@ -25,13 +24,11 @@ __all__ = [
     "EntrywiseWeight",
     "FittedMagnitude",
     "Form",
-    "FullWeight",
     "Method",
     "NominalChoice",
     "OutlierModel",
     "OutlierScore",
     "Perturbation",
-    "Quantified",
     "ResidualSystems",
     "ResponseUncertainty",
     "Side",
@@ -41,7 +38,6 @@ __all__ = [
     "UncertainModel",
     "VariationAndNoise",
     "Weight",
-    "all_bounds",
     "bounds",
     "certify",
     "choose_nominal",
@@ -55,7 +51,6 @@ __all__ = [
     "magnitude_tightness",
     "misfit",
     "optimal_cover",
-    "optimal_left",
     "quantify_responses",
     "quantify_systems",
     "rebuild",
@@ -65,5 +60,4 @@ __all__ = [
     "score_outliers",
     "sigma_max",
     "variation_and_noise",
-    "weight_tightness",
 ]

@@ -17,7 +17,6 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from ..core.lti import StateSpace
-from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 
@@ -77,10 +76,6 @@ class BilinearAxis:
         scale = np.sqrt(2 * rate)
         A, through = inverse @ (rate * eye + system.A), system.C @ inverse @ system.B
         return StateSpace(A, scale * (inverse @ system.B), scale * (system.C @ inverse), system.D + through, self.period_s)
-
-    def continuous_weight(self, weight: Weight) -> Weight:
-        """Return a weight with both sides continuous."""
-        return weight.mapped(self.continuous)
 
 
 def beyond(freqs_hz: Array) -> Array:

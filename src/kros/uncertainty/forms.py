@@ -45,6 +45,11 @@ class Form(str, Enum):
     INVERSE_OUTPUT_MULTIPLICATIVE = "inverse_output_multiplicative"
 
     @property
+    def inverse(self) -> bool:
+        """Whether the perturbed plant is rebuilt by an inverse."""
+        return self in (Form.INVERSE_ADDITIVE, Form.INVERSE_INPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
+
+    @property
     def dual(self) -> Form:
         """The form of the transposed plants: input and output sides change places."""
         return _DUAL[self]

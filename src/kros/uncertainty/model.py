@@ -1,4 +1,4 @@
-r"""The uncertainty stage: models of all units in, an `UncertainModel` out.
+r"""What a quantification gives: a nominal, and a bound on how the units of the population differ from it.
 
 Outputs and inputs are divided by the population's ranges first: with `S_y = diag(output_scale)`, `S_u = diag(input_scale)` every response is
 `S_y^-1 G S_u`. Residuals, covers and weights live in these coordinates. In physical units an output-side residual is `S_y E S_y^-1`, an
@@ -18,28 +18,111 @@ from ..core.artifacts import load_artifact, save_artifact
 from ..core.loading import check_shapes, loader
 from ..core.lti import StateSpace
 from .forms import Form
-from .quantified import Quantified
 from .weights.certificate import Method
-from .weights.cover import Cover, Structure
-from .weights.entrywise import EntrywiseWeight
-from .weights.full import FullWeight
-from .weights.weight import Weight
+from .weights.cover import Cover, Structure, as_structure
+from .weights.weight import EntrywiseWeight, Weight
 
 Array = npt.NDArray[Any]
 
-_KINDS: dict[Structure, type[Weight]] = {Structure.ENTRYWISE: EntrywiseWeight, Structure.FULL: FullWeight}
-_OWN_FACTS = {Structure.ENTRYWISE: ("unstructured_excess",), Structure.FULL: ("saved_db",)}
-_FRAMES = ("left_frame", "right_frame")
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Uncertainty:
+    """A bound on how the units of a population differ from a nominal one, whether their models are known or their responses alone.
+
+    Parameters
+    ----------
+    form : Form
+    unit_ids : tuple of str
+        Units that the weights cover.
+    nominal : int
+        Row of the nominal unit; -1 when the nominal is none of the units (for example a pooled one).
+    nominal_id : str
+    freqs_hz : ndarray, shape (frequency,), Hz
+    output_scale : ndarray, shape (p,)
+    input_scale : ndarray, shape (m,)
+    bounds : dict of Form to ndarray, shape (frequency,)
+        Largest residual over the other units, for the best nominal of each form (for the chosen form: the nominal used).
+    nominals : dict of Form to str
+        Unit behind each of these bounds.
+    cover : Cover
+        Optimal cover of the residuals, frequency by frequency.
+    weight : Weight
+    misfit : ndarray, shape (unit, frequency)
+        What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular (condition above 1e12).
+    remainder : Weight or None
+        Additive weights for `Gp - rebuilt(G, E)`, where the form does not rebuild every unit.
+    remainder_cover : Cover or None
+    """
+
+    form: Form
+    unit_ids: tuple[str, ...]
+    nominal: int
+    nominal_id: str
+    freqs_hz: Array
+    output_scale: Array
+    input_scale: Array
+    bounds: dict[Form, Array]
+    nominals: dict[Form, str]
+    cover: Cover
+    weight: Weight
+    misfit: Array
+    remainder: Weight | None = None
+    remainder_cover: Cover | None = None
+
+    @property
+    def peak_db(self) -> dict[Form, float]:
+        """Peak of the bound of each form, dB; minus infinity where all units are alike."""
+        with np.errstate(divide="ignore"):
+            return {form: float(20 * np.log10(bound.max())) for form, bound in self.bounds.items()}
+
+    @property
+    def misfit_max(self) -> float:
+        """Largest misfit where it is known; NaN where it is known nowhere."""
+        known = self.misfit[np.isfinite(self.misfit)]
+        return float(known.max()) if known.size else float("nan")
+
+    @property
+    def cover_max(self) -> float:
+        """Largest `sigma_max(W_L^-1 E_k W_R^-1)` where it was verified; at most one."""
+        return self.weight.cover_max
+
+    @property
+    def overbound_db_max(self) -> float:
+        """Largest distance of the weight from the optimal cover, dB."""
+        return self.weight.overbound_db_max
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class UncertainModel(Quantified):
+class ResponseUncertainty(Uncertainty):
+    """Weights that bound how measured frequency responses differ from a nominal one, at the frequencies given and nowhere else.
+
+    Parameters
+    ----------
+    nominal_response : ndarray, shape (frequency, p, m), complex
+        In physical units.
+    sample_period_s : float, s
+        Zero for continuous time.
+    certificate : str
+        Where the bound holds.
+    unresolved_hz : ndarray, shape (n,), Hz
+        Frequencies of local maxima of the bound that fall by more than 3 dB to a neighbouring frequency: peaks that the grid does not resolve, and
+        that may be higher beside it. All other fields are those of `Uncertainty`.
+    """
+
+    nominal_response: Array
+    sample_period_s: float
+    certificate: str
+    unresolved_hz: Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class UncertainModel(Uncertainty):
     """A nominal model and a bound on how the units of the population differ from it.
 
     Parameters
     ----------
     nominal_system : StateSpace
-        In physical units; all others are those of `Quantified`.
+        In physical units; all others are those of `Uncertainty`.
     """
 
     nominal_system: StateSpace
@@ -123,18 +206,18 @@ def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) ->
 
 
 def _facts(weight: Weight) -> dict[str, Any]:
-    own = {name: getattr(weight, name) for name in _OWN_FACTS.get(weight.structure, ())}
-    return own | {
-        "structure": weight.structure,
-        "perturbation": weight.perturbation,
-        "orders": [weight.left_orders, weight.right_orders],
-        "cover_max": weight.cover_max,
-        "overbound_db_max": weight.overbound_db_max,
-        "overbound_entry_db": weight.overbound_entry_db,
-        "within_tolerance": weight.within_tolerance,
-        "method": weight.method,
-        "remaining_margin": weight.remaining_margin,
-    }
+    own = {"unstructured_excess": weight.unstructured_excess} if isinstance(weight, EntrywiseWeight) else {}
+    same = (
+        "structure",
+        "perturbation",
+        "cover_max",
+        "overbound_db_max",
+        "overbound_entry_db",
+        "within_tolerance",
+        "method",
+        "remaining_margin",
+    )
+    return own | {"orders": [weight.left_orders, weight.right_orders]} | {name: getattr(weight, name) for name in same}
 
 
 def _number(value: float | None) -> float:
@@ -151,30 +234,25 @@ def _unpack_system(name: str, arrays: dict[str, Array], dt: float) -> StateSpace
 
 
 def _pack_weight(name: str, weight: Weight, cover: Cover) -> dict[str, Array]:
-    systems = {"left": weight.left, "right": weight.right}
-    if isinstance(weight, FullWeight):
-        systems |= dict(zip(_FRAMES, weight.frames, strict=True))
-    packed = {key: array for part, system in systems.items() for key, array in _pack_system(f"{name}_{part}", system).items()}
+    packed = _pack_system(f"{name}_left", weight.left) | _pack_system(f"{name}_right", weight.right)
     return packed | {f"{name}_cover_left": cover.left, f"{name}_cover_right": cover.right}
 
 
 def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> tuple[Weight, Cover]:
-    structure = Structure(facts["structure"])
-    own: dict[str, Any] = {field: _number(facts[field]) for field in _OWN_FACTS.get(structure, ())}
-    if structure is Structure.FULL:
-        own |= {part: _unpack_system(f"{name}_{part}", arrays, dt) for part in _FRAMES}
-    weight = _KINDS.get(structure, Weight)(
-        **own,
-        left=_unpack_system(f"{name}_left", arrays, dt),
-        right=_unpack_system(f"{name}_right", arrays, dt),
-        left_orders=tuple(facts["orders"][0]),
-        right_orders=tuple(facts["orders"][1]),
-        structure=structure,
-        cover_max=facts["cover_max"],
-        overbound_db_max=facts["overbound_db_max"],
-        within_tolerance=facts["within_tolerance"],
-        overbound_entry_db=_number(facts.get("overbound_entry_db")),
-        method=Method(facts.get("method", Method.GRID)),
-        remaining_margin=_number(facts.get("remaining_margin")),
-    )
-    return weight, Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])
+    fields: dict[str, Any] = {
+        "left": _unpack_system(f"{name}_left", arrays, dt),
+        "right": _unpack_system(f"{name}_right", arrays, dt),
+        "left_orders": tuple(facts["orders"][0]),
+        "right_orders": tuple(facts["orders"][1]),
+        "structure": as_structure(facts["structure"]),
+        "cover_max": facts["cover_max"],
+        "overbound_db_max": facts["overbound_db_max"],
+        "within_tolerance": facts["within_tolerance"],
+        "overbound_entry_db": _number(facts.get("overbound_entry_db")),
+        "method": Method(facts.get("method", Method.GRID)),
+        "remaining_margin": _number(facts.get("remaining_margin")),
+    }
+    cover = Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])
+    if fields["structure"] is Structure.ENTRYWISE:
+        return EntrywiseWeight(**fields, unstructured_excess=_number(facts["unstructured_excess"])), cover
+    return Weight(**fields), cover

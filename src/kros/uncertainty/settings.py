@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from ..core.settings import Settings
 
@@ -23,10 +23,17 @@ class UncertaintySettings(Settings):
 
     form: FORMS = "inverse_input_multiplicative"
     nominal: str | None = None
-    structure: Literal["auto", "diagonal", "scalar", "full", "entrywise"] = "auto"
+    structure: Literal["auto", "diagonal", "scalar", "entrywise"] = "auto"
     n_freqs: int = Field(1000, ge=50)
     max_order: int = Field(4, ge=1, le=8)
     tolerance_db: float = Field(1.0, gt=0)
     drop_outliers: bool = False
     outlier_form: FORMS = "additive"
     false_alarm_rate: float = Field(3e-3, gt=0, lt=1)
+
+    @field_validator("structure", mode="before")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value == "full":
+            raise ValueError("full weights are no longer there; choose 'auto' or 'diagonal', whose sets are somewhat larger")
+        return value

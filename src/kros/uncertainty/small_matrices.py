@@ -54,6 +54,11 @@ def squared(values: Array) -> Array:
     return values.real**2 + values.imag**2 if np.iscomplexobj(values) else values**2
 
 
+def sigma_max(matrices: npt.ArrayLike) -> Array:
+    """Return the largest singular value, shape (...), of matrices of shape (..., p, m)."""
+    return sigma_max_first(entries_first(np.asarray(matrices)))
+
+
 def sigma_max_first(matrices: Array) -> Array:
     """Return the largest singular value of entries-first matrices (p, m, ...), shape (...).
 
@@ -92,16 +97,6 @@ def condition_number(matrices: Array) -> Array:
         return np.asarray(sigma_max_squared(entries) / det)
 
 
-def lower_factor(pseudo_inverse: Array) -> Array:
-    """Return square `L` with `P P^H = L L^H` for entries-first P of shape (r, s, ...), r <= s.
-
-    `sigma_max(D P) = sigma_max(D L)`: the wide factor shrinks to a triangle, once per unit instead of once per pair. From QR, not from
-    Cholesky of the product: no squared condition number.
-    """
-    R = np.linalg.qr(np.conj(np.swapaxes(entries_last(pseudo_inverse), -1, -2)), mode="r")
-    return entries_first(np.conj(np.swapaxes(R, -1, -2)))
-
-
 def pseudo_inverse_first(matrices: Array) -> Array:
     """Return pseudo-inverses, entries first, of matrices (..., p, m).
 
@@ -129,13 +124,15 @@ def pseudo_inverse_first(matrices: Array) -> Array:
     return out
 
 
-def triangle(pseudo_inverse: Array) -> Array:
-    """Return `lower_factor` of entries-first P of shape (r, s, ...), without a loop over matrices for one or two rows.
+def lower_factor(pseudo_inverse: Array) -> Array:
+    """Return square `L` with `P P^H = L L^H` for entries-first P of shape (r, s, ...), r <= s.
 
-    Two rows are orthogonalised twice, as accurate as QR; rows of zeros give zeros.
+    `sigma_max(D P) = sigma_max(D L)`: the wide factor shrinks to a triangle, once per unit instead of once per pair. Two rows are orthogonalised
+    twice, as accurate as QR of more; no squared condition number. Rows of zeros give zeros.
     """
     if pseudo_inverse.shape[0] > 2:
-        return lower_factor(pseudo_inverse)
+        R = np.linalg.qr(np.conj(np.swapaxes(entries_last(pseudo_inverse), -1, -2)), mode="r")
+        return entries_first(np.conj(np.swapaxes(R, -1, -2)))
     size = np.sqrt(squared(pseudo_inverse[0]).sum(axis=0))
     if pseudo_inverse.shape[0] == 1:
         return size[None, None] + 0j

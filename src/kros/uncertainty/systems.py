@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,14 +11,13 @@ import numpy.typing as npt
 from ..core.frequency import check_grid, dense_grid, log_grid
 from ..core.lti import StateSpace
 from .bilinear import BilinearAxis, beyond, check_continuous_grid, continuous_grid
-from .forms import Form, as_form
+from .forms import Form
 from .model import UncertainModel, scale_system
-from .nominal.choice import Criterion, NominalChoice, as_criterion, choose_nominal, choose_nominals
-from .quantified import findings
-from .validation import check_fit, find_nominal, read_candidates, read_models
-from .weights.bounded import Bounded, Responder, bound_residuals
+from .nominal.choice import Criterion
+from .quantification import AUTO, Quantification
+from .validation import check_candidate, find_nominal, read_candidates, read_models
 from .weights.check import checking_grid
-from .weights.cover import Structure, as_structure
+from .weights.cover import Structure
 from .weights.pencils import ResidualSystems, peaks_hz
 
 Array = npt.NDArray[Any]
@@ -36,8 +34,7 @@ def quantify_systems(
     nominal: int | str | StateSpace | None = None,
     criterion: Criterion | str = Criterion.PEAK,
     extra: Mapping[str, StateSpace] | None = None,
-    candidates: npt.ArrayLike | None = None,
-    structure: Structure | str = Structure.DIAGONAL,
+    structure: Structure | str = AUTO,
     max_order: int = 4,
     tolerance_db: float = 1.0,
     density: int = 10,
@@ -63,14 +60,13 @@ def quantify_systems(
         Ranges of outputs and inputs over the population; residuals and weights are in these units. Ones by default.
     nominal : int, str or StateSpace, optional
         Unit (or name in `extra`) to use as nominal, or a model of its own; by default the best by `criterion`.
-    criterion : {"peak", "area", "cost"}
+    criterion : {"peak", "area"}
         What the nominal of this form makes small, see `choose_nominal`; those of the other forms have the lowest peaks.
     extra : mapping of str to StateSpace, optional
         Further candidates for the nominal by name, for example a pooled model; they are no units, and need not be covered.
-    candidates : array_like of bool, shape (unit,), optional
-        Units that may be nominal.
-    structure : {"diagonal", "scalar", "full", "entrywise"}
-        Of the weights; entrywise ones bound the entries and are sound for a diagonal perturbation only.
+    structure : {"auto", "diagonal", "scalar", "entrywise"}
+        Of the weights. Automatic ones are diagonal, or scalar where diagonal ones come close to an ill-posed set or are fitted badly; entrywise ones
+        bound the entries and are sound for a diagonal perturbation only.
     max_order : int
         Largest order of one entry of a weight.
     tolerance_db : float, dB
@@ -103,84 +99,38 @@ def quantify_systems(
     >>> model.nominal, model.cover_max <= 1
     (1, True)
     """
-    form, criterion, structure = as_form(form), as_criterion(criterion), as_structure(structure)
-    check_fit(max_order, tolerance_db, density)
+    asked = Quantification.of(form, criterion, structure, max_order, tolerance_db, density)
     system, ids, scales = read_models(models, unit_ids, output_scale, input_scale)
     others = read_candidates(extra, system, ids)
-    axis, freqs = _axis(system, freqs_hz, getattr(models, "longest_s", None))
-    responses = scale_system(system, *scales).frequency_response(freqs)
+    freqs, time = _axis(system, freqs_hz, getattr(models, "longest_s", None))
+    units = scale_system(system, *scales)
+    responses = units.frequency_response(freqs)
     of_others = np.array([scale_system(s, *scales).frequency_response(freqs) for s in others.values()]).reshape(-1, *responses.shape[1:])
-    choices = choose_by(responses, form, criterion, of_others, candidates, freqs, structure)
-    index, nominal_system = find_nominal(nominal, system, ids, others, choices[form].index)
-    found = axis.bound(
-        form, scale_system(nominal_system, *scales), scale_system(system, *scales), structure, max_order, tolerance_db, density
-    )
-    return UncertainModel(nominal_system=nominal_system, **findings(form, ids, tuple(others), index, freqs, scales, choices, found))
+    choices = asked.choose(responses, of_others, freqs)
+    names = (*ids, *others)
+    if isinstance(nominal, StateSpace):
+        check_candidate(nominal, system, "the nominal")
+        index, chosen = -1, nominal
+    else:
+        index = find_nominal(nominal, names, choices[asked.form].index)
+        chosen = system[index] if index < len(ids) else others[names[index]]
+    base = scale_system(chosen, *scales)
+    if isinstance(time, BilinearAxis):
+        residuals = ResidualSystems(asked.form, time.discrete(base), time.discrete(units))
+        grid, dt = dense_grid(time.discrete_hz(freqs), time.period_s, density), time.period_s
+        grid = grid[grid <= time.discrete_hz(freqs[-1])]
+        exact = None  # beyond the end of the grid residuals count as constant, which those of the mapped systems are not
+    else:
+        residuals, dt = ResidualSystems(asked.form, base, units), time
+        grid, exact = checking_grid(freqs, dt, density, filled=True), residuals
+    also = peaks_hz(residuals, grid, dt)
+    found = asked.bound(base.frequency_response, units.frequency_response, freqs, time, systems=exact, also_hz=also)
+    return UncertainModel(nominal_system=chosen, **asked.fields(ids, names, index, freqs, scales, choices, found))
 
 
-def choose_by(
-    responses: Array,
-    form: Form,
-    criterion: Criterion,
-    extra: Array,
-    candidates: npt.ArrayLike | None,
-    freqs_hz: Array,
-    structure: Structure | str,
-) -> dict[Form, NominalChoice]:
-    """Return the nominal of every form with the lowest peak, and of one form by a criterion."""
-    choices = choose_nominals(responses, extra=extra, candidates=candidates)
-    if criterion is not Criterion.PEAK:
-        options: dict[str, Any] = {"extra": extra, "candidates": candidates, "freqs_hz": freqs_hz, "structure": structure}
-        choices[form] = choose_nominal(responses, form, criterion, **options)
-    return choices
-
-
-@dataclass(frozen=True)
-class _Axis:
-    """Where weights are fitted: the unit circle of discrete models, or the one that a bilinear map makes of the imaginary axis."""
-
-    freqs_hz: Array
-    sample_period_s: float
-    map: BilinearAxis | None
-
-    def bound(
-        self,
-        form: Form,
-        nominal: StateSpace,
-        units: StateSpace,
-        structure: Structure | str,
-        max_order: int,
-        tolerance_db: float,
-        density: int,
-    ) -> Bounded:
-        """Return weights in the time of the models."""
-        options: dict[str, Any] = {"structure": structure, "max_order": max_order, "tolerance_db": tolerance_db, "density": density}
-        if self.map is None:
-            systems, dt = ResidualSystems(form, nominal, units), self.sample_period_s
-            also = peaks_hz(systems, checking_grid(self.freqs_hz, dt, density, filled=True), dt)
-            return bound_residuals(
-                form, nominal.frequency_response, units.frequency_response, self.freqs_hz, dt, systems, also_hz=also, **options
-            )
-        mapped = ResidualSystems(form, self.map.discrete(nominal), self.map.discrete(units))
-        grid = dense_grid(self.map.discrete_hz(self.freqs_hz), self.map.period_s, density)
-        also = peaks_hz(mapped, grid[grid <= self.map.discrete_hz(self.freqs_hz[-1])], self.map.period_s)
-        return bound_continuous(
-            form, nominal.frequency_response, units.frequency_response, self.freqs_hz, self.map, also_hz=also, **options
-        )
-
-
-def bound_continuous(form: Form, nominal: Responder, units: Responder, freqs_hz: Array, axis: BilinearAxis, **options: Any) -> Bounded:
-    """Return continuous weights for responses at continuous frequencies, as `bound_residuals`."""
-    back, grid = axis.continuous_hz, axis.discrete_hz(freqs_hz)
-    found = bound_residuals(form, lambda f: nominal(back(f)), lambda f: units(back(f)), grid, axis.period_s, **options)
-    remainder = None if found.remainder is None else axis.continuous_weight(found.remainder)
-    return replace(found, weight=axis.continuous_weight(found.weight), remainder=remainder)
-
-
-def _axis(system: StateSpace, freqs_hz: npt.ArrayLike | None, longest_s: float | None) -> tuple[_Axis, Array]:
+def _axis(system: StateSpace, freqs_hz: npt.ArrayLike | None, longest_s: float | None) -> tuple[Array, float | BilinearAxis]:
+    """Grid, and the sampling period or the map of the imaginary axis to a unit circle."""
     if system.dt > 0:
-        freqs = log_grid(system.dt, longest_s=longest_s) if freqs_hz is None else check_grid(freqs_hz, system.dt)
-        return _Axis(freqs, system.dt, None), freqs
-    freqs = continuous_grid(system) if freqs_hz is None else check_continuous_grid(freqs_hz)
-    wide = beyond(freqs)
-    return _Axis(wide, 0.0, BilinearAxis.over(wide)), wide
+        return log_grid(system.dt, longest_s=longest_s) if freqs_hz is None else check_grid(freqs_hz, system.dt), system.dt
+    wide = beyond(continuous_grid(system) if freqs_hz is None else check_continuous_grid(freqs_hz))
+    return wide, BilinearAxis.over(wide)

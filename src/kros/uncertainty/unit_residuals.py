@@ -22,14 +22,12 @@ from ..core.errors import DimensionError
 from ..core.loading import check_shapes, loader
 from .fits.magnitude import fit_magnitude
 from .forms import Form, residual
-from .residuals import sigma_max
-from .weights.cover import Cover, Structure, cover_ratio
-from .weights.weight import Weight
+from .weights.cover import Cover, cover_ratio
+from .weights.weight import EntrywiseWeight, Weight, unstructured_excess
 
 Array = npt.NDArray[Any]
 
 MOST_UNITS = 200  # that are kept for a picture
-_SINGULAR = 1e10
 _ARRAYS = ("freqs_hz", "entries", "ratio", "largest", "entry_weights", "entry_orders")
 
 
@@ -181,26 +179,11 @@ def weight_ratio(weights: Weight | Cover, E: Array, freqs_hz: Array) -> Array:
     E : ndarray, shape (unit, frequency, p', m'), complex
     freqs_hz : ndarray, shape (frequency,), Hz
     """
-    if isinstance(weights, Weight) and weights.structure in (Structure.SCALAR, Structure.DIAGONAL):
-        weights = weights.magnitudes(freqs_hz)
-    if isinstance(weights, Cover):
-        return cover_ratio(E, weights.left, weights.right)
-    left, right = weights.left.frequency_response(freqs_hz), weights.right.frequency_response(freqs_hz)
-    if left.shape[-1] != left.shape[-2]:
-        size = np.abs(left @ right)
+    if isinstance(weights, EntrywiseWeight):
+        size = np.abs(weights.matrix().frequency_response(freqs_hz))
         return np.asarray(np.divide(np.abs(E), size, out=np.zeros(E.shape), where=size > 0).max(axis=(-2, -1)))
-    return sigma_max(np.linalg.solve(left, E) @ np.linalg.inv(right))
-
-
-def unstructured_excess(W: Array, E: Array) -> float:
-    """Return the largest ``sigma_max(W^-1 E)`` where W, shape (frequency, p', p'), can be inverted well; NaN where that is nowhere.
-
-    Above one, residuals leave the set ``W Delta`` with a full perturbation, although every entry is bounded.
-    """
-    if W.shape[-1] != W.shape[-2] or not np.abs(W).max():
-        return float("nan")
-    usable = np.linalg.cond(W) < _SINGULAR
-    return float(sigma_max(np.linalg.inv(W[usable]) @ E[:, usable]).max()) if usable.any() else float("nan")
+    cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
+    return cover_ratio(E, cover.left, cover.right)
 
 
 def shown_rows(inside: npt.NDArray[np.bool_]) -> Array:

@@ -1,8 +1,8 @@
-"""What a quantification is given: models of units, candidates for the nominal, scales and options, read and checked, every refusal by name."""
+"""What a quantification is given: models or responses of units, candidates for the nominal, scales and options, read and checked, every refusal by name."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,13 @@ def read_models(
         unit_ids = tuple(models.unit_ids) if unit_ids is None else tuple(unit_ids)
         models = models.systems(unit_ids)
     system = stack_systems(models)
-    count = system.batch_shape[0]
+    ids = check_ids(unit_ids, system.batch_shape[0])
+    _check(system, tuple(f"unit {name}" for name in ids))
+    return system, ids, (check_scale("output", output_scale, system.n_outputs), check_scale("input", input_scale, system.n_inputs))
+
+
+def check_ids(unit_ids: Sequence[str] | None, count: int) -> tuple[str, ...]:
+    """Return the names of units, ``0, 1, ...`` by default, or say what is wrong with them or that there are too few units."""
     ids = tuple(str(k) for k in range(count)) if unit_ids is None else tuple(unit_ids)
     if len(ids) != count or len(set(ids)) != count:
         raise DimensionError(
@@ -34,8 +40,7 @@ def read_models(
         raise DataError(
             f"Quantify: uncertainty of a population needs at least two units, found {count} ({', '.join(ids)}); record more units."
         )
-    _check(system, tuple(f"unit {name}" for name in ids))
-    return system, ids, (check_scale("output", output_scale, system.n_outputs), check_scale("input", input_scale, system.n_inputs))
+    return ids
 
 
 def stack_systems(models: Any) -> StateSpace:
@@ -72,34 +77,32 @@ def stack_systems(models: Any) -> StateSpace:
     return models
 
 
+def check_names(ids: Collection[str], others: Collection[str]) -> None:
+    """Raise a `ConfigError` when further candidates have names of units."""
+    double = sorted(set(ids) & set(others))
+    if double:
+        raise ConfigError(f"Quantify: candidates {double} have the name of a unit; give them others.")
+
+
 def read_candidates(extra: Mapping[str, StateSpace] | None, system: StateSpace, ids: tuple[str, ...]) -> dict[str, StateSpace]:
     """Further candidates, checked like units."""
     others = dict(extra or {})
+    check_names(ids, others)
     for name, candidate in others.items():
-        if name in ids:
-            raise ConfigError(f"Quantify: candidate {name!r} has the name of a unit; give it another.")
-        _check_candidate(candidate, system)
-        _check(candidate[None], (f"candidate {name}",))
+        check_candidate(candidate, system, f"candidate {name}")
     return others
 
 
-def find_nominal(
-    nominal: int | str | StateSpace | None, system: StateSpace, ids: tuple[str, ...], others: Mapping[str, StateSpace], best: int
-) -> tuple[int, StateSpace]:
-    """Row of the nominal among units and candidates (-1 for a model of its own) and its system."""
-    if isinstance(nominal, StateSpace):
-        _check_candidate(nominal, system)
-        _check(nominal[None], ("the nominal",))
-        return -1, nominal
-    names = (*ids, *others)
+def find_nominal(nominal: Any, names: tuple[str, ...], best: int) -> int:
+    """Row of the nominal among units and further candidates: the one asked for by name or row, otherwise the best."""
     if isinstance(nominal, str):
         if nominal not in names:
             raise ConfigError(f"Quantify: nominal {nominal!r} is not among the units {', '.join(names[:10])}.")
-        nominal = names.index(nominal)
+        return names.index(nominal)
     index = best if nominal is None else nominal
     if not isinstance(index, (int, np.integer)) or not 0 <= index < len(names):
         raise ConfigError(f"Quantify: nominal {index!r} is out of range; give a name, a system, or a whole number below {len(names)}.")
-    return int(index), system[index] if index < len(ids) else others[names[index]]
+    return int(index)
 
 
 def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
@@ -110,21 +113,14 @@ def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
     return scale
 
 
-def check_fit(max_order: int, tolerance_db: float, density: int = 1) -> None:
-    """Raise a `ConfigError` when an option of the fit is out of range."""
-    if not (isinstance(max_order, (int, np.integer)) and max_order >= 0 and tolerance_db >= 0 and density >= 1):
-        raise ConfigError(
-            f"Quantify: max_order = {max_order!r} should be a whole number from 0, tolerance_db = {tolerance_db} not negative, "
-            f"density = {density} at least 1."
-        )
-
-
-def _check_candidate(nominal: StateSpace, system: StateSpace) -> None:
-    if nominal.batch_shape or (nominal.n_outputs, nominal.n_inputs, nominal.dt) != (system.n_outputs, system.n_inputs, system.dt):
+def check_candidate(candidate: StateSpace, system: StateSpace, name: str) -> None:
+    """Raise a `DimensionError` or `DataError` when a candidate for the nominal is not one stable system like the units."""
+    if candidate.batch_shape or (candidate.n_outputs, candidate.n_inputs, candidate.dt) != (system.n_outputs, system.n_inputs, system.dt):
         raise DimensionError(
             f"Quantify: the nominal should be one system with {system.n_outputs} outputs, {system.n_inputs} inputs at {system.dt} s, found "
-            f"{nominal.n_outputs}, {nominal.n_inputs} at {nominal.dt} s in a batch of {nominal.batch_shape}."
+            f"{candidate.n_outputs}, {candidate.n_inputs} at {candidate.dt} s in a batch of {candidate.batch_shape}."
         )
+    _check(candidate[None], (name,))
 
 
 def _check(system: StateSpace, names: tuple[str, ...]) -> None:

@@ -29,8 +29,7 @@ from ..core.loading import check_shapes, loader
 from ..core.lti import StateSpace
 from ..identify import KoopmanMatrices, ModelSamples
 from .forms import Form, as_form, residual
-from .residuals import sigma_max
-from .small_matrices import squared
+from .small_matrices import sigma_max, squared
 
 Array = npt.NDArray[Any]
 

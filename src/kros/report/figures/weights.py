@@ -95,8 +95,7 @@ def _draw_row(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] |
         _draw_entries(panel, model.freqs_hz, magnitudes, below, names)
     if square:
         loop = model.weight.right.frequency_response(model.freqs_hz) @ model.weight.left.frequency_response(model.freqs_hz)
-        best = None if model.weight.structure is Structure.FULL else (cover.left * cover.right).max(axis=1)  # the frames are the fit's own
-        _draw_product(row[2], model.freqs_hz, sigma_max(loop), best)
+        _draw_product(row[2], model.freqs_hz, sigma_max(loop), (cover.left * cover.right).max(axis=1))
 
 
 def in_gauge(cover: Cover, other: Cover) -> Cover:

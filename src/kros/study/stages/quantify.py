@@ -11,7 +11,6 @@ import numpy as np
 
 from ...core.artifacts import save_artifact, write_json
 from ...core.errors import IdentificationError
-from ...core.norms import hinf_norm
 from ...identify import ModelSet
 from ...uncertainty import Form, OutlierScore, UncertainModel, choose_nominals, quantify_systems, residual, score_outliers, sigma_max
 from ...uncertainty.settings import UncertaintySettings
@@ -21,8 +20,6 @@ from ..scoring import Recorded
 from .diagnose import diagnose
 
 log = logging.getLogger(__name__)
-_LARGEST_PRODUCT = 0.7  # of |W_R W_L|: an amplification by 3.3
-_LOOSEST = 3.0  # overbound in tolerances at which a diagonal weight is loose
 
 
 def run(context: Context) -> None:
@@ -58,39 +55,19 @@ def choose_nominal(models: ModelSet, units: list[str], config: UncertaintySettin
 
 
 def quantify_models(models: ModelSet, units: list[str], config: UncertaintySettings, nominal: str) -> UncertainModel:
-    """Quantify one kind of model over the pooled units.
-
-    Diagonal weights are tighter than scalar ones channel by channel, but their product can be larger, for which inverse forms pay by
-    ``1 / (1 - |W_R W_L|)``, and they may bend too sharply to be fitted. Where either happens, scalar weights are taken instead.
-    """
-
-    def attempt(structure: str) -> UncertainModel:
-        return quantify_systems(
-            models.systems(units),
-            config.form,
-            models.frequencies(config.n_freqs),
-            unit_ids=units,
-            output_scale=models.output_scale,
-            input_scale=models.input_scale,
-            nominal=nominal,
-            structure=structure,
-            max_order=config.max_order,
-            tolerance_db=config.tolerance_db,
-        )
-
-    if config.structure != "auto":
-        return attempt(config.structure)
-    diagonal = attempt("diagonal")
-    inverse = config.form.startswith("inverse") and config.form != "inverse_additive"
-    amplified = inverse and hinf_norm(diagonal.weight.right @ diagonal.weight.left) >= _LARGEST_PRODUCT
-    if not amplified and diagonal.weight.overbound_db_max <= _LOOSEST * config.tolerance_db:
-        return diagonal
-    scalar = attempt("scalar")
-    if not amplified and diagonal.weight.overbound_db_max <= scalar.weight.overbound_db_max:
-        return diagonal
-    reason = "come close to an ill-posed set" if amplified else f"exceed the optimal ones by {diagonal.weight.overbound_db_max:.1f} dB"
-    log.info("%s: diagonal weights %s, scalar ones are taken", models.name, reason)
-    return scalar
+    """Quantify one kind of model over the pooled units."""
+    return quantify_systems(
+        models.systems(units),
+        config.form,
+        models.frequencies(config.n_freqs),
+        unit_ids=units,
+        output_scale=models.output_scale,
+        input_scale=models.input_scale,
+        nominal=nominal,
+        structure=config.structure,
+        max_order=config.max_order,
+        tolerance_db=config.tolerance_db,
+    )
 
 
 def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:

@@ -134,7 +134,7 @@ def usable_problem(
     if uncertain.weight.structure is Structure.ENTRYWISE:
         refusal = (
             "the weights are entrywise, made for a diagonal perturbation, and synthesis is for a full one; "
-            "set uncertainty.structure to 'auto', 'diagonal', 'full' or 'scalar'"
+            "set uncertainty.structure to 'auto', 'diagonal' or 'scalar'"
         )
     else:
         problem = observer_problem(models, unit, uncertain, noise, context)

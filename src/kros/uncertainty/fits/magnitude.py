@@ -21,7 +21,6 @@ import numpy.typing as npt
 from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
 from ...core.lti import StateSpace, gain
-from .given import best_numerator, pole_roots
 from .minimax import Grid, Programs
 from .spectral import RationalMagnitude, basis, on_half_line, roots, spectral_factor
 
@@ -63,7 +62,7 @@ class FittedMagnitude:
         Whether `overbound_db` is within the tolerance asked for.
     proven_db : float, dB
         No system of this order stays closer to the data on the same grid than this: proven by the alternation of the fit around them,
-        whatever the programs did. With given poles, NaN.
+        whatever the programs did.
     """
 
     system: StateSpace
@@ -88,9 +87,6 @@ def fit_magnitude(
     max_order: int = 4,
     tolerance_db: float = 1.0,
     side: Side | str = Side.ABOVE,
-    nyquist_zeros: int = 0,
-    dc_zeros: int = 0,
-    poles: npt.ArrayLike | None = None,
 ) -> FittedMagnitude:
     r"""Return a discrete system whose magnitude is the tightest uniform bound of the data.
 
@@ -109,12 +105,6 @@ def fit_magnitude(
         Largest distance accepted when the order is chosen.
     side : {"above", "below"}
         Smallest majorant or largest minorant of the data.
-    nyquist_zeros, dc_zeros : int
-        Zeros at z = -1 and z = 1 that the system must have beyond `order` (roll-off); it then has no stable inverse, and grid points where
-        it vanishes do not count.
-    poles : array_like of complex, optional
-        Poles in z that the system must have, complex ones in pairs; only its zeros are fitted then, and the order is their number. From below
-        the zeros are given in the same way.
 
     Returns
     -------
@@ -145,13 +135,11 @@ def fit_magnitude(
     freqs = check_grid(freqs_hz, sample_period_s)
     values = _check_magnitude(magnitude, freqs, side)
     highest = max_order if order is None else order
-    if highest < 0 or min(nyquist_zeros, dc_zeros) < 0:
-        raise ConfigError(f"Magnitude fit: orders and numbers of zeros should not be negative, found order {order}, max_order {max_order}.")
+    if highest < 0:
+        raise ConfigError(f"Magnitude fit: orders should not be negative, found order {order}, max_order {max_order}.")
     if not values.any():
         return FittedMagnitude(gain([[0.0]], sample_period_s), 0, 0.0, side, True)
-    problem = _Problem(freqs, values, sample_period_s, side, nyquist_zeros, dc_zeros)
-    if poles is not None:
-        return problem.with_poles(pole_roots(poles), tolerance_db)
+    problem = _Problem(freqs, values, sample_period_s, side)
     best: FittedMagnitude | None = None
     lower: _Bound | None = None
     if order is not None:
@@ -238,57 +226,36 @@ class _Problem:
     values: Array
     dt: float
     side: Side
-    nyquist_zeros: int
-    dc_zeros: int
 
     def fit(self, order: int, tolerance_db: float, lower: _Bound | None, *, last: bool) -> tuple[FittedMagnitude | None, _Bound | None]:
         """Fit one order, starting from the bound of a lower order; None where the programs fail."""
-        tau, targets, unit, keep = self._targets()
+        tau = bilinear_squared(self.freqs, self.dt)
+        targets = self.values ** (2 if self.side is Side.ABOVE else -2)  # to stay above
+        unit = float(np.exp(np.mean(np.log(targets))))
         hopeless = np.inf if last else 10 ** (_HOPELESS * tolerance_db / 10)
-        found = _minimax(tau, targets, order, lower, hopeless)
+        found = _minimax(tau, targets / unit, order, lower, hopeless)
         if found is None:
             return None, lower
         try:
-            return self._finish(found.rational, unit, keep, tolerance_db), found
+            return self._finish(found.rational, unit, tolerance_db), found
         except KrosError as error:  # positive on the grid and zero at Nyquist: no system with an inverse, another order is
             _LOG.debug("Magnitude fit: order %d has no spectral factor (%s)", order, error)
             return None, lower
 
-    def with_poles(self, found: Array, tolerance_db: float) -> FittedMagnitude:
-        """Fit the numerator for given roots of the denominator in tau: one linear program, and further points where it is not positive."""
-        tau, targets, unit, keep = self._targets()
-        return replace(self._finish(best_numerator(tau, targets, found), unit, keep, tolerance_db), proven_db=float("nan"))
-
-    def _targets(self) -> tuple[Array, Array, float, Array]:
-        """Points in tau, squared magnitudes to stay above there, their unit, and which points of the grid these are."""
-        tau = bilinear_squared(self.freqs, self.dt)
-        shape = self._zero_factor(tau)
-        keep = shape > 1e-30
-        targets = self.values[keep] ** (2 if self.side is Side.ABOVE else -2) / shape[keep]
-        unit = float(np.exp(np.mean(np.log(targets))))
-        return tau[keep], targets / unit, unit, keep
-
-    def _zero_factor(self, tau: Array) -> Array:
-        """Squared magnitude of the prescribed zeros; from below they would be poles of the inverse fit."""
-        down = 1.0 / (1.0 + tau)
-        power = down**self.nyquist_zeros * (1.0 - down) ** self.dc_zeros if self.dc_zeros else down**self.nyquist_zeros
-        return power if self.side is Side.ABOVE else 1.0 / np.maximum(power, 1e-300)
-
-    def _finish(self, rational: RationalMagnitude, unit: float, keep: Array, tolerance_db: float) -> FittedMagnitude:
+    def _finish(self, rational: RationalMagnitude, unit: float, tolerance_db: float) -> FittedMagnitude:
         """Factorise, and lift (or lower) by the deficit of the system as evaluated."""
         bound = RationalMagnitude(rational.numerator * unit, rational.denominator, rational.knots)
         if self.side is Side.BELOW:
             bound = RationalMagnitude(bound.denominator, bound.numerator, bound.knots)
-        system = spectral_factor(bound, self.dt, nyquist_zeros=self.nyquist_zeros, dc_zeros=self.dc_zeros)
-        ratio = np.abs(system.frequency_response(self.freqs[keep])[:, 0, 0]) / self.values[keep]
+        system = spectral_factor(bound, self.dt)
+        ratio = np.abs(system.frequency_response(self.freqs)[:, 0, 0]) / self.values
         margin = 1 + 1e-12
         if not (ratio.min() > 0 and np.isfinite(ratio).all()):
             raise KrosError("Magnitude fit: the system vanishes or is infinite at a frequency of the grid; try another order.")
         touch = margin / ratio.min() if self.side is Side.ABOVE else 1 / (margin * ratio.max())
         system = StateSpace(system.A, system.B, system.C * touch, system.D * touch, system.dt)
         overbound = float(20 * np.log10(ratio.max() / ratio.min()))
-        degree = system.n_states - self.nyquist_zeros - self.dc_zeros
-        proven = alternation_db(ratio, 2 * degree + 2)
+        proven = alternation_db(ratio, 2 * system.n_states + 2)
         return FittedMagnitude(system, system.n_states, overbound, self.side, overbound <= tolerance_db, proven)
 
 

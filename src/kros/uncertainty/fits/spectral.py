@@ -34,7 +34,6 @@ _DIGITS = 60
 _POLISH = 60
 _REAL = 1e-12  # relative imaginary part below which a root counts as real
 _INSIDE = 1e-13  # distance from the unit circle that is no rounding
-_AT_NYQUIST = complex("inf")  # a zero at z = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +162,7 @@ def on_half_line(found: Sequence[complex]) -> list[float]:
     return [r.real for r in found if r.real >= 0 and abs(r.imag) <= _REAL * abs(r)]
 
 
-def spectral_factor(magnitude: RationalMagnitude, sample_period_s: float, *, nyquist_zeros: int = 0, dc_zeros: int = 0) -> StateSpace:
+def spectral_factor(magnitude: RationalMagnitude, sample_period_s: float) -> StateSpace:
     """Return the stable, minimum-phase system whose squared magnitude is given.
 
     Parameters
@@ -171,14 +170,11 @@ def spectral_factor(magnitude: RationalMagnitude, sample_period_s: float, *, nyq
     magnitude : RationalMagnitude
         Positive on the whole axis.
     sample_period_s : float, s
-    nyquist_zeros, dc_zeros : int
-        Further zeros of the system at z = -1 and z = 1: the squared magnitude is multiplied by `((1 + cos theta) / 2) ** nyquist_zeros`
-        and `((1 - cos theta) / 2) ** dc_zeros`. Poles at w = -1 (z = 0) go with them.
 
     Returns
     -------
     StateSpace
-        One input, one output, as many states as knots (and further zeros).
+        One input, one output, as many states as knots.
 
     Raises
     ------
@@ -195,10 +191,8 @@ def spectral_factor(magnitude: RationalMagnitude, sample_period_s: float, *, nyq
         raise KrosError(
             f"Spectral factor: the squared magnitude is not positive and finite at tau = {bad}; lift the numerator or refine the grid."
         )
-    degree = len(zero_roots)
-    zeros = [-np.sqrt(-complex(r)) for r in zero_roots] + [_AT_NYQUIST] * nyquist_zeros + [0j] * dc_zeros
-    poles = [-np.sqrt(-complex(r)) for r in pole_roots] + [-1.0 + 0j] * (nyquist_zeros + dc_zeros)
-    _check_inside([*zeros[:degree], *poles[:degree]])
+    zeros, poles = ([-np.sqrt(-complex(r)) for r in side] for side in (zero_roots, pole_roots))
+    _check_inside([*zeros, *poles])
     return cascade(zeros, poles, float(np.sqrt(abs(lead_n)) / np.sqrt(abs(lead_d))), sample_period_s)
 
 
@@ -217,13 +211,13 @@ def cascade(zeros: Sequence[complex], poles: Sequence[complex], factor: float, s
     Parameters
     ----------
     zeros, poles : sequence of complex
-        In the variable w, equally many, complex ones in conjugate pairs; a zero at infinity stands for z = -1.
+        In the variable w, equally many, complex ones in conjugate pairs.
     factor : float
     sample_period_s : float, s
     """
     sections, total = [], factor
     for q, p in _pair(list(zeros), list(poles)):
-        total *= float(np.real(np.prod([1 if np.isinf(x) else 1 - x for x in q]) / np.prod([1 - x for x in p])))
+        total *= float(np.real(np.prod([1 - x for x in q]) / np.prod([1 - x for x in p])))
         sections.append(_section([_to_zeta(x) for x in q], [_to_zeta(x) for x in p], sample_period_s))
     scale = gain([[total]], sample_period_s)
     return reduce(lambda system, section: section @ system, sections, scale)
@@ -231,7 +225,7 @@ def cascade(zeros: Sequence[complex], poles: Sequence[complex], factor: float, s
 
 def _to_zeta(w: complex) -> complex:
     """From w to zeta = z - 1, without subtracting near one."""
-    return -2.0 + 0j if np.isinf(w) else 2 * w / (1 - w)
+    return 2 * w / (1 - w)
 
 
 def _section(q: list[complex], p: list[complex], dt: float) -> StateSpace:
@@ -278,15 +272,15 @@ def _pair(zeros: list[complex], poles: list[complex]) -> list[tuple[list[complex
 
 def _split(values: list[complex]) -> tuple[list[complex], list[complex]]:
     """Upper halves of the conjugate pairs, and the real ones."""
-    real = [v for v in values if np.isinf(v) or abs(v.imag) <= _REAL * abs(v)]
+    real = [v for v in values if abs(v.imag) <= _REAL * abs(v)]
     upper = [v for v in values if v not in real and v.imag > 0]
     if len(real) + 2 * len(upper) != len(values):
         raise KrosError(f"Spectral factor: complex roots should come in conjugate pairs, found {values}; try another order.")
-    return upper, [v if np.isinf(v) else complex(v.real) for v in real]
+    return upper, [complex(v.real) for v in real]
 
 
 def _distance(one: complex, other: complex) -> float:
-    """Distance in decades between magnitudes; zeros at z = 1 and z = -1 are far from everything."""
+    """Distance in decades between magnitudes."""
     sizes = np.clip([abs(one), abs(other)], 1e-30, 1e30)
     return float(abs(np.log10(sizes[0] / sizes[1])))
 

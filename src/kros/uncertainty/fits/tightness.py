@@ -12,9 +12,6 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.loading import loader
-from ..weights.check import Residuals
-from ..weights.cover import Structure
-from ..weights.weight import fit_weight
 from .magnitude import _FLOOR, FittedMagnitude, Side, _Problem, fit_magnitude
 
 Array = npt.NDArray[Any]
@@ -27,12 +24,10 @@ class Tightness:
     Parameters
     ----------
     orders : ndarray of int, shape (n_orders,)
-        Of a magnitude, or the largest of one entry of a weight.
     overbound_db : ndarray, shape (n_orders,), dB
     proven_db : ndarray, shape (n_orders,), dB
         What no fit of that order goes below (magnitudes); zero where nothing is proven.
     states : ndarray of int, shape (n_orders,)
-        Of all entries together.
     """
 
     orders: Array
@@ -81,26 +76,9 @@ def _fit_orders(freqs_hz: npt.ArrayLike, magnitude: npt.ArrayLike, sample_period
     if constant.overbound_db == 0:
         return [constant]
     freqs, values = np.asarray(freqs_hz, float), np.asarray(magnitude, float)
-    problem = _Problem(freqs, np.maximum(values, _FLOOR * values.max()), sample_period_s, Side.ABOVE, 0, 0)
+    problem = _Problem(freqs, np.maximum(values, _FLOOR * values.max()), sample_period_s, Side.ABOVE)
     found, lower = [constant], None
     for order in range(highest + 1):
         fit, lower = problem.fit(order, 0.0, lower, last=True)
         found += [fit] if fit is not None and order > 0 else []
     return found
-
-
-def weight_tightness(
-    residuals: Residuals,
-    freqs_hz: Array,
-    sample_period_s: float,
-    orders: Iterable[int] = range(1, 9),
-    *,
-    structure: Structure | str = Structure.DIAGONAL,
-    density: int = 10,
-) -> Tightness:
-    """Return the overbound of weights whose entries have at most each order; nothing is proven about the best ones."""
-    chosen = np.array(list(orders), int)
-    options: dict[str, Any] = {"structure": structure, "tolerance_db": 0.0, "density": density}
-    found = [fit_weight(residuals, freqs_hz, sample_period_s, max_order=int(n), **options)[0] for n in chosen]
-    states = np.array([sum(w.left_orders) + sum(w.right_orders) for w in found])
-    return Tightness(chosen, np.array([w.overbound_db_max for w in found]), np.zeros(len(chosen)), states)

@@ -8,7 +8,8 @@ few rounds are needed; each visits as many pairs as there are units, not their s
 
 A peak is looked for on part of the frequencies first, because a maximum over part of them is a lower bound as well. A mean needs all.
 
-Plants are tall here: wide ones are transposed, with the dual form, and the inverse additive form then has its plants exchanged (see `residuals`).
+Plants are tall here: wide ones are transposed, with the dual form; as `E_ia(G^T, Gp^T) = -E_ia(Gp, G)^T`, the inverse additive form then has nominal
+and perturbed plant exchanged. With `G^+ = L Q^H`, L small and triangular, `sigma(D G^+) = sigma(D L)`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..forms import Form
-from ..small_matrices import entries_first, multiply, pseudo_inverse_first, sigma_max_first, triangle
+from ..small_matrices import entries_first, lower_factor, multiply, pseudo_inverse_first, sigma_max_first
 
 Array = npt.NDArray[Any]
 Score = Callable[[Array], Array]
@@ -52,6 +53,14 @@ class Plants:
         """Return some units and frequencies; two integer arrays are matched, as in NumPy."""
         key = (slice(None), slice(None), *index)
         return Plants(self.G[key], None if self.P is None else self.P[key], None if self.L is None else self.L[key])
+
+    def joined(self, other: Plants) -> Plants:
+        """Return the units of both."""
+
+        def both(a: Array | None, b: Array | None) -> Array | None:
+            return None if a is None or b is None else np.concatenate([a, b], axis=2)
+
+        return Plants(np.concatenate([self.G, other.G], axis=2), both(self.P, other.P), both(self.L, other.L))
 
     def one(self, unit: int) -> Plants:
         """Return one unit, with its axis."""
@@ -86,7 +95,7 @@ class Geometry:
             if P is not None:
                 P[:, :, rows] = pseudo_inverses
             if L is not None:
-                L[:, :, rows] = triangle(pseudo_inverses)
+                L[:, :, rows] = lower_factor(pseudo_inverses)
         return Plants(G, P, L)
 
     def sigma(self, nominal: Plants, units: Plants) -> Array:
@@ -114,7 +123,7 @@ class Found:
     bound : ndarray, shape (frequency,)
         Its largest residual over the units.
     scores : ndarray, shape (candidate,)
-        Where a candidate was evaluated its score, elsewhere a lower bound; infinity where it was not allowed.
+        Where a candidate was evaluated its score, elsewhere a lower bound.
     evaluated : ndarray of bool, shape (candidate,)
         Which scores are exact.
     """
@@ -125,8 +134,8 @@ class Found:
     evaluated: Array
 
 
-def search(geometry: Geometry, candidates: Plants, units: Plants, allowed: Array, score: Score, *, partial: bool) -> Found:
-    """Return the allowed candidate whose bound has the lowest score.
+def search(geometry: Geometry, candidates: Plants, units: Plants, score: Score, *, partial: bool) -> Found:
+    """Return the candidate whose bound has the lowest score.
 
     Parameters
     ----------
@@ -134,7 +143,6 @@ def search(geometry: Geometry, candidates: Plants, units: Plants, allowed: Array
     candidates : Plants
         Among them the units themselves: a residual of zero with itself changes no maximum.
     units : Plants
-    allowed : ndarray of bool, shape (candidate,)
     score : callable
         From bounds (..., frequency) to scores (...), non-negative and never falling when a bound rises.
     partial : bool
@@ -147,10 +155,10 @@ def search(geometry: Geometry, candidates: Plants, units: Plants, allowed: Array
     n_freqs = units.G.shape[3]
     coarse = np.unique(np.linspace(0, n_freqs - 1, max(2, n_freqs // _COARSE)).round().astype(int)) if partial else np.arange(n_freqs)
     few_candidates, few_units = (candidates.part(slice(None), coarse), units.part(slice(None), coarse)) if partial else (candidates, units)
-    lower = np.zeros((len(allowed), len(coarse)))
-    scores = np.where(allowed, 0.0, np.inf)
-    evaluated = np.zeros(len(allowed), bool)
-    best, bound, holder, waiting = np.inf, np.zeros(n_freqs), -1, allowed.copy()
+    count = candidates.G.shape[2]
+    lower, scores = np.zeros((count, len(coarse))), np.zeros(count)
+    evaluated, waiting = np.zeros(count, bool), np.ones(count, bool)
+    best, bound, holder = np.inf, np.zeros(n_freqs), -1
     while waiting.any():
         rows = np.flatnonzero(waiting)
         row = int(rows[np.argmin(scores[rows])]) if evaluated.any() else _central(candidates, rows)

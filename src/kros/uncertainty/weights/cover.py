@@ -52,7 +52,6 @@ class Structure(str, Enum):
     SCALAR = "scalar"
     DIAGONAL = "diagonal"
     ENTRYWISE = "entrywise"
-    FULL = "full"
 
     @property
     def perturbation(self) -> Perturbation:
@@ -73,6 +72,10 @@ class Cover:
 
     left: Array
     right: Array
+
+    def at(self, rows: Array) -> Cover:
+        """Return the cover at some frequencies."""
+        return Cover(self.left[rows], self.right[rows])
 
     def entries(self) -> Array:
         """Return `left_i right_j`, what the cover allows entry by entry, shape (frequency, p', m'); independent of the gauge."""
@@ -96,6 +99,8 @@ def as_structure(structure: Structure | str) -> Structure:
     ConfigError
         When there is no structure of that name.
     """
+    if structure == "full":
+        raise ConfigError("Weight structure 'full' is no longer there; choose 'diagonal', whose sets are somewhat larger.")
     try:
         return Structure(structure)
     except ValueError as error:
@@ -127,17 +132,10 @@ def optimal_cover(
     size = sigma_max_first(first).max(axis=0)
     if as_structure(structure) is Structure.SCALAR:
         return Cover(np.repeat(size[:, None], p, axis=1), np.ones((len(size), m)))
-    x = _descend(first, size, p, pull, free_right=True, squarings=squarings)
+    x = _descend(first, size, p, pull, squarings)
     right = np.exp(x[p:] - x[p:].mean(axis=0)).T
     right = right / right[:, [int(np.argmax(np.median(right, axis=0)))]]
     return Cover(_scaled_left(first, np.exp(x[:p]).T, right), right)
-
-
-def optimal_left(E: Array, right: Array, pull: float = _PULL) -> Array:
-    """Return the best left magnitudes, shape (frequency, p'), for given right ones, shape (frequency, m')."""
-    first = entries_first(E) / right.T[None, :, None, :]
-    x = _descend(first, sigma_max_first(first).max(axis=0), first.shape[0], pull, free_right=False)
-    return _scaled_left(first, np.exp(x[: first.shape[0]]).T, np.ones_like(right))
 
 
 def cover_ratio(E: Array, left: Array, right: Array) -> Array:
@@ -155,8 +153,8 @@ def _scaled_left(first: Array, left: Array, right: Array) -> Array:
     return left * sigma_max_first(first / left.T[:, None, None, :] / right.T[None, :, None, :]).max(axis=0)[:, None]
 
 
-def _descend(first: Array, size: Array, p: int, pull: float, *, free_right: bool, squarings: tuple[int, ...] = _SQUARINGS) -> Array:
-    """Minimise the smoothed cost over x of shape (p' + m', frequency); the right part only where it is free.
+def _descend(first: Array, size: Array, p: int, pull: float, squarings: tuple[int, ...]) -> Array:
+    """Minimise the smoothed cost over x of shape (p' + m', frequency).
 
     Newton's method runs on part of the frequencies and of the units, and x is interpolated: the scale s, which is recomputed for all
     frequencies and units, keeps every x sound.
@@ -171,7 +169,7 @@ def _descend(first: Array, size: Array, p: int, pull: float, *, free_right: bool
     x = np.zeros((n, len(chosen)))
     for power in squarings:
         for _ in range(_NEWTON):
-            x, moved = _newton(_Smooth(E, p, n if free_right else p, power, pull), x)
+            x, moved = _newton(_Smooth(E, p, power, pull), x)
             if moved < 1e-3:
                 break
     return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
@@ -185,16 +183,15 @@ def _largest(sizes: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Smooth:
-    """The smoothed cost of residuals (p', m', unit, frequency) in the first `free` of the x."""
+    """The smoothed cost of residuals (p', m', unit, frequency)."""
 
     E: Array
     p: int
-    free: int
     squarings: int
     pull: float
 
     def cost(self, x: Array) -> tuple[Array, Array]:
-        """Return the cost, shape (frequency,), and its gradient, shape (free, frequency)."""
+        """Return the cost, shape (frequency,), and its gradient, shape of x."""
         p, m = self.p, len(x) - self.p
         M = self.E * np.exp(-x[:p])[:, None, None, :] * np.exp(-x[p:])[None, :, None, :]
         top = np.sqrt(squared(M).sum(axis=(0, 1)).max(axis=0))  # no smaller than the largest singular value, and at most four times
@@ -207,32 +204,27 @@ class _Smooth:
         marginal = (Y * np.conj(M)).real.sum(axis=2)  # over units: (p', m', frequency)
         total = marginal.sum(axis=(0, 1))
         q = 2**self.squarings + 1
-        cost = x[:p].mean(axis=0) + np.log(top) + np.log(total) / (2 * q) + self.pull / 2 * (x**2).sum(axis=0)
-        gradient = 1 / p - marginal.sum(axis=1) / total
-        if self.free > p:
-            cost = cost + x[p:].mean(axis=0)
-            gradient = np.concatenate([gradient, 1 / m - marginal.sum(axis=0) / total])
-        return cost, gradient + self.pull * x[: self.free]
+        cost = x[:p].mean(axis=0) + np.log(top) + np.log(total) / (2 * q) + self.pull / 2 * (x**2).sum(axis=0) + x[p:].mean(axis=0)
+        gradient = np.concatenate([1 / p - marginal.sum(axis=1) / total, 1 / m - marginal.sum(axis=0) / total])
+        return cost, gradient + self.pull * x
 
 
 def _newton(smooth: _Smooth, x: Array) -> tuple[Array, float]:
     """One damped Newton step; the Hessian from differences of the gradient."""
-    free = smooth.free
     cost, gradient = smooth.cost(x)
-    hessian = np.empty((x.shape[1], free, free))
-    for i in range(free):
+    hessian = np.empty((x.shape[1], len(x), len(x)))
+    for i in range(len(x)):
         ahead = x.copy()
         ahead[i] += _DIFFERENCE
         hessian[:, :, i] = ((smooth.cost(ahead)[1] - gradient) / _DIFFERENCE).T
-    hessian = (hessian + hessian.swapaxes(1, 2)) / 2 + 1e-6 * np.eye(free)
+    hessian = (hessian + hessian.swapaxes(1, 2)) / 2 + 1e-6 * np.eye(len(x))
     step = -np.linalg.solve(hessian, gradient.T[..., None])[..., 0].T
     step *= np.minimum(1.0, _REACH / np.maximum(np.abs(step).max(axis=0), _TINY))
     slope = (gradient * step).sum(axis=0)
     best, length = x, np.ones(x.shape[1])
     pending = np.ones(x.shape[1], bool)
     for _ in range(8):
-        trial = x.copy()
-        trial[:free] += length * step
+        trial = x + length * step
         better = pending & (smooth.cost(trial)[0] <= cost + 0.1 * length * slope)
         best = np.where(better, trial, best)
         pending &= ~better

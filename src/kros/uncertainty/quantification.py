@@ -1,0 +1,259 @@
+"""The mechanism behind every quantification: choose the nominal, bound its residuals and what the form leaves out, name the results.
+
+Nominal and units are responses that can be asked for at some frequencies, of systems (`systems`) or as measured (`responses`); continuous ones are
+bounded on the unit circle that the bilinear map makes of the imaginary axis (`bilinear`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError
+from ..core.norms import hinf_norm
+from .bilinear import BilinearAxis
+from .forms import Form, as_form, residual
+from .nominal.choice import Criterion, NominalChoice, as_criterion, choose_nominal, choose_nominals
+from .residuals import completion, misfit
+from .small_matrices import sigma_max
+from .weights.check import Residuals, between_points
+from .weights.cover import Cover, Structure, as_structure
+from .weights.fit import fit_weight
+from .weights.pencils import Part, ResidualSystems
+from .weights.weight import Weight
+
+Array = npt.NDArray[Any]
+Responder = Callable[[Array], Array]
+
+AUTO = "auto"  # structure: diagonal weights, or scalar ones where these are not good enough
+POOLED = "pooled"  # name of a nominal that is neither unit nor candidate
+_LOG = logging.getLogger(__name__)
+_EXACT = 1e-9  # relative misfit up to which a form is said to rebuild every unit: rounding
+_WORTH_SAYING = 0.01  # a misfit that makes another form worth a thought
+_REMAINDER_TOLERANCE = 1.5  # the remainder is small: its weight may be looser by this factor
+_LARGEST_PRODUCT = 0.7  # of |W_R W_L|: an amplification by 3.3
+_LOOSEST = 3.0  # overbound in tolerances at which a diagonal weight is loose
+
+
+@dataclass(frozen=True, eq=False)
+class Bounded:
+    """Weights of a form and, where the form leaves something out, of the additive remainder; fields as in `Uncertainty`.
+
+    Parameters
+    ----------
+    bound : ndarray, shape (frequency,)
+        Largest residual over the units.
+    """
+
+    bound: Array
+    cover: Cover
+    weight: Weight
+    misfit: Array
+    remainder: Weight | None = None
+    remainder_cover: Cover | None = None
+
+
+@dataclass(frozen=True)
+class Quantification:
+    """What is asked for: options of `quantify_systems`, read and checked; no structure stands for the automatic one."""
+
+    form: Form
+    criterion: Criterion
+    structure: Structure | None
+    max_order: int
+    tolerance_db: float
+    density: int = 10
+
+    @classmethod
+    def of(
+        cls,
+        form: Form | str,
+        criterion: Criterion | str,
+        structure: Structure | str,
+        max_order: int,
+        tolerance_db: float,
+        density: int = 10,
+    ) -> Quantification:
+        """Check the options.
+
+        Raises
+        ------
+        ConfigError
+            Unknown form, criterion or structure, an order or tolerance out of range.
+        """
+        if not (isinstance(max_order, (int, np.integer)) and max_order >= 0 and tolerance_db >= 0 and density >= 1):
+            raise ConfigError(
+                f"Quantify: max_order = {max_order!r} should be a whole number from 0, tolerance_db = {tolerance_db} not negative, "
+                f"density = {density} at least 1."
+            )
+        known = None if structure == AUTO else as_structure(structure)
+        return cls(as_form(form), as_criterion(criterion), known, max_order, tolerance_db, density)
+
+    def choose(self, responses: Array, extra: Array, freqs_hz: Array) -> dict[Form, NominalChoice]:
+        """Return the nominal of every form with the lowest peak, and of the form asked for by its criterion."""
+        choices = choose_nominals(responses, extra=extra)
+        if self.criterion is not Criterion.PEAK:
+            choices[self.form] = choose_nominal(responses, self.form, self.criterion, extra=extra, freqs_hz=freqs_hz)
+        return choices
+
+    def bound(
+        self,
+        nominal: Responder,
+        units: Responder,
+        freqs_hz: Array,
+        time: float | BilinearAxis,
+        *,
+        systems: ResidualSystems | None = None,
+        also_hz: Array | None = None,
+        sampled: bool = False,
+    ) -> Bounded:
+        """Return weights for the residuals and for the remainder, in the time of the responses.
+
+        Parameters
+        ----------
+        nominal, units : callable
+            From frequencies (n,), Hz, to responses of shape (n, p, m) and (unit, n, p, m) in scaled coordinates.
+        freqs_hz : ndarray, shape (frequency,), Hz
+        time : float, s, or BilinearAxis
+            Sampling period, or the map of the axis for continuous time.
+        systems : ResidualSystems, optional
+            The discrete systems behind the responses, for a proof between grid points, also of the remainder's weight.
+        also_hz : ndarray, shape (n,), Hz, optional
+            Where the bound is checked besides; on the mapped axis for continuous time.
+        sampled : bool
+            The responses are known at `freqs_hz` only, and nominal and units are asked for no others.
+        """
+        if isinstance(time, BilinearAxis):
+            back = time.continuous_hz
+            grid, dt = time.discrete_hz(freqs_hz), time.period_s
+            residuals = _Residuals(self.form, lambda f: nominal(back(f)), lambda f: units(back(f)))
+            found = self._bound(residuals, grid, dt, systems, also_hz, sampled)
+            remainder = None if found.remainder is None else found.remainder.mapped(time.continuous)
+            return replace(found, weight=found.weight.mapped(time.continuous), remainder=remainder)
+        return self._bound(_Residuals(self.form, nominal, units), freqs_hz, time, systems, also_hz, sampled)
+
+    def _bound(
+        self, residuals: _Residuals, freqs_hz: Array, dt: float, systems: ResidualSystems | None, also_hz: Array | None, sampled: bool
+    ) -> Bounded:
+        G, Gp = residuals.responses(freqs_hz)
+        E = residual(self.form, G, Gp)
+        options: dict[str, Any] = {"max_order": self.max_order, "density": self.density, "also_hz": also_hz, "sampled": sampled}
+
+        def fit(structure: Structure) -> tuple[Weight, Cover]:
+            of_form: Residuals = between_points(E, freqs_hz) if sampled else residuals.of_form
+            return fit_weight(of_form, freqs_hz, dt, structure=structure, tolerance_db=self.tolerance_db, systems=systems, **options)
+
+        weight, cover = self._automatic(fit) if self.structure is None else fit(self.structure)
+        ratio, bound = misfit(self.form, G, Gp, E), sigma_max(E).max(axis=0)
+        if not _leaves_out(self.form, ratio):
+            return Bounded(bound, cover, weight, ratio)
+        left_over: Residuals = between_points(residuals.left_over(freqs_hz), freqs_hz) if sampled else residuals.left_over
+        rest = None if systems is None else replace(systems, part=Part.REMAINDER)
+        structure = Structure.DIAGONAL if weight.structure is Structure.ENTRYWISE else weight.structure
+        looser = _REMAINDER_TOLERANCE * self.tolerance_db
+        remainder = fit_weight(left_over, freqs_hz, dt, structure=structure, tolerance_db=looser, systems=rest, **options)
+        return Bounded(bound, cover, weight, ratio, *remainder)
+
+    def _automatic(self, fit: Callable[[Structure], tuple[Weight, Cover]]) -> tuple[Weight, Cover]:
+        """Diagonal weights, or scalar ones where these are better.
+
+        Diagonal weights are tighter than scalar ones channel by channel, but their product can be larger, for which inverse forms pay by
+        ``1 / (1 - |W_R W_L|)``, and they may bend too sharply to be fitted.
+        """
+        diagonal = fit(Structure.DIAGONAL)
+        weight = diagonal[0]
+        loop = self.form.inverse and self.form is not Form.INVERSE_ADDITIVE
+        amplified = loop and hinf_norm(weight.right @ weight.left) >= _LARGEST_PRODUCT
+        if not amplified and weight.overbound_db_max <= _LOOSEST * self.tolerance_db:
+            return diagonal
+        scalar = fit(Structure.SCALAR)
+        if not amplified and weight.overbound_db_max <= scalar[0].overbound_db_max:
+            return diagonal
+        reason = "come close to an ill-posed set" if amplified else f"exceed the optimal ones by {weight.overbound_db_max:.1f} dB"
+        _LOG.info("Diagonal weights %s; scalar ones are taken.", reason)
+        return scalar
+
+    def fields(
+        self,
+        unit_ids: tuple[str, ...],
+        names: tuple[str, ...],
+        index: int,
+        freqs_hz: Array,
+        scales: tuple[Array, Array],
+        choices: Mapping[Form, NominalChoice],
+        found: Bounded,
+    ) -> dict[str, Any]:
+        """Return the fields of `Uncertainty` for the nominal `index` among `names` of units and other candidates, -1 for a model of its own."""
+        name = names[index] if index >= 0 else POOLED
+        return {
+            "form": self.form,
+            "unit_ids": unit_ids,
+            "nominal": index if index < len(unit_ids) else -1,
+            "nominal_id": name,
+            "freqs_hz": freqs_hz,
+            "output_scale": scales[0],
+            "input_scale": scales[1],
+            "bounds": {f: choice.bound for f, choice in choices.items()} | {self.form: found.bound},
+            "nominals": {f: names[choice.index] for f, choice in choices.items()} | {self.form: name},
+            **{key: getattr(found, key) for key in ("cover", "weight", "misfit", "remainder", "remainder_cover")},
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class _Residuals:
+    """Residuals of the scaled units at any frequency."""
+
+    form: Form
+    nominal: Responder
+    units: Responder
+
+    @cached_property
+    def _known(self) -> dict[bytes, tuple[Array, Array]]:
+        return {}
+
+    def responses(self, freqs_hz: Array) -> tuple[Array, Array]:
+        """Responses of the nominal and the units."""
+        key = freqs_hz.tobytes()
+        if key not in self._known:
+            self._known[key] = self.nominal(freqs_hz), self.units(freqs_hz)
+        return self._known[key]
+
+    def of_form(self, freqs_hz: Array) -> Array:
+        """Residuals of the form."""
+        return residual(self.form, *self.responses(freqs_hz))
+
+    def left_over(self, freqs_hz: Array) -> Array:
+        """What the form does not rebuild; the whole difference from the nominal where the misfit is not known."""
+        return completion(self.form, *self.responses(freqs_hz))[1]
+
+
+def _leaves_out(form: Form, ratio: Array) -> bool:
+    """Tell whether an additive remainder is needed, and warn.
+
+    A misfit is small or large beside the *error* of an observer, which is a difference of responses: where all units agree, a thousandth of the
+    response may be more than all that the weights allow. So anything beyond rounding joins the set.
+    """
+    unknown = int(np.isnan(ratio).sum())
+    if unknown:
+        _LOG.warning(
+            "Uncertainty form %s: near singular (condition above 1e12) for %d of %d units and frequencies; the misfit is unknown there.",
+            form.value,
+            unknown,
+            ratio.size,
+        )
+    largest = np.nanmax(ratio) if unknown < ratio.size else np.inf
+    if largest <= _EXACT and not unknown:
+        return False
+    _LOG.log(
+        logging.WARNING if largest > _WORTH_SAYING else logging.INFO,
+        "Uncertainty form %s leaves out up to %.3g of a unit's response; an additive remainder joins the set. The additive form leaves nothing.",
+        form.value,
+        largest,
+    )
+    return True

@@ -1,0 +1,308 @@
+r"""Fits of weights: what is fitted, against what, and the check at the end.
+
+All entries of diagonal weights are fitted together (`diagonal`, `joint`), against the cost of the optimal cover, of which no single choice has
+to be followed; entrywise weights are one scalar fit for every entry. What counts is the check at the end: on a grid ten times denser with DC and
+Nyquist, and between its points as far as the residuals allow (`certificate`), for the systems as returned. Where it fails, the worst frequencies and
+units join the fit, and at last the left weight is scaled until it touches.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.frequency import bilinear_squared
+from ...core.lti import block_diagonal, gain
+from ..fits.diagonal import Problem, fit_sections, refit
+from ..fits.magnitude import fit_magnitude
+from ..fits.sections import Sections
+from .certificate import Certificate, Method
+from .check import Checks, Residuals, joined
+from .cover import Cover, Structure, as_structure, cover_ratio, optimal_cover
+from .pencils import ResidualSystems
+from .weight import EntrywiseWeight, Weight, unstructured_excess
+
+Array = npt.NDArray[Any]
+
+_LOG = logging.getLogger(__name__)
+_MARGIN = 1e-9
+_LIFT = 1.02  # a deficit up to here is lifted, a larger one refines the grid
+_ROUNDS = 4
+_WORST = 20  # frequencies added in a round
+_POINTS = 160  # of the grid in the joint fit
+_MISSED_DB = 0.05  # a cost higher than this between the points of the fit brings further ones
+_PROOFS = 2  # fits, each with the frequencies at which the proof found the one before exceeded
+
+
+def fit_weight(
+    residuals: Residuals,
+    freqs_hz: Array,
+    sample_period_s: float,
+    *,
+    structure: Structure | str = Structure.DIAGONAL,
+    max_order: int = 4,
+    tolerance_db: float = 1.0,
+    density: int = 10,
+    systems: ResidualSystems | None = None,
+    also_hz: npt.ArrayLike | None = None,
+    sampled: bool = False,
+) -> tuple[Weight, Cover]:
+    """Fit weights to residuals that can be evaluated at any frequency.
+
+    Parameters
+    ----------
+    residuals : callable
+        From frequencies (n,), Hz, to residuals of shape (unit, n, p', m'), complex.
+    freqs_hz : ndarray, shape (frequency,), Hz
+    sample_period_s : float, s
+    structure : Structure or str
+    max_order : int
+        Largest order of an entry, up to about eight.
+    tolerance_db : float, dB
+        Overbound at which lower orders are good enough: of scalar weights the smallest order within it is taken; of diagonal ones orders start
+        at four, are lowered entry by entry while the overbound stays within it, and raised by two in all entries where it does not.
+    density : int
+        How much denser the grid of the final check is.
+    systems : ResidualSystems, optional
+        The systems behind the residuals: the bound is then tested at all frequencies, by level sets, and not on a grid alone.
+    also_hz : array_like, shape (n,), Hz, optional
+        Where the bound is checked besides, see `peaks_hz`.
+    sampled : bool
+        The residuals are known at `freqs_hz` only. The bound is claimed there and, as the ends stand for what is beyond them, towards DC and
+        Nyquist; between the points the weight is not lifted.
+
+    Returns
+    -------
+    Weight
+    Cover
+        The optimal cover at `freqs_hz`, against which the overbound is measured.
+    """
+    structure = as_structure(structure)
+    checks = Checks(density, None if also_hz is None else np.asarray(also_hz, float), systems, sampled)
+    fit = _fit_entries if structure is Structure.ENTRYWISE else _fit_checked
+    return fit(residuals, freqs_hz, sample_period_s, structure, (max_order, tolerance_db), checks)
+
+
+def _fit_checked(
+    residuals: Residuals, freqs_hz: Array, dt: float, structure: Structure, limits: tuple[int, float], checks: Checks
+) -> tuple[Weight, Cover]:
+    """Scalar or diagonal weights; `limits` are the largest order and the tolerance."""
+    dense, claimed = checks.grid(freqs_hz, dt), checks.claimed(freqs_hz, dt)
+    checked = _Checked(dense, residuals(dense))
+    fitter = _Fitter(dt, *limits, (freqs_hz[0], freqs_hz[-1]))
+    of_fit, lowest = checks.of_fit(freqs_hz), 0
+    for _ in range(_PROOFS):
+        unscaled = _fit(fitter, residuals, of_fit, structure, checked, lowest)
+        proof = _proof(unscaled, residuals, checks, claimed)
+        found = np.array([proof.freq_hz])
+        if proof.peak <= _LIFT * max(1.0, float(checked.ratio(unscaled).max(initial=0.0))):
+            break
+        checked, of_fit = checked.with_points(found, residuals(found)), joined(of_fit, found)[0]
+        lowest = max(max(unscaled.left_orders) - 1, 0)  # further points do not make a lower order better
+    best = optimal_cover(residuals(freqs_hz), structure)
+    return _finish(unscaled, checked, proof, claimed).measured(freqs_hz, best, fitter.tolerance_db), best
+
+
+def _fit_entries(
+    residuals: Residuals, freqs_hz: Array, dt: float, structure: Structure, limits: tuple[int, float], checks: Checks
+) -> tuple[EntrywiseWeight, Cover]:
+    """A scalar weight for every entry; the cover is ones, and the largest entries of the residuals row by row."""
+    E = residuals(freqs_hz)
+    p, m = E.shape[2:]
+
+    def fit(i: int, j: int) -> Weight:
+        systems = None if checks.systems is None else replace(checks.systems, entry=(i, j))
+        entry = replace(checks, systems=systems)
+        return _fit_checked(lambda f: residuals(f)[:, :, i : i + 1, j : j + 1], freqs_hz, dt, Structure.SCALAR, limits, entry)[0]
+
+    fits = [fit(i, j) for i, j in np.ndindex(p, m)]
+    sizes = np.abs(E).max(axis=0).reshape(len(freqs_hz), p * m)
+    fitted, some = np.hstack([w.magnitudes(freqs_hz).left for w in fits]), sizes.min(axis=1) > 0
+    rows, columns = np.kron(np.eye(p), np.ones((1, m))), np.tile(np.eye(m), (p, 1))
+    weight = EntrywiseWeight(
+        left=gain(rows, dt),
+        right=block_diagonal([w.left for w in fits]) @ gain(columns, dt),
+        left_orders=(0,) * (p * m),
+        right_orders=tuple(w.left_orders[0] for w in fits),
+        structure=structure,
+        cover_max=max(w.cover_max for w in fits),
+        overbound_db_max=float((20 * np.log10(fitted[some] / sizes[some])).mean(axis=1).max(initial=0.0)),
+        within_tolerance=all(w.within_tolerance for w in fits),
+        overbound_entry_db=max(w.overbound_entry_db for w in fits),
+        method=Method.LEVEL_SETS if all(w.method is Method.LEVEL_SETS for w in fits) else Method.GRID,
+        remaining_margin=min(w.remaining_margin for w in fits),
+    )
+    dense = checks.claimed(freqs_hz, dt)
+    excess = unstructured_excess(weight.matrix().frequency_response(dense), residuals(dense))
+    return replace(weight, unstructured_excess=excess), Cover(np.ones_like(sizes), sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Checked:
+    """Residuals on the dense grid."""
+
+    freqs_hz: Array
+    E: Array
+
+    def ratio(self, weight: Weight) -> Array:
+        """Largest ratio for every unit and frequency."""
+        used = weight.magnitudes(self.freqs_hz)
+        return cover_ratio(self.E, used.left, used.right)
+
+    def at(self, freqs_hz: Array) -> _Checked:
+        """Return those of some frequencies, and of none beyond them."""
+        some = np.isin(self.freqs_hz, freqs_hz)
+        return _Checked(self.freqs_hz[some], self.E[:, some])
+
+    def with_points(self, freqs_hz: Array, E: Array) -> _Checked:
+        """Return the same with further frequencies."""
+        freqs, index = joined(self.freqs_hz, freqs_hz)
+        return _Checked(freqs, np.concatenate([self.E, E], axis=1)[:, index])
+
+    def added(self, worst: Array, freqs_hz: Array, E: Array) -> tuple[Array, Array]:
+        """Grid and residuals with the worst frequencies in them."""
+        freqs, index = joined(freqs_hz, self.freqs_hz[worst])
+        return freqs, np.concatenate([E, self.E[:, worst]], axis=1)[:, index]
+
+
+@dataclass(frozen=True)
+class _Fitter:
+    """Settings of the fits."""
+
+    sample_period_s: float
+    max_order: int
+    tolerance_db: float
+    band_hz: tuple[float, float]
+
+    def inside(self, freqs_hz: Array) -> Array:
+        """Whether frequencies are within the band that was asked for."""
+        return (freqs_hz >= self.band_hz[0]) & (freqs_hz <= self.band_hz[1])
+
+    def weight(self, sections: Sections, n_left: int) -> Weight:
+        """Return the systems, not yet checked."""
+        systems, orders = sections.systems(self.sample_period_s), tuple(int(n) for n in sections.orders)
+        left, right = block_diagonal(systems[:n_left]), block_diagonal(systems[n_left:])
+        return Weight(left, right, orders[:n_left], orders[n_left:], Structure.DIAGONAL, np.nan, np.nan)
+
+
+def _fit(
+    fitter: _Fitter,
+    residuals: Residuals,
+    freqs_hz: Array,
+    structure: Structure,
+    checked: _Checked,
+    lowest: int,
+) -> Weight:
+    """Fit diagonal or scalar magnitudes; of one entry, diagonal weights are scalar ones."""
+    E = residuals(freqs_hz)
+    if structure is Structure.DIAGONAL and E.any() and E.shape[2:] != (1, 1):
+        return _fit_diagonal(fitter, residuals, freqs_hz, E, optimal_cover(E), checked)
+    return _fit_scalar(fitter, freqs_hz, E, checked, structure, lowest)
+
+
+def _fit_scalar(fitter: _Fitter, freqs_hz: Array, E: Array, checked: _Checked, structure: Structure, lowest: int) -> Weight:
+    """One magnitude for the largest singular values, fitted again with the frequencies at which it is exceeded."""
+    dt, p, m = fitter.sample_period_s, E.shape[2], E.shape[3]
+    options: dict[str, Any] = {"max_order": fitter.max_order, "tolerance_db": fitter.tolerance_db}
+    for _ in range(_ROUNDS):
+        size = optimal_cover(E, Structure.SCALAR).left[:, 0]
+        fit = fit_magnitude(freqs_hz, size, dt, min_order=lowest, **options)
+        lowest = max(fit.order - 1, 0)
+        left = block_diagonal([fit.system] * p)
+        weight = Weight(left, gain(np.eye(m), dt), (fit.order,) * p, (0,) * m, structure, np.nan, np.nan)
+        ratio = checked.ratio(weight).max(axis=0)
+        if ratio.max(initial=0.0) <= _LIFT:
+            break
+        _LOG.debug("Weight: exceeded %.3f times between grid points, refining the grid", ratio.max())
+        freqs_hz, E = checked.added(_peaks(ratio), freqs_hz, E)
+    return weight
+
+
+def _fit_diagonal(fitter: _Fitter, residuals: Residuals, freqs_hz: Array, E: Array, best: Cover, checked: _Checked) -> Weight:
+    """Joint fit, and again with the frequencies and units at which it is exceeded or costs more than it should."""
+    problem = _problem(fitter, freqs_hz, E, best, checked)
+    found = fit_sections(problem, fitter.max_order, fitter.tolerance_db)
+    weight = fitter.weight(found.sections, E.shape[2])
+    for _ in range(_ROUNDS):
+        bends = np.arctan(np.sqrt(found.sections.bends())) / (np.pi * fitter.sample_period_s)
+        seen = checked.with_points(bends, residuals(bends))
+        ratio, used = seen.ratio(weight), weight.magnitudes(freqs_hz)
+        excess = (used.cost_db() - best.cost_db()) - found.excess_db
+        if ratio.max() <= _LIFT and not (excess > _MISSED_DB).any():
+            break
+        _LOG.debug("Weight: exceeded %.3f times, by %.2f dB in cost between the points of the fit", ratio.max(), excess.max())
+        exceeded, costly = _peaks(ratio.max(axis=0)), _peaks(10 ** (np.nan_to_num(excess, nan=0.0, posinf=0.0) / 20))
+        problem = problem.joined(_problem_at(fitter, seen.freqs_hz[exceeded], seen.E[:, exceeded], freqs_hz, best, ratio[:, exceeded]))
+        problem = problem.joined(_problem_at(fitter, freqs_hz[costly], E[:, costly], freqs_hz, best))
+        found = refit(problem, found.sections)
+        weight = fitter.weight(found.sections, E.shape[2])
+    return weight
+
+
+def _problem(fitter: _Fitter, freqs_hz: Array, E: Array, best: Cover, checked: _Checked) -> Problem:
+    """Where the size of the residuals bends and where the cover does; sound beyond the band, where nothing has to be tight."""
+    size, beyond = optimal_cover(E, Structure.SCALAR).left[:, 0], np.flatnonzero(~fitter.inside(checked.freqs_hz))
+    cost = np.sqrt(np.maximum(10 ** (best.cost_db() / 10), 0.0))
+    chosen = np.union1d(
+        _telling(freqs_hz, size, _POINTS // 2), _telling(freqs_hz, np.where(best.left.min(axis=1) > 0, cost, 0.0), _POINTS // 2)
+    )
+    inner = _problem_at(fitter, freqs_hz[chosen], E[:, chosen], freqs_hz, best)
+    return inner.joined(_problem_at(fitter, checked.freqs_hz[beyond], checked.E[:, beyond], freqs_hz, best))
+
+
+def _problem_at(fitter: _Fitter, freqs_hz: Array, E: Array, grid_hz: Array, best: Cover, ratio: Array | None = None) -> Problem:
+    """Residuals at some frequencies, with the cost of the optimal cover from the grid; frequencies where there is nothing to cover are left out."""
+    known = np.flatnonzero(best.left.min(axis=1) > 0)
+    cost = np.log(best.left[known]).mean(axis=1) + np.log(best.right[known]).mean(axis=1)
+    optimal = np.where(fitter.inside(freqs_hz), np.interp(freqs_hz, grid_hz[known], cost), np.inf)
+    near = known[np.searchsorted(grid_hz[known], freqs_hz).clip(0, len(known) - 1)]
+    ratio = cover_ratio(E, best.left[near], best.right[near]) if ratio is None else ratio
+    some = np.abs(E).max(axis=(0, 2, 3), initial=0.0) > 0
+    return Problem(freqs_hz[some], bilinear_squared(freqs_hz[some], fitter.sample_period_s), E[:, some], optimal[some], ratio[:, some])
+
+
+def _telling(freqs_hz: Array, size: Array, count: int) -> Array:
+    """Indices of both ends, the highest peaks, and points as dense as a size bends, a share of them evenly spaced."""
+    inner = np.flatnonzero((size > 0) & (freqs_hz > 0))
+    ends = [0, len(freqs_hz) - 1]
+    if len(inner) < count:
+        return np.unique(np.concatenate([inner, ends]))
+    level = np.log(size[inner])
+    peaks = np.flatnonzero((level[1:-1] >= level[:-2]) & (level[1:-1] > level[2:])) + 1
+    peaks = peaks[np.argsort(-level[peaks])[:_WORST]]
+    bend = np.abs(np.gradient(np.gradient(level, np.log(freqs_hz[inner])))) + 1e-12
+    share = np.cumsum(bend / bend.sum() + 1 / len(inner)) / 2
+    spread = np.interp((np.arange(count) + 0.5) / count, share, np.arange(len(inner))).round().astype(int)
+    return np.unique(np.concatenate([inner[peaks], inner[spread], ends]))
+
+
+def _proof(weight: Weight, residuals: Residuals, checks: Checks, claimed_hz: Array) -> Certificate:
+    """Largest ratio wherever the bound is claimed."""
+
+    def ratio(freqs_hz: Array) -> Array:
+        used = weight.magnitudes(freqs_hz)
+        return cover_ratio(residuals(freqs_hz), used.left, used.right)
+
+    return checks.proof(ratio, claimed_hz, weight.left, weight.right)
+
+
+def _finish(weight: Weight, checked: _Checked, proof: Certificate, claimed_hz: Array) -> Weight:
+    """Scale the left weight until it touches the residuals from above, between grid points too, and measure what is returned."""
+    if not proof.peak > 0:
+        return replace(weight, cover_max=0.0, remaining_margin=1.0)
+    bound = proof.peak * (1 + proof.margin) if proof.method is Method.LEVEL_SETS else proof.peak
+    lift = bound * (1 + _MARGIN)
+    weight = weight.scaled(lift)
+    on_grid = float(checked.at(claimed_hz).ratio(weight).max())
+    return replace(weight, cover_max=on_grid, method=proof.method, remaining_margin=1 - max(bound / lift, on_grid))
+
+
+def _peaks(ratio: Array) -> Array:
+    """Indices of the worst local maxima above one."""
+    inner = np.concatenate([[-np.inf], ratio, [-np.inf]])
+    found = np.flatnonzero((ratio >= inner[:-2]) & (ratio >= inner[2:]) & (ratio > 1))
+    return found[np.argsort(-ratio[found])[:_WORST]]

@@ -14,7 +14,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from kros.identify import Factor, KoopmanMatrices, combine, edmd, free_run, lifted_factor, predict_ahead, reduce_episode
+from kros.identify import Factor, KoopmanMatrices, combine, edmd, free_run, lifted_factor, reduce_episode
 from kros.lifting import Lifting
 
 EPISODES, SAMPLES, COLUMNS = 38, 20_000, 95
@@ -105,15 +105,6 @@ def test_free_run_of_195_episodes_against_pykoop(benchmark):
     if benchmark.stats is not None:
         ours_s = benchmark.stats.stats.median / (batch * steps)
         benchmark.extra_info.update({"kros_s_per_step": ours_s, "pykoop_s_per_step": pykoop_s, "ratio": pykoop_s / ours_s})
-
-
-def test_predict_100_steps_ahead_from_every_sample(benchmark):
-    """20 000 starts side by side; divide by 2 million for one step."""
-    lifting = Lifting(STATES, ("sin(100*a)",))
-    x, u = episode(0)
-    model = KoopmanMatrices(0.5 * np.eye(4), np.ones((4, 2)))
-    ends = benchmark.pedantic(predict_ahead, args=(model, lifting, {}, x, u, 100), rounds=3)
-    assert ends.shape == (19_900, 3)
 
 
 if __name__ == "__main__":

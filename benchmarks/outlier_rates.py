@@ -129,7 +129,7 @@ def phases(factors: dict[str, Any], rows: list[int]) -> Array:
 
 def factors_of(seed: int, options: argparse.Namespace) -> dict[str, Any]:
     """Return factors and phases of 12 drives and the planted ones, from the cache where they are there."""
-    from kros.identify.phase import UnitPhase
+    from kros.identify.calibration import UnitPhase
 
     path = options.cache / f"seed{seed}_{options.episodes}x{options.seconds:g}s.npz"
     if not path.exists():

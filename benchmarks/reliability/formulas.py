@@ -195,7 +195,6 @@ def one(text: Any, tally: Tally, rng: np.random.Generator) -> None:
             outcome = "accepted, in agreement"
             if not lifting.history:
                 lifting.c_expressions()
-                lifting.units({"x": "rad", "y": "s"})
                 with suppress(ConfigError):  # a parameter that does not separate
                     _ = lifting.separation
                 wrong = judge_slopes(lifting, rng)

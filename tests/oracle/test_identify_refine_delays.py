@@ -13,9 +13,9 @@ from kros.identify import Factor, combine, free_run, lifted_factor, reduce_episo
 from kros.identify.episode_factors import episode_factors
 from kros.identify.refine import RefinedModels, RefineOptions, refine_population
 from kros.identify.refine.episodes import episode_normals
-from kros.identify.refine.judge import free_run_errors
 from kros.identify.refine.segments import Segments, read_segments
 from kros.identify.refine.sensitivity import normal_equations
+from kros.identify.refine.validation_set import free_run_errors
 from kros.lifting import Lifting
 
 DELAYED = Lifting(
@@ -141,7 +141,7 @@ def test_only_the_samples_asked_for_are_judged() -> None:
     few = replace(OPTIONS, strengths=(1.0,), horizons=(5, 20), segments=4)
     with pytest.raises(IdentificationError, match="reaches"):
         refine_population(broken, keys, BILINEAR, {}, factor, options=few)
-    models = refine_population(broken, keys, BILINEAR, {}, factor, options=replace(few, judged=200))
+    models = refine_population(broken, keys, BILINEAR, {}, factor, options=replace(few, validation_samples=200))
     whole = refine_population(population, keys, BILINEAR, {}, factor, options=few)
     assert models.trade_off[0].score != whole.trade_off[0].score
     last = [keys[unit][-1] for unit in keys]

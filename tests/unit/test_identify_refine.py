@@ -16,7 +16,7 @@ from kros.lifting import Lifting
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"horizons": ()}, {"horizons": (20, 5)}, {"segments": 0}, {"strengths": (0.0,)}, {"balance": 1.5}, {"judged": 1}]
+    "wrong", [{"horizons": ()}, {"horizons": (20, 5)}, {"segments": 0}, {"strengths": (0.0,)}, {"balance": 1.5}, {"validation_samples": 1}]
 )
 def test_options_out_of_range_are_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):

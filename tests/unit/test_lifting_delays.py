@@ -267,8 +267,6 @@ def test_models_survive_the_disk(tmp_path):
     assert again.lifting == DELAYED
     assert again.recorded_inputs == INPUTS
     assert again.inputs == (*INPUTS, "current*voltage", "cos(position[-1] + phase)*target")
-    assert again.units == ("rad", "A", "1", "rad", "A·V")
-    assert again.input_units == ("V", "rad", "A·V", "rad")
     assert again.systems().n_inputs == 4
     assert pickle.loads(pickle.dumps(DELAYED)) == DELAYED
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -47,7 +48,7 @@ class ModelSamples:
         A (unit, draw, n, n) and B (unit, draw, n, m).
     linear : bool
         The samples are first-order steps: they have the right spread, but what follows from them nonlinearly, such as a response or an
-        eigenvalue, is to be taken to first order around the estimate as well (`response_bands` does).
+        eigenvalue, is to be taken to first order around the estimate as well (`responses` does).
     """
 
     unit_ids: tuple[str, ...]
@@ -60,20 +61,22 @@ class ModelSamples:
         """Number of samples of every unit."""
         return self.samples.A.shape[1]
 
-    def covariance(self) -> Array:
-        """Return the covariance of the entries of [A B], row after row, about the mean of the samples; shape (unit, n p, n p)."""
-        W = np.concatenate([self.samples.A, self.samples.B], axis=-1)
-        flat = W.reshape(*W.shape[:2], -1)
-        centred = flat - flat.mean(axis=1, keepdims=True)
-        return np.asarray(np.swapaxes(centred, 1, 2) @ centred / (self.n_draws - 1))
-
     def standard_error(self) -> KoopmanMatrices:
         """Return the standard deviation of every entry of A and B over the samples."""
         return KoopmanMatrices(self.samples.A.std(axis=1, ddof=1), self.samples.B.std(axis=1, ddof=1))
 
-    def unstable_share(self) -> Array:
-        """Return the share of samples with a spectral radius of one or more, shape (unit,); of little meaning where they are `linear`."""
-        return np.asarray((self.samples.spectral_radius() >= 1).mean(axis=1))
+    def responses(self, row: int, freqs_hz: Array, sample_period_s: float) -> npt.NDArray[Any]:
+        """Return frequency responses of one unit's samples, shape (draw, frequency, n, m).
+
+        First-order samples have first-order deviations, ``dG = (zI - A)^-1 dW [G; I]``.
+        """
+        drawn = KoopmanMatrices(self.samples.A[row], self.samples.B[row])
+        if not self.linear:
+            return drawn.responses(freqs_hz, sample_period_s)
+        A, B = self.estimate.A[row], self.estimate.B[row]
+        G = KoopmanMatrices(A, B).responses(freqs_hz, sample_period_s)
+        Phi = KoopmanMatrices(A, np.eye(len(A))).responses(freqs_hz, sample_period_s)
+        return np.asarray(G + Phi @ ((drawn.A - A)[:, None] @ G + (drawn.B - B)[:, None]))
 
 
 def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:

@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import IdentificationError
 from ..core.linalg import qr_triangle
+from ..core.lti import StateSpace
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -39,6 +41,12 @@ class KoopmanMatrices:
     def spectral_radius(self) -> Array:
         """Return the largest eigenvalue magnitude of each A."""
         return np.abs(np.linalg.eigvals(self.A)).max(axis=-1)
+
+    def responses(self, freqs_hz: Array, sample_period_s: float) -> npt.NDArray[Any]:
+        """Return frequency responses from inputs to lifted states, shape (..., frequency, n, m)."""
+        n, m = self.B.shape[-2:]
+        C, D = (np.broadcast_to(M, (*self.A.shape[:-2], *M.shape)) for M in (np.eye(n), np.zeros((n, m))))
+        return StateSpace(self.A, self.B, C, D, sample_period_s).frequency_response(freqs_hz)
 
 
 def edmd(R: Array, n_lifted: int, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices:

@@ -22,7 +22,7 @@ from .ranges import Ranges
 Array = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ModelSet:
     """Koopman (or linear) models of all units, identified in one condition.
 
@@ -71,6 +71,13 @@ class ModelSet:
     status: tuple[str, ...] = field(default=())
     longest_s: float | None = None
 
+    def __repr__(self) -> str:
+        """Say what was modelled, and how."""
+        outputs, inputs = ", ".join(self.lifting.names), ", ".join(self.inputs)
+        return (
+            f"ModelSet({self.name!r}: {len(self.unit_ids)} units in condition {self.condition!r}; lifted states {outputs}; inputs {inputs})"
+        )
+
     @property
     def recorded_inputs(self) -> tuple[str, ...]:
         """Names of the inputs that are recorded."""
@@ -80,17 +87,6 @@ class ModelSet:
     def inputs(self) -> tuple[str, ...]:
         """Names of the model's inputs, the columns of `B`: the recorded ones, then the lifting's input functions."""
         return self.recorded_inputs + self.lifting.input_functions
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Physical units of the lifted states, empty where they are not known."""
-        return self.lifting.units({c.name: c.unit for c in self.channels})
-
-    @property
-    def input_units(self) -> tuple[str, ...]:
-        """Physical units of the model's inputs, empty where they are not known."""
-        known = {c.name: c.unit for c in self.channels}
-        return tuple(known[name] for name in self.recorded_inputs) + self.lifting.input_units(known)
 
     @property
     def measured(self) -> tuple[int, ...]:
@@ -168,8 +164,6 @@ class ModelSet:
             "inputs": self.recorded_inputs,
             "lifting": self.lifting.functions,
             **self.lifting.extension(),
-            "units": self.units,
-            "input_units": self.input_units,
             "parameters": {k: dict(zip(self.unit_ids, v.tolist(), strict=True)) for k, v in self.parameters.items()},
             "sample_period_s": self.sample_period_s,
             "alpha": self.alpha,

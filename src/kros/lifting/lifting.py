@@ -26,7 +26,6 @@ from .evaluation import Columns
 from .formula import Formula, require_text
 from .intervals import Box, bounds_of
 from .separation import Separation
-from .units import unit_of
 from .window import Window
 
 Array = npt.NDArray[np.float64]
@@ -174,20 +173,6 @@ class Lifting:
     def names(self) -> tuple[str, ...]:
         """Names of the lifted states."""
         return self.states + self.functions
-
-    def units(self, known: Mapping[str, str]) -> tuple[str, ...]:
-        """Return the physical unit of every lifted state, empty where it does not follow.
-
-        Parameters
-        ----------
-        known : mapping of str to str
-            Units of states and inputs, such as ``rad/s``.
-        """
-        return tuple(known.get(state, "") for state in self.states) + tuple(unit_of(f.written, known) for f in self.formulas)
-
-    def input_units(self, known: Mapping[str, str]) -> tuple[str, ...]:
-        """Return the physical unit of every input function."""
-        return tuple(unit_of(f.written, known) for f in self.input_formulas)
 
     def lift(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the lifted states.

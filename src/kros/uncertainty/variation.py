@@ -26,8 +26,7 @@ from ..core.artifacts import load_artifact, save_artifact
 from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.frequency import check_grid
 from ..core.loading import check_shapes, loader
-from ..core.lti import StateSpace
-from ..identify import KoopmanMatrices, ModelSamples
+from ..identify import ModelSamples
 from .forms import Form, as_form, residual
 from .small_matrices import sigma_max, squared
 
@@ -149,11 +148,11 @@ def variation_and_noise(
     units, draws, n, m = _require(models, nominal, level)
     scale = _scale(output_scale, n)[:, None] / _scale(input_scale, m)
     # Responses of the estimates, scaled: (unit, frequency, n, m).
-    G = _response(models.estimate, freqs, sample_period_s) / scale
+    G = models.estimate.responses(freqs, sample_period_s) / scale
     noise, band = np.zeros(len(freqs)), np.empty((units, len(freqs)))
     for row in range(units):
         for part in _parts(len(freqs), draws * n * max(n, m)):
-            other = _draws(models, row, freqs[part], sample_period_s, G[row, part] * scale) / scale  # (draw, frequency, n, m)
+            other = models.responses(row, freqs[part], sample_period_s) / scale  # (draw, frequency, n, m)
             noise[part] += _mean_square(residual(form, other, np.roll(other, 1, axis=0))) / units
             band[row, part] = np.quantile(sigma_max(residual(form, G[row, part], other)), level, axis=0)
     return VariationAndNoise(
@@ -182,22 +181,6 @@ def _between(form: Form, G: Array) -> Array:
 def _mean_square(E: Array) -> Array:
     """Mean over the first axis of squared Frobenius norms, shape (frequency,)."""
     return np.asarray(squared(E).sum(axis=(-2, -1)).mean(axis=0))
-
-
-def _draws(models: ModelSamples, row: int, freqs: Array, sample_period_s: float, G: Array) -> Array:
-    """Responses of one unit's resampled models; first-order samples have first-order deviations, ``(zI - A)^-1 dW [G; I]``."""
-    A, B = models.samples.A[row], models.samples.B[row]
-    if not models.linear:
-        return _response(KoopmanMatrices(A, B), freqs, sample_period_s)
-    own_A, own_B = models.estimate.A[row], models.estimate.B[row]
-    Phi = _response(KoopmanMatrices(own_A, np.eye(len(own_A))), freqs, sample_period_s)
-    return np.asarray(G + Phi @ ((A - own_A)[:, None] @ G + (B - own_B)[:, None]))
-
-
-def _response(models: KoopmanMatrices, freqs: Array, sample_period_s: float) -> Array:
-    n, m = models.B.shape[-2:]
-    C, D = (np.broadcast_to(M, (*models.A.shape[:-2], *M.shape)) for M in (np.eye(n), np.zeros((n, m))))
-    return StateSpace(models.A, models.B, C, D, sample_period_s).frequency_response(freqs)
 
 
 def _require(models: ModelSamples, nominal: int, level: float) -> tuple[int, int, int, int]:

@@ -52,7 +52,7 @@ class RefineOptions:
         Relative decrease of the cost below which a horizon is done.
     bound : float
         A free run on training episodes may reach this times the range of the states.
-    judged : int, optional
+    validation_samples : int, optional
         At most this many samples of each training episode are run freely to choose the strength and to see that runs stay bounded; None
         runs whole episodes. For plants that no model follows for long, such as those that are unstable in open loop.
     seed : int
@@ -82,7 +82,7 @@ class RefineOptions:
     path_iterations: int = 8
     least_gain: float = 1e-3
     bound: float = 10.0
-    judged: int | None = None
+    validation_samples: int | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -104,7 +104,7 @@ class RefineOptions:
             "iterations": min(self.iterations, self.path_iterations) >= 1,
             "least_gain": self.least_gain > 0,
             "bound": self.bound >= 1,
-            "judged": self.judged is None or self.judged >= 2,
+            "validation_samples": self.validation_samples is None or self.validation_samples >= 2,
         }
         for name, fine in good.items():
             if not fine:

@@ -23,7 +23,6 @@ from ...data.scaled import scale_population
 from ...lifting import Lifting
 from ..factors import Factor
 from ..ranges import Ranges
-from .judge import Judge, find_unbounded
 from .marquardt import Solution, minimise
 from .metric import ResponsePrior
 from .model import RefinedModels, TradeOff
@@ -31,6 +30,7 @@ from .options import RefineOptions
 from .pooled import matrices_of, normalised, ranges, refine_pooled, restrict, start_pooled
 from .problem import Problem
 from .segments import held_segments, read_segments
+from .validation_set import ValidationSet, find_unbounded
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -53,7 +53,7 @@ def refine_population(
     ----------
     population : Population
     keys : mapping of str to sequence of EpisodeKey
-        Training episodes of every unit; the last one of each judges the strength of the prior.
+        Training episodes of every unit; the last one of each validates the strength of the prior.
     lifting : Lifting
     parameters : mapping of str to ndarray, shape (unit,)
         The lifting's parameters, in the order of `keys`.
@@ -101,11 +101,11 @@ def _refine(
     rows = np.flatnonzero(pooled)
     start, problem, error, span = start_pooled(lifting, parameters, factor, fitted, rows, options)
     spans = ranges(factor, rows, lifting)
-    judge = Judge(population, keys, lifting, parameters, rows, problem, spans, options.judged)
-    common = refine_pooled(start, restrict(problem, rows), error, span, lambda V: judge.trade_off([V], (np.inf,))[0].score, options)
+    validation = ValidationSet(population, keys, lifting, parameters, rows, problem, spans, options.validation_samples)
+    common = refine_pooled(start, restrict(problem, rows), error, span, lambda V: validation.trade_off([V], (np.inf,))[0].score, options)
     prepared = _with_prior(problem, common, factor, rows, options)
-    judge = replace(judge, problem=prepared)
-    path, trade_off = _path(prepared, common, judge, options)
+    validation = replace(validation, problem=prepared)
+    path, trade_off = _path(prepared, common, validation, options)
     choice = _choose(trade_off, options)
     log.info("prior of strength %g chosen, held-out score %.4g", trade_off[choice].strength, trade_off[choice].score)
     final = replace(prepared, segments=segments)
@@ -116,7 +116,9 @@ def _refine(
         models = matrices_of(V, problem.T, lifting.n_lifted)
         own = {name: values[some] for name, values in parameters.items()}
         ids = tuple(keys)
-        return find_unbounded(models.A, models.B, lifting, own, population, {ids[i]: keys[ids[i]] for i in some}, limit, options.judged)
+        return find_unbounded(
+            models.A, models.B, lifting, own, population, {ids[i]: keys[ids[i]] for i in some}, limit, options.validation_samples
+        )
 
     solution, strengths = _keep_bounded(final, solution, common, trade_off[choice].strength, unbounded, options)
     units = matrices_of(solution.V, problem.T, lifting.n_lifted)
@@ -128,7 +130,7 @@ def _refine(
         pooled=matrices_of(common, problem.T, lifting.n_lifted),
         strength=trade_off[choice].strength,
         strengths=strengths,
-        trade_off=(*judge.trade_off([common], (np.inf,)), *trade_off),
+        trade_off=(*validation.trade_off([common], (np.inf,)), *trade_off),
         sigma=prepared.sigma,
         converged=solution.converged,
         information=solution.matrix[:, :-1, :-1],
@@ -169,7 +171,7 @@ def _strengthen(problem: Problem, strength: float) -> Problem:
     return problem if problem.prior is None else replace(problem, prior=problem.prior.scaled(strength * problem.residuals))
 
 
-def _path(problem: Problem, common: Array, judge: Judge, options: RefineOptions) -> tuple[list[Array], list[TradeOff]]:
+def _path(problem: Problem, common: Array, validation: ValidationSet, options: RefineOptions) -> tuple[list[Array], list[TradeOff]]:
     """Fit all units at falling strengths, each from the one before, until weaker ones bring nothing or too much uncertainty.
 
     Returns models of shape (unit, n_lifted, p) and what they are worth, at every strength.
@@ -181,7 +183,7 @@ def _path(problem: Problem, common: Array, judge: Judge, options: RefineOptions)
         now = _strengthen(problem, strength)
         V = minimise(now.evaluate, now.admissible, V, options.path_iterations, options.least_gain).V
         path.append(V)
-        rows += judge.trade_off([V], (strength,))
+        rows += validation.trade_off([V], (strength,))
         log.debug("prior of strength %g: held-out score %.4g, peak residual %.1f dB", strength, rows[-1].score, rows[-1].peak_db)
         idle = len(rows) > _PATIENCE and rows[-1].score > (1 - options.tolerance / 2) * rows[-1 - _PATIENCE].score
         if idle or _too_uncertain(rows[-1], options):

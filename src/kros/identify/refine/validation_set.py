@@ -27,7 +27,7 @@ def free_run_errors(
     parameters: Mapping[str, Array],
     population: Population,
     keys: Sequence[EpisodeKey],
-    judged: int | None = None,
+    validation_samples: int | None = None,
 ) -> tuple[Array, Array, Array]:
     """Return what the free runs of several models differ by from one episode of every unit.
 
@@ -40,7 +40,7 @@ def free_run_errors(
     population : Population
     keys : sequence of EpisodeKey
         One for every unit.
-    judged : int, optional
+    validation_samples : int, optional
         Samples of each episode that are run, those before a free run's start not counted; all by default.
 
     Returns
@@ -54,7 +54,7 @@ def free_run_errors(
     """
     n, h, models = lifting.n_states, lifting.history, len(A)
     rms, reached, top = np.full((models, len(keys), n), np.inf), np.full((models, len(keys), n), np.inf), np.zeros((len(keys), n))
-    episodes = [population.read(key)[: None if judged is None else h + judged] for key in keys]
+    episodes = [population.read(key)[: None if validation_samples is None else h + validation_samples] for key in keys]
     by_length: dict[int, list[int]] = {}
     for row, episode in enumerate(episodes):
         by_length.setdefault(len(episode), []).append(row)
@@ -88,7 +88,7 @@ def find_unbounded(
     population: Population,
     keys: Mapping[str, Sequence[EpisodeKey]],
     limit: Array,
-    judged: int | None = None,
+    validation_samples: int | None = None,
 ) -> dict[int, str]:
     """Run every unit's model over all of its training episodes, and find those that leave the limit.
 
@@ -102,7 +102,7 @@ def find_unbounded(
     keys : mapping of str to sequence of EpisodeKey
     limit : ndarray, shape (n,)
         Largest magnitude of every state that is still bounded.
-    judged : int, optional
+    validation_samples : int, optional
         As in `free_run_errors`.
 
     Returns
@@ -116,7 +116,9 @@ def find_unbounded(
     for part in (flat[i : i + width] for i in range(0, len(flat), width)):
         rows = [row for row, _ in part]
         own = {name: values[rows] for name, values in parameters.items()}
-        _, _, reached = free_run_errors(A[None, rows], B[None, rows], lifting, own, population, [key for _, key in part], judged)
+        _, _, reached = free_run_errors(
+            A[None, rows], B[None, rows], lifting, own, population, [key for _, key in part], validation_samples
+        )
         for which, state in np.argwhere(~(reached[0] <= limit)):
             row, key = part[which]
             found.setdefault(
@@ -127,8 +129,8 @@ def find_unbounded(
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
-    """Scores models on the last training episode of every pooled unit, or on its first `judged` samples."""
+class ValidationSet:
+    """Scores models on the last training episode of every pooled unit, or on its first `validation_samples` samples."""
 
     population: Population
     keys: Mapping[str, Sequence[EpisodeKey]]
@@ -137,7 +139,7 @@ class Judge:
     rows: npt.NDArray[np.int64]
     problem: Problem
     scales: tuple[Array, Array]
-    judged: int | None = None
+    validation_samples: int | None = None
 
     def trade_off(self, V: Sequence[Array], strengths: Sequence[float]) -> tuple[TradeOff, ...]:
         """Return accuracy and uncertainty of models (unit, n_lifted, p), or of one for all units."""
@@ -146,7 +148,7 @@ class Judge:
         last = [episodes[-1] for episodes in self.keys.values()]
         own = {name: values[self.rows] for name, values in self.parameters.items()}
         ends = [last[row] for row in self.rows]
-        rms, top, _ = free_run_errors(models.A, models.B, self.lifting, own, self.population, ends, self.judged)
+        rms, top, _ = free_run_errors(models.A, models.B, self.lifting, own, self.population, ends, self.validation_samples)
         span = np.where(top > 0, top, self.scales[0][: self.lifting.n_states])  # a state may rest at zero in the last episode
         percent = np.median(100 * rms / span, axis=1)
         score = np.mean((rms / self.problem.sigma) ** 2, axis=(1, 2))

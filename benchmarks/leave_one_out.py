@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from kros.core.artifacts import write_json
-from kros.report.left_out_table import PAPER, LeftOutCell, LeftOutTable, left_out_tables
+from kros.report.error_tables import PAPER, ErrorCell, ErrorTable, left_out_tables
 from kros.report.names import BASELINES, minus, number, split_observer
 from kros.study import load_config, run_study
 from kros.study.commands.demo import simulate_to
@@ -108,7 +108,7 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
     return left_out
 
 
-def show(table: LeftOutTable, facts: Facts, folds: int) -> None:
+def show(table: ErrorTable, facts: Facts, folds: int) -> None:
     """Print one condition."""
     channels = [c for c in HIDDEN if c in table.channels]
     say(f"\n{table.condition:31s} {'':>5s} {'certified':>11s} " + " ".join(f"{f'{c}, % of the largest value':>45s}" for c in channels))
@@ -122,24 +122,24 @@ def show(table: LeftOutTable, facts: Facts, folds: int) -> None:
         say(f"{made:31s} {orders:>5s} {proofs[0]:>5s} {proofs[1]:>5s} " + " ".join(numbers(cells.get(c)) for c in channels))
 
 
-def rounded(cell: LeftOutCell | None) -> str:
+def rounded(cell: ErrorCell | None) -> str:
     """Return mean, interval and worst unit to three digits."""
     if cell is None or cell.mean is None:
         return "– | –" if cell is None else "diverged | –"
-    return f"{number(cell.mean)} ({number(cell.low)}–{number(cell.high)}) | {number(cell.worst)}"
+    return f"{number(cell.mean)} ({'–'.join(map(number, cell.interval))}) | {number(cell.worst)}"
 
 
-def numbers(cell: LeftOutCell | None) -> str:
+def numbers(cell: ErrorCell | None) -> str:
     """Return the numbers of one channel."""
     if cell is None:
         return f"{'-':>45s}"
     if cell.mean is None:
         return f"{'diverged':>45s}"
     band = f"{cell.band_db:8.1f}" if cell.band_db is not None else f"{'-':>8s}"
-    return f"{cell.mean:8.4f} {f'({cell.low:.4f}, {cell.high:.4f})':>18s} {cell.worst:8.4f} {band}"
+    return f"{cell.mean:8.4f} {'({:.4f}, {:.4f})'.format(*cell.interval):>18s} {cell.worst:8.4f} {band}"
 
 
-def markdown(tables: list[LeftOutTable], facts: Facts, folds: int) -> list[str]:
+def markdown(tables: list[ErrorTable], facts: Facts, folds: int) -> list[str]:
     """Return the rows of a table for people: velocity and current at home, velocity elsewhere, powers around the gearbox frequency at home."""
     places = [(tables[0], "velocity"), (tables[0], "current"), *((table, "velocity") for table in tables[1:])]
     head = [f"{channel}, {table.condition} | worst" for table, channel in places]
@@ -156,7 +156,7 @@ def markdown(tables: list[LeftOutTable], facts: Facts, folds: int) -> list[str]:
     return lines
 
 
-def asked(tables: Mapping[str, LeftOutTable], facts: Facts, folds: int) -> list[str]:
+def asked(tables: Mapping[str, ErrorTable], facts: Facts, folds: int) -> list[str]:
     """Return what is asked of a population's tables, each with whether it is met."""
     lines: list[str] = []
     for key, what in (("robust", "for the set"), ("relift_certified", "as it runs")):
@@ -175,24 +175,24 @@ def own(name: str) -> bool:
     return split_observer(name)[1] not in (*BASELINES, "mixed", "paper")
 
 
-def worst(table: LeftOutTable, name: str, channel: str) -> float:
+def worst(table: ErrorTable, name: str, channel: str) -> float:
     """Return the error of the worst unit; infinite where there is none."""
     cell = table.cells.get(name, {}).get(channel)
     return inf if cell is None or cell.worst is None else cell.worst
 
 
-def mean(table: LeftOutTable, name: str, channel: str) -> float:
+def mean(table: ErrorTable, name: str, channel: str) -> float:
     """Return the mean error; infinite where there is none."""
     cell = table.cells.get(name, {}).get(channel)
     return inf if cell is None or cell.mean is None else cell.mean
 
 
-def both(table: LeftOutTable, name: str) -> float:
+def both(table: ErrorTable, name: str) -> float:
     """Return the geometric mean of the worst units' errors in velocity and current."""
     return sqrt(worst(table, name, "velocity") * worst(table, name, "current"))
 
 
-def best_of_certified(table: LeftOutTable, certified: list[str], chosen: str | None, facts: Facts, what: str) -> list[str]:
+def best_of_certified(table: ErrorTable, certified: list[str], chosen: str | None, facts: Facts, what: str) -> list[str]:
     """How far kros's best certified observer is from the best certified one of all, and which uncertified ones beat it."""
     if chosen is None:
         return [f"{what}: none of kros's own {met(False)}"]
@@ -209,7 +209,7 @@ def best_of_certified(table: LeftOutTable, certified: list[str], chosen: str | N
     return lines
 
 
-def against_paper(tables: Mapping[str, LeftOutTable], name: str) -> list[str]:
+def against_paper(tables: Mapping[str, ErrorTable], name: str) -> list[str]:
     """Errors and powers beside those of the paper's own observer."""
     lines, papers = [], [n for n in (PAPER, ENTRYWISE) if n in tables[HOME].cells]
     for paper, (channel, times) in product(papers, (("current", 3.0), ("velocity", 4.0))):
@@ -228,7 +228,7 @@ def against_paper(tables: Mapping[str, LeftOutTable], name: str) -> list[str]:
     return lines
 
 
-def against_learned(tables: Mapping[str, LeftOutTable], name: str) -> list[str]:
+def against_learned(tables: Mapping[str, ErrorTable], name: str) -> list[str]:
     """Errors beside those of the learned estimator."""
     lines = []
     for condition, channel, most in (*((c, "velocity", 1.0) for c in tables), (HOME, "current", 1.1)):

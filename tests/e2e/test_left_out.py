@@ -14,7 +14,7 @@ from kros.data import read_parquet, split_episodes, write_parquet
 from kros.evaluate import unit_interval
 from kros.identify import ModelSet
 from kros.observer import Observer, run_observer
-from kros.report.left_out_table import PAPER, left_out_tables
+from kros.report.error_tables import PAPER, left_out_tables
 from kros.study import load_config, run_study
 from kros.study.commands.estimate import load_calibration, unit_parameters
 from kros.study.config import Stage
@@ -184,7 +184,7 @@ def test_the_table_holds_means_intervals_worst_units_and_powers():
     (table,) = left_out_tables(rows, "noload")
     cell = table.cells["koopman/memory"]["velocity"]
     assert (cell.mean, cell.worst, cell.worst_unit) == (3.0, 6.0, "2")
-    assert (cell.low, cell.high) == pytest.approx(tuple(float(v[0]) for v in unit_interval(np.array([[1.0], [2.0], [6.0]]))))
+    assert cell.interval == pytest.approx(tuple(float(v[0]) for v in unit_interval(np.array([[1.0], [2.0], [6.0]]))))
     assert cell.band_db == pytest.approx(10 * np.log10(3 / 10))
     assert table.cells[PAPER]["velocity"].band_db == pytest.approx(0)
     assert table.cells["learned"]["velocity"].mean is None

@@ -33,7 +33,7 @@ def test_a_run_that_stopped_early_asks_for_nothing() -> None:
     assert advice({**found, "study": {k: v for k, v in found["study"].items() if k != "deployed"}}) == []
 
 
-def test_a_good_observer_is_handed_over() -> None:
+def test_a_good_observer_is_deployed() -> None:
     assert "deployed.json" in " ".join(advice(metrics(), ("position",)))
     without = metrics(observers={NAME: {"relift_certified": False}})
     assert "No certificate covers it as it runs" in " ".join(advice(without))

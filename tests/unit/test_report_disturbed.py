@@ -6,7 +6,7 @@ import pytest
 from kros.core.errors import DataError, DimensionError
 from kros.evaluate import Kind, draw_interval, interval_rows, mean_intervals, severity_of_growth, unit_interval
 from kros.report.disturbances import curves, severity_text, shown_observers
-from kros.report.error_table import error_table
+from kros.report.error_tables import error_table
 
 
 def test_noise_doubles_an_error_where_its_own_share_is_root_three():

@@ -28,18 +28,16 @@ from kros.identify.refine import RefinedModels, TradeOff
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.report import plot, render, write_figures
-from kros.report.encode import to_svg
 from kros.report.figures import FIGURES, draw, draw_all
-from kros.report.figures.entries import entry_names
-from kros.report.figures.error_spectra import of_episode
-from kros.report.figures.forms import paper_bounds
-from kros.report.figures.forms_entrywise import entry_bounds
-from kros.report.figures.outlier_scores import referred_range
-from kros.report.figures.spectra import band_shares
-from kros.report.figures.synthesis_bode import scaled_filter
-from kros.report.figures.trajectories import longest_steady, steady_stretches
-from kros.report.figures.uncertain_model import beside
-from kros.report.figures.weights import in_gauge
+from kros.report.figures.episodes import longest_steady, steady_stretches
+from kros.report.figures.outliers.scores import referred_range
+from kros.report.figures.residuals import beside, entry_names
+from kros.report.figures.spectra import band_shares, of_episode
+from kros.report.figures.synthesis.bode import scaled_filter
+from kros.report.figures.uncertainty.forms import paper_bounds
+from kros.report.figures.uncertainty.forms_entrywise import entry_bounds
+from kros.report.figures.uncertainty.weights import in_gauge
+from kros.report.files import to_svg
 from kros.report.names import observer_label
 from kros.report.run_folder import NotShownError, RunFolder
 from kros.report.theme import Tone
@@ -438,14 +436,14 @@ def test_half_a_run_is_told_by_halves(tmp_path: Path) -> None:
     assert "<figure" not in text
     assert "stopped before an observer was made" in text
     assert "is left out: the recordings are not in their place any more" in text
-    assert all(result.drawing is None and result.reason for result in draw_all(RunFolder(tmp_path)))
+    assert all(result.figure is None and result.reason for result in draw_all(RunFolder(tmp_path)))
 
 
 def test_stopped_run_shows_its_recordings(tmp_path: Path) -> None:
     write_read_stage(tmp_path)
     sources = {EpisodeKey("001", c, "1"): (k + 1) * np.hstack(shown_signals(0)) for k, c in enumerate(("load", "noload"))}
     write_parquet(Population(CHANNELS, DT, (Unit("001"),), tuple(sources), sources.__getitem__), tmp_path / "recordings")
-    drawn = [r.name for r in draw_all(RunFolder(tmp_path)) if r.drawing]
+    drawn = [r.name for r in draw_all(RunFolder(tmp_path)) if r.figure]
     assert drawn == ["signals"]
 
 
@@ -477,8 +475,8 @@ def test_broken_artifact_is_an_error(tmp_path: Path) -> None:
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> tuple[str, ...]:
     """Leave out most figures, for speed."""
-    chosen = ("phase", "forms", "errors_chart")
-    monkeypatch.setattr("kros.report.figures.FIGURES", chosen)
+    chosen = ("phase", "forms", "errors")
+    monkeypatch.setattr("kros.report.figures.FIGURES", {name: FIGURES[name] for name in chosen})
     return chosen
 
 
@@ -496,14 +494,14 @@ def test_figures_as_files(finished: tuple[Path, dict[str, Any]], tmp_path: Path,
 def test_same_run_gives_the_same_figures(finished: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     first, second = ([(tmp_path / n / f).read_bytes() for f in write_figures(finished[0], tmp_path / n)] for n in "ab")
     assert first == second
-    drawn = [[to_svg(r.drawing.figure, r.name) for r in draw_all(RunFolder(finished[0])) if r.drawing] for _ in range(2)]
+    drawn = [[to_svg(r.figure, r.name) for r in draw_all(RunFolder(finished[0])) if r.figure] for _ in range(2)]
     assert drawn[0] == drawn[1]
 
 
 def test_observer_figures_show_nominal_above_worst_off_nominal_and_the_errors(finished: tuple[Path, dict[str, Any]]) -> None:
     run = RunFolder(finished[0])
     pair = ["linear_edmd/mixed", "koopman_edmd/mixed"]
-    figure = draw("observers_in_time_paper", run).drawing.figure
+    figure = draw("observers_in_time_paper", run).figure
     titles = [axes.get_title("left") for axes in figure.axes[::6]]
     assert titles == ["nominal: unit 001, episode 1", "worst off-nominal: unit 002, episode 1"]
     assert [line.get_label() for line in figure.axes[0].lines] == ["recorded", *map(observer_label, pair)]
@@ -512,7 +510,7 @@ def test_observer_figures_show_nominal_above_worst_off_nominal_and_the_errors(fi
         error = run.shown[1].observers[name].astype(float) - run.shown[1].states
         _, density = welch(error, 1 / DT, "hann", 512, axis=0)
         assert spectra[name] == pytest.approx(density, rel=1e-9)
-    drawn = draw("loaded_spectra", run).drawing.figure.axes[0].lines[1].get_ydata()
+    drawn = draw("loaded_spectra", run).figure.axes[0].lines[1].get_ydata()
     error = run.shown[2].observers[pair[1]].astype(float) - run.shown[2].states
     assert drawn == pytest.approx(welch(error[:, 0], 1 / DT, "hann", 512)[1][1 : 1 + len(drawn)], rel=1e-9)
 
@@ -605,17 +603,15 @@ def test_ranges_of_scores_move_with_them() -> None:
 def test_plots_of_an_uncertain_model_come_in_two_versions(uncertain: dict[str, UncertainModel]) -> None:
     model, found = uncertain["koopman_edmd"], models("koopman_edmd", "noload", 1)
     assert len(plot(model).axes) == 2
-    assert len(plot(model, version="sound", models=found).axes) == 3
-    panels = plot(model, version="entrywise", models=found).axes
+    assert len(plot(model, models=found).axes) == 3
+    panels = plot(model, models=found, entries=True).axes
     assert len(panels) == 4  # the inverse input form of two inputs
     bound, fitted = (line.get_ydata() for line in panels[1].lines[:2])
     assert np.all(fitted >= bound - 1e-9)
     with pytest.raises(ConfigError, match="pass models="):
-        plot(model, version="entrywise")
-    with pytest.raises(ConfigError, match="'hopeful' is unknown"):
-        plot(model, version="hopeful")
-    with pytest.raises(ConfigError, match="no option 'version'"):
-        plot(found, version="sound")
+        plot(model, entries=True)
+    with pytest.raises(ConfigError, match="no option 'entries'"):
+        plot(found, entries=True)
 
 
 def test_units_beside_weights_are_the_ratios_of_the_cover(uncertain: dict[str, UncertainModel]) -> None:

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from kros.report.canvas import decibel, power_of_ten, spread, thin, thin_log
-from kros.report.error_table import error_table
-from kros.report.figures.observer_rows import best_last, log_ticks
+from kros.report.canvas import decibel, log_ticks, power_of_ten, spread, thin, thin_log
+from kros.report.error_tables import error_table
+from kros.report.figures.rows import best_last
 from kros.report.names import best_models, deployed_pair, main_observers, model_label, number, observer_label, observer_look, paper_pair
 from kros.report.theme import Tone
 from kros.report.verdict import verdict
@@ -109,11 +109,12 @@ def test_verdict_tells_of_units_that_were_left_out() -> None:
     rows = [row("koopman/worst_case_h2", unit, channel, e) for unit, e in (("b", 0.3), ("c", 0.5)) for channel in ("position", "velocity")]
     told = " ".join(verdict({**METRICS, "left_out": {"rows": rows}}, ("position",)))
     assert (
-        "Made without the unit it runs on, the same kind of observer estimates velocity to 0.400 % (0.500 % on the worst unit, c)" in told
+        "Designed without the unit it runs on, the same kind of observer estimates velocity to 0.400 % (0.500 % on the worst unit, c)"
+        in told
     )
     rows[1]["error_percent"] = None
     assert "diverges on some units" in " ".join(verdict({**METRICS, "left_out": {"rows": rows}}, ("position",)))
-    assert "Made without" not in " ".join(verdict(METRICS, ("position",)))
+    assert "Designed without" not in " ".join(verdict(METRICS, ("position",)))
 
 
 @pytest.mark.parametrize("absent", ["evaluation", "observers", "outliers"])

@@ -10,7 +10,7 @@ from kros.data import split_episodes
 from kros.lifting import Lifting
 from kros.observer import Observer, Seen
 from kros.plants import HarmonicDrivePopulation
-from kros.report.figures import load_torque
+from kros.report.figures.observers import load_torque
 from kros.study.config import LoadConfig
 from kros.study.engine.context import Facts
 from kros.study.engine.store import Store
@@ -50,7 +50,10 @@ def test_a_declared_load_is_found_on_the_other_units(tmp_path: Path) -> None:
     made = Observer.load(tmp_path / "load" / "linear.json")
     assert made.lifting.states[3] == "load"
     assert made.seen is not None
-    assert "linear/load" in load_torque.draw(SimpleNamespace(folder=tmp_path, sample_period_s=1e-3)).caption
+    assert (
+        "linear/load"
+        in load_torque.draw(SimpleNamespace(folder=tmp_path, sample_period_s=1e-3, has=lambda name: (tmp_path / name).exists()))[1]
+    )
 
 
 def test_without_a_moment_nothing_is_done(tmp_path: Path) -> None:

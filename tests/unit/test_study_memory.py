@@ -183,7 +183,7 @@ def test_the_verdict_claims_no_set_for_it():
     told = " ".join(
         verdict(metrics | {"observers": {"koopman/memory": entry}, "uncertainty": {"koopman": {"peak_db": {"x": 1.0}, "form": "x"}}})
     )
-    assert "“Koopman, with memory”" in told
+    assert "“Koopman, subspace predictor”" in told
     assert "not designed for a set of machines" in told
     assert "A certificate covers it as it runs" in told
 

@@ -1,4 +1,4 @@
-"""What to do next, from the metrics: a few sentences, each with the reason it stands for."""
+"""What to do next, from the metrics: a few sentences, each with its reason."""
 
 from __future__ import annotations
 
@@ -6,22 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from .caveats import confounded_text, small_set_text
-from .error_table import ErrorTable, error_table
+from .error_tables import ErrorTable, error_table
 from .names import condition_label, model_label, number, observer_label, split_observer
 
 _MANY = 0.5  # share of noise from which on longer recordings are advised
 
 
 def advice(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[str]:
-    """Return what the result asks for; nothing for a run that stopped before an observer was made.
-
-    Parameters
-    ----------
-    metrics : mapping
-        As in ``metrics.json``; any part may be absent.
-    measured : tuple of str
-        Channels that are available at run time.
-    """
+    """Return what ``metrics.json`` asks for, given the channels that are measured at run time; nothing for a run that stopped before an observer was made."""
     if metrics["study"].get("deployed") is None:
         return []
     model = split_observer(metrics["study"]["deployed"])[0]
@@ -30,7 +22,7 @@ def advice(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[s
 
 
 def _outliers(metrics: Mapping[str, Any]) -> list[str]:
-    """Look at flagged units, the highest score first, and at those about which nothing can be told."""
+    """Name flagged units, the highest score first, and those about which the scores say nothing."""
     flagged = sorted((r for r in metrics.get("outliers", []) if r["outlier"]), key=lambda r: -float(r["score"]))
     first: dict[str, Mapping[str, Any]] = {}
     for row in flagged:
@@ -80,12 +72,12 @@ def _observer(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str
         return [
             f"Do not use “{observer_label(name)}”: its estimates diverge. Look at Models first: free runs there should not diverge either."
         ]
-    better = [o for o in table.observers if o != name and _smaller(table, o, name, hidden, 0.95)]
+    better = [o for o in table.cells if o != name and _smaller(table, o, name, hidden, 0.95)]
     if better:
         best = min(better, key=lambda o: sum(table.cells[o][c].mean or 0.0 for c in hidden))
         return [
-            f"Look at “{observer_label(best)}” before handing anything over: it is better in all that is not measured. Compare what is certified under "
-            "Synthesis; observer.deployed names the one that is handed over."
+            f"Look at “{observer_label(best)}” before deploying anything: it is better in all that is not measured. Compare what is certified under "
+            "Synthesis; observer.deployed names the one that is deployed."
         ]
     if name != other and other in table.cells and not _smaller(table, name, other, hidden, 0.99):
         return ["The observer is no better than its model alone: correction from these measurements brings nothing here."]

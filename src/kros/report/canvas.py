@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from math import ceil, floor, log10
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,52 +19,47 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[Any]
 _BUCKETS = 700  # pairs of points that a line across the page can show
+_POINTS = 220  # of a frequency line
+_LEGEND_IN = 0.19  # height of a row of a legend
+_READABLE = 48  # units whose names fit on an axis
 
 
-def grid(rows: int, columns: int, row_height_in: float, *, legend_rows: int = 1, **options: Any) -> tuple[Figure, npt.NDArray[Any]]:
-    """Return a figure with rows and columns of axes.
-
-    Parameters
-    ----------
-    rows, columns : int
-    row_height_in : float
-    legend_rows : int
-        Lines of legend above the axes, see `legend`.
-    **options
-        Passed to `Figure.subplots`.
-
-    Returns
-    -------
-    figure : Figure
-    axes : ndarray of Axes, shape (rows, columns)
-    """
+def grid(rows: int, columns: int, row_height_in: float, **options: Any) -> tuple[Figure, npt.NDArray[Any]]:
+    """Return a figure in constrained layout and its axes, shape (rows, columns); `options` are those of `Figure.subplots`."""
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    from .layout import OnePass
+    layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04, wspace=0.02, hspace=0.02)
+    figure = Figure(figsize=(WIDTH_IN, rows * row_height_in + 0.06), layout=layout)
+    ratios = {key: options.pop(key) for key in ("width_ratios", "height_ratios") if key in options}
+    return figure, figure.subplots(rows, columns, squeeze=False, **ratios, **options)
 
-    top_in = 0.06 + 0.19 * legend_rows
-    height = rows * row_height_in + top_in
-    figure = Figure(figsize=(WIDTH_IN, height))
-    figure.subplots_adjust(
-        left=0.09, right=0.98, bottom=min(0.5 / height, 0.3), top=1 - min((top_in + 0.2) / height, 0.4), wspace=0.15, hspace=0.2
-    )
-    axes = figure.subplots(rows, columns, squeeze=False, **options)
-    figure.set_layout_engine(OnePass(axes, top_in, options.get("width_ratios"), options.get("height_ratios")))
-    return figure, axes
+
+def settle(figure: Figure) -> None:
+    """Lay a figure out once and for all; otherwise every file written from it does so again."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)  # a placeholder, "none", would still draw everything twice
+
+
+def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:
+    """Write a legend across the top of the figure, from one axes' labelled lines; one row, or as many as `columns` makes of them."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        columns = columns or len(handles)
+        figure.set_figheight(figure.get_figheight() + _LEGEND_IN * ceil(len(handles) / columns))
+        figure.legend(handles, labels, loc="outside upper left", ncols=columns, borderaxespad=0.0, borderpad=0.1)
+
+
+def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float] = (0, 0), **options: Any) -> None:
+    """Write a small text at a place in shares of the axes (`xycoords` says otherwise), moved by an offset in points."""
+    settings: dict[str, Any] = {"xycoords": "axes fraction", "size": 7.5} | options
+    axes.annotate(text, at, xytext=offset, textcoords="offset points", **settings)
 
 
 def thin(x: Array, y: Array, buckets: int = _BUCKETS) -> tuple[Array, Array]:
-    """Return a line with fewer points that looks the same: smallest and largest value of every bucket, in their order.
-
-    Parameters
-    ----------
-    x, y : ndarray, shape (n,)
-    buckets : int
-
-    Returns
-    -------
-    x, y : ndarray, shape (at most 2 * buckets + the rest,)
-    """
+    """Return a line with fewer points that looks the same: smallest and largest value of every bucket, in their order."""
     size = len(y) // buckets
     if size < 3:
         return x, y
@@ -75,21 +71,8 @@ def thin(x: Array, y: Array, buckets: int = _BUCKETS) -> tuple[Array, Array]:
     return x[rows], y[rows]
 
 
-def thin_log(freqs_hz: Array, values: Array, points: int = 220) -> tuple[Array, Array]:
-    """Return a frequency line with fewer, logarithmically spaced points; peaks are kept.
-
-    Parameters
-    ----------
-    freqs_hz : ndarray, shape (n,), Hz
-    values : ndarray, shape (..., n)
-    points : int
-        Most points that are left.
-
-    Returns
-    -------
-    freqs_hz : ndarray, shape (m,)
-    values : ndarray, shape (..., m)
-    """
+def thin_log(freqs_hz: Array, values: Array, points: int = _POINTS) -> tuple[Array, Array]:
+    """Return a frequency line, shape (..., n), with at most so many logarithmically spaced points; peaks are kept."""
     if len(freqs_hz) <= points:
         return freqs_hz, values
     starts = np.unique(np.linspace(0, len(freqs_hz), points, endpoint=False).astype(int))
@@ -102,25 +85,33 @@ def decibel(values: npt.ArrayLike) -> Array:
     return 20 * np.log10(np.where(magnitude > 0, magnitude, np.nan))
 
 
+def lines_of_units(axes: Axes, freqs_hz: Array, lines: Array, colour: str, label: str) -> None:
+    """Draw thin lines, shape (unit, frequency) in dB, a unit each; a unit without a residual is left out."""
+    from matplotlib.collections import LineCollection
+
+    paths = [np.column_stack([freqs_hz, line]) for line in lines if np.isfinite(line).any()]
+    axes.add_collection(LineCollection(paths, colors=colour, linewidths=0.6, alpha=0.35, label=label))
+
+
 def frequency_axis(axes: Axes, freqs_hz: Array, label: str = "frequency (Hz)", most: int = 6) -> None:
     """Make the horizontal axis logarithmic over the frequencies, with at most `most` numbers."""
     positive = freqs_hz[freqs_hz > 0]
     limits = (float(positive[0]), float(positive[-1]))
-    if axes.get_xscale() != "log" or axes.get_xlim() != limits:  # shared axes are told once: each call goes through all of them
+    if axes.get_xscale() != "log" or axes.get_xlim() != limits:  # once for shared axes: each call goes through all of them
         axes.set_xscale("log")
         axes.set_xlim(*limits)
-        plain_powers(axes.xaxis, "{x:g}", most)
+        _powers_of_ten(axes.xaxis, "{x:g}", most)
     axes.set_xlabel(label)
 
 
-def logarithmic(axes: Axes) -> None:
-    """Make the vertical axis logarithmic, with few ticks in powers of ten."""
+def logarithmic(axes: Axes, plain: bool = False) -> None:
+    """Make the vertical axis logarithmic, with few ticks in powers of ten, in plain figures or as powers."""
     axes.set_yscale("log")
-    plain_powers(axes.yaxis, lambda value, _: power_of_ten(value))
+    _powers_of_ten(axes.yaxis, "{x:g}" if plain else lambda value, _: power_of_ten(value))
 
 
-def plain_powers(axis: Axis, formatter: Any, most: int = 6) -> None:
-    """Tick a logarithmic axis at powers of ten only, numbered without mathematical text, which is slow to set."""
+def _powers_of_ten(axis: Axis, formatter: Any, most: int = 6) -> None:
+    """Number a logarithmic axis at powers of ten only, without mathematical text, which is slow to set."""
     from matplotlib.ticker import LogLocator, NullLocator
 
     axis.set_major_locator(LogLocator(numticks=most))
@@ -130,18 +121,58 @@ def plain_powers(axis: Axis, formatter: Any, most: int = 6) -> None:
 
 def power_of_ten(value: float) -> str:
     """Return a power of ten with its exponent raised, such as 10⁻³."""
-    return f"10{str(round(float(np.log10(value)))).translate(RAISED)}"
+    return f"10{str(round(log10(value))).translate(RAISED)}"
 
 
-def settle(figure: Figure) -> None:
-    """Lay a figure out once and for all; otherwise every file written from it does so again."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        engine.execute(figure)
-        figure.set_layout_engine(None)  # a placeholder, "none", would still draw everything twice
+def log_ticks(low: float, high: float, most: int = 3) -> list[float]:
+    """Return at most `most` round numbers between two positive ones, in the densest steps that allows it."""
+    exponents = range(floor(log10(low)), ceil(log10(high)) + 1)
+    for steps in ((1, 2, 5), (1, 3), (1,)):
+        found = [s * 10.0**e for e in exponents for s in steps if low <= s * 10.0**e <= high]
+        if len(found) <= most:
+            return found
+    return found[:: ceil(len(found) / most)]
 
 
-def limit_decibels(axes: Axes, floor_db: float = 90.0) -> None:
+def fit_log_axis(axes: Axes, values: Sequence[float], most: int = 3) -> None:
+    """Fit a logarithmic horizontal axis around values and number it in plain figures, as many as there is room for."""
+    from matplotlib.ticker import FixedLocator, NullLocator
+
+    low, high = min(values) / 1.6, max(max(values) * 1.6, 4 * min(values))
+    axes.set_xscale("log")
+    axes.set_xlim(low, high)
+    axes.xaxis.set_major_locator(FixedLocator(log_ticks(low, high, most)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_locator(NullLocator())
+
+
+def units_axis(axes: Axes, units: Sequence[str]) -> None:
+    """Label the horizontal axis with units at 0, 1, 2, ...: their names as long as they can be read, else their count."""
+    axes.set_xlim(-0.7, len(units) - 0.3)
+    axes.grid(visible=False, axis="x")
+    if len(units) <= _READABLE:
+        axes.set_xticks(range(len(units)), units, rotation=90 if len(units) > 8 else 0, size=7)
+        axes.set_xlabel("unit")
+    else:
+        axes.set_xlabel(f"{len(units)} units, in order")
+
+
+def name_rows(axes: Axes, labels: Sequence[str], bold: int | None, shift: float = 0.0, **options: Any) -> None:
+    """Name rows at 0, 1, 2, ... from below on the vertical axis, `shift` above them, one in bold."""
+    axes.set_yticks(np.arange(len(labels)) + shift, labels, **options)
+    for i, label in enumerate(axes.get_yticklabels()):
+        label.set_fontweight("bold" if i == bold else "normal")
+    axes.set_ylim(-0.6, len(labels) - 0.4)
+    axes.grid(visible=False, axis="y")
+
+
+def label_below(axes: Iterable[Axes], text: str = "frequency (Hz)") -> None:
+    """Label the horizontal axes of a row."""
+    for panel in axes:
+        panel.set_xlabel(text)
+
+
+def limit_decibels(axes: Axes, floor_db: float) -> None:
     """Show at most `floor_db` decibels below the highest line."""
     low, high = axes.get_ylim()
     axes.set_ylim(max(low, high - floor_db), high)
@@ -153,25 +184,16 @@ def end_labels(axes: Axes, entries: Sequence[tuple[float, str, str]], spacing: f
     Parameters
     ----------
     axes : Axes
-        With its final limits and scale.
+        With its final limits and linear scale.
     entries : sequence of (value, text, colour)
         Value of the line at its right end, in data units.
     spacing : float
         Smallest distance, as a share of the axes' height.
     """
-    shown = sorted((_fraction(axes, value), text, colour) for value, text, colour in entries if np.isfinite(value))
+    low, high = axes.get_ylim()
+    shown = sorted(((value - low) / (high - low), text, colour) for value, text, colour in entries if np.isfinite(value))
     for place, (_, text, colour) in zip(spread([s[0] for s in shown], spacing), shown, strict=True):
-        axes.annotate(
-            text,
-            (1, place),
-            xycoords="axes fraction",
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-            color=colour,
-            size=7.5,
-            annotation_clip=False,
-        )
+        note(axes, text, (1, place), (4, 0), va="center", color=colour, annotation_clip=False)
 
 
 def spread(places: Sequence[float], spacing: float) -> list[float]:
@@ -186,25 +208,6 @@ def spread(places: Sequence[float], spacing: float) -> list[float]:
     return moved
 
 
-def _fraction(axes: Axes, value: float) -> float:
-    low, high = axes.get_ylim()
-    if axes.get_yscale() == "log":
-        value, low, high = (float(np.log10(max(v, 1e-300))) for v in (value, low, high))
-    return (value - low) / (high - low)
-
-
-def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:
-    """Write a legend across the top of the figure, from one axes' labelled lines; one row, or as many as `columns` makes of them."""
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        height = figure.get_figheight()
-        figure.legend(
-            handles, labels, loc="upper left", ncols=columns or len(handles), bbox_to_anchor=(0.0, 1.0 - 0.02 / height), borderaxespad=0.0
-        )
-
-
-def mark(axes: Axes, text: str) -> None:
-    """Write a quiet note inside the axes, upper left."""
-    axes.annotate(
-        text, (0.0, 1.0), xycoords="axes fraction", xytext=(4, -3), textcoords="offset points", va="top", color=Tone.SOFT.light, size=7.5
-    )
+def zero_line(axes: Axes) -> None:
+    """Mark 0 dB."""
+    axes.axhline(0, color=Tone.SOFT.light, lw=0.7)

@@ -11,13 +11,13 @@ SMALLER = 5.0  # times: a free run that is off by this much more than the set al
 
 
 def conditions_apart(metrics: Mapping[str, Any]) -> bool:
-    """Tell whether every unit was recorded in one of several conditions only, so that nothing tells units from conditions."""
+    """Tell whether every unit was recorded in one of several conditions only, which confounds units and conditions."""
     recorded = [row["conditions"] for row in metrics.get("units", []) if row.get("conditions")]
     return len({c for conditions in recorded for c in conditions}) > 1 and all(len(conditions) == 1 for conditions in recorded)
 
 
 def confounded_text(metrics: Mapping[str, Any]) -> list[str]:
-    """Warn where units cannot be told from conditions, or where some units took no part in the models; nothing where all is well."""
+    """Warn where units and conditions are confounded, or where some units took no part in the models; nothing where all is well."""
     units = [row for row in metrics.get("units", []) if row.get("conditions") and row.get("group") != "outliers"]
     home = metrics["study"]["identify_on"]
     known = [row["unit"] for row in units if home in row["conditions"]]
@@ -28,20 +28,12 @@ def confounded_text(metrics: Mapping[str, Any]) -> list[str]:
         return [f"{about}; about the others nothing was identified."]
     return [
         f"Units and conditions are confounded: each unit was recorded in one condition only, so a difference between units of two conditions may be "
-        f"the machine's or the condition's. {about}; record the units in the same conditions to tell more."
+        f"the machine's or the condition's. {about}; record the units in the same conditions to separate them."
     ]
 
 
 def small_set_text(metrics: Mapping[str, Any], models: tuple[str, ...] | None = None) -> list[str]:
-    """Warn of uncertain sets that are far smaller than what their models are off by in a free run.
-
-    Parameters
-    ----------
-    metrics : mapping
-        As in ``metrics.json``; any part may be absent.
-    models : tuple of str, optional
-        Kinds of models that are looked at; all by default.
-    """
+    """Warn of uncertain sets that are far smaller than the errors of their models in a free run; of all kinds of models, or of some."""
     texts = []
     for name, entry in metrics.get("uncertainty", {}).items():
         peak = entry.get("peak_db", {}).get(entry.get("form"))

@@ -1,17 +1,28 @@
-"""Figures as files, for papers and slides."""
+"""Figures to bytes and files: SVG for the page, PNG and PDF for papers and slides."""
 
 from __future__ import annotations
 
+import io
 import logging
+import re
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ..core.artifacts import write_bytes
 from ..core.errors import ConfigError
-from .encode import to_pdf, to_png
+from .canvas import settle
 from .figures import draw_all
 from .run_folder import RunFolder
+from .theme import Tone, style
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
+
+_DPI = 200
+_FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
+_FAMILY = re.compile(r"(?<=px )'DejaVu Sans'(?:, [^;\"]*)?|(?<=font-family: )'?DejaVu Sans'?(?:, [^;\"]*)?")
 
 
 def write_figures(run: Path, out: Path) -> list[str]:
@@ -38,11 +49,46 @@ def write_figures(run: Path, out: Path) -> list[str]:
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Figures to {out}: is a file; name a folder.")
     names = []
-    for result in draw_all(RunFolder(Path(run))):
-        if result.drawing is None:
-            log.warning("figure %s is left out: %s", result.name, result.reason)
+    for drawn in draw_all(RunFolder(Path(run))):
+        if drawn.figure is None:
+            log.warning("figure %s is left out: %s", drawn.name, drawn.reason)
             continue
         for suffix, encode in (("png", to_png), ("pdf", to_pdf)):
-            write_bytes(out / f"{result.name}.{suffix}", encode(result.drawing.figure))
-            names.append(f"{result.name}.{suffix}")
+            write_bytes(out / f"{drawn.name}.{suffix}", encode(drawn.figure))
+            names.append(f"{drawn.name}.{suffix}")
     return names
+
+
+def to_png(figure: Figure) -> bytes:
+    """Return a figure as PNG, 200 dots an inch."""
+    return _encode(figure, "png", dpi=_DPI, metadata={"Software": None})
+
+
+def to_pdf(figure: Figure) -> bytes:
+    """Return a figure as PDF; the same content gives the same bytes."""
+    return _encode(figure, "pdf", dpi=_DPI, metadata={"CreationDate": None, "Creator": None, "Producer": None})
+
+
+def to_svg(figure: Figure, name: str) -> str:
+    """Return a figure as an inline SVG element whose colours are the page's variables; `name` is the prefix of all identifiers."""
+    metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
+    text = _encode(figure, "svg", transparent=True, metadata=metadata).decode()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", text)
+    opening = r'<svg viewBox="\1" role="img" xmlns:xlink="http://www.w3.org/1999/xlink">'
+    text = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', opening, text, count=1)
+    for tone in Tone:
+        text = text.replace(tone.light, f"var({tone.variable})")
+    text = _FAMILY.sub(_FONTS, text)
+    # coordinates stand inside tags; a hundredth of a point is enough
+    return re.sub(r"<[^>]*>", lambda tag: re.sub(r"(\d\.\d{2})\d+", r"\1", tag.group()), text).strip()
+
+
+def _encode(figure: Figure, kind: str, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    with style():
+        settle(figure)
+        figure.savefig(buffer, format=kind, **options)
+    return buffer.getvalue()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,8 @@ from typing import Any
 from ..core.artifacts import write_bytes
 from ..data.population import DEFAULT_CONDITION
 from .advice import advice
-from .encode import to_svg
 from .figures import FIGURES, draw
+from .files import to_svg
 from .names import condition_label
 from .run_folder import RunFolder
 from .sections import SECTIONS
@@ -25,17 +24,8 @@ log = logging.getLogger(__name__)
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
-@dataclass(frozen=True)
-class Encoded:
-    """A figure as the page shows it, or the reason why it does not."""
-
-    name: str
-    title: str
-    svg: str
-    caption: str
-    reason: str
-
-
+Encoded = dict[str, str]
+"""A figure as the page shows it: name, title, svg and caption, or the reason why it is left out."""
 Mapped = Callable[[Callable[[str], Encoded], Iterable[str]], Iterator[Encoded]]
 
 
@@ -77,13 +67,15 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
         loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     figures = {}
-    for figure in mapped(partial(encoded, run), FIGURES):
-        if figure.reason:
-            log.info("figure %s: left out, %s", figure.name, figure.reason)
-        figures[figure.name] = {"title": figure.title, "svg": Markup(figure.svg), "caption": figure.caption, "reason": figure.reason}
+    for found in mapped(partial(encoded, run), FIGURES):
+        if found["reason"]:
+            log.info("figure %s: left out, %s", found["name"], found["reason"])
+        figures[found["name"]] = {**found, "svg": Markup(found["svg"])}
+    study = metrics["study"]
+    conditions = [condition_label(c) for c in study["conditions"] if c != DEFAULT_CONDITION]
     return environment.get_template("report.html.jinja").render(
         name=run.study.get("name", run.folder.name),
-        subtitle=_subtitle(metrics),
+        subtitle=" · ".join([f"{study['units']} units", *conditions]),
         verdict={
             "What was found": findings(metrics, run.measured_states),
             "Can it be trusted": trust(metrics),
@@ -95,12 +87,11 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
     )
 
 
-def encoded(run: RunFolder, module_name: str) -> Encoded:
+def encoded(run: RunFolder, name: str) -> Encoded:
     """Draw a figure and return it as the page shows it."""
-    result = draw(module_name, run)
-    if result.drawing is None:
-        return Encoded(result.name, result.title, "", "", result.reason)
-    return Encoded(result.name, result.title, to_svg(result.drawing.figure, result.name), result.drawing.caption, "")
+    drawn = draw(name, run)
+    svg = "" if drawn.figure is None else to_svg(drawn.figure, name)
+    return {"name": name, "title": drawn.title, "svg": svg, "caption": drawn.caption, "reason": drawn.reason}
 
 
 def stylesheet() -> str:
@@ -109,8 +100,3 @@ def stylesheet() -> str:
     dark = "".join(f"{t.variable}:{t.dark};" for t in Tone)
     text = (_TEMPLATES / "report.css").read_text(encoding="utf-8")
     return text.replace("/* light tones */", light).replace("/* dark tones */", dark)
-
-
-def _subtitle(metrics: Mapping[str, Any]) -> str:
-    study = metrics["study"]
-    return " · ".join([f"{study['units']} units", *(condition_label(c) for c in study["conditions"] if c != DEFAULT_CONDITION)])

@@ -23,7 +23,7 @@ _METHODS = {
     "worst_case_h2": "worst-case H2",
     "worst_case_hinf": "worst-case H∞",
     "residual_h2": "residual-shaped H2",
-    "memory": "with memory",
+    "memory": "subspace predictor",
     "filtered_difference": "filtered difference",
     "learned": "learned",
 }
@@ -71,9 +71,8 @@ def model_label(name: str) -> str:
 
 def observer_label(name: str) -> str:
     """Return what an observer is called, for example ``Koopman (EDMD), worst-case H2``."""
-    model, method = split_observer(name)
-    text = _METHODS.get(method, method.replace("_", " "))
-    return f"{model_label(model)}, {text}" if model else text
+    model = split_observer(name)[0]
+    return f"{model_label(model)}, {method_label(name)}" if model else method_label(name)
 
 
 def method_label(name: str) -> str:
@@ -112,11 +111,7 @@ def best_models(names: Iterable[str]) -> list[str]:
 def main_observers(names: Sequence[str], deployed: str | None) -> list[str]:
     """Return the few observers that figures compare: the deployed one, its linear twin, the tuned Kalman filter, the open loop.
 
-    Parameters
-    ----------
-    names : sequence of str
-    deployed : str or None
-        Observer that is handed over; the first robust one where it is unknown.
+    The first robust one stands for the deployed one where that is unknown.
     """
     known = list(names)
     robust = [n for n in known if split_observer(n)[1] not in BASELINES]
@@ -129,7 +124,7 @@ def main_observers(names: Sequence[str], deployed: str | None) -> list[str]:
 
 
 def deployed_pair(names: Sequence[str], deployed: str | None) -> list[str]:
-    """Return the observer that is handed over and its linear twin; beside a lonely one its tuned Kalman filter."""
+    """Return the deployed observer and its linear twin; without a twin its tuned Kalman filter."""
     known = main_observers(names, deployed)
     main = [n for n in known if split_observer(n)[1] != "open_loop"] or known
     robust = [n for n in main if split_observer(n)[1] not in BASELINES]
@@ -151,7 +146,7 @@ def axis_label(channel: str, unit: str) -> str:
 
 
 def channel_units(metrics: Mapping[str, Any]) -> dict[str, str]:
-    """Return the unit of measure of every channel; nothing where the metrics do not tell."""
+    """Return the unit of measure of every channel; nothing where the metrics do not say."""
     return dict(metrics["study"].get("channels", {}))
 
 

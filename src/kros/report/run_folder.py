@@ -18,10 +18,9 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, read_arrays, read_json
 from ..core.records import recorded_files
-from ..data.population import Channel, EpisodeKey, Population
+from ..data.population import Channel, EpisodeKey, Population, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..identify.refine import RefinedModels
-from ..observer import Observer
 from ..synthesis.result import Synthesis
 
 if TYPE_CHECKING:
@@ -82,8 +81,7 @@ class RunFolder:
     @cached_property
     def facts(self) -> dict[str, Any]:
         """What the read stage found."""
-        self._require("population/facts.json", "the recordings have not been read yet")
-        return load_artifact(self.folder / "population", "facts")[0]
+        return self._record("population", "facts", "the recordings have not been read yet")
 
     @property
     def identify_on(self) -> str:
@@ -95,16 +93,30 @@ class RunFolder:
         """The recordings, where they are still in place."""
         from ..data import read_parquet
 
-        recordings = Path(self.facts["recordings"])
-        folder = recordings if recordings.is_absolute() else self.folder / recordings
+        folder = self.folder / self.facts["recordings"]
         if not (folder / "population.json").exists():
             raise NotShownError("the recordings are not in their place any more")
         return read_parquet(folder)
 
     @cached_property
+    def _described(self) -> ModelSet | Population:
+        """What knows channels and sampling period: models, or the recordings where there are none yet."""
+        return next(iter(self.models.values())) if any(name.startswith("models/") for name in self.files) else self.population
+
+    @property
     def channels(self) -> tuple[Channel, ...]:
         """Channels with their units of measure."""
-        return next(iter(self.models.values())).channels if self._any_models else self.population.channels
+        return self._described.channels
+
+    @property
+    def states(self) -> list[Channel]:
+        """State channels, in column order."""
+        return [c for c in self.channels if c.role is Role.STATE]
+
+    @property
+    def hidden_states(self) -> list[str]:
+        """Names of the states that are not measured; all states where all are."""
+        return [c.name for c in self.states if not c.measured] or [c.name for c in self.states]
 
     @property
     def measured_states(self) -> tuple[str, ...]:
@@ -117,11 +129,7 @@ class RunFolder:
     @property
     def sample_period_s(self) -> float:
         """Sampling period, s."""
-        return next(iter(self.models.values())).sample_period_s if self._any_models else self.population.sample_period_s
-
-    @property
-    def _any_models(self) -> bool:
-        return any(name.startswith("models/") for name in self.files)
+        return self._described.sample_period_s
 
     @cached_property
     def calibration(self) -> PhaseCalibration:
@@ -136,17 +144,14 @@ class RunFolder:
 
     @cached_property
     def models(self) -> dict[str, ModelSet]:
-        """Models of the condition that was identified on."""
-        found = {
-            f.name: ModelSet.load(f)
-            for f in self._folders("models", "model.json", "no models have been identified yet")
-            if "@" not in f.name
-        }
+        """Models of the condition that was identified on, Koopman models first."""
+        folders = self._folders("models", "model.json", "no models have been identified yet")
+        found = {f.name: ModelSet.load(f) for f in folders if "@" not in f.name}
         return dict(sorted(found.items(), key=lambda item: (not item[0].startswith("koopman"), item[0])))
 
     @cached_property
     def refined(self) -> dict[str, RefinedModels]:
-        """What the refinement found out, by kind of model."""
+        """What the refinement found out, by kind of model, Koopman models first."""
         folders = self._folders("refinement", "refinement.json", "this study has no refined models")
         found = {f.name: RefinedModels.load(f) for f in folders}
         return dict(sorted(found.items(), key=lambda item: not item[0].startswith("koopman")))
@@ -172,9 +177,9 @@ class RunFolder:
         """Variation and noise, by kind of model."""
         from ..uncertainty import VariationAndNoise
 
-        reason = "variation and noise were not told apart; it takes two training episodes of every unit"
-        found = {f.name: VariationAndNoise.load(f / "noise") for f in self._folders("uncertainty", "noise/*.json", reason)}
-        return _in_order(found)
+        reason = "variation and noise were not separated; it takes two training episodes of every unit"
+        folders = self._folders("uncertainty", "noise/*.json", reason)
+        return _in_order({f.name: VariationAndNoise.load(f / "noise") for f in folders})
 
     @cached_property
     def orders(self) -> dict[str, Tightness]:
@@ -197,9 +202,8 @@ class RunFolder:
         """Condition of the highest outlier score, and there the residuals of all units beside the cover of the others, by kind of model."""
         from ..uncertainty.unit_residuals import UnitResiduals
 
-        folders = self._folders(
-            "outliers", "others/*.json", "no unit was compared with the cover of the others; it takes two others in a condition"
-        )
+        reason = "no unit was compared with the cover of the others; it takes two others in a condition"
+        folders = self._folders("outliers", "others/*.json", reason)
         found = {f.name.partition("@")[0]: UnitResiduals.load(f / "others") for f in folders}
         return self._condition(folders[0].name), _in_order(found)
 
@@ -218,15 +222,7 @@ class RunFolder:
     @cached_property
     def choice(self) -> dict[str, Any]:
         """Which unit is nominal and which is worst off nominal."""
-        self._require("uncertainty/choice.json", "the uncertainty has not been quantified yet")
-        return load_artifact(self.folder / "uncertainty", "choice")[0]
-
-    @cached_property
-    def outlier_rows(self) -> list[dict[str, Any]]:
-        """Scores of all units in all conditions."""
-        self._require("outliers/scores.json", "no outlier scores have been computed yet")
-        rows: list[dict[str, Any]] = read_json(self.folder / "outliers" / "scores.json")["rows"]
-        return rows
+        return self._record("uncertainty", "choice", "the uncertainty has not been quantified yet")
 
     @cached_property
     def syntheses(self) -> dict[str, Synthesis]:
@@ -235,23 +231,13 @@ class RunFolder:
         return {f"{m.parent.name}/{m.name}": Synthesis.load(m) for m in methods}
 
     @cached_property
-    def observer_names(self) -> list[str]:
-        """Names of the observers, in the order of the study."""
-        return list(self.observers_record["names"])
-
-    @cached_property
     def observers_record(self) -> dict[str, Any]:
         """What the synthesis stage says about its observers."""
-        self._require("observers/observers.json", "no observer has been made yet")
-        return load_artifact(self.folder / "observers", "observers")[0]
-
-    def observer(self, name: str) -> Observer:
-        """Load an observer."""
-        return Observer.load(self.folder / "observers" / f"{name}.json")
+        return self._record("observers", "observers", "no observer has been made yet")
 
     @property
     def deployed(self) -> str | None:
-        """Name of the observer that is handed over, where there is one."""
+        """Name of the deployed observer, where there is one."""
         try:
             name = self.observers_record.get("deployed")
         except NotShownError:
@@ -265,6 +251,12 @@ class RunFolder:
         content: dict[str, Any] = read_json(self.folder / "evaluation" / "evaluation.json")
         return content
 
+    @property
+    def band_hz(self) -> tuple[float, float] | None:
+        """Band around the gearbox frequency at top speed, Hz, where there is one."""
+        found = self.evaluation.get("band_hz")
+        return None if found is None else (found[0], found[1])
+
     @cached_property
     def disturbed(self) -> dict[str, Any]:
         """What was found on disturbed measurements and on random members of the set; empty where the study asks for neither."""
@@ -273,41 +265,36 @@ class RunFolder:
     @cached_property
     def members(self) -> dict[str, Array]:
         """Norms of the errors over random members of the set, ``members/<observer>`` and ``units/<observer>``."""
-        self._require("disturbed/arrays.npz", "no member of an uncertain set was drawn")
-        return dict(read_arrays(self.folder / "disturbed" / "arrays.npz"))
+        return self._arrays("disturbed", "no member of an uncertain set was drawn")
 
     @cached_property
     def left_out(self) -> dict[str, Any]:
-        """What observers did on units that took no part in their making."""
-        self._require("left_out/left_out.json", "no unit was left out; set evaluate.folds")
-        return load_artifact(self.folder / "left_out", "left_out")[0]
+        """What observers did on units that took no part in their design."""
+        return self._record("left_out", "left_out", "no unit was left out; set evaluate.folds")
 
     @cached_property
     def arrays(self) -> dict[str, Array]:
         """Trajectories and spectra of the evaluation."""
-        self._require("evaluation/arrays.npz", "the observers have not been evaluated yet")
-        return dict(read_arrays(self.folder / "evaluation" / "arrays.npz"))
+        return self._arrays("evaluation", "the observers have not been evaluated yet")
 
     @cached_property
     def shown(self) -> list[Shown]:
         """Episodes that the evaluation kept: nominal, worst off-nominal, and the nominal unit in every other condition."""
-        keys = [EpisodeKey(*row) for row in self.evaluation["shown"]]
-        return [self._shown(number, key) for number, key in enumerate(keys)]
+        return [self._shown(number, EpisodeKey(*row)) for number, row in enumerate(self.evaluation["shown"])]
 
     def _shown(self, number: int, key: EpisodeKey) -> Shown:
         start = f"shown{number}/"
         part = {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
-        states = part["states"]
-        observers = {k.removeprefix("observer/"): v for k, v in part.items() if k.startswith("observer/")}
-        models = {k.removeprefix("model/"): v for k, v in part.items() if k.startswith("model/")}
-        return Shown(key, np.arange(len(states)) * self.sample_period_s, states, part["inputs"], observers, models)
+        observers, models = ({k.removeprefix(kind): v for k, v in part.items() if k.startswith(kind)} for kind in ("observer/", "model/"))
+        return Shown(key, np.arange(len(part["states"])) * self.sample_period_s, part["states"], part["inputs"], observers, models)
 
-    def show(self, unit: str, condition: str) -> Shown:
-        """Return the kept episode of a unit in a condition."""
-        for shown in self.shown:
-            if (shown.key.unit, shown.key.condition) == (unit, condition):
-                return shown
-        raise NotShownError(f"there is no held-out episode of unit {unit} ({condition})")
+    def _record(self, place: str, name: str, reason: str) -> dict[str, Any]:
+        self._require(f"{place}/{name}.json", reason)
+        return load_artifact(self.folder / place, name)[0]
+
+    def _arrays(self, place: str, reason: str) -> dict[str, Array]:
+        self._require(f"{place}/arrays.npz", reason)
+        return dict(read_arrays(self.folder / place / "arrays.npz"))
 
     def _folders(self, place: str, file: str, reason: str) -> list[Path]:
         """Return the folders `place`/* that hold a file; both may be patterns, a star for one part of a name."""

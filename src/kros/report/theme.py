@@ -6,14 +6,9 @@ Hues follow Okabe and Ito and stay apart for colour-blind readers; meaning is ne
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from contextlib import AbstractContextManager
 from enum import Enum
-from typing import Any, ParamSpec, TypeVar
-
-P = ParamSpec("P")
-R = TypeVar("R")
+from typing import Any
 
 WIDTH_IN = 7.4  # page width of every figure
 
@@ -86,7 +81,6 @@ _SETTINGS: dict[str, Any] = {
     "legend.fontsize": 8,
     "legend.handlelength": 1.8,
     "legend.columnspacing": 1.6,
-    "figure.constrained_layout.use": False,
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
     "text.hinting": "none",  # widths of text do not depend on the resolution
@@ -105,14 +99,3 @@ def style() -> AbstractContextManager[None]:
 
     context: AbstractContextManager[None] = matplotlib.rc_context(_SETTINGS)  # type: ignore[arg-type]
     return context
-
-
-def styled(draw: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function that draws, so that it draws in this theme."""
-
-    @functools.wraps(draw)
-    def inside(*args: P.args, **kwargs: P.kwargs) -> R:
-        with style():
-            return draw(*args, **kwargs)
-
-    return inside

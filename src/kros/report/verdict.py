@@ -1,4 +1,4 @@
-"""The first paragraph: what was recorded, what is handed over, how well it works, who is flagged. Plain words, numbers from the metrics."""
+"""The first paragraph: what was recorded, which observer is deployed, how well it works, which units are flagged; numbers from the metrics."""
 
 from __future__ import annotations
 
@@ -7,36 +7,29 @@ from typing import Any
 
 from ..data.population import DEFAULT_CONDITION
 from .caveats import conditions_apart, confounded_text
-from .error_table import ErrorTable, error_table
-from .left_out_table import left_out_tables
+from .error_tables import ErrorTable, error_table, left_out_tables
 from .names import BASELINES, channel_units, condition_label, form_label, minus, number, observer_label, split_observer
 from .sections.outliers import flagged_text, silence_text
 
+Metrics = Mapping[str, Any]
 
-def verdict(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[str]:
-    """Return the sentences of the verdict.
 
-    Parameters
-    ----------
-    metrics : mapping
-        As in ``metrics.json``; any part may be absent.
-    measured : tuple of str
-        Channels that are available at run time; their errors are left to the table.
-    """
+def verdict(metrics: Metrics, measured: tuple[str, ...] = ()) -> list[str]:
+    """Return the sentences of the verdict from ``metrics.json``, any part of which may be absent; errors of `measured` channels are left to the table."""
     return [*findings(metrics, measured), *trust(metrics)]
 
 
-def findings(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[str]:
-    """Return what was recorded, what is handed over and how well it works, and who is flagged."""
-    return [*_recorded(metrics), *_handed_over(metrics, measured), *_left_out(metrics, measured), *_flagged(metrics)]
+def findings(metrics: Metrics, measured: tuple[str, ...] = ()) -> list[str]:
+    """Return what was recorded, what is deployed and how well it works, and which units are flagged."""
+    return [*_recorded(metrics), *_deployed(metrics, measured), *_left_out(metrics, measured), *_flagged(metrics)]
 
 
-def trust(metrics: Mapping[str, Any]) -> list[str]:
+def trust(metrics: Metrics) -> list[str]:
     """Return what stands behind the numbers; nothing where no observer was made."""
     return [*_covered(metrics), *_certificate(metrics)]
 
 
-def _recorded(metrics: Mapping[str, Any]) -> list[str]:
+def _recorded(metrics: Metrics) -> list[str]:
     study = metrics["study"]
     conditions = " and ".join(condition_label(c) for c in study["conditions"] if c != DEFAULT_CONDITION)
     units = f"{study['units']} unit" + ("s" if study["units"] != 1 else "")
@@ -44,11 +37,11 @@ def _recorded(metrics: Mapping[str, Any]) -> list[str]:
     return [f"{units}{batch} were recorded" + (f" ({conditions})." if conditions else "."), *confounded_text(metrics)]
 
 
-def _handed_over(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str]:
+def _deployed(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
     name = metrics["study"].get("deployed")
     if name is None:
         return ["The run stopped before an observer was made."]
-    sentences = [f"The observer that is handed over is “{observer_label(name)}”."]
+    sentences = [f"The deployed observer is “{observer_label(name)}”."]
     tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
     if not tables or name not in tables[0].cells:
         return [*sentences, "It has not been evaluated."]
@@ -66,7 +59,7 @@ def _handed_over(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[
     return sentences + _better(table, name, known)
 
 
-def _left_out(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str]:
+def _left_out(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
     """What the same method does on units that took no part."""
     name, rows = metrics["study"].get("deployed"), metrics.get("left_out", {}).get("rows", [])
     tables = left_out_tables([r for r in rows if r["observer"] == name], metrics["study"]["identify_on"])
@@ -74,11 +67,11 @@ def _left_out(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str
         return []
     cells = {c: cell for c, cell in tables[0].cells[name].items() if c not in measured}
     if any(cell.mean is None for cell in cells.values()):
-        return ["Made without the unit it runs on, the same kind of observer diverges on some units: do not use it on new ones."]
+        return ["Designed without the unit it runs on, the same kind of observer diverges on some units: do not use it on new ones."]
     parts = [
         f"{c.replace('_', ' ')} to {number(v.mean)} % ({number(v.worst)} % on the worst unit, {v.worst_unit})" for c, v in cells.items()
     ]
-    return [f"Made without the unit it runs on, the same kind of observer estimates {_join(parts)}, in the mean."] if parts else []
+    return [f"Designed without the unit it runs on, the same kind of observer estimates {_join(parts)}, in the mean."] if parts else []
 
 
 def _better(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
@@ -87,7 +80,7 @@ def _better(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
     for channel in channels:
         own, best = table.cells[name][channel].mean, table.best(channel, "mean")
         if own is not None and best is not None and best < 0.95 * own:
-            other = next(o for o in table.observers if channel in table.cells[o] and table.cells[o][channel].mean == best)
+            other = next(o for o in table.cells if channel in table.cells[o] and table.cells[o][channel].mean == best)
             parts.append(f"“{observer_label(other)}” in {channel.replace('_', ' ')} ({number(best)} %)")
     return [f"Better in the mean: {_join(parts)}."] if parts else []
 
@@ -101,11 +94,8 @@ def _channel(table: ErrorTable, name: str, channel: str, unit: str) -> str:
 
 def _comparison(table: ErrorTable, name: str, method: str, label: str, channels: list[str]) -> list[str]:
     model = split_observer(name)[0]
-    other = (
-        f"{model}/{method}"
-        if f"{model}/{method}" in table.cells
-        else next((o for o in table.observers if split_observer(o)[1] == method), None)
-    )
+    same = f"{model}/{method}"
+    other = same if same in table.cells else next((o for o in table.cells if split_observer(o)[1] == method), None)
     if other is None or other == name:
         return []
     theirs = {c: table.cells[other][c].mean for c in channels if c in table.cells[other]}
@@ -126,8 +116,8 @@ def _ratio(own: float | None, theirs: float) -> str:
     return f" ({100 * (ratio - 1):.0f} % more)" if ratio > 1 else f" ({100 * (1 - ratio):.0f} % less)"
 
 
-def _covered(metrics: Mapping[str, Any]) -> list[str]:
-    """The uncertain set of the observer that is handed over."""
+def _covered(metrics: Metrics) -> list[str]:
+    """The uncertain set of the deployed observer."""
     name = metrics["study"].get("deployed") or ""
     entry = metrics.get("uncertainty", {}).get(split_observer(name)[0])
     if split_observer(name)[1] == "memory":
@@ -135,21 +125,18 @@ def _covered(metrics: Mapping[str, Any]) -> list[str]:
     if entry is None or entry["peak_db"].get(entry["form"]) is None:
         return []
     peak, cover = minus(f"{entry['peak_db'][entry['form']]:.1f}"), entry["weight"]["cover_max"]
-    held = (
-        "its weights cover the units that it was made from"
-        if cover is not None and cover <= 1
-        else "its weights do not cover all units that it was made from"
-    )
+    covers = "cover the" if cover is not None and cover <= 1 else "do not cover all"
     return [
-        f"The set of machines it is designed for ({form_label(entry['form'])}) has residuals of at most {peak} dB around unit {entry['nominal']}; {held}."
+        f"The set of machines it is designed for ({form_label(entry['form'])}) has residuals of at most {peak} dB around unit {entry['nominal']}; "
+        f"its weights {covers} units that it was made from."
     ]
 
 
-def _certificate(metrics: Mapping[str, Any]) -> list[str]:
+def _certificate(metrics: Metrics) -> list[str]:
     name = metrics["study"].get("deployed") or ""
     entry, sentences = metrics.get("observers", {}).get(name, {}), []
     if name and all(split_observer(n)[1] in BASELINES for n in metrics.get("observers", {})):
-        sentences.append("No robust observer could be made from this population; the reasons stand under Synthesis.")
+        sentences.append("No robust observer could be designed for this population; Synthesis says why.")
     if entry.get("worst_case_h2") is not None:
         gap = entry.get("gap_percent")
         near = f", at most {number(gap)} % above what any correction of this kind can reach" if gap is not None else ""
@@ -157,21 +144,21 @@ def _certificate(metrics: Mapping[str, Any]) -> list[str]:
     if entry.get("relift_certified") is not None:
         which = "A second certificate" if entry.get("worst_case_h2") is not None else "A certificate"
         sentences.append(
-            f"{which} covers it as it runs, lifted anew at every step, on any machine."
+            f"{which} covers it as it runs, re-lifted at every step, on any machine."
             if entry["relift_certified"]
-            else "No certificate could be found for it as it runs, lifted anew at every step."
+            else "No certificate could be found for it as it runs, re-lifted at every step."
         )
     return sentences
 
 
-def _flagged(metrics: Mapping[str, Any]) -> list[str]:
+def _flagged(metrics: Metrics) -> list[str]:
     if "outliers" not in metrics:
         return []
     flagged = [r for r in metrics["outliers"] if r["outlier"]]
     if not flagged and not metrics["outliers"]:
         return ["There are too few units to look for outliers."]
-    told = f"Flagged as not belonging to the batch: {flagged_text(flagged)}." if flagged else "No unit is flagged as an outlier."
-    return [told, *silence_text(metrics["outliers"])]
+    text = f"Flagged as not belonging to the batch: {flagged_text(flagged)}." if flagged else "No unit is flagged as an outlier."
+    return [text, *silence_text(metrics["outliers"])]
 
 
 def _join(parts: list[str]) -> str:

@@ -1,81 +1,88 @@
-"""Figures, one file a figure, in the order of the paper's argument."""
+"""Figures: one file a figure, one row of one table, in the order of the paper's argument.
+
+The function `draw` of a figure's file takes a `RunFolder`, and the options of its row, and returns the figure and a caption that says what to see in it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from ..run_folder import NotShownError, RunFolder
 from ..theme import style
-from .drawing import Drawing
 
-FIGURES = (
-    "signals",
-    "tracking_spectrum",
-    "phase",
-    "bode",
-    "free_run",
-    "free_run_spectra",
-    "trade_off",
-    "forms",
-    "variation",
-    "weights",
-    "weight_orders",
-    "forms_entrywise",
-    "weights_entrywise",
-    "synthesis_bode",
-    "certificates",
-    "members",
-    "errors_chart",
-    "left_out",
-    "observers_in_time",
-    "observers_in_time_paper",
-    "observer_spectra",
-    "loaded",
-    "loaded_paper",
-    "loaded_spectra",
-    "load_torque",
-    "robustness",
-    "robustness_second",
-    "outlier_scores",
-    "outlier_ratio",
-    "outlier_residuals",
-)
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-__all__ = ["FIGURES", "Drawing", "Result", "draw", "draw_all"]
+__all__ = ["FIGURES", "Drawn", "Row", "draw", "draw_all"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A figure of the report: its title, the module that draws it, and what that is told."""
+
+    title: str
+    module: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+FIGURES: dict[str, Row] = {
+    "signals": Row("Recorded signals", "recordings.signals"),
+    "tracking_spectrum": Row("Tracking error at constant speed", "recordings.tracking_spectrum"),
+    "phase": Row("Phase calibration", "recordings.phase"),
+    "models": Row("Models of all units", "models.bode"),
+    "free_run": Row("Predictions of the models", "models.free_run"),
+    "free_run_spectra": Row("Spectra of the prediction errors", "models.free_run_spectra"),
+    "trade_off": Row("Accuracy against uncertainty", "models.trade_off"),
+    "forms": Row("Six uncertainty forms", "uncertainty.forms"),
+    "variation": Row("Manufacturing or finite recordings", "uncertainty.variation"),
+    "weights": Row("Weights over the optimal cover", "uncertainty.weights"),
+    "weight_orders": Row("Order against tightness", "uncertainty.weight_orders"),
+    "forms_entrywise": Row("Six uncertainty forms, entry by entry", "uncertainty.forms_entrywise"),
+    "weights_entrywise": Row("Weights entry by entry", "uncertainty.weights_entrywise"),
+    "synthesis": Row("Plant, weights and correction filters", "synthesis.bode"),
+    "certificates": Row("Certified worst cases", "synthesis.certificates"),
+    "members": Row("Random members of the uncertain set", "synthesis.members"),
+    "errors": Row("Errors of all observers", "observers.errors"),
+    "left_out": Row("Units that were left out", "observers.left_out"),
+    "observers_in_time": Row("Estimates", "observers.in_time"),
+    "observers_in_time_paper": Row("Estimates of the paper's observers", "observers.in_time", {"paper": True}),
+    "observer_spectra": Row("Spectra of the estimation errors", "observers.spectra"),
+    "loaded": Row("Errors in the other condition", "observers.other_condition"),
+    "loaded_paper": Row("Errors of the paper's observers in the other condition", "observers.other_condition", {"paper": True}),
+    "loaded_spectra": Row("Spectra of the errors in the other condition", "observers.other_condition_spectra"),
+    "load_torque": Row("Load torque", "observers.load_torque"),
+    "robustness": Row("Disturbed measurements", "observers.robustness"),
+    "robustness_second": Row("Disturbed measurements, the second hidden state", "observers.robustness", {"number": 1}),
+    "outlier_scores": Row("Outlier scores", "outliers.scores"),
+    "outlier_ratio": Row("The most conspicuous unit against the cover of the others", "outliers.ratio"),
+    "outlier_residuals": Row("The most conspicuous unit, entry by entry", "outliers.residuals"),
+}
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
-    """A figure that was drawn, or the reason why it was left out.
-
-    Parameters
-    ----------
-    name : str
-        Also the name of its file.
-    title : str
-    drawing : Drawing or None
-    reason : str
-        Why there is none; empty where there is one.
-    """
+class Drawn:
+    """A figure that was drawn, or the reason why it was left out; `name` is also the name of its file."""
 
     name: str
     title: str
-    drawing: Drawing | None
+    figure: Figure | None = None
+    caption: str = ""
     reason: str = ""
 
 
-def draw(module_name: str, run: RunFolder) -> Result:
+def draw(name: str, run: RunFolder) -> Drawn:
     """Draw one figure of a run; one that lacks an artifact comes with the reason instead."""
-    module = import_module(f".{module_name}", __name__)
+    row = FIGURES[name]
     with style():
         try:
-            return Result(module.NAME, module.TITLE, module.draw(run))
+            return Drawn(name, row.title, *import_module(f".{row.module}", __name__).draw(run, **row.options))
         except NotShownError as absent:
-            return Result(module.NAME, module.TITLE, None, str(absent))
+            return Drawn(name, row.title, reason=str(absent))
 
 
-def draw_all(run: RunFolder) -> Iterator[Result]:
+def draw_all(run: RunFolder) -> Iterator[Drawn]:
     """Draw all figures of a run, one at a time."""
     return (draw(name, run) for name in FIGURES)

@@ -7,7 +7,7 @@ from typing import Any
 
 from ...data.population import DEFAULT_CONDITION
 from ..content import Cell, Section, Table
-from ..left_out_table import PAPER, LeftOutCell, LeftOutTable, left_out_tables
+from ..error_tables import PAPER, ErrorCell, ErrorTable, left_out_tables
 from ..names import condition_label, minus, number, observer_label
 from ..run_folder import RunFolder
 
@@ -34,7 +34,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     return Section("left-out", "On units that were left out", paragraphs, tables, ["left_out"])
 
 
-def _table(table: LeftOutTable, facts: Mapping[str, Mapping[str, Any]], folds: int, measured: Sequence[str], deployed: str | None) -> Table:
+def _table(table: ErrorTable, facts: Mapping[str, Mapping[str, Any]], folds: int, measured: Sequence[str], deployed: str | None) -> Table:
     channels = [c for c in table.channels if c not in measured] or list(table.channels)
     powers = any(cell.band_db is not None for cells in table.cells.values() for cell in cells.values())
     rows = []
@@ -62,12 +62,12 @@ def _count(value: int | None, folds: int) -> str:
     return "–" if value is None else f"{value}/{folds}"
 
 
-def _cells(table: LeftOutTable, channel: str, cell: LeftOutCell | None, powers: bool) -> list[Cell]:
+def _cells(table: ErrorTable, channel: str, cell: ErrorCell | None, powers: bool) -> list[Cell]:
     extra = [Cell("–" if cell is None or cell.band_db is None else minus(f"{cell.band_db:.1f}"))] if powers else []
     if cell is None:
         return [Cell("–")] * 3 + extra
     if cell.mean is None:
         return [Cell("diverged"), Cell("–"), Cell("–"), *extra]
-    interval = "–" if cell.low is None else f"{number(cell.low)}–{number(cell.high)}"
+    interval = "–" if cell.interval is None else "–".join(map(number, cell.interval))
     mean, worst = (Cell(number(getattr(cell, what)), strong=getattr(cell, what) == table.best(channel, what)) for what in ("mean", "worst"))
     return [mean, Cell(interval), worst, *extra]

@@ -7,7 +7,7 @@ from typing import Any
 
 from ...data.population import DEFAULT_CONDITION
 from ..content import Cell, Section, Table
-from ..error_table import ErrorCell, ErrorTable, error_table
+from ..error_tables import ErrorCell, ErrorTable, error_table
 from ..names import axis_label, channel_units, condition_label, number, observer_label
 from ..run_folder import RunFolder
 
@@ -22,7 +22,7 @@ def result(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     text = (
         "RMS error on held-out episodes that nothing was fitted to, in percent of the largest absolute value of the signal in the episode. Off nominal: mean "
         "over the units other than the nominal one, with its 95 % interval by a bootstrap over these units, and the "
-        "worst of them; RMS: the same mean in the channel's own unit of measure. Best of each column in bold; the observer that is handed over is set off."
+        "worst of them; RMS: the same mean in the channel's own unit of measure. Best of each column in bold; the deployed observer is set off."
     )
     return Section("results", "Results", [text], [errors(t, deployed, measured, channel_units(metrics)) for t in tables], ["errors"])
 
@@ -32,7 +32,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     if not metrics.get("evaluation"):
         return None
     text = (
-        "The observers as they run: at every step the estimate is cut back to the original states and lifted anew with the unit's "
+        "The observers as they run: at every step the estimate is cut back to the original states and re-lifted with the unit's "
         "own parameters. An estimate for the next "
         "sample uses data up to this one."
     )
@@ -44,14 +44,14 @@ def errors(table: ErrorTable, deployed: str | None, measured: tuple[str, ...] = 
     units = units or {}
     channels = sorted(table.channels, key=lambda c: c in measured)
     rows = []
-    for observer in table.observers:
+    for observer in table.cells:
         cells = [Cell(observer_label(observer))]
         for channel in channels:
             cells += _cells(table, channel, table.cells[observer].get(channel), channel not in measured)
         rows.append(cells)
     head = ["observer", *(title for c in channels for title in ("nominal", "mean", "worst", axis_label("RMS", units.get(c, ""))))]
     groups = [("", 1), *((c.replace("_", " ") + ("" if c in table.ranked else " (not ranked)"), 4) for c in channels)]
-    emphasised = [i for i, o in enumerate(table.observers) if o == deployed]
+    emphasised = [i for i, o in enumerate(table.cells) if o == deployed]
     where = "" if table.condition == DEFAULT_CONDITION else f", {condition_label(table.condition)}"
     caption = f"Errors in percent of the largest value, and as RMS in the channel's unit{where}."
     if len(table.ranked) < len(table.channels):

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..content import Cell, Section, Table
-from ..figures.entries import entry_names, short
+from ..figures.residuals import entry_names, short
 from ..names import condition_label, number
 from ..run_folder import NotShownError, RunFolder
 

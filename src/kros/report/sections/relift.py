@@ -12,7 +12,7 @@ from ..names import number, observer_label
 from ..run_folder import RunFolder
 
 _TEXT = (
-    "An observer that cuts its estimate back to the original states and lifts it anew at every step is not linear, and no linear "
+    "An observer that cuts its estimate back to the original states and re-lifts it at every step is not linear, and no linear "
     "certificate covers it. Its error is driven by the one-step residual alone: what the nominal model misses from one sample to the "
     "next, whatever the reason. For every unit, known or not, the error's RMS is at most the gain times the residual's, plus what the "
     "first error costs. The residual is divided by its size in this population and errors by the ranges: on a unit with the typical "

@@ -42,7 +42,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     rows = [_row(name, entry) for name, entry in observers.items()]
     head, rows = _without_empty(_HEAD, rows)
     emphasised = [i for i, name in enumerate(observers) if name == deployed]
-    caption = "Certificates. “As it runs”: one bound for the observer with its state lifted anew at every step, for any unit. Handed over: the row set off."
+    caption = "Certificates. “As it runs”: one bound for the observer with its state re-lifted at every step, for any unit. Deployed: the row set off."
     tables = [Table(head, rows, caption, emphasised=emphasised), *_remarks(run)]
     return Section("synthesis", "Synthesis", [_TEXT], tables, ["synthesis", "certificates"])
 

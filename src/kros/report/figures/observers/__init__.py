@@ -1,0 +1,1 @@
+"""Figures of errors and estimates of the observers."""

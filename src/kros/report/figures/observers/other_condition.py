@@ -1,0 +1,41 @@
+"""Estimation errors of the nominal unit in a condition that no model has seen, of the deployed pair or the paper's (the paper's Figure 13).
+
+Needs: the evaluation's kept episodes in a second condition.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...names import condition_label, deployed_pair, episode_title, observer_label, observer_look
+from ...run_folder import NotShownError, RunFolder, Shown
+from ..episodes import overview_and_zoom, require_paper_pair
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def draw(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
+    """Draw errors over the episode and over a zoom at constant speed."""
+    shown = other_episode(run)
+    found = list(shown.observers)
+    names, text = require_paper_pair(found) if paper else (deployed_pair(found, run.deployed), "")
+    lines = {
+        i: [(observer_label(n), shown.states[:, i] - shown.observers[n][:, i], observer_look(n)) for n in names]
+        for i in range(len(run.states[:4]))
+    }
+    text += f"Recorded minus estimated, with models identified in {condition_label(run.identify_on)} only. "
+    if any(c.name == "current" for c in run.states) and shown.key.condition == "load":
+        text += (
+            "What is left of the current is the load's torque, in units of current: a slow wave as the load turns. Less "
+            "oscillation on it is a better torque estimate."
+        )
+    return overview_and_zoom(run, [(episode_title(shown.key), shown, lines)], 1.35), text
+
+
+def other_episode(run: RunFolder) -> Shown:
+    """Return the kept episode of the nominal unit in another condition."""
+    shown = next((s for s in run.shown if s.key.condition != run.identify_on), None)
+    if shown is None or not shown.observers:
+        raise NotShownError("the recordings have one condition only")
+    return shown

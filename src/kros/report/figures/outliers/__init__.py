@@ -1,0 +1,1 @@
+"""Figures of units that do not belong to the batch."""

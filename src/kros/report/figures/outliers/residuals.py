@@ -1,0 +1,28 @@
+"""Residual of the most conspicuous unit against those of all the others, entry by entry (the paper's Figure 15).
+
+Needs: outlier scores, models and residuals in the condition of the highest score.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...names import condition_label, form_label
+from ...run_folder import RunFolder
+from ..residuals import entries_figure, entry_names
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def draw(run: RunFolder) -> tuple[Figure, str]:
+    """Draw one panel an entry, linear beside Koopman."""
+    condition, found = run.others
+    first = next(iter(found.values()))
+    unit = first.outside[0]
+    names = {n: entry_names(r.form, run.condition_models(n, condition)) for n, r in found.items()}
+    text = (
+        f"Entries of the {form_label(first.form.value)} residuals against unit {first.nominal_id}, {condition_label(condition)}, beside weights that are "
+        f"fitted to all units but {unit}. It is conspicuous where it leaves them; the figure above judges all entries at once."
+    )
+    return entries_figure(found, names, alarm=unit), text

@@ -1,0 +1,1 @@
+"""Figures of correction filters and what is certified about them."""

@@ -1,0 +1,1 @@
+"""Figures of residuals, their bounds and the weights."""

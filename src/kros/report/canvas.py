@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[Any]
 _BUCKETS = 700  # pairs of points that a line across the page can show
 _POINTS = 220  # of a frequency line
-_LEGEND_IN = 0.19  # height of a row of a legend
+_LEGEND_IN = 0.21  # height of a row of a legend
 _READABLE = 48  # units whose names fit on an axis
 
 
@@ -29,7 +29,7 @@ def grid(rows: int, columns: int, row_height_in: float, **options: Any) -> tuple
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04, wspace=0.02, hspace=0.02)
+    layout = ConstrainedLayoutEngine(w_pad=0.05, h_pad=0.05, wspace=0.02, hspace=0.02)
     figure = Figure(figsize=(WIDTH_IN, rows * row_height_in + 0.06), layout=layout)
     ratios = {key: options.pop(key) for key in ("width_ratios", "height_ratios") if key in options}
     return figure, figure.subplots(rows, columns, squeeze=False, **ratios, **options)
@@ -49,7 +49,7 @@ def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:
     if handles:
         columns = columns or len(handles)
         figure.set_figheight(figure.get_figheight() + _LEGEND_IN * ceil(len(handles) / columns))
-        figure.legend(handles, labels, loc="outside upper left", ncols=columns, borderaxespad=0.0, borderpad=0.1)
+        figure.legend(handles, labels, loc="outside upper left", ncols=columns, borderaxespad=0.3, borderpad=0.1)
 
 
 def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float] = (0, 0), **options: Any) -> None:

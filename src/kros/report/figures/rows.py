@@ -39,7 +39,7 @@ def row_panels(channels: Sequence[str], order: Sequence[str], deployed: str | No
     for panel, channel in zip(axes[0], channels, strict=True):
         panel.set_title(channel.replace("_", " "))
         panel.grid(visible=False, axis="y")
-    label_below(axes[0], "error (% of the largest value)")
+    label_below(axes[0], "error (% of the largest value)" if len(channels) < 3 else "error (% of the\nlargest value)")
     name_rows(axes[0, 0], [observer_label(o) for o in order], order.index(deployed) if deployed in order else None)
     return figure, axes[0]
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from ....core.artifacts import read_arrays, read_json
 from ....evaluate.errors import error_spectrum
-from ...canvas import grid, legend, logarithmic
-from ...names import Look, condition_label
+from ...canvas import frequency_axis, grid, legend, logarithmic
+from ...names import Look, condition_label, model_label
 from ...run_folder import NotShownError, RunFolder
 from ...theme import Tone
 from ..episodes import TRUTH, clip_to, draw_lines, hide_times
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SEGMENT = 4096
+_HIGHEST_HZ = 200.0
 _LOWEST = 1e-8  # of the load's own density: below it nothing matters
 _WAYS = (("load", "a load of its own"), ("current", "error of the\nrecorded current"))
 
@@ -39,7 +40,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     for (label, names), (time, spectrum) in zip(ways, axes, strict=True):
         looks = {n: Look((Tone.BLUE if n.startswith("koopman") else Tone.ORANGE).light) for n in reversed(names)}
         estimates = {n: arrays[f"estimate/{n}"].astype(float) for n in looks}
-        lines = [("declared load", truth, TRUTH), *((n.partition("/")[0], estimates[n], look) for n, look in looks.items())]
+        lines = [("declared load", truth, TRUTH), *((model_label(n.partition("/")[0]), estimates[n], look) for n, look in looks.items())]
         draw_lines(time, times, lines, width=1.0)
         clip_to(time, truth, 0.35)
         time.set_ylabel(label)
@@ -48,8 +49,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
             spectrum.plot(freqs[1:], error_spectrum(estimates[n] - truth, run.sample_period_s, _SEGMENT)[1][1:], color=look.colour)
         logarithmic(spectrum)
         spectrum.set_ylim(bottom=_LOWEST * density.max())
-        spectrum.set_xscale("log")
-        spectrum.set_xlim(freqs[1], min(200.0, freqs[-1]))
+        frequency_axis(spectrum, freqs[freqs <= _HIGHEST_HZ], "")
     hide_times(axes[:-1].ravel())
     axes[0, 0].set_title("in units of current")
     axes[0, 1].set_title("PSD of load and errors, 1/Hz")

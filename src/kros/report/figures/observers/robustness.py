@@ -71,7 +71,7 @@ def _panel(panel: Axes, kind: Kind, lines: Mapping[str, Curve], deployed: str | 
             label=method_label(name) + (" (deployed)" if main else ""),
         )
     panel.axhline(_AS_LARGE, color=Tone.SOFT.light, lw=0.8, ls=":")
-    panel.set_title(axis.title, size=8)
+    panel.set_title(axis.title.replace(" (", "\n("), size=8)
     if axis.logarithmic:  # with a place for zero at its left end
         severities = next(iter(lines.values())).severities * axis.factor
         low, high = float(severities[1]), float(severities[-1])

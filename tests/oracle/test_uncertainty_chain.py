@@ -8,7 +8,7 @@ import pytest
 
 from kros.core import StateSpace
 from kros.core.lti import block_diagonal, gain
-from kros.uncertainty.fits.chain import diagonal_response
+from kros.uncertainty.fits.diagonal_response import diagonal_response
 from kros.uncertainty.fits.sections import Sections
 
 DT = 1e-3

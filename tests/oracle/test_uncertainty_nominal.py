@@ -126,7 +126,7 @@ def test_mean_over_log_frequency_does_not_depend_on_where_the_points_lie() -> No
 
 def test_what_cannot_be_searched_is_refused() -> None:
     G = random_responses(3, 5, (2, 2), 10)
-    with pytest.raises(ConfigError, match="'peak' or 'area'"):
+    with pytest.raises(ConfigError, match="one of peak, area"):
         choose_nominal(G, "additive", "volume")
     with pytest.raises(DimensionError, match=r"\(any, 5, 2, 2\)"):
         choose_nominal(G, "additive", extra=G[0])

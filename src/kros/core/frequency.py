@@ -59,21 +59,21 @@ def log_grid(sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0, 
     return grid
 
 
-def check_grid(freqs_hz: npt.ArrayLike, sample_period_s: float) -> Array:
-    """Return the frequencies as an array, or say why they are no grid.
+def check_grid(freqs_hz: npt.ArrayLike, sample_period_s: float | None) -> Array:
+    """Return the frequencies as an array, or say why they are no grid; without a sampling period of continuous time.
 
     Raises
     ------
     ConfigError
-        When they are not finite, not increasing, negative, or above Nyquist.
+        When they are not finite, not increasing, negative, all zero, or above Nyquist.
     """
     freqs = np.atleast_1d(np.asarray(freqs_hz, dtype=float))
-    top = nyquist_hz(sample_period_s)
+    top = np.inf if sample_period_s is None else nyquist_hz(sample_period_s)
     if freqs.ndim != 1 or freqs.size == 0 or not np.isfinite(freqs).all():
         raise ConfigError(
             f"Frequency grid: needs a list of finite frequencies in Hz, found shape {freqs.shape} with {np.isnan(freqs).sum()} NaN."
         )
-    if np.any(np.diff(freqs) <= 0) or freqs[0] < 0:
+    if np.any(np.diff(freqs) <= 0) or freqs[0] < 0 or (sample_period_s is None and freqs[-1] == 0):
         raise ConfigError(
             f"Frequency grid: frequencies should increase from zero or above, found {freqs[:5]} ... {freqs[-1]} Hz; sort them and drop doubles."
         )

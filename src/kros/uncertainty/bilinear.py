@@ -84,22 +84,6 @@ def beyond(freqs_hz: Array) -> Array:
     return np.concatenate([freqs_hz, np.geomspace(top, _BEYOND * top, _POINTS_BEYOND)[1:]])
 
 
-def check_continuous_grid(freqs_hz: npt.ArrayLike) -> Array:
-    """Return the frequencies as an array, or say why they are no grid.
-
-    Raises
-    ------
-    ConfigError
-        When they are not finite, not increasing or negative.
-    """
-    freqs = np.atleast_1d(np.asarray(freqs_hz, float))
-    if freqs.ndim != 1 or not freqs.size or not np.isfinite(freqs).all() or freqs[0] < 0 or np.any(np.diff(freqs) <= 0) or freqs[-1] == 0:
-        raise ConfigError(
-            f"Frequency grid: needs finite frequencies in Hz that increase from zero or above, found {freqs.ravel()[:5]} ...; sort them and drop doubles."
-        )
-    return freqs
-
-
 def continuous_grid(system: StateSpace) -> Array:
     """Return 1000 logarithmic points from a hundredth of the slowest to ten times the fastest pole, Hz.
 

@@ -21,15 +21,17 @@ Plants here are already in scaled coordinates. Nothing in this module chooses, f
 from __future__ import annotations
 
 from enum import Enum
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
+from ..core.linalg import adjoint
 from .small_matrices import condition_number, entries_first, entries_last, multiply, pseudo_inverse_first
 
 Array = npt.NDArray[Any]
+E = TypeVar("E", bound=Enum)
 
 MAX_CONDITION = 1e12  # beyond this an inverse form cannot rebuild the plant
 
@@ -65,18 +67,17 @@ _DUAL = {
 }
 
 
-def as_form(form: Form | str) -> Form:
-    """Return the form of a name.
-
-    Raises
-    ------
-    ConfigError
-        When there is no form of that name.
-    """
+def member(kind: type[E], value: E | str, what: str) -> E:
+    """Return the member of an enumeration by its name, or raise a `ConfigError` that lists the names."""
     try:
-        return Form(form)
+        return kind(value)
     except ValueError as error:
-        raise ConfigError(f"Uncertainty form {form!r} is unknown; choose one of {', '.join(f.value for f in Form)}.") from error
+        raise ConfigError(f"{what} {value!r} is unknown; choose one of {', '.join(str(m.value) for m in kind)}.") from error
+
+
+def as_form(form: Form | str) -> Form:
+    """Return the form of a name, or raise a `ConfigError`."""
+    return member(Form, form, "Uncertainty form")
 
 
 def residual_shape(form: Form | str, n_outputs: int, n_inputs: int) -> tuple[int, int]:
@@ -121,20 +122,15 @@ def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike,
     if form is Form.ADDITIVE:
         return Gp - G
     first, second = entries_first(G), entries_first(Gp)
-    if paper and form is not Form.INVERSE_ADDITIVE:
-        return entries_last(_paper_residual(form, G, Gp, first, second))
-    difference = second - first
-    if form is Form.INPUT_MULTIPLICATIVE:
-        E = multiply(pseudo_inverse_first(G), difference)
-    elif form is Form.OUTPUT_MULTIPLICATIVE:
-        E = multiply(difference, pseudo_inverse_first(G))
-    elif form is Form.INVERSE_ADDITIVE:
-        E = multiply(multiply(pseudo_inverse_first(Gp), difference), pseudo_inverse_first(G))
-    elif form is Form.INVERSE_INPUT_MULTIPLICATIVE:
-        E = multiply(pseudo_inverse_first(Gp), difference)
-    else:
-        E = multiply(difference, pseudo_inverse_first(Gp))
-    return entries_last(E)
+    inverse, difference = pseudo_inverse_first(Gp if form.inverse else G), second - first
+    if form is Form.INVERSE_ADDITIVE:
+        return entries_last(multiply(multiply(inverse, difference), pseudo_inverse_first(G)))
+    left = form in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
+    other = (first if form.inverse else second) if paper else difference
+    product = multiply(inverse, other) if left else multiply(other, inverse)
+    if paper:
+        product = (product - np.eye(len(product)).reshape(product.shape[:2] + (1,) * (product.ndim - 2))) * (-1 if form.inverse else 1)
+    return entries_last(product)
 
 
 def rebuild(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) -> Array:
@@ -187,16 +183,14 @@ def existence(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike
     G, Gp = _plants(nominal, perturbed)
     if form is Form.ADDITIVE:
         return np.ones(np.broadcast_shapes(G.shape, Gp.shape)[:-2], bool)
-    if form is Form.INPUT_MULTIPLICATIVE:
-        return _in_range(Gp - G, G, rtol)
-    if form is Form.OUTPUT_MULTIPLICATIVE:
-        return _in_range(_turn(Gp - G), _turn(G), rtol)
-    if form is Form.INVERSE_ADDITIVE:
-        inside = _in_range(G, Gp, rtol) & _in_range(_turn(Gp), _turn(G), rtol)
-    elif form is Form.INVERSE_INPUT_MULTIPLICATIVE:
-        inside = _in_range(G, Gp, rtol)
-    else:
-        inside = _in_range(_turn(G), _turn(Gp), rtol)
+    rows, columns = (lambda a, b: _in_range(adjoint(a), adjoint(b), rtol)), (lambda a, b: _in_range(a, b, rtol))
+    if not form.inverse:
+        return columns(Gp - G, G) if form is Form.INPUT_MULTIPLICATIVE else rows(Gp - G, G)
+    inside = {
+        Form.INVERSE_ADDITIVE: lambda: columns(G, Gp) & rows(Gp, G),
+        Form.INVERSE_INPUT_MULTIPLICATIVE: lambda: columns(G, Gp),
+        Form.INVERSE_OUTPUT_MULTIPLICATIVE: lambda: rows(G, Gp),
+    }[form]()
     matrix = inverted_matrix(form, G, residual(form, G, Gp))
     return inside & (condition_number(matrix) < MAX_CONDITION)
 
@@ -211,22 +205,6 @@ def _plants(nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> tuple[Array, Ar
     return G.reshape((1,) * (axes - G.ndim) + G.shape), Gp.reshape((1,) * (axes - Gp.ndim) + Gp.shape)
 
 
-def _paper_residual(form: Form, G: Array, Gp: Array, first: Array, second: Array) -> Array:
-    """The published pipeline's multiplicative residuals, entries first."""
-    p, m = G.shape[-2:]
-    q = m if form in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE) else p
-    if form is Form.INPUT_MULTIPLICATIVE:
-        product, sign = multiply(pseudo_inverse_first(G), second), 1
-    elif form is Form.OUTPUT_MULTIPLICATIVE:
-        product, sign = multiply(second, pseudo_inverse_first(G)), 1
-    elif form is Form.INVERSE_INPUT_MULTIPLICATIVE:
-        product, sign = multiply(pseudo_inverse_first(Gp), first), -1
-    else:
-        product, sign = multiply(first, pseudo_inverse_first(Gp)), -1
-    eye = np.eye(q).reshape((q, q) + (1,) * (product.ndim - 2))
-    return sign * (product - eye)
-
-
 def _inverse(matrices: Array) -> Array:
     """Inverses, NaN where a matrix is singular."""
     try:
@@ -235,10 +213,6 @@ def _inverse(matrices: Array) -> Array:
         regular = np.linalg.cond(matrices) < 1 / np.finfo(float).eps
         safe = np.where(regular[..., None, None], matrices, np.eye(matrices.shape[-1]))
         return np.where(regular[..., None, None], np.linalg.inv(safe), np.nan)
-
-
-def _turn(matrices: Array) -> Array:
-    return np.conj(np.swapaxes(matrices, -1, -2))
 
 
 def _in_range(inner: Array, outer: Array, rtol: float) -> Array:

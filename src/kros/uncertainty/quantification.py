@@ -18,8 +18,8 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 from ..core.norms import hinf_norm
 from .bilinear import BilinearAxis
-from .forms import Form, as_form, residual
-from .nominal.choice import Criterion, NominalChoice, as_criterion, choose_nominal, choose_nominals
+from .forms import Form, as_form, member, residual
+from .nominal.choice import Criterion, NominalChoice, choose_nominal, choose_nominals
 from .residuals import completion, misfit
 from .small_matrices import sigma_max
 from .weights.check import Residuals, between_points
@@ -93,7 +93,7 @@ class Quantification:
                 f"density = {density} at least 1."
             )
         known = None if structure == AUTO else as_structure(structure)
-        return cls(as_form(form), as_criterion(criterion), known, max_order, tolerance_db, density)
+        return cls(as_form(form), member(Criterion, criterion, "Nominal criterion"), known, max_order, tolerance_db, density)
 
     def choose(self, responses: Array, extra: Array, freqs_hz: Array) -> dict[Form, NominalChoice]:
         """Return the nominal of every form with the lowest peak, and of the form asked for by its criterion."""

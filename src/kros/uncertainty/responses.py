@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError
 from ..core.frequency import check_grid
-from .bilinear import BilinearAxis, check_continuous_grid
+from .bilinear import BilinearAxis
 from .forms import Form
 from .model import ResponseUncertainty
 from .nominal.choice import Criterion
@@ -96,7 +96,7 @@ def quantify_responses(
     """
     asked = Quantification.of(form, criterion, structure, max_order, tolerance_db)
     G = check_responses(responses)
-    freqs = check_grid(freqs_hz, sample_period_s) if sample_period_s > 0 else check_continuous_grid(freqs_hz)
+    freqs = check_grid(freqs_hz, sample_period_s or None)
     if G.shape[1] != len(freqs):
         raise DimensionError(f"Quantify: responses at {G.shape[1]} frequencies need as many in freqs_hz, found {len(freqs)}.")
     ids = check_ids(unit_ids, len(G))

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..core.frequency import check_grid, dense_grid, log_grid
 from ..core.lti import StateSpace
-from .bilinear import BilinearAxis, beyond, check_continuous_grid, continuous_grid
+from .bilinear import BilinearAxis, beyond, continuous_grid
 from .forms import Form
 from .model import UncertainModel, scale_system
 from .nominal.choice import Criterion
@@ -132,5 +132,5 @@ def _axis(system: StateSpace, freqs_hz: npt.ArrayLike | None, longest_s: float |
     """Grid, and the sampling period or the map of the imaginary axis to a unit circle."""
     if system.dt > 0:
         return log_grid(system.dt, longest_s=longest_s) if freqs_hz is None else check_grid(freqs_hz, system.dt), system.dt
-    wide = beyond(continuous_grid(system) if freqs_hz is None else check_continuous_grid(freqs_hz))
+    wide = beyond(continuous_grid(system) if freqs_hz is None else check_grid(freqs_hz, None))
     return wide, BilinearAxis.over(wide)

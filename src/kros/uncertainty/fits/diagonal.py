@@ -25,6 +25,7 @@ from ..weights.cover import Cover, optimal_cover
 from .joint import NEPER_DB, Fitted, JointFit, follow
 from .magnitude import majorant
 from .sections import Sections
+from .spectral import log_knots
 
 Array = npt.NDArray[Any]
 
@@ -38,7 +39,6 @@ _KEPT = 2
 _QUICK = (1, 3)
 _FLOOR = 1e-8  # magnitudes below this fraction of the largest count as this fraction (-160 dB)
 _SMOOTHING_DECADES = 0.15
-_TOP = 10.0  # tau beyond which (80 % of Nyquist) no knots are placed
 _WIDTH = np.log(8.0)  # of the first sections
 _FOLLOW = 15
 _SCREEN, _SCREEN_STEPS = (0.5, 0.2, 0.1, 0.05), 8  # temperatures, nepers
@@ -159,7 +159,7 @@ def _starts(problem: Problem, joint: JointFit, order: int) -> Iterator[Sections]
         orders = [order] * len(logs)
         orders[cover.left.shape[1] + reference] = 0
         for even in _EVEN if order > 1 else _EVEN[:1]:
-            places = [_knots(problem.tau, row, (n + 1) // 2, even) for row, n in zip(logs, orders, strict=True)]
+            places = [log_knots(problem.tau, row, (n + 1) // 2, even) for row, n in zip(logs, orders, strict=True)]
             yield follow(problem.tau, logs, Sections.spread(places, orders, _WIDTH), joint.ends(), _FOLLOW)
 
 
@@ -173,7 +173,7 @@ def _from_scalar(problem: Problem, joint: JointFit, order: int) -> Iterator[Sect
     cover = optimal_cover(problem.residuals[:, problem.some(_COARSE)], pull=_PULLS[1], squarings=_QUICK)
     for reference in np.argsort(-np.median(cover.right, axis=0), kind="stable")[:_GAUGES]:
         orders = [0] * p + [0 if j == reference else order for j in range(m)]
-        places = [_knots(problem.tau, np.log(size), (n + 1) // 2, _EVEN[0]) for n in orders]
+        places = [log_knots(problem.tau, np.log(size), (n + 1) // 2, _EVEN[0]) for n in orders]
         try:
             yield Sections.spread(places, orders, _WIDTH).like(np.arange(p), scalar)
         except KrosError as error:
@@ -220,19 +220,6 @@ def _lowered(joint: JointFit, found: Fitted, tolerance_db: float) -> Fitted:
 
 def _excess(fitted: Fitted) -> float:
     return fitted.excess_db if np.isfinite(fitted.excess_db) else np.inf
-
-
-def _knots(tau: Array, log: Array, count: int, even: float) -> Array:
-    """Places as dense as log magnitudes bend over log tau, plus a share that is evenly spaced."""
-    inside = (tau > 0) & (tau < _TOP)
-    if not count or inside.sum() < 3:
-        return np.linspace(-10.0, 0.0, count + 2)[1:-1]
-    x = np.log(tau[inside])
-    middle = (x[1:] + x[:-1]) / 2
-    bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.diff(log[inside]) / np.diff(x))))])
-    bend = bend / bend[-1] if bend[-1] > 0 else bend
-    share = (1 - even) * bend + even * (middle - middle[0]) / (middle[-1] - middle[0])
-    return np.interp((np.arange(count) + 0.5) / count * share[-1], share, middle)
 
 
 def _level(values: Array, inside: Array) -> Array:

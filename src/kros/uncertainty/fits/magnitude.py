@@ -21,8 +21,9 @@ import numpy.typing as npt
 from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
 from ...core.lti import StateSpace, gain
+from ..forms import member
 from .minimax import Grid, Programs
-from .spectral import RationalMagnitude, basis, on_half_line, roots, spectral_factor
+from .spectral import RationalMagnitude, basis, log_knots, on_half_line, roots, spectral_factor
 
 Array = npt.NDArray[Any]
 
@@ -31,7 +32,6 @@ _FLOOR = 1e-8  # magnitudes below this fraction of the largest count as this fra
 _POINTS = 150  # of the grid in the first programs
 _ROUNDS = 6
 _PROGRAMS = 150  # for one order, half as many while a higher one is allowed; more than 200 were never seen to gain anything
-_TOP = 10.0  # tau beyond which (80 % of Nyquist) no knots are placed
 _EXCHANGE = 10**0.002 - 1  # 0.02 dB of squared magnitude
 _HOPELESS = 2.0  # an order whose overbound is beyond this many tolerances is not polished while a higher one is allowed
 _UNPROVEN_DB = 0.5  # a fit farther than this from what is proven to be the best is compared with those that start from lower orders
@@ -131,7 +131,7 @@ def fit_magnitude(
     >>> bool(np.all(gain_at_freqs >= 1 / np.hypot(1.0, freqs / 3.0) + 0.01))
     True
     """
-    side = _as_side(side)
+    side = member(Side, side, "Magnitude fit: side")
     freqs = check_grid(freqs_hz, sample_period_s)
     values = _check_magnitude(magnitude, freqs, side)
     highest = max_order if order is None else order
@@ -276,27 +276,13 @@ def _minimax(tau: Array, targets: Array, order: int, lower: _Bound | None, hopel
     if order == 0:
         return _Bound(RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0)), float(targets.max() / targets.min()))
     programs = Programs(_PROGRAMS if np.isinf(hopeless) else _PROGRAMS // 2)
-    best = _exchange(tau, targets, _knots(tau, targets, order, 0.05), lower, hopeless, programs)
+    best = _exchange(tau, targets, np.exp(log_knots(tau, np.log(targets), order, 0.05)), lower, hopeless, programs)
     for even in (1.0, 0.3):
         if best is not None and (lower is None or best.ratio < lower.ratio * (1 - 1e-3) or lower.ratio < 1 + _EXCHANGE):
             break
-        other = _exchange(tau, targets, _knots(tau, targets, order, even), lower, hopeless, programs)
+        other = _exchange(tau, targets, np.exp(log_knots(tau, np.log(targets), order, even)), lower, hopeless, programs)
         best = other if best is None or (other is not None and other.ratio < best.ratio) else best
     return best
-
-
-def _knots(tau: Array, targets: Array, order: int, even: float) -> Array:
-    """Knots of the basis, as dense as the data bend in log-log coordinates, plus a share that is evenly spaced."""
-    inside = (tau > 0) & (tau < _TOP)
-    if inside.sum() < 3:
-        return np.geomspace(1e-6, 1.0, order + 2)[1:-1]
-    x = np.log(tau[inside])
-    slope = np.diff(np.log(targets[inside])) / np.diff(x)
-    middle = (x[1:] + x[:-1]) / 2
-    bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(slope)))])
-    bend = bend / bend[-1] if bend[-1] > 0 else bend
-    share = (1 - even) * bend + even * (middle - middle[0]) / (middle[-1] - middle[0])
-    return np.exp(np.interp((np.arange(order) + 0.5) / order * share[-1], share, middle))
 
 
 def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None, hopeless: float, programs: Programs) -> _Bound | None:
@@ -341,13 +327,6 @@ def _extremes(ratio: Array, low: float, high: float) -> Array:
     dips = (ratio <= inner[:-2]) & (ratio <= inner[2:]) & (ratio < low * (1 - _EXCHANGE))
     peaks = (ratio >= inner[:-2]) & (ratio >= inner[2:]) & (ratio > high * (1 + _EXCHANGE))
     return np.flatnonzero(dips | peaks)
-
-
-def _as_side(side: Side | str) -> Side:
-    try:
-        return Side(side)
-    except ValueError as error:
-        raise ConfigError(f"Magnitude fit: side {side!r} is unknown; choose 'above' or 'below'.") from error
 
 
 def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array, side: Side) -> Array:

@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,6 +29,7 @@ from ...core.lti import StateSpace, gain
 
 Array = npt.NDArray[Any]
 
+_TOP = 10.0  # tau beyond which (80 % of Nyquist) no knots are placed
 _DIGITS = 60
 _POLISH = 60
 _REAL = 1e-12  # relative imaginary part below which a root counts as real
@@ -69,10 +69,23 @@ def basis(tau: Array, knots: Array) -> Array:
     return rising * falling
 
 
+def log_knots(tau: Array, log: Array, count: int, even: float) -> Array:
+    """Return log tau, shape (count,), as dense as log magnitudes bend over log tau, plus a share that is evenly spaced."""
+    inside = (tau > 0) & (tau < _TOP)
+    if not count or inside.sum() < 3:
+        return np.linspace(-10.0, 0.0, count + 2)[1:-1]
+    x = np.log(tau[inside])
+    middle = (x[1:] + x[:-1]) / 2
+    bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.diff(log[inside]) / np.diff(x))))])
+    bend = bend / bend[-1] if bend[-1] > 0 else bend
+    share = (1 - even) * bend + even * (middle - middle[0]) / (middle[-1] - middle[0])
+    return np.interp((np.arange(count) + 0.5) / count * share[-1], share, middle)
+
+
 def roots(coefficients: Array, knots: Array) -> tuple[list[complex], float]:
     """Return the roots in tau of `sum a_k phi_k`, and the coefficient of the highest power (its value at Nyquist where that is not zero).
 
-    Aberth's iteration from the Newton polygon, in double precision and then in 60 digits: the roots differ by many decades.
+    Eigenvalues of the companion matrix, then Aberth's iteration in 60 digits: the roots differ by many decades.
 
     Raises
     ------
@@ -91,8 +104,11 @@ def roots(coefficients: Array, knots: Array) -> tuple[list[complex], float]:
         low = next((k for k in range(order + 1) if powers[k] != 0), order)
         high = next((k for k in range(order, -1, -1) if powers[k] != 0), 0)
         inner = powers[low : high + 1]
-        with np.errstate(all="ignore"):
-            started = _aberth(np.array([float(c) for c in inner])) if high >= low else np.full(1, np.nan)
+        try:
+            with np.errstate(all="ignore"):
+                started = np.roots([float(c) for c in reversed(inner)]) if high >= low else np.full(1, np.nan)
+        except np.linalg.LinAlgError:  # coefficients that are not finite
+            started = np.full(1, np.nan)
         found, change = [mpmath.mpc(r) for r in started], mpmath.inf
         for _ in range(_POLISH if np.isfinite(started).all() else 0):
             change = max((_polish(inner, found, i) for i in range(len(found))), default=mpmath.mpf(0))
@@ -101,44 +117,6 @@ def roots(coefficients: Array, knots: Array) -> tuple[list[complex], float]:
     raise KrosError(
         f"Spectral factor: the roots of a polynomial of degree {high - low} did not settle (last change {float(change):.1e}); try another order."
     )
-
-
-def _aberth(powers: Array) -> Array:
-    """Roots of a polynomial with coefficients of rising powers, both ends not zero, in double precision."""
-    degree = len(powers) - 1
-    z = _newton_polygon(powers)
-    falling = powers[::-1].astype(complex)
-    slope = np.polyder(falling)
-    for _ in range(100):
-        step = np.polyval(falling, z) / _regular(np.polyval(slope, z))
-        apart = z[:, None] - z
-        np.fill_diagonal(apart, np.inf)
-        step = step / _regular(1 - step * (1 / _regular(apart)).sum(axis=1))
-        z = z - step
-        if degree == 0 or np.all(np.abs(step) <= 1e-13 * np.abs(z)):
-            break
-    return z
-
-
-def _regular(values: Array) -> Array:
-    return np.where(values == 0, 1e-300, values)
-
-
-def _newton_polygon(powers: Array) -> Array:
-    """Bini's starting points: moduli from the upper convex hull of `log |a_k|` over k, angles spread."""
-    degree = len(powers) - 1
-    with np.errstate(divide="ignore"):
-        height = np.log(np.abs(powers))
-    hull = [0]
-    while hull[-1] < degree:
-        later = np.arange(hull[-1] + 1, degree + 1)
-        hull.append(int(later[np.argmax((height[later] - height[hull[-1]]) / (later - hull[-1]))]))
-    z = [
-        np.exp((height[i] - height[j]) / (j - i) + 1j * (2 * np.pi * k / (j - i) + 2 * np.pi * i / max(degree, 1) + 0.7))
-        for i, j in pairwise(hull)
-        for k in range(j - i)
-    ]
-    return np.array(z, complex)
 
 
 def _polish(powers: list[Any], found: list[Any], i: int) -> Any:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import ConfigError, DimensionError
-from ..forms import Form, as_form
+from ...core.errors import DimensionError
+from ..forms import Form, as_form, member
 from ..residuals import check_responses
 from .search import Geometry, search
 
@@ -96,19 +96,21 @@ def choose_nominal(
     >>> choose_nominal(gains, "additive").index, choose_nominal(gains, "additive", extra=[[[[5.0]]]]).index
     (1, 3)
     """
-    form, criterion = as_form(form), as_criterion(criterion)
+    form, criterion = as_form(form), member(Criterion, criterion, "Nominal criterion")
     G, others = _read(responses, extra)
     weights = frequency_weights(G.shape[1], freqs_hz)
     geometry = Geometry.of(form, (G.shape[2], G.shape[3]))
-    units = geometry.plants(G)
-    plants = units.joined(geometry.plants(others)) if len(others) else units
+    plants = geometry.plants(np.concatenate([G, others]))
+    units = plants.part(slice(0, len(G)))
     if criterion is Criterion.PEAK:
-        found = search(geometry, plants, units, lambda bound: bound.max(axis=-1), partial=True)
+        index, bound, scores, evaluated = search(geometry, plants, units, lambda bound: bound.max(axis=-1), partial=True)
     else:
         floor = 10 ** (_FLOOR_DB / 20)
-        found = search(geometry, plants, units, lambda bound: np.exp(np.log(np.maximum(bound, floor)) @ weights), partial=False)
+        index, bound, scores, evaluated = search(
+            geometry, plants, units, lambda bound: np.exp(np.log(np.maximum(bound, floor)) @ weights), partial=False
+        )
     with np.errstate(divide="ignore"):
-        return NominalChoice(form, found.index, found.bound, 20 * np.log10(found.scores), found.evaluated, criterion)
+        return NominalChoice(form, index, bound, 20 * np.log10(scores), evaluated, criterion)
 
 
 def choose_nominals(
@@ -120,20 +122,6 @@ def choose_nominals(
 ) -> dict[Form, NominalChoice]:
     """Return the best nominal of every form; arguments and errors as of `choose_nominal`."""
     return {form: choose_nominal(responses, form, criterion, extra=extra, freqs_hz=freqs_hz) for form in Form}
-
-
-def as_criterion(criterion: Criterion | str) -> Criterion:
-    """Return the criterion of a name.
-
-    Raises
-    ------
-    ConfigError
-        When there is no criterion of that name.
-    """
-    try:
-        return Criterion(criterion)
-    except ValueError as error:
-        raise ConfigError(f"Nominal criterion {criterion!r} is unknown; choose 'peak' or 'area'.") from error
 
 
 def frequency_weights(n_freqs: int, freqs_hz: npt.ArrayLike | None = None) -> Array:

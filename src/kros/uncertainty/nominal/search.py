@@ -54,14 +54,6 @@ class Plants:
         key = (slice(None), slice(None), *index)
         return Plants(self.G[key], None if self.P is None else self.P[key], None if self.L is None else self.L[key])
 
-    def joined(self, other: Plants) -> Plants:
-        """Return the units of both."""
-
-        def both(a: Array | None, b: Array | None) -> Array | None:
-            return None if a is None or b is None else np.concatenate([a, b], axis=2)
-
-        return Plants(np.concatenate([self.G, other.G], axis=2), both(self.P, other.P), both(self.L, other.L))
-
     def one(self, unit: int) -> Plants:
         """Return one unit, with its axis."""
         return self.part(slice(unit, unit + 1))
@@ -112,29 +104,7 @@ class Geometry:
         return sigma_max_first(multiply(D, _known(base.L)))
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """Result of a search.
-
-    Parameters
-    ----------
-    index : int
-        Best candidate; of several equal ones the first.
-    bound : ndarray, shape (frequency,)
-        Its largest residual over the units.
-    scores : ndarray, shape (candidate,)
-        Where a candidate was evaluated its score, elsewhere a lower bound.
-    evaluated : ndarray of bool, shape (candidate,)
-        Which scores are exact.
-    """
-
-    index: int
-    bound: Array
-    scores: Array
-    evaluated: Array
-
-
-def search(geometry: Geometry, candidates: Plants, units: Plants, score: Score, *, partial: bool) -> Found:
+def search(geometry: Geometry, candidates: Plants, units: Plants, score: Score, *, partial: bool) -> tuple[int, Array, Array, Array]:
     """Return the candidate whose bound has the lowest score.
 
     Parameters
@@ -150,7 +120,14 @@ def search(geometry: Geometry, candidates: Plants, units: Plants, score: Score, 
 
     Returns
     -------
-    Found
+    index : int
+        Best candidate; of several equal ones the first.
+    bound : ndarray, shape (frequency,)
+        Its largest residual over the units.
+    scores : ndarray, shape (candidate,)
+        Where a candidate was evaluated its score, elsewhere a lower bound.
+    evaluated : ndarray of bool, shape (candidate,)
+        Which scores are exact.
     """
     n_freqs = units.G.shape[3]
     coarse = np.unique(np.linspace(0, n_freqs - 1, max(2, n_freqs // _COARSE)).round().astype(int)) if partial else np.arange(n_freqs)
@@ -183,7 +160,7 @@ def search(geometry: Geometry, candidates: Plants, units: Plants, score: Score, 
     index = first_best(np.where(evaluated, scores, np.inf))
     if index != holder:
         bound = bound_of(geometry, candidates.one(index), units)[0]
-    return Found(index, bound, scores, evaluated)
+    return index, bound, scores, evaluated
 
 
 def bound_of(geometry: Geometry, nominal: Plants, units: Plants) -> tuple[Array, Array]:

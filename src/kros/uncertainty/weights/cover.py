@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError
+from ..forms import member
 from ..small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
 
 Array = npt.NDArray[Any]
@@ -92,19 +93,10 @@ class Cover:
 
 
 def as_structure(structure: Structure | str) -> Structure:
-    """Return the structure of a name.
-
-    Raises
-    ------
-    ConfigError
-        When there is no structure of that name.
-    """
+    """Return the structure of a name, or raise a `ConfigError`."""
     if structure == "full":
         raise ConfigError("Weight structure 'full' is no longer there; choose 'diagonal', whose sets are somewhat larger.")
-    try:
-        return Structure(structure)
-    except ValueError as error:
-        raise ConfigError(f"Weight structure {structure!r} is unknown; choose {', '.join(repr(s.value) for s in Structure)}.") from error
+    return member(Structure, structure, "Weight structure")
 
 
 def optimal_cover(

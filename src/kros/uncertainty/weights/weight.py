@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace, gain
-from ..fits.chain import diagonal_response
+from ..fits.diagonal_response import diagonal_response
 from ..small_matrices import sigma_max
 from .certificate import Method
 from .cover import Cover, Perturbation, Structure

@@ -87,11 +87,9 @@ def test_states_that_do_nothing_and_gains_survive() -> None:
     assert (back.n_states, back.D.tolist(), back.dt) == (0, [[1.0], [1.0]], DT)
 
 
-def test_a_continuous_system_goes_out_but_not_in() -> None:
+def test_continuous_systems_go_both_ways() -> None:
     continuous = to_control(StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]], 0.0))
-    assert continuous.dt == 0
-    with pytest.raises(DimensionError, match=r"continuous.*control\.sample_system"):
-        from_control(continuous)
+    assert continuous.dt == from_control(continuous).dt == 0
     assert from_control(control.sample_system(continuous, DT)).A[0, 0] == pytest.approx(np.exp(-DT))
 
 
@@ -101,9 +99,11 @@ def test_an_unknown_sampling_period_is_refused(dt: bool | None) -> None:
         from_control(control.StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], dt))
 
 
-def test_a_transfer_function_is_refused() -> None:
-    with pytest.raises(DimensionError, match=r"TransferFunction; convert it with control\.ss"):
-        from_control(control.tf([1.0], [1.0, -0.5], DT))
+def test_a_transfer_function_is_realised_and_responses_are_refused() -> None:
+    system = from_control(control.tf([1.0], [1.0, -0.5], DT))
+    assert system.frequency_response([0.0]).item() == pytest.approx(2.0)
+    with pytest.raises(DimensionError, match=r"needs a control\.StateSpace or control\.TransferFunction, found FrequencyResponseData"):
+        from_control(control.frd(control.tf([1.0], [1.0, -0.5], DT), [1.0]))
 
 
 @pytest.mark.parametrize("names", [["a", "b"], ["a", "a", "b"], "abc"])

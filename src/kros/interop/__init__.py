@@ -9,7 +9,7 @@ from ..core.lazy import lazy_names
 if TYPE_CHECKING:
     from .adopted import AdoptedModel
     from .control import UncertaintyForControl, from_control, models_to_control, to_control, uncertainty_to_control
-    from .models import QuantifiedModels, quantify_models
+    from .models import quantify_models
     from .pairs import one_step_pairs
     from .pykoop import from_pykoop
     from .pykoop_population import models_from_pykoop
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _HOME = {
     **dict.fromkeys(("UncertaintyForControl", "from_control", "models_to_control", "to_control", "uncertainty_to_control"), "control"),
     "AdoptedModel": "adopted",
-    **dict.fromkeys(("QuantifiedModels", "quantify_models"), "models"),
+    "quantify_models": "models",
     "KoopmanRegressor": "sklearn_estimator",
     "from_pykoop": "pykoop",
     "models_from_pykoop": "pykoop_population",
@@ -28,7 +28,6 @@ _HOME = {
 __all__ = [
     "AdoptedModel",
     "KoopmanRegressor",
-    "QuantifiedModels",
     "UncertaintyForControl",
     "from_control",
     "from_pykoop",

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import DimensionError, MissingDependencyError
+from ..core.errors import DataError, DimensionError, MissingDependencyError
 from ..core.lti import StateSpace
 from ..identify import ModelSet
-from ..uncertainty import UncertainModel
+from ..uncertainty import ResponseUncertainty, UncertainModel
 
 try:
     import control
@@ -26,22 +26,32 @@ except ImportError as error:
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyForControl:
-    """An uncertain model as python-control systems; the weights act on scaled signals.
+    """A nominal and weights as python-control systems: every model is in the set of the form with ``E = left Delta right``, ``||Delta|| <= 1``.
 
     Parameters
     ----------
-    nominal : control.StateSpace
-        In physical units.
-    scaled_nominal : control.StateSpace
+    nominal : control.StateSpace or control.FRD
+        In physical units; response data where the models were.
+    scaled_nominal : control.StateSpace or control.FRD
         Between scaled inputs and outputs, where the weights act.
     left, right : control.StateSpace
-        ``E = left Delta right`` with ``||Delta|| <= 1``, in the form of the uncertain model.
+        Stable and minimum phase, in the time of the models.
+    remainder_left, remainder_right : control.StateSpace or None
+        Weights of an additive part that joins the set where the form does not reach every model.
+    model : UncertainModel or ResponseUncertainty
+        Bounds of all forms, cover, misfit, names.
+    certificate : str
+        Where the bound is known to hold.
     """
 
     nominal: Any
     scaled_nominal: Any
     left: Any
     right: Any
+    remainder_left: Any
+    remainder_right: Any
+    model: UncertainModel | ResponseUncertainty
+    certificate: str
 
 
 def to_control(
@@ -96,12 +106,12 @@ def to_control(
 
 
 def from_control(system: Any) -> StateSpace:
-    """Return a discrete `control.StateSpace` as a system of kros.
+    """Return a system of python-control as a system of kros, discrete or continuous (``dt`` zero); names of signals are not kept.
 
     Parameters
     ----------
-    system : control.StateSpace
-        With a sampling period in seconds. Names of its signals are not kept.
+    system : control.StateSpace or control.TransferFunction
+        With a sampling period in seconds, or continuous. Entries of a transfer function get states of their own.
 
     Returns
     -------
@@ -110,23 +120,49 @@ def from_control(system: Any) -> StateSpace:
     Raises
     ------
     DimensionError
-        Continuous time, no or an unspecified sampling period, or no state space.
+        An unspecified sampling period, or neither of the two.
+    DataError
+        An improper transfer function.
     """
-    if not isinstance(system, control.StateSpace):
+    if not is_system(system):
+        raise DimensionError(f"from_control: needs a control.StateSpace or control.TransferFunction, found {type(system).__name__}.")
+    if system.dt is None or system.dt is True:
         raise DimensionError(
-            f"from_control: needs a control.StateSpace, found {type(system).__name__}; convert it with control.ss(system)."
+            f"from_control: the sampling period is not known (dt = {system.dt}); give it in seconds, control.ss(A, B, C, D, 0.001), or 0."
         )
-    dt = system.dt
-    if dt is None or dt is True:
-        raise DimensionError(
-            f"from_control: the sampling period is not known (dt = {dt}); give it in seconds, control.ss(A, B, C, D, 0.001)."
-        )
-    if not dt > 0:
-        raise DimensionError(
-            f"from_control: the system is continuous (dt = {dt}); sample it with control.sample_system(system, 0.001) or another period."
-        )
+    if isinstance(system, control.TransferFunction):
+        return _realised(system)
     A, B, C, D = (np.array(getattr(system, matrix), dtype=float) for matrix in "ABCD")
-    return StateSpace(A, B, C, D, float(dt))
+    return StateSpace(A, B, C, D, float(system.dt))
+
+
+def is_system(model: Any) -> bool:
+    """Tell whether a model is known at every frequency."""
+    return isinstance(model, (control.StateSpace, control.TransferFunction))
+
+
+def _realised(model: Any) -> StateSpace:
+    """A transfer function, entry by entry: no minimal realisation is needed for a frequency response."""
+    from scipy.linalg import block_diag
+    from scipy.signal import tf2ss
+
+    p, m = model.noutputs, model.ninputs
+    blocks, D = [], np.zeros((p, m))
+    for i, j in np.ndindex(p, m):
+        numerator, denominator = np.trim_zeros(model.num[i][j], "f"), np.trim_zeros(model.den[i][j], "f")
+        if len(numerator) > len(denominator):
+            raise DataError(f"from_control: entry ({i}, {j}) of the transfer function is improper; give a causal model.")
+        if len(denominator) == 1 and numerator.size:
+            D[i, j] = numerator[0] / denominator[0]
+        elif numerator.size:
+            a, b, c, d = tf2ss(numerator, denominator)
+            D[i, j] = d[0, 0]
+            blocks.append((a, b @ np.eye(m)[[j]], np.eye(p)[:, [i]] @ c))
+    n = sum(len(a) for a, _, _ in blocks)
+    A = block_diag(*(a for a, _, _ in blocks)) if blocks else np.zeros((0, 0))
+    B = np.concatenate([np.zeros((0, m)), *(b for _, b, _ in blocks)])
+    C = np.concatenate([np.zeros((p, 0)), *(c for _, _, c in blocks)], axis=1)
+    return StateSpace(A.reshape(n, n), B, C, D, float(model.dt))
 
 
 def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> dict[str, Any]:
@@ -158,21 +194,29 @@ def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> d
 
 
 def uncertainty_to_control(model: UncertainModel) -> UncertaintyForControl:
-    """Return the nominal and the weights of an uncertain model as `control.StateSpace`.
+    """Return the nominal and the weights of an uncertain model as `control.StateSpace`."""
+    nominal, scaled = to_control(model.nominal_system, name="nominal"), to_control(model.scaled_nominal(), name="scaled_nominal")
+    certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
+    if model.sample_period_s == 0:
+        certificate = (
+            f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map, checked between the points of the "
+            "grid; from there on residuals count as constant"
+        )
+    return with_weights(nominal, scaled, model, certificate)
 
-    Parameters
-    ----------
-    model : UncertainModel
 
-    Returns
-    -------
-    UncertaintyForControl
-    """
+def with_weights(nominal: Any, scaled: Any, model: UncertainModel | ResponseUncertainty, certificate: str) -> UncertaintyForControl:
+    """Put the weights of an uncertain model beside its nominal."""
+    extra = model.remainder
     return UncertaintyForControl(
-        nominal=to_control(model.nominal_system, name="nominal"),
-        scaled_nominal=to_control(model.scaled_nominal(), name="scaled_nominal"),
+        nominal=nominal,
+        scaled_nominal=scaled,
         left=to_control(model.weight.left, name="weight_left"),
         right=to_control(model.weight.right, name="weight_right"),
+        remainder_left=None if extra is None else to_control(extra.left, name="remainder_left"),
+        remainder_right=None if extra is None else to_control(extra.right, name="remainder_right"),
+        model=model,
+        certificate=certificate,
     )
 
 

@@ -82,7 +82,7 @@ def tasks(folder: Path) -> list[Task]:
     config = validate_config(read_json(folder / "study.json"), folder)
     with open_executor(1) as executor:
         context = Context(config, Store(folder), Work(executor))
-        return [replace(tasks_of(context, name)[0], name=f"{name}/mixed", method="mixed") for name in context.model_names]
+        return [replace(tasks_of(context, name)[0], name=f"{name}/mixed", method="mixed") for name in context.identified.kinds]
 
 
 def solve(task: Task) -> tuple[str, float, bool]:

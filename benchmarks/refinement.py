@@ -62,7 +62,7 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
 
 def facts(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
     """Return errors, ratios and weights of one study."""
-    sets = {name: context.models(name) for name in context.model_names}
+    sets = {name: context.identified.models(name) for name in context.identified.kinds}
     errors = {name: percent(context, models) for name, models in sets.items()}
     refined = {name: RefinedModels.load(context.store.path("refinement", name)) for name in ("koopman", "linear")}
     pooled = {name: percent(context, sets[name], found.pooled) for name, found in refined.items()}

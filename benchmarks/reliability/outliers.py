@@ -24,8 +24,8 @@ from scipy.stats import binom
 from kros.data import Channel, Role
 from kros.identify import Factor, ModelSet, reduce_episode
 from kros.lifting import Lifting
-from kros.study.scoring import Evidence, Recorded
 from kros.uncertainty import OutlierModel, Status, score_outliers
+from kros.uncertainty.outliers.recorded import Evidence, Recorded
 
 Array = npt.NDArray[Any]
 

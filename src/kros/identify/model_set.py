@@ -126,8 +126,11 @@ class ModelSet:
 
     def responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
         """Return frequency responses from inputs to lifted states in the recordings' units, shape (unit, frequency, n, m)."""
-        scaled = self.normalised().systems(units).frequency_response(freqs_hz)
-        return np.asarray(scaled * self.output_scale[:, None] / self.input_scale)
+        return np.asarray(self.scaled_responses(freqs_hz, units) * self.output_scale[:, None] / self.input_scale)
+
+    def scaled_responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
+        """Return the same with every signal divided by its range."""
+        return self.normalised().systems(units).frequency_response(freqs_hz)
 
     def systems(self, units: Sequence[str] | None = None) -> StateSpace:
         """Return the models as a batch from input to lifted state, all of it or some units."""

@@ -48,7 +48,7 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
     if facts.alerts:
         study["alerts"] = facts.alerts
     if Stage.IDENTIFY in done:
-        study["alpha"] = context.models(context.edmd_names[0]).alpha
+        study["alpha"] = context.identified.models(context.identified.edmd_kinds[0]).alpha
     if Stage.SYNTHESIZE in done:
         study["deployed"] = _observers_record(context)["deployed"]
     return study
@@ -62,7 +62,7 @@ def _timing(context: Context, done: list[Stage], total_s: float | None) -> dict[
 def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
     facts = context.facts
     calibration = calibrate.load(context) if Stage.CALIBRATE in done else None
-    models = context.models(context.model_names[0]) if Stage.IDENTIFY in done else None
+    models = context.identified.models(context.identified.kinds[0]) if Stage.IDENTIFY in done else None
     rows = []
     for unit, group in facts.groups.items():
         keys = [*facts.keys("train", unit), *facts.keys("test", unit)]
@@ -83,20 +83,20 @@ def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
 def _models(context: Context) -> dict[str, Any]:
     return {
         name: {"order": m.lifting.n_lifted, "spectral_radius_max": _pooled_radius(context, name)}
-        for name in context.model_names
-        for m in [context.models(name)]
+        for name in context.identified.kinds
+        for m in [context.identified.models(name)]
     }
 
 
 def _pooled_radius(context: Context, name: str) -> float:
-    models = context.models(name)
+    models = context.identified.models(name)
     rows = [models.index(u) for u in context.facts.pooled if u in models.unit_ids]
     return float(models.spectral_radius()[rows].max())
 
 
 def _uncertainty(context: Context) -> dict[str, Any]:
     store = context.store
-    found = [name for name in context.model_names if store.holds("uncertainty", name)]
+    found = [name for name in context.identified.kinds if store.holds("uncertainty", name)]
     return {name: uncertainty_entry(UncertainModel.load(store.path("uncertainty", name))) | diagnostic_entry(store, name) for name in found}
 
 

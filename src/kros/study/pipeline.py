@@ -80,9 +80,10 @@ def run_study(
 
 def require_usable(config: StudyConfig, until: Stage) -> None:
     """Refuse what can be refused from the names of recordings alone."""
-    read.check_source(config, single_allowed=list(Stage).index(until) <= list(Stage).index(Stage.IDENTIFY))
+    population = read.open_source(config)
+    read.check_source(config, population, single_allowed=list(Stage).index(until) <= list(Stage).index(Stage.IDENTIFY))
     if left_out.wanted(config):
-        left_out.check_folds(config, read.open_source(config))
+        left_out.check_folds(config, population)
 
 
 def run_in(

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from ...core.artifacts import plain
 from ...core.errors import ConfigError, DataError
 from ...core.work import Executor
 from ...data import Population, check_population
 from ...identify import ModelSet
+from ...identify.identified import EpisodeFactors
+from ...identify.identify import reduce_episodes
 from ...observer import Observer
 from ...uncertainty import OutlierModel, Status
+from ...uncertainty.outliers.population import score_row
+from ...uncertainty.outliers.recorded import Evidence, Recorded
 from ..config import Stage, StudyConfig
 from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
-from ..scoring import Evidence, Recorded
-from ..stages.identify import reduce_episodes
-from ..stages.quantify import score_row
-from .estimate import check_channels, load_calibration, open_data, training_keys, unit_parameters
+from .estimate import check_channels, identify_on, load_calibration, open_data, training_keys, unit_parameters
 
 
 def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]:
@@ -31,7 +33,7 @@ def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]
     -------
     list of dict
         One row a unit and condition that the study knows: ``unit, condition, score, threshold, outlier, status, detectable, freq_hz`` and more
-        (see `kros.study.stages.quantify.score_row`), and ``left_out``, units of the study that it was not compared with.
+        (see `kros.uncertainty.outliers.population.score_row`), and ``left_out``, units of the study that it was not compared with.
     """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (config, store):
         return scored(config, store, data, workers)
@@ -69,12 +71,12 @@ def score_condition(
     training, everything = training_keys(population), {(u, c): keys for u, c, keys in population.groups()}
     units = [u for u in population.unit_ids if training.get((u, models.condition))]
     parameters = (
-        unit_parameters(population.select(units), load_calibration(store), _identify_on(store))
+        unit_parameters(population.select(units), load_calibration(store), identify_on(store))
         if models.lifting.parameters
         else {u: {} for u in units}
     )
     tasks = [(population.select([u], [models.condition]), everything[u, models.condition], models.lifting) for u in units]
-    recorded, rows = Recorded.load(store, models, outliers.freqs_hz), []
+    recorded, rows = Recorded.of(factors_of(store, models.condition), models, outliers.freqs_hz), []
     for unit, factor in zip(units, executor.map(reduce_episodes, tasks), strict=True):
         keys, used = everything[unit, models.condition], training[unit, models.condition]
         evidence = Evidence.of(factor, models, parameters[unit]).part([keys.index(k) for k in used])
@@ -84,6 +86,11 @@ def score_condition(
         seconds = float(factor.n_samples.sum()) * models.sample_period_s
         rows.append(score_row(score, models.condition, len(keys), seconds) | {"left_out": sorted(known)})
     return rows
+
+
+def factors_of(store: Store, condition: str) -> EpisodeFactors:
+    """Return the factors of a run's training episodes."""
+    return EpisodeFactors.load(store.path("factors", quote(condition, safe="")))
 
 
 def check_line(row: dict[str, Any]) -> str:
@@ -104,9 +111,3 @@ def check_line(row: dict[str, Any]) -> str:
         return f"{line}: {seen}, there are too few units to compare with"
     where = f"at {row['detectable_hz']:.3g} Hz"
     return f"{line}: {seen}, {where}, {row['detectable_db']:.1f} dB beyond the other units"
-
-
-def _identify_on(store: Store) -> str:
-    from ..engine.context import Facts
-
-    return Facts.load(store.path("population")).identify_on

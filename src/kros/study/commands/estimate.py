@@ -13,12 +13,13 @@ from ...core.errors import ConfigError, DataError, IdentificationError
 from ...core.files import read_toml
 from ...data import EpisodeBatch, Population, read, split_episodes
 from ...data.population import EpisodeKey
+from ...data.survey import RecordingFacts
 from ...identify import PhaseCalibration
+from ...identify.calibrate import segments_of
 from ...observer import Observer, run_observer
 from ..config import Stage, StudyConfig, validate_config
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
-from ..stages.calibrate import segments_of
 
 log = logging.getLogger(__name__)
 _BATCH = 64
@@ -106,15 +107,14 @@ def estimate_recordings(run: Path, data: Path, out: Path) -> int:
         observer = Observer.load(store.path("observers", "deployed.json"))
         population = open_data(config, data)
         check_channels(population, observer)
-        units = unit_parameters(population, load_calibration(store), _identify_on(store))
+        units = unit_parameters(population, load_calibration(store), identify_on(store))
         _write(out, population, observer, units)
     return len(population.episodes)
 
 
-def _identify_on(store: Store) -> str:
-    from ..engine.context import Facts
-
-    return Facts.load(store.path("population")).identify_on
+def identify_on(store: Store) -> str:
+    """Return the condition that feeds synthesis in a run."""
+    return RecordingFacts.load(store.path("population")).identify_on
 
 
 def _write(out: Path, population: Population, observer: Observer, units: dict[str, dict[str, float]]) -> None:

@@ -28,10 +28,10 @@ from ...uncertainty import (
     residual,
     variation_and_noise,
 )
+from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.settings import UncertaintySettings
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
 from ..engine.context import Context
-from ..responses import scaled_responses
 from .resampling import resampled_models
 
 log = logging.getLogger(__name__)
@@ -47,31 +47,21 @@ class _Result(Protocol):
         """Write into a folder."""
 
 
-Work = tuple[Path, Callable[[], _Result]]
+Task = tuple[Path, Callable[[], _Result]]
 
 
-def diagnose(context: Context, units: list[str], found: Mapping[str, UncertainModel], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Compute and save what there is to tell; what cannot be told is logged, with its reason, and left out.
-
-    Parameters
-    ----------
-    context : Context
-    units : list of str
-        Units that the weights cover.
-    found : mapping of str to UncertainModel
-    rows : sequence of mapping
-        Outlier scores of all conditions.
-    """
+def diagnose(context: Context, found: UncertainModels) -> None:
+    """Compute and save what there is to say; what cannot be said is logged, with its reason, and left out."""
     folder, config = context.store.draft("uncertainty"), context.config.uncertainty
-    work: list[Work] = []
-    for name, uncertain in found.items():
-        work += [(folder / name / "noise", task) for task in _noise(context, name, units, uncertain)]
-        work.append((folder / name / "order", partial(order_curve, uncertain, config.max_order + _FURTHER_ORDERS)))
-    for name in context.model_names[: len(context.edmd_names)]:  # the pair that figures compare
-        work.append((folder / name / "units", partial(beside_weights, context.models(name), found[name], config)))
-    work += _others(context, rows)
-    results = context.work.run("quantify (diagnose)", [partial(_attempt, place.parent.name, task) for place, task in work])
-    for (place, _), result in zip(work, results, strict=True):
+    tasks: list[Task] = []
+    for kind, uncertain in found.sets.items():
+        tasks += [(folder / kind / "noise", task) for task in _noise(context, kind, uncertain)]
+        tasks.append((folder / kind / "order", partial(order_curve, uncertain, config.max_order + _FURTHER_ORDERS)))
+    for kind in found.models.kinds[: len(found.models.edmd_kinds)]:  # the pair that figures compare
+        tasks.append((folder / kind / "units", partial(beside_weights, found.models.models(kind), found.sets[kind], config)))
+    tasks += _others(context, found.scores)
+    results = context.work.run("quantify (diagnose)", [partial(_attempt, place.parent.name, task) for place, task in tasks])
+    for (place, _), result in zip(tasks, results, strict=True):
         if result is not None:
             result.save(place)
 
@@ -84,13 +74,14 @@ def _attempt(name: str, task: Callable[[], _Result]) -> _Result | None:
         return None
 
 
-def _noise(context: Context, name: str, units: list[str], uncertain: UncertainModel) -> list[Callable[[], _Result]]:
+def _noise(context: Context, name: str, uncertain: UncertainModel) -> list[Callable[[], _Result]]:
     """Compare variation and noise over at most 60 units, the nominal one among them."""
     if uncertain.nominal < 0:
         return []
+    units = uncertain.unit_ids
     some = np.linspace(0, len(units) - 1, min(_MOST_UNITS, len(units))).round().astype(int)
     chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
-    models = context.models(name)
+    models = context.identified.models(name)
     try:
         samples = resampled_models(context, name, chosen)
     except KrosError as error:
@@ -123,7 +114,7 @@ def beside_weights(models: ModelSet, uncertain: UncertainModel, config: Uncertai
     return unit_residuals(
         uncertain.form,
         uncertain.scaled_nominal().frequency_response(freqs),
-        scaled_responses(models, list(uncertain.unit_ids), freqs),
+        models.scaled_responses(freqs, list(uncertain.unit_ids)),
         uncertain.weight,
         freqs,
         models.sample_period_s,
@@ -134,22 +125,22 @@ def beside_weights(models: ModelSet, uncertain: UncertainModel, config: Uncertai
     )
 
 
-def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Work]:
+def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Task]:
     """The most conspicuous unit against the others, in the condition where it scores highest; both kinds of models as in the paper."""
     top = most_conspicuous(rows)
     if top is None:
         return []
     condition = top["condition"]
     outside = [top["unit"], *(r["unit"] for r in rows if r["outlier"] and r["condition"] == condition and r["unit"] != top["unit"])]
-    sets = [context.models(name, condition) for name in context.edmd_names]
+    sets = [context.identified.models(name, condition) for name in context.identified.edmd_kinds]
     others = [u for u, state in zip(sets[0].unit_ids, sets[0].status, strict=True) if state == "ok" and u not in outside]
     if len(others) < 2:
         return []
-    responses = scaled_responses(sets[0], others, sets[0].frequencies(_POINTS))
+    responses = sets[0].scaled_responses(sets[0].frequencies(_POINTS), others)
     nominal = others[choose_nominals(responses)[Form(context.config.uncertainty.form)].index]
     return [
         (
-            context.store.draft("outliers", context.model_folder(models.name, condition), "others"),
+            context.store.draft("outliers", context.identified.place(models.name, condition), "others"),
             partial(against_others, models, others, outside, nominal, context.config.uncertainty),
         )
         for models in sets
@@ -166,7 +157,7 @@ def against_others(models: ModelSet, others: list[str], outside: list[str], nomi
     """Return the residuals of all units beside the smallest diagonal cover of `others`, frequency by frequency, and beside fits to their entries."""
     freqs, form, row = models.frequencies(_POINTS), Form(config.form), others.index(nominal)
     everyone = [*others, *outside]
-    responses = scaled_responses(models, everyone, freqs)
+    responses = models.scaled_responses(freqs, everyone)
     cover = optimal_cover(residual(form, responses[row], responses[: len(others)]))
     return unit_residuals(
         form,

@@ -99,7 +99,7 @@ def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, di
     record = load_artifact(context.store.path("observers"), "observers")[0]
     kind = str(record["deployed"]).rpartition("/")[0]
     names = tuple(name for name in record["names"] if everything or name.rpartition("/")[0] == kind)
-    models = context.models(context.model_names[0])
+    models = context.identified.models(context.identified.kinds[0])
     firsts = {(k.unit, k.condition): k for k in reversed(keys) if roles[k.unit] != "outlier"}
     chosen = [k for k in keys if firsts.get((k.unit, k.condition)) == k and (everything or k.condition == context.facts.identify_on)]
     dt = context.population.sample_period_s
@@ -118,7 +118,7 @@ def noise_draws(context: Context, keys: Sequence[EpisodeKey], measured: Sequence
     """Return realisations of the noise that the study assumes, as declared or that of the quantisation; the largest share of a largest value counts."""
     from .synthesize import measurement_noise
 
-    noise = measurement_noise(context, context.models(context.model_names[0]))
+    noise = measurement_noise(context, context.identified.models(context.identified.kinds[0]))
     y = np.concatenate([context.population.read_parts(k)[0][:, list(measured)] for k in keys])
     size = np.abs(y).max(axis=0)
     severity = float(np.max(noise / np.where(size > 0, size, np.inf)))

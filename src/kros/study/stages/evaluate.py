@@ -18,9 +18,9 @@ from ...data.population import EpisodeKey, Population
 from ...design.estimators import Baseline, make_difference, make_extended, make_learned
 from ...evaluate import ErrorSummary, summarise
 from ...identify import ModelSet, free_run
+from ...identify.presets import gearbox_band_hz
 from ...observer import Observer, run_observers
 from ..engine.context import Context
-from ..presets import gearbox_band_hz
 from . import calibrate
 from .disturbed import Trial, make_trial, run_disturbed
 from .load import run_load
@@ -141,7 +141,7 @@ def run(context: Context) -> None:
     shown = showcase(context, keys, roles)
     shown_on = tuple(on.index(keys[i]) for i in shown if keys[i] in on)
 
-    observers, models = load_observers(context), {name: context.models(name) for name in context.model_names}
+    observers, models = load_observers(context), {name: context.identified.models(name) for name in context.identified.kinds}
     trial = make_trial(context, keys, units, roles)
     work = estimation(context, population, keys, units, shown, trial)
     work += [Piece((f"free run/{m}",), partial(evaluate_model, found, population, on, units, shown_on)) for m, found in models.items()]
@@ -197,7 +197,7 @@ def outcomes(context: Context, work: Sequence[Piece]) -> dict[str, Outcome | str
 
 def baseline_makers(context: Context) -> dict[str, Callable[[], Baseline]]:
     """Return what makes every baseline that is no correction of a model: the extended filter of the first lifted model, and those without a model."""
-    models = {name: context.models(name) for name in context.model_names}
+    models = {name: context.identified.models(name) for name in context.identified.kinds}
     asked, first = context.config.observer.baselines, next(iter(models.values()))
     nominal = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
     tuning = tuning_set(context, first)
@@ -222,7 +222,7 @@ def facts_of(name: str, result: Outcome | str) -> dict[str, Any]:
 
 
 def _usable(context: Context) -> list[str]:
-    ids = context.models(context.model_names[0]).unit_ids
+    ids = context.identified.models(context.identified.kinds[0]).unit_ids
     return [u for u in context.facts.groups if u in ids]
 
 
@@ -231,9 +231,9 @@ def band_hz(context: Context) -> tuple[float, float] | None:
     spec = context.phase_spec
     if spec is None:
         return None
-    first = context.models(context.model_names[0])
+    first = context.identified.models(context.identified.kinds[0])
     top_speed = float(first.input_scale[first.inputs.index(spec.reference)]) if spec.reference in first.inputs else 0.0
-    return gearbox_band_hz(context.config, context.population, top_speed)
+    return gearbox_band_hz(context.config.calibrate, context.population, top_speed)
 
 
 def unit_roles(context: Context) -> dict[str, str]:

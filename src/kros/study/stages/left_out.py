@@ -17,6 +17,8 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
 from ...core.work import Progress
 from ...data.population import OUTLIERS, Population
+from ...identify.calibrate import calibration_keys, segments_of
+from ...identify.identified import recordings_of, recordings_path
 from ..config import RequireConfig, Stage, StudyConfig
 from ..engine.context import Context
 from ..engine.steps import Step, run_steps
@@ -59,7 +61,7 @@ def parted(units: Sequence[str], folds: int) -> list[list[str]]:
 
 def run(context: Context) -> None:
     """Make the study once for every fold, and collect what its observers do on the units that it does not know."""
-    models = context.models(context.model_names[0])
+    models = context.identified.models(context.identified.kinds[0])
     folds = parted([u for u in context.facts.pooled if u in models.unit_ids], context.config.evaluate.folds)
     for surplus in context.store.runs(FOLDER):
         if surplus.folder.name not in map(str, range(len(folds))):
@@ -90,7 +92,7 @@ def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> di
 def without(whole: Context, held: Sequence[str]) -> StudyConfig:
     """Return the study on the prepared recordings of all other units, which hands nothing over and so requires nothing."""
     config = whole.config
-    prepared = {"source": whole.recordings.absolute(), "reader": "parquet", "prepare": (), "csv": None}
+    prepared = {"source": recordings_path(whole.store.folder).absolute(), "reader": "parquet", "prepare": (), "csv": None}
     data = config.data.model_copy(update={**prepared, "identify_on": whole.facts.identify_on, "exclude": (*absent(whole), *held)})
     observer = config.observer.model_copy(update={"deployed": None})
     changes: dict[str, Any] = {"data": data, "observer": observer, "require": RequireConfig()}
@@ -101,9 +103,7 @@ def without(whole: Context, held: Sequence[str]) -> StudyConfig:
 
 def absent(whole: Context) -> tuple[str, ...]:
     """Return units that the study itself excludes, where their recordings are still there."""
-    from ...data import read_parquet
-
-    return tuple(unit for unit in read_parquet(whole.recordings).unit_ids if unit not in whole.facts.groups)
+    return tuple(unit for unit in recordings_of(whole.store.folder).unit_ids if unit not in whole.facts.groups)
 
 
 def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None:
@@ -127,8 +127,8 @@ def held_parameters(whole: Context, held: Sequence[str], context: Context) -> Un
     calibration = calibrate.load(context)
     if calibration is None:
         return {unit: {} for unit in held}
-    tasks = [(whole.population.select([u]), calibrate.calibration_keys(whole, u), calibration.spec) for u in held]
-    segments = context.work.map("calibrate", calibrate.segments_of, tasks)
+    tasks = [(whole.population.select([u]), calibration_keys(whole.facts, u), calibration.spec) for u in held]
+    segments = context.work.map("calibrate", segments_of, tasks)
     return {u: {calibration.spec.parameter: calibration.calibrate(found, u).phase_rad} for u, found in zip(held, segments, strict=True)}
 
 

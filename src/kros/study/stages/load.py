@@ -160,7 +160,7 @@ class LoadStudy:
 
     @property
     def _measured(self) -> tuple[int, ...]:
-        return self.context.models(self.context.model_names[0]).measured
+        return self.context.identified.models(self.context.identified.kinds[0]).measured
 
     def parameters(self, made: Observer | Lifting, batch: EpisodeBatch) -> dict[str, Array] | None:
         """Lifting parameters of a batch, where a lifting has any."""

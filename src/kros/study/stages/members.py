@@ -34,7 +34,7 @@ def member_work(context: Context, model: str, members: int) -> Callable[[], Memb
     }
     if not bounds:
         return dict
-    models, uncertain = context.models(model), UncertainModel.load(context.store.path("uncertainty", model))
+    models, uncertain = context.identified.models(model), UncertainModel.load(context.store.path("uncertainty", model))
     unit = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
     base, _ = usable_problem(models, unit, uncertain, measurement_noise(context, models), context)
     assert base is not None  # there are bounds

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact
 from ...core.errors import DataError
 from ...data.scaled import scale_population
 from ...identify import (
@@ -26,10 +25,9 @@ from ...identify import (
     episode_weights,
     lifted_factor,
 )
-from ...identify.refine import RefinedModels
+from ...identify.identify import refine_options
 from ...identify.refine.episodes import episode_normals
 from ..engine.context import Context
-from .identify import refine_options
 
 Array = npt.NDArray[np.float64]
 
@@ -58,7 +56,7 @@ def resampled_models(context: Context, name: str, units: list[str]) -> ModelSamp
     IdentificationError
         When episodes that were drawn leave a model undetermined.
     """
-    models = context.models(name)
+    models = context.identified.models(name)
     if models.alpha is None:
         everyone = _refined_samples(context, models)
         return _chosen(everyone, [models.index(u) for u in units])
@@ -70,17 +68,14 @@ def resampled_models(context: Context, name: str, units: list[str]) -> ModelSamp
 
 def episode_factor(context: Context, models: ModelSet, units: list[str]) -> tuple[Factor, list[int]]:
     """Return the stored factors of ``[Psi | Theta_plus]``, batch (unit, episode), and every unit's number of episodes."""
-    content, arrays = load_artifact(context.factors_folder(context.facts.identify_on), "factors")
-    places: dict[str, list[int]] = {unit: [] for unit in units}
-    for place, (unit, _) in enumerate(content["rows"]):
-        if unit in places:
-            places[unit].append(place)
+    recorded = context.identified.factors[context.facts.identify_on]
+    places = {unit: recorded.rows_of(unit) for unit in units}
     counts = [len(found) for found in places.values()]
     if min(counts) < 2:
         raise DataError(f"Resampling: unit {units[int(np.argmin(counts))]} has {min(counts)} training episodes; at least two are needed.")
-    R, peak, n_samples = (_by_unit(arrays[key], list(places.values()), max(counts)) for key in ("R", "peak", "n_samples"))
+    R, peak, n_samples = (_by_unit(getattr(recorded.factor, key), list(places.values()), max(counts)) for key in ("R", "peak", "n_samples"))
     whole = Factor(R, peak, n_samples)
-    lifted = context.models(context.edmd_names[0])
+    lifted = context.identified.models(context.identified.edmd_kinds[0])
     parameters = {key: values[[lifted.index(u) for u in units]][:, None] for key, values in lifted.parameters.items()}
     return lifted_factor(whole, context.lifting, parameters, models.lifting), counts
 
@@ -96,7 +91,7 @@ def _by_unit(values: npt.NDArray[Any], places: list[list[int]], most: int) -> np
 def _refined_samples(context: Context, models: ModelSet) -> ModelSamples:
     """Samples of all units that were refined together, in channels divided by their ranges as they were."""
     units, facts, ranges = list(models.unit_ids), context.facts, models.ranges
-    refined = RefinedModels.load(context.store.path("refinement", models.name)).in_channels(ranges)
+    refined = context.identified.refined[models.name].in_channels(ranges)
     factor, counts = episode_factor(context, models, units)
     population, lifting = scale_population(context.population, models.sizes), models.lifting.in_sizes(models.sizes)
     keys = {u: facts.keys("train", u, facts.identify_on) for u in units}

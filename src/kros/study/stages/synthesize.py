@@ -36,7 +36,7 @@ WORST_CASE = ("worst_case_h2", "worst_case_hinf")
 
 def run(context: Context) -> None:
     """Make all observers, certify them, save them."""
-    tasks = [task for name in context.model_names for task in tasks_of(context, name)]
+    tasks = [task for name in context.identified.kinds for task in tasks_of(context, name)]
     products = produced(context, tasks)
     facts = {}
     certificates = iter(context.work.run("certify", certificates_of(tasks, products)))
@@ -109,7 +109,7 @@ def robust_of(running: Sequence[Running], facts: Mapping[str, Mapping[str, Any]]
 
 def tasks_of(context: Context, name: str) -> list[Task]:
     """Return a task for every observer of one kind of model, in channels divided by their ranges."""
-    recorded, config = context.models(name), context.config
+    recorded, config = context.identified.models(name), context.config
     models = recorded.normalised()
     unit = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
     folder = context.store.path("uncertainty", name)
@@ -120,7 +120,7 @@ def tasks_of(context: Context, name: str) -> list[Task]:
     tuning = replace(tuning, population=scale_population(tuning.population, recorded.sizes), seen=seen)
     uncertain = UncertainModel.load(folder)
     problem, refusal = usable_problem(models, unit, uncertain, noise, context)
-    methods = suitable(config.observer.baselines + config.synthesis.methods, name, refined=name not in context.edmd_names)
+    methods = suitable(config.observer.baselines + config.synthesis.methods, name, refined=name not in context.identified.edmd_kinds)
     settings: dict[str, Any] = {"input_weight": config.synthesis.input_weight, "time_limit_s": config.synthesis.time_limit_s}
     settings |= {"max_order": config.uncertainty.max_order, "max_states": config.synthesis.max_states, "covered": uncertain.unit_ids}
     settings |= {"memory": config.predictor, "tune": config.synthesis.tune}

@@ -13,15 +13,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact
-from ..identify import Factor, ModelSet, combine, lifted_factor
-from ..uncertainty import OutlierScore, Status
-from .engine.store import Store
+from ...identify import Factor, ModelSet, combine, lifted_factor
+from ...identify.identified import EpisodeFactors
+from .score import OutlierScore, Status
 
 Array = npt.NDArray[Any]
 
@@ -83,16 +81,12 @@ class Recorded:
     freqs_hz: Array
 
     @classmethod
-    def load(cls, store: Store, models: ModelSet, freqs_hz: Array) -> Recorded:
-        """Read the factors that the identify stage stored."""
-        content, arrays = load_artifact(store.path("factors", quote(models.condition, safe="")), "factors")
-        rows: dict[str, list[int]] = {unit: [] for unit in models.unit_ids}
-        for row, (unit, _) in enumerate(content["rows"]):
-            rows.setdefault(unit, []).append(row)
-        units = {}
+    def of(cls, factors: EpisodeFactors, models: ModelSet, freqs_hz: Array) -> Recorded:
+        """Take the units of models from the factors of all training episodes of a condition."""
+        f, units = factors.factor, {}
         for unit in models.unit_ids:
-            own = rows[unit]
-            factor = Factor(arrays["R"][own], arrays["peak"][own], arrays["n_samples"][own])
+            own = factors.rows_of(unit)
+            factor = Factor(f.R[own], f.peak[own], f.n_samples[own])
             units[unit] = Evidence.of(factor, models, {k: float(v[models.index(unit)]) for k, v in models.parameters.items()})
         return cls(models, units, freqs_hz)
 

@@ -1,0 +1,213 @@
+"""One pass over all recordings: every episode read and checked once, training and test told apart, and what later steps need to know.
+
+Population --survey--> Population that can be used, RecordingFacts
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.artifacts import load_artifact
+from ..core.errors import DataError
+from ..core.loading import loader
+from ..core.work import Work
+from .alerts import period_alerts
+from .checks import check_population, scan_prints
+from .copies import Print, refuse_copies
+from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
+from .writers import GroupRecord, write_group, write_index
+
+log = logging.getLogger(__name__)
+UNLOADED = "noload"
+
+
+@dataclass(frozen=True)
+class RecordingFacts:
+    """What is known about recordings once all were read.
+
+    Parameters
+    ----------
+    identify_on : str
+        Condition whose models feed synthesis.
+    groups : mapping of unit to group
+    train, test : tuple of EpisodeKey
+    resolution : mapping of channel to float
+        Quantisation step found in every measured channel.
+    dropped : tuple of str
+        Episodes that were left out, with the reason.
+    alerts : tuple of str
+        What looks wrong in the recordings without making them unusable.
+    """
+
+    identify_on: str
+    groups: dict[str, str]
+    train: tuple[EpisodeKey, ...]
+    test: tuple[EpisodeKey, ...]
+    resolution: dict[str, float]
+    dropped: tuple[str, ...] = ()
+    alerts: tuple[str, ...] = ()
+
+    @property
+    def pooled(self) -> tuple[str, ...]:
+        """Units that take part in pooled results."""
+        return tuple(u for u, group in self.groups.items() if group != OUTLIERS)
+
+    def keys(self, part: str, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
+        """Return the episodes of a part, ``train`` or ``test``, of a unit, a condition or both."""
+        return tuple(k for k in getattr(self, part) if unit in (None, k.unit) and condition in (None, k.condition))
+
+    def content(self) -> dict[str, Any]:
+        """Return the facts in JSON's types."""
+        rows = {part: [[k.unit, k.condition, k.episode] for k in getattr(self, part)] for part in ("train", "test")}
+        return asdict(self) | rows
+
+    @classmethod
+    @loader
+    def load(cls, folder: Path) -> RecordingFacts:
+        """Read what a study's stage `read`, or a saved result, keeps in its folder ``population``."""
+        content, _ = load_artifact(folder, "facts")
+        train, test = (tuple(EpisodeKey(*row) for row in content[part]) for part in ("train", "test"))
+        texts = {name: tuple(content.get(name, ())) for name in ("dropped", "alerts")}
+        return cls(content["identify_on"], content["groups"], train, test, content["resolution"], **texts)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """One unit in one condition, for a worker; `folder` is None where the recordings stay where they are."""
+
+    population: Population
+    unit: str
+    condition: str
+    folder: Path | None
+    on_nan: str
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a worker found in one unit and condition."""
+
+    record: GroupRecord | None
+    episodes: tuple[EpisodeKey, ...]
+    resolution: dict[str, float]
+    prints: list[tuple[EpisodeKey, Print]]
+    alerts: tuple[str, ...]
+
+
+def survey(
+    population: Population,
+    test: Iterable[str] | None = None,
+    identify_on: str | None = None,
+    on_nan: str = "error",
+    folder: Path | None = None,
+    work: Work | None = None,
+) -> tuple[Population, RecordingFacts]:
+    """Read all recordings once.
+
+    Parameters
+    ----------
+    population : Population
+    test : iterable of str, optional
+        Names of the held-out episodes; default the last tenth of each unit and condition, at least one.
+    identify_on : str, optional
+        Condition whose models feed synthesis; default ``noload``, else the first.
+    on_nan : {"error", "drop_episode"}
+    folder : Path, optional
+        Where the recordings are written as Parquet on the way; default nowhere.
+    work : Work, optional
+        Where it runs.
+
+    Returns
+    -------
+    Population
+        Without the episodes that were dropped; that of `folder` where one is given.
+    RecordingFacts
+
+    Raises
+    ------
+    DataError
+        When recordings cannot be used, with the episode.
+    """
+    if folder is not None:
+        folder.mkdir(parents=True)
+    tasks = [_Group(population.select([u], [c]), u, c, folder, on_nan) for u, c, _ in population.groups()]
+    found = list((work or Work()).map("read", _read_group, tasks))
+    kept = _kept(population, found, folder)
+    splits = split_episodes(kept, test)
+    facts = RecordingFacts(
+        identify_on=condition_of(population, identify_on),
+        groups={u.id: u.group for u in kept.units},
+        train=tuple(k for s in splits.values() for k in s.train),
+        test=tuple(k for s in splits.values() for k in s.test),
+        resolution={m: min(f.resolution[m] for f in found) for m in kept.measured},
+        dropped=tuple(str(k) for k in population.episodes if k not in set(kept.episodes)),
+        alerts=tuple(dict.fromkeys(alert for f in found for alert in f.alerts)),
+    )
+    for alert in facts.alerts:
+        log.warning("%s", alert)
+    return kept, facts
+
+
+def check_usable(population: Population, test: Iterable[str] | None, identify_on: str | None, single_allowed: bool) -> None:
+    """Refuse what can be refused from names alone, before anything is read or written."""
+    check_population(population, allow_single=single_allowed)
+    split_episodes(population, test)
+    condition_of(population, identify_on)
+    if not population.measured:
+        raise DataError(
+            f"No channel is measured: an observer needs a state that is available at run time, found states {', '.join(population.states)}; "
+            "declare measured = true for at least one."
+        )
+
+
+def condition_of(population: Population, wanted: str | None) -> str:
+    """Return the condition whose models feed synthesis: the one asked for, else that without load, else the first."""
+    conditions = population.conditions
+    if wanted is None:
+        return UNLOADED if UNLOADED in conditions else (conditions[0] if conditions else DEFAULT_CONDITION)
+    if wanted not in conditions:
+        raise DataError(f"data.identify_on = {wanted!r}: the recordings have the conditions {', '.join(conditions)}; name one of them.")
+    return wanted
+
+
+def _read_group(task: _Group) -> _Found:
+    """Read, check and, where asked, write one unit and condition."""
+    population, record = task.population, None
+    if task.folder is None:
+        prints = scan_prints(population.select([task.unit], [task.condition]), on_nan=task.on_nan)
+    else:
+        record = write_group(population, task.unit, task.condition, task.folder, task.on_nan)
+        prints = record.recognised
+    episodes = tuple(key for key, _ in prints)
+    if not episodes:
+        raise DataError(f"Unit {task.unit} ({task.condition}): every episode was dropped; fix the source or leave the unit out.")
+    first = population.read(episodes[0])
+    names = population.states + population.inputs
+    steps = {m: resolution(first[:, names.index(m)]) for m in population.measured}
+    return _Found(record, episodes, steps, prints, period_alerts(first, population.channels, population.sample_period_s))
+
+
+def _kept(population: Population, found: Sequence[_Found], folder: Path | None) -> Population:
+    if folder is not None:
+        from .readers import read_parquet
+
+        write_index(population, [f.record for f in found if f.record is not None], folder)
+        return read_parquet(folder)
+    refuse_copies(pair for f in found for pair in f.prints)
+    present = {key for f in found for key in f.episodes}
+    if len(present) == len(population.episodes):
+        return population
+    return replace(population, episodes=tuple(k for k in population.episodes if k in present))
+
+
+def resolution(signal: npt.NDArray[np.float64]) -> float:
+    """Return the smallest step between samples, the quantisation of a digital sensor."""
+    steps = np.abs(np.diff(signal))
+    floor = 1e-9 * np.max(np.abs(signal))
+    return float(steps[steps > floor].min()) if np.any(steps > floor) else float(floor)

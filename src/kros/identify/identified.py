@@ -1,0 +1,219 @@
+"""All models of a population: every kind in every condition, with the recordings and what was learned from them on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import quote
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.artifacts import load_artifact, save_artifact
+from ..core.errors import DataError
+from ..core.loading import loader
+from ..data.population import Population
+from ..data.survey import RecordingFacts
+from ..lifting import Lifting
+from .factors import Factor
+from .model_set import ModelSet
+from .phase import PhaseCalibration
+from .refine.model import RefinedModels
+
+Array = npt.NDArray[np.float64]
+T = TypeVar("T")
+_KIND = "models"
+
+
+class Stored(Mapping[str, T]):
+    """Results in a folder, each loaded when it is asked for and then kept."""
+
+    def __init__(self, names: tuple[str, ...], load: Callable[[str], T]) -> None:
+        self._names, self._load, self._known = names, load, dict[str, T]()
+
+    def __getitem__(self, name: str) -> T:
+        if name not in self._names:
+            raise KeyError(name)
+        if name not in self._known:
+            self._known[name] = self._load(name)
+        return self._known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeFactors:
+    """Triangular factors of every training episode of one condition, free of the lifting's parameters.
+
+    Parameters
+    ----------
+    condition : str
+    rows : tuple of (unit, episode)
+    factor : Factor
+        Batch over `rows`.
+    """
+
+    condition: str
+    rows: tuple[tuple[str, str], ...]
+    factor: Factor
+
+    def rows_of(self, unit: str) -> list[int]:
+        """Return where the episodes of a unit are."""
+        return [row for row, (name, _) in enumerate(self.rows) if name == unit]
+
+    def save(self, folder: Path, lifting: Lifting, inputs: tuple[str, ...]) -> None:
+        """Write them with the names of what they are of."""
+        arrays = {name: getattr(self.factor, name) for name in ("R", "peak", "n_samples")}
+        content: dict[str, Any] = {"condition": self.condition, "states": lifting.states, "functions": lifting.functions}
+        content |= {"inputs": inputs, "input_functions": lifting.input_functions, "rows": self.rows}
+        save_artifact(folder, "factors", content, arrays)
+
+    @classmethod
+    @loader
+    def load(cls, folder: Path) -> EpisodeFactors:
+        """Read what `save` wrote."""
+        content, arrays = load_artifact(folder, "factors")
+        rows = tuple((str(unit), str(episode)) for unit, episode in content["rows"])
+        return cls(content["condition"], rows, Factor(arrays["R"], arrays["peak"], arrays["n_samples"]))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class IdentifiedModels:
+    """What `kros.identify` returns.
+
+    Parameters
+    ----------
+    population : Population
+        The recordings that were used.
+    facts : RecordingFacts
+        What is known about them, with the split into training and test.
+    lifting : Lifting
+        Of the Koopman models.
+    calibration : PhaseCalibration or None
+        Of the lifting's parameter, where it has one.
+    kinds : tuple of str
+        Kinds of models; the one that others follow comes first.
+    sets : mapping of str to ModelSet
+        By `place`: kind, and condition where it is not that of synthesis.
+    factors : mapping of str to EpisodeFactors
+        By condition.
+    refined : mapping of str to RefinedModels
+        What the refinement found out, by kind.
+    """
+
+    population: Population
+    facts: RecordingFacts
+    lifting: Lifting
+    calibration: PhaseCalibration | None = None
+    kinds: tuple[str, ...] = ()
+    sets: Mapping[str, ModelSet] = field(default_factory=dict)
+    factors: Mapping[str, EpisodeFactors] = field(default_factory=dict)
+    refined: Mapping[str, RefinedModels] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        facts = self.facts
+        return f"<IdentifiedModels: {', '.join(self.kinds)} of {len(facts.pooled)} units, identified on {facts.identify_on!r}>"
+
+    @property
+    def edmd_kinds(self) -> tuple[str, ...]:
+        """The paper's kinds of models, identified in every condition; the first one scores outliers."""
+        return edmd_kinds(self.lifting)
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Conditions that models were identified in, that of synthesis first."""
+        found = sorted({k.condition for k in self.facts.train}, key=lambda c: c != self.facts.identify_on)
+        return tuple(found)
+
+    @property
+    def parameters(self) -> dict[str, dict[str, float]]:
+        """Values of the lifting's parameters of every unit that can be modelled, by name."""
+        if self.calibration is None:
+            return {unit: {} for unit in self.facts.groups}
+        name, known = self.calibration.spec.parameter, self.calibration.units
+        return {unit: {name: known[unit].phase_rad} for unit in self.facts.groups if unit in known}
+
+    def place(self, kind: str, condition: str | None = None) -> str:
+        """Return the name of the models of a kind in a condition, which is that of their folder too."""
+        return kind if condition in (None, self.facts.identify_on) else f"{kind}@{quote(str(condition), safe='')}"
+
+    def models(self, kind: str | None = None, condition: str | None = None) -> ModelSet:
+        """Return the models of one kind, the first where none is named, in the condition that feeds synthesis or another."""
+        place = self.place(kind or self.kinds[0], condition)
+        if place not in self.sets:
+            raise DataError(f"Models {place!r}: there are none, only {', '.join(self.sets)}; name one of them.")
+        return self.sets[place]
+
+    @cached_property
+    def sizes(self) -> dict[str, float]:
+        """Largest absolute value of every channel in the training episodes of all units and conditions."""
+        states, inputs = self.population.states, self.population.inputs
+        peak = np.concatenate([self.factors[c].factor.peak for c in sorted(self.conditions)]).max(axis=0)
+        behind = len(states) + len(self.lifting.separation.basis)
+        return dict(zip(states + inputs, [*peak[: len(states)].tolist(), *peak[behind : behind + len(inputs)].tolist()], strict=True))
+
+    def save(self, folder: Path | str) -> None:
+        """Write all of it, with the recordings, in the layout of a run folder."""
+        from ..data import write_parquet
+
+        folder = Path(folder)
+        write_parquet(self.population, folder / "recordings")
+        save_artifact(folder / "population", "facts", {"recordings": "recordings", **self.facts.content()})
+        if self.calibration is not None:
+            self.calibration.save(folder / "calibration")
+        self.save_models(folder)
+
+    def save_models(self, folder: Path) -> None:
+        """Write the models and what belongs to them, without the recordings."""
+        for place, models in self.sets.items():
+            models.save(folder / "models" / place)
+        for condition, factors in self.factors.items():
+            factors.save(folder / "factors" / quote(condition, safe=""), self.lifting, self.population.inputs)
+        for kind, refined in self.refined.items():
+            refined.save(folder / "refinement" / kind)
+        content = {"kinds": self.kinds, "sets": list(self.sets), "conditions": list(self.factors), "refined": list(self.refined)}
+        save_artifact(folder / "models", _KIND, content)
+
+    @classmethod
+    @loader
+    def load(cls, folder: Path) -> IdentifiedModels:
+        """Read what `save` wrote, or a run folder; models and factors are read when they are asked for."""
+        folder = Path(folder)
+        facts = RecordingFacts.load(folder / "population")
+        return cls.load_models(folder, recordings_of(folder).select(facts.groups), facts)
+
+    @classmethod
+    def load_models(cls, folder: Path, population: Population, facts: RecordingFacts) -> IdentifiedModels:
+        """Read what `save_models` wrote, of recordings that are open already."""
+        content, _ = load_artifact(folder / "models", _KIND)
+        sets = Stored(tuple(content["sets"]), lambda place: ModelSet.load(folder / "models" / place))
+        factors = Stored(tuple(content["conditions"]), lambda c: EpisodeFactors.load(folder / "factors" / quote(c, safe="")))
+        refined = Stored(tuple(content["refined"]), lambda kind: RefinedModels.load(folder / "refinement" / kind))
+        lifting = next(found.lifting for name in ("koopman_edmd", "linear_edmd") if (found := sets.get(name)) is not None)
+        calibration = PhaseCalibration.load(folder / "calibration") if lifting.parameters else None
+        return cls(population, facts, lifting, calibration, tuple(content["kinds"]), sets, factors, refined)
+
+
+def recordings_of(folder: Path) -> Population:
+    """Open the recordings of a run folder, or of a saved result."""
+    from ..data import read_parquet
+
+    return read_parquet(recordings_path(folder))
+
+
+def recordings_path(folder: Path) -> Path:
+    """Return where the recordings of a run folder, or of a saved result, are."""
+    content: dict[str, Any] = load_artifact(folder / "population", "facts")[0]
+    return folder / str(content["recordings"])  # an absolute path stays as it is
+
+
+def edmd_kinds(lifting: Lifting) -> tuple[str, ...]:
+    """Return the paper's kinds of models."""
+    return ("koopman_edmd", "linear_edmd") if lifting.functions + lifting.input_functions else ("linear_edmd",)

@@ -1,0 +1,267 @@
+"""The verb: from a population's recordings to models of every unit.
+
+recordings --survey--> training episodes --calibrate--> parameters of the lifting
+training episodes --one pass--> factors --EDMD, one regularisation for all--> koopman_edmd, linear_edmd in every condition
+in the condition that feeds synthesis --refined on free-run error--> koopman, linear
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError, IdentificationError
+from ..core.linalg import radius_text
+from ..core.work import Work
+from ..data.population import EpisodeKey, Population
+from ..data.survey import RecordingFacts, check_usable, survey
+from ..lifting import Lifting
+from .calibrate import calibrate
+from .edmd import KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
+from .excitation import require_excitation, require_independent
+from .factors import Factor, combine, lifted_factor, reduce_episode
+from .identified import EpisodeFactors, IdentifiedModels, edmd_kinds
+from .model_set import ModelSet
+from .phase import PhaseCalibration
+from .presets import lifting_settings, resolve_lifting, resolve_phase
+from .ranges import Ranges
+from .refine import RefinedModels, RefineOptions, refine_population
+from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
+from .spread import peak_residual_db
+
+log = logging.getLogger(__name__)
+_DOUBLINGS = 12
+_POINTS = 60  # frequencies at which the models of units are compared
+Array = npt.NDArray[np.float64]
+Task = tuple[Population, tuple[EpisodeKey, ...], Lifting]
+
+
+def identify(
+    population: Population,
+    lifting: Lifting | LiftingSettings | Mapping[str, Any] | Sequence[str] | None = None,
+    *,
+    identify_on: str | None = None,
+    test: Iterable[str] | None = None,
+    calibration: PhaseCalibration | CalibrationSettings | Mapping[str, Any] | None = None,
+    facts: RecordingFacts | None = None,
+    work: Work | None = None,
+    **settings: Any,
+) -> IdentifiedModels:
+    """Identify Koopman and linear models of every unit of a population.
+
+    Parameters
+    ----------
+    population : Population
+    lifting : sequence of str, mapping, Lifting or None
+        Lifted functions, such as ``["sin(100*position + phase)"]``, or a table as ``[lifting]`` of a study. Default: that of the plant
+        that the recordings name, else linear models alone.
+    identify_on : str, optional
+        Condition that feeds synthesis; default ``noload``, else the first.
+    test : iterable of str, optional
+        Names of held-out episodes; default the last tenth of each unit and condition.
+    calibration : mapping or PhaseCalibration, optional
+        How the lifting's parameter ``phase`` is calibrated, as ``[calibrate]`` of a study, or its known values.
+    facts : RecordingFacts, optional
+        Of a `survey` that was made already.
+    work : Work, optional
+        Where it runs.
+    **settings
+        Of `IdentifySettings`: ``alpha``, ``alpha_factor``, ``refine``, ``largest_residual``, ``margin``.
+
+    Returns
+    -------
+    IdentifiedModels
+
+    Raises
+    ------
+    DataError, ConfigError
+        When recordings or settings cannot be used.
+    IdentificationError
+        When no stable models are found, or too few units can be calibrated.
+    """
+    asked, work = IdentifySettings.of(settings, "Identify"), work or Work()
+    if facts is None:
+        check_usable(population, test, identify_on, single_allowed=True)
+        population, facts = survey(population, test, identify_on, work=work)
+    known = isinstance(calibration, PhaseCalibration)
+    declared = CalibrationSettings() if known else CalibrationSettings.of(calibration or {}, "Calibrate")
+    found = lifting if isinstance(lifting, Lifting) else resolve_lifting(lifting_settings(lifting), declared, population, test)
+    if not known:
+        spec = resolve_phase(declared, population, found)
+        calibration = None if spec is None else calibrate(population, facts, spec, work)
+    base = IdentifiedModels(population, facts, found, calibration if isinstance(calibration, PhaseCalibration) else None)
+    sets, factors, refined = dict[str, ModelSet](), dict[str, EpisodeFactors](), dict[str, RefinedModels]()
+    for condition in base.conditions:
+        factors[condition], models, found_out = identify_condition(base, condition, asked, work)
+        sets |= {base.place(m.name, condition): m for m in models}
+        refined |= found_out
+    kinds = tuple(kind.removesuffix("_edmd") for kind in base.edmd_kinds) if asked.refine else ()
+    return replace(base, kinds=kinds + base.edmd_kinds, sets=sets, factors=factors, refined=refined)
+
+
+def identify_condition(
+    base: IdentifiedModels, condition: str, settings: IdentifySettings, work: Work
+) -> tuple[EpisodeFactors, list[ModelSet], dict[str, RefinedModels]]:
+    """Reduce the training episodes of one condition, and identify every kind of model from them."""
+    population, facts, own = base.population, base.facts, base.parameters
+    units = [u for u in facts.groups if u in own and facts.keys("train", u, condition)]
+    tasks = [(population.select([u], [condition]), facts.keys("train", u, condition), base.lifting) for u in units]
+    episodes = list(work.map(f"identify ({condition})", reduce_episodes, tasks))
+    factor = Factor.stack([combine(f) for f in episodes])
+    parameters = {name: np.array([own[u][name] for u in units]) for name in base.lifting.parameters}
+    models, refined = identify_models(base, condition, units, factor, parameters, settings), dict[str, RefinedModels]()
+    if settings.refine and condition == facts.identify_on:
+        better, refined = refine_models(base, units, factor, parameters, models, settings, work)
+        models += better
+    longest_s = max(int(f.n_samples.max()) for f in episodes) * population.sample_period_s
+    rows = tuple((k.unit, k.episode) for u in units for k in facts.keys("train", u, condition))
+    together = Factor(*(np.concatenate([getattr(f, name) for f in episodes]) for name in ("R", "peak", "n_samples")))
+    return EpisodeFactors(condition, rows, together), [replace(m, longest_s=longest_s) for m in models], refined
+
+
+def reduce_episodes(task: Task) -> Factor:
+    """Reduce every episode of a task to its factor, stacked on the first axis."""
+    population, keys, lifting = task
+    factors = []
+    for key in keys:
+        try:
+            factors.append(reduce_episode(*population.read_parts(key), lifting))
+        except DataError as error:
+            raise DataError(f"Identifying from {key}: {error}") from error
+    return Factor.stack(factors)
+
+
+def identify_models(
+    base: IdentifiedModels, condition: str, units: list[str], factor: Factor, parameters: dict[str, Array], settings: IdentifySettings
+) -> list[ModelSet]:
+    """Identify every kind of model of one condition with one common regularisation."""
+    population, on = base.population, condition == base.facts.identify_on
+    liftings = {kind: base.lifting if kind.startswith("koopman") else Lifting(base.lifting.states) for kind in edmd_kinds(base.lifting)}
+    factors = {kind: lifted_factor(factor, base.lifting, parameters, lifting) for kind, lifting in liftings.items()}
+    pooled = np.array([u in base.facts.pooled for u in units])
+    rows = pooled if pooled.any() else slice(None)
+    ranges = {kind: Ranges.of(factors[kind], lifting.n_lifted, rows) for kind, lifting in liftings.items()}
+    alpha = settings.alpha
+    if alpha == "auto":
+        shared = [(ranges[kind].triangles(factors[kind].R[rows]), lifting.n_lifted) for kind, lifting in liftings.items()]
+        edge = smallest_stabilising_alpha(shared, settings.margin)
+        times = alpha_factor(shared, edge, settings) if on else settings.alpha_factor
+        alpha = times * edge
+        note = "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
+        log.info(note, condition, alpha, times)
+    require_excitation(factor, population.inputs, units, condition, float(alpha))
+    if alpha == 0:
+        for kind, lifting in liftings.items():
+            require_independent(factors[kind], lifting.names + population.inputs + lifting.input_functions, units, condition)
+    models = []
+    for kind, lifting in liftings.items():
+        nothing = np.zeros((len(units), 0, 0))
+        unfitted = ModelSet(
+            name=kind,
+            condition=condition,
+            lifting=lifting,
+            channels=population.channels,
+            sample_period_s=population.sample_period_s,
+            unit_ids=tuple(units),
+            A=nothing,
+            B=nothing,
+            parameters=parameters if lifting.parameters else {},
+            residual_covariance=nothing,
+            output_scale=ranges[kind].outputs,
+            input_scale=ranges[kind].inputs,
+            alpha=float(alpha),
+            alpha_in_ranges=settings.alpha == "auto",
+        )
+        models.append(fitted(unfitted, factors[kind], settings.margin))
+    if on:
+        for found in models:
+            require_stable(found, pooled)
+    return models
+
+
+def fitted(models: ModelSet, factor: Factor, margin: float) -> ModelSet:
+    """Return a set of models fitted to factors of its units; a regularisation that was searched acts on channels divided by their ranges."""
+    matrices = models.fit(factor.R)
+    radius = models.ranges.normalise(matrices).spectral_radius()
+    return replace(
+        models,
+        A=matrices.A,
+        B=matrices.B,
+        residual_covariance=residual_covariance(factor.R, models.lifting.n_lifted, matrices, factor.n_samples),
+        status=tuple("ok" if r < 1 - margin else f"unstable, spectral radius {radius_text(r)}" for r in radius),
+    )
+
+
+def alpha_factor(shared: list[tuple[Array, int]], edge: float, settings: IdentifySettings) -> float:
+    """Return how many times the smallest stabilising coefficient is taken: doubled until units are near enough for an uncertain set around one of them.
+
+    Where no factor brings them near enough, the configured one stays.
+    """
+    limit = 20 * np.log10(settings.largest_residual)
+    for doubled in range(_DOUBLINGS if edge > 0 else 0):
+        factor = settings.alpha_factor * 2.0**doubled
+        models = [edmd(R, n, factor * edge) for R, n in shared]
+        if not any(peak_residual_db(m.A, m.B, np.ones(m.B.shape[1]), np.ones(m.B.shape[2]), _POINTS) > limit for m in models):
+            return factor
+    return settings.alpha_factor
+
+
+def refine_models(
+    base: IdentifiedModels,
+    units: list[str],
+    factor: Factor,
+    parameters: dict[str, Array],
+    starts: list[ModelSet],
+    settings: IdentifySettings,
+    work: Work,
+) -> tuple[list[ModelSet], dict[str, RefinedModels]]:
+    """Refine every kind of model on free-run error, the population first, then each unit with a prior centred on it.
+
+    Beside the models come what the refinement found out: the pooled model, the trade-off, the information matrices.
+    """
+    facts = base.facts
+    keys = {u: facts.keys("train", u, facts.identify_on) for u in units}
+    pooled = np.array([u in facts.pooled for u in units])
+    factors = [lifted_factor(factor, base.lifting, parameters, start.lifting) for start in starts]
+    tasks = [
+        partial(refine_population, base.population, keys, start.lifting, start.parameters, lifted, pooled, refine_options(settings))
+        for start, lifted in zip(starts, factors, strict=True)
+    ]
+    refined = work.run("identify (refine)", tasks)
+    models = [with_matrices(*three) for three in zip(starts, (found.units for found in refined), factors, strict=True)]
+    return models, {m.name: found for m, found in zip(models, refined, strict=True)}
+
+
+def refine_options(settings: IdentifySettings) -> RefineOptions:
+    """Return the options of the refinement that settings ask for."""
+    return RefineOptions(margin=max(settings.margin, RefineOptions().margin), largest_residual=settings.largest_residual)
+
+
+def with_matrices(start: ModelSet, matrices: KoopmanMatrices, lifted: Factor) -> ModelSet:
+    """Return a refined model set with the names, scales and phases of the one it started from."""
+    return replace(
+        start,
+        name=start.name.removesuffix("_edmd"),
+        A=matrices.A,
+        B=matrices.B,
+        residual_covariance=residual_covariance(lifted.R, start.lifting.n_lifted, matrices, lifted.n_samples),
+        alpha=None,
+        alpha_in_ranges=False,
+        status=("ok",) * len(start.unit_ids),
+    )
+
+
+def require_stable(models: ModelSet, pooled: npt.NDArray[np.bool_]) -> None:
+    """Refuse unstable models where they feed the synthesis."""
+    for unit, status, counts in zip(models.unit_ids, models.status, pooled, strict=True):
+        if counts and status != "ok":
+            raise IdentificationError(
+                f"Identifying {models.name} of unit {unit} ({models.condition}) with alpha = {models.alpha:g}: the model is {status}; "
+                "set identify.alpha = 'auto', or raise it."
+            )

@@ -1,0 +1,85 @@
+"""Outlier scores of a population: every unit against the others, in every condition."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ...identify.identified import IdentifiedModels
+from ..settings import UncertaintySettings
+from .model import OutlierModel, score_outliers
+from .recorded import Recorded
+from .score import OutlierScore
+
+log = logging.getLogger(__name__)
+
+
+def score_population(models: IdentifiedModels, settings: UncertaintySettings) -> tuple[dict[str, OutlierModel], list[dict[str, Any]]]:
+    """Score every unit against the others in every condition, whatever group it is filed under.
+
+    Returns
+    -------
+    dict of str to OutlierModel
+        By the place of the models in `IdentifiedModels.sets`.
+    list of dict
+        One row a score, see `score_row`.
+    """
+    found: dict[str, OutlierModel] = {}
+    rows: list[dict[str, Any]] = []
+    for condition in models.population.conditions:
+        place = models.place(models.edmd_kinds[0], condition)
+        if place not in models.sets:
+            continue
+        own = models.sets[place]
+        if len(own.unit_ids) < 3:
+            log.info("%s: outlier scores need at least three units, found %d", condition, len(own.unit_ids))
+            continue
+        freqs = own.frequencies(settings.n_freqs)
+        recorded = Recorded.of(models.factors[condition], own, freqs)
+        evidence = list(recorded.units.values())
+        outliers = score_outliers(
+            recorded.response(evidence),
+            freqs,
+            settings.outlier_form,
+            unit_ids=own.unit_ids,
+            output_scale=own.output_scale,
+            input_scale=own.input_scale,
+            false_alarm_rate=settings.false_alarm_rate,
+            deviations=[recorded.deviations(e) for e in evidence],
+        )
+        judged = tuple(recorded.judged(*pair) for pair in zip(outliers.scores, evidence, strict=True))
+        found[place] = outliers = replace(outliers, scores=judged)
+        for score, data in zip(outliers.scores, evidence, strict=True):
+            keys, used = (models.facts.keys(part, score.unit, condition) for part in ("test", "train"))
+            seconds = data.n_samples * own.sample_period_s * (1 + len(keys) / len(used))  # episodes that are held out, like the others
+            rows.append(score_row(score, condition, len(keys) + len(used), seconds))
+    return found, rows
+
+
+def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:
+    """Return a score as a row of metrics.
+
+    Parameters
+    ----------
+    score : OutlierScore
+    condition : str
+    episodes : int
+        Recorded, those that are held out among them.
+    recorded_s : float, s
+
+    Returns
+    -------
+    dict
+        ``unit, condition, score, threshold`` (dB), ``outlier``; ``status``; where the score comes from; ``detectable``, the smallest change of gain
+        that would have been flagged in percent, with ``detectable_db``, ``detectable_hz`` and ``detectable_entry`` (output, input); ``episodes`` and
+        ``recorded_s``, and what would be needed of both.
+    """
+    row = {"unit": score.unit, "condition": condition, "score": score.score_db, "threshold": score.threshold_db, "outlier": score.outlier}
+    row |= {key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db", "agreement")}
+    row |= {"status": score.status, "detectable": score.detectable_percent}
+    row |= {key: getattr(score, key) for key in ("detectable_db", "detectable_hz", "detectable_entry")}
+    needed = {"needed_episodes": int(np.ceil(episodes * score.more_data)), "needed_s": recorded_s * score.more_data}
+    return row | {"episodes": episodes, "recorded_s": recorded_s} | needed

@@ -1,0 +1,176 @@
+"""The verb: from models of every unit to how the units differ.
+
+models --scored against one another--> outliers, which may be dropped
+models of the others --smallest peak residual--> nominal --residuals, covered by weights--> one uncertain set a kind of model
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.artifacts import load_artifact, read_json, save_artifact, write_json
+from ..core.errors import IdentificationError
+from ..core.loading import loader
+from ..core.work import Work
+from ..identify import ModelSet
+from ..identify.identified import IdentifiedModels, Stored
+from .forms import Form, residual
+from .model import UncertainModel
+from .nominal.choice import choose_nominals
+from .outliers.model import OutlierModel
+from .outliers.population import score_population
+from .residuals import sigma_max
+from .settings import UncertaintySettings
+from .systems import quantify_systems
+
+_KIND = "choice"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class UncertainModels:
+    """What `kros.quantify` returns.
+
+    Parameters
+    ----------
+    models : IdentifiedModels
+        Where it comes from, with the recordings.
+    nominal, worst_off_nominal : str
+        Units: the one that all others are compared with, and the one farthest from it.
+    dropped : tuple of str
+        Units that were left out as outliers.
+    sets : mapping of str to UncertainModel
+        By kind of model.
+    scores : tuple of dict
+        Outlier scores, one row a unit and condition.
+    outliers : mapping of str to OutlierModel
+        By place of the models in `models.sets`.
+    max_order : int
+        Highest order of a weight.
+    """
+
+    models: IdentifiedModels
+    nominal: str
+    worst_off_nominal: str
+    dropped: tuple[str, ...]
+    sets: Mapping[str, UncertainModel]
+    scores: tuple[dict[str, Any], ...] = ()
+    outliers: Mapping[str, OutlierModel] = field(default_factory=dict)
+    max_order: int = 4
+
+    def __repr__(self) -> str:
+        flagged = sum(bool(row["outlier"]) for row in self.scores)
+        return (
+            f"<UncertainModels: {', '.join(self.sets)} around unit {self.nominal}, {flagged} of {len(self.scores)} outlier scores flagged>"
+        )
+
+    def save(self, folder: Path | str) -> None:
+        """Write all of it, with models and recordings, in the layout of a run folder."""
+        self.models.save(folder)
+        self.save_sets(Path(folder))
+
+    def save_sets(self, folder: Path) -> None:
+        """Write the uncertain sets and the outlier scores, without models and recordings."""
+        for kind, uncertain in self.sets.items():
+            uncertain.save(folder / "uncertainty" / kind)
+        for place, outliers in self.outliers.items():
+            outliers.save(folder / "outliers" / place)
+        write_json(folder / "outliers" / "scores.json", {"schema": 1, "rows": self.scores})
+        content: dict[str, Any] = {"nominal": self.nominal, "worst_off_nominal": self.worst_off_nominal, "dropped": self.dropped}
+        content |= {"kinds": list(self.sets), "outliers": list(self.outliers), "max_order": self.max_order}
+        save_artifact(folder / "uncertainty", _KIND, content)
+
+    @classmethod
+    @loader
+    def load(cls, folder: Path) -> UncertainModels:
+        """Read what `save` wrote, or a run folder."""
+        return cls.load_sets(Path(folder), IdentifiedModels.load(folder))
+
+    @classmethod
+    def load_sets(cls, folder: Path, models: IdentifiedModels) -> UncertainModels:
+        """Read what `save_sets` wrote, of models that are there already."""
+        content, _ = load_artifact(folder / "uncertainty", _KIND)
+        sets = Stored(tuple(content["kinds"]), lambda kind: UncertainModel.load(folder / "uncertainty" / kind))
+        outliers = Stored(tuple(content["outliers"]), lambda place: OutlierModel.load(folder / "outliers" / place))
+        scores = tuple(read_json(folder / "outliers" / "scores.json")["rows"])
+        dropped, order = tuple(content["dropped"]), content["max_order"]
+        return cls(models, content["nominal"], content["worst_off_nominal"], dropped, sets, scores, outliers, order)
+
+
+def quantify(models: IdentifiedModels, *, work: Work | None = None, **settings: Any) -> UncertainModels:
+    """Quantify how the units of a population differ.
+
+    Parameters
+    ----------
+    models : IdentifiedModels
+        Of `kros.identify`.
+    work : Work, optional
+        Where it runs.
+    **settings
+        Of `UncertaintySettings`: ``form``, ``nominal``, ``structure``, ``n_freqs``, ``max_order``, ``tolerance_db``, ``drop_outliers``,
+        ``outlier_form``, ``false_alarm_rate``.
+
+    Returns
+    -------
+    UncertainModels
+
+    Raises
+    ------
+    IdentificationError
+        When fewer than two units are left, or the nominal is none of them.
+    """
+    asked = UncertaintySettings.of(settings, "Quantify")
+    outliers, scores = score_population(models, asked)
+    dropped = {row["unit"] for row in scores if row["outlier"]} if asked.drop_outliers else set()
+    first = models.models()
+    units = [u for u in models.facts.pooled if u in first.unit_ids and u not in dropped]
+    if len(units) < 2:
+        raise IdentificationError(
+            f"Uncertainty: {len(units)} units are left of {len(models.facts.pooled)}, at least two are needed; dropped are {sorted(dropped)}."
+        )
+    nominal = choose_unit(first, units, asked)
+    tasks = [partial(quantify_models, models.models(kind), units, asked, nominal) for kind in models.kinds]
+    sets = dict(zip(models.kinds, (work or Work()).run("quantify", tasks), strict=True))
+    farthest = worst_off_nominal(first, sets[models.kinds[0]])
+    return UncertainModels(models, nominal, farthest, tuple(sorted(dropped)), sets, tuple(scores), outliers, asked.max_order)
+
+
+def choose_unit(models: ModelSet, units: list[str], settings: UncertaintySettings) -> str:
+    """Return the nominal unit: the one asked for, else the best of the first kind of models, which all others share as in the paper."""
+    if settings.nominal is None:
+        responses = models.scaled_responses(models.frequencies(settings.n_freqs), units)
+        return units[choose_nominals(responses)[Form(settings.form)].index]
+    if settings.nominal not in units:
+        raise IdentificationError(
+            f"uncertainty.nominal = {settings.nominal!r}: is not among the units {', '.join(units)}; name one of them."
+        )
+    return settings.nominal
+
+
+def quantify_models(models: ModelSet, units: list[str], settings: UncertaintySettings, nominal: str) -> UncertainModel:
+    """Quantify one kind of model over the pooled units."""
+    return quantify_systems(
+        models.systems(units),
+        settings.form,
+        models.frequencies(settings.n_freqs),
+        unit_ids=units,
+        output_scale=models.output_scale,
+        input_scale=models.input_scale,
+        nominal=nominal,
+        structure=settings.structure,
+        max_order=settings.max_order,
+        tolerance_db=settings.tolerance_db,
+    )
+
+
+def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:
+    """Return the unit with the largest residual against the nominal one."""
+    responses = models.scaled_responses(uncertain.freqs_hz, uncertain.unit_ids)
+    peaks = sigma_max(residual(uncertain.form, responses[uncertain.nominal], responses)).max(axis=-1)
+    peaks[uncertain.nominal] = -np.inf
+    return uncertain.unit_ids[int(np.argmax(peaks))]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,16 +25,15 @@ from ..observer import (
     run_observers,
     with_memory,
 )
-from .validation import Judge, TuningSet, hidden_mean
+from .task import DesignResult, DesignTask
+from .validation import ValidationSet, hidden_mean
 
-if TYPE_CHECKING:
-    from .task import Product, Task
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 _EPISODE_S = 5.0
-_SEEN_S, _BLIND_S, _BLIND_EPISODES = 0.5, 1.5, 3
-LOST = 100.0  # percent of the largest value: an estimate that says nothing
+_SEEN_S, _DROPOUT_S, _DROPOUT_EPISODES = 0.5, 1.5, 3
+DIVERGED = 100.0  # percent of the largest value: an estimate that says nothing
 _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has no global slope bounds
 
 
@@ -43,14 +42,14 @@ class Running:
     """What is known about one observer as it runs: its certificate, a row for every unit, and the size of its errors.
 
     `hidden_percent` is the geometric mean over the states that are not measured of the mean error on training episodes, percent of the largest value;
-    `blind_percent` the largest error of a state in a short run in which measurements stop arriving.
+    `dropout_percent` the largest error of a state in a short run in which measurements stop arriving.
     """
 
     name: str
     certificate: ReliftCertificate
     rows: list[ReliftRow]
     hidden_percent: float
-    blind_percent: float
+    dropout_percent: float
 
     def facts(self) -> dict[str, Any]:
         """Return what goes into the metrics."""
@@ -59,62 +58,53 @@ class Running:
             "relift_certified": found.certified,
             "relift_gain": found.gain,
             "hidden_error_percent": self.hidden_percent,
-            "blind_error_percent": self.blind_percent,
+            "blind_error_percent": self.dropout_percent,
         }
         if not found.certified:
             return facts | {"relift_reason": found.reason}
         return facts | {"relift_mismatch_gain": found.mismatch_gain, "relift_bound_worst": max((r.bound for r in self.rows), default=None)}
 
 
-def certify_running(tasks: Sequence[Task], products: Sequence[Product]) -> list[Running]:
-    """Certify the observers of one kind of model.
-
-    Parameters
-    ----------
-    tasks, products : sequence of Task, of Product
-        Of one kind of model; what could not be made is left out.
-    """
-    observers = [task.observer(p.synthesis) for task, p in zip(tasks, products, strict=True) if p.synthesis is not None]
-    if not observers:
-        return []
-    task = tasks[0]
-    judge = first_episodes(task.tuning).read().first(_EPISODE_S / task.models.sample_period_s)
-    found = {r.name: r for group in by_lifting(observers) for r in running_of(group, judge, task)}
+def certify_running(task: DesignTask, results: Sequence[DesignResult]) -> list[Running]:
+    """Certify observers of one kind of model; `task` is that of any of them, and what could not be made is left out."""
+    observers = [found.observer for found in results if found.observer is not None]
+    data = task.training.first_of_units().read().first(_EPISODE_S / task.models.sample_period_s)
+    found = {r.name: r for group in by_lifting(observers) for r in running_of(group, data, task)}
     return [found[observer.name] for observer in observers]
 
 
 def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:
-    """Return observers in groups that can run side by side: those with a memory have states of their own."""
+    """Return observers in groups that can run side by side: predictors have states of their own."""
     groups: dict[Lifting, list[Observer]] = {}
     for observer in observers:
         groups.setdefault(observer.lifting, []).append(observer)
     return list(groups.values())
 
 
-def running_of(observers: Sequence[Observer], judge: Judge, task: Task) -> list[Running]:
+def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[Running]:
     """Certify observers of one lifting, and compare with what they do; certificates come back in the recordings' units."""
-    first, batch = observers[0], judge.batch
-    values, units = judge.parameters if first.lifting.parameters else None, [key.unit for key in batch.keys]
-    scales = scales_of(observers, judge, task)
+    first, batch = observers[0], data.batch
+    values, units = data.parameters if first.lifting.parameters else None, [key.unit for key in batch.keys]
+    scales = scales_of(observers, data, task)
     certificates = [certify(observer, own, task) for observer, own in zip(observers, scales, strict=True)]
-    estimates = run_observers(observers, judge.measurements(first.measured), batch.inputs, values)
+    estimates = run_observers(observers, data.measurements(first.measured), batch.inputs, values)
     rows = [
         relift_report(c, o, batch.states, batch.inputs, units, batch.lengths, values, estimates=x) if c.certified else []
         for o, c, x in zip(observers, certificates, estimates, strict=True)
     ]
-    hidden = hidden_mean(judge.compare(estimates), first.measured)
-    blind = blind_percent(observers, judge, task.models.sample_period_s)
+    hidden = hidden_mean(data.compare(estimates), first.measured)
+    dropout = dropout_error_percent(observers, data, task.models.sample_period_s)
     certificates = [c.in_sizes(o, {}) for o, c in zip(observers, certificates, strict=True)]
-    return [Running(o.name, c, r, float(h), float(b)) for o, c, r, h, b in zip(observers, certificates, rows, hidden, blind, strict=True)]
+    return [Running(o.name, c, r, float(h), float(b)) for o, c, r, h, b in zip(observers, certificates, rows, hidden, dropout, strict=True)]
 
 
-def scales_of(observers: Sequence[Observer], judge: Judge, task: Task) -> list[ReliftScales]:
+def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[ReliftScales]:
     """Return the sizes that every observer's gain refers to: ranges, the residual of its own model in this population, quantisation."""
     known: dict[bytes, ReliftScales] = {}
     for observer in observers:
         model, n = observer.A.tobytes() + observer.B.tobytes(), len(observer.recorded)
         if model not in known:
-            values, batch = judge.parameters if observer.lifting.parameters else None, judge.batch
+            values, batch = data.parameters if observer.lifting.parameters else None, data.batch
             driven = with_memory(observer, batch.states, batch.inputs, values)
             residual = one_step_residual(observer.lifting, observer.A, observer.B, driven, batch.inputs, values)[..., :n]
             typical = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
@@ -122,22 +112,16 @@ def scales_of(observers: Sequence[Observer], judge: Judge, task: Task) -> list[R
     return [known[observer.A.tobytes() + observer.B.tobytes()] for observer in observers]
 
 
-def first_episodes(tuning: TuningSet) -> TuningSet:
-    """Return the first training episode of every unit."""
-    firsts = {key.unit: key for key in reversed(tuning.keys)}
-    return replace(tuning, keys=tuple(key for key in tuning.keys if firsts[key.unit] == key))
-
-
-def blind_percent(observers: Sequence[Observer], judge: Judge, dt: float) -> Array:
+def dropout_error_percent(observers: Sequence[Observer], data: ValidationSet, dt: float) -> Array:
     """Return the largest error of a state in percent of the largest value where measurements stop arriving, shape (observer,); infinite where it grows on."""
-    short, first = judge.part(range(min(_BLIND_EPISODES, len(judge.batch.keys)))).first((_SEEN_S + _BLIND_S) / dt), observers[0]
+    short, first = data.part(range(min(_DROPOUT_EPISODES, len(data.batch.keys)))).first((_SEEN_S + _DROPOUT_S) / dt), observers[0]
     y = short.measurements(first.measured)
     y[round(_SEEN_S / dt) :] = np.nan
     values = short.parameters if first.lifting.parameters else None
     return np.asarray(short.compare(run_observers(observers, y, short.batch.inputs, values)).max(axis=-1))
 
 
-def certify(observer: Observer, scales: ReliftScales, task: Task) -> ReliftCertificate:
+def certify(observer: Observer, scales: ReliftScales, task: DesignTask) -> ReliftCertificate:
     """Certify one observer everywhere, or in an operating box where slopes have no bound of their own."""
     found = relift_certificate(observer, scales=scales)
     if found.status is ReliftStatus.UNBOUNDED:
@@ -157,7 +141,7 @@ def certify(observer: Observer, scales: ReliftScales, task: Task) -> ReliftCerti
 def save_running(folder: Path, found: Sequence[Running]) -> None:
     """Write certificates and rows below the folder of the observers."""
     rows = {r.name: [row.as_dict() for row in r.rows] for r in found}
-    told = {r.name: {"assumptions": r.certificate.assumptions, "method": r.certificate.method} for r in found}
-    save_artifact(folder, "relift", {"rows": rows, "certificates": told})
+    notes = {r.name: {"assumptions": r.certificate.assumptions, "method": r.certificate.method} for r in found}
+    save_artifact(folder, "relift", {"rows": rows, "certificates": notes})
     for running in found:
         running.certificate.save(folder / "relift" / running.name)

@@ -32,7 +32,7 @@ from ..observer import (
 from ..observer.baselines.restarts import restarted
 from ..observer.screen import Screen
 from .gains import EQUAL, RESIDUAL
-from .validation import TuningSet, rank
+from .validation import TrainingSet, rank
 
 Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, Array]
@@ -60,17 +60,17 @@ class Baseline:
         States that it estimates.
     facts : dict
         For the records.
-    bears_missing : bool
+    takes_missing : bool
         Whether it knows what to do where a measurement is missing; others get the last one that arrived.
     seen : Seen, optional
-        Largest sizes in training: samples are judged as those of an observer are.
+        Largest sizes in training: samples are datad as those of an observer are.
     """
 
     by_unit: Mapping[str, Estimator]
     measured: tuple[int, ...]
     estimated: tuple[int, ...]
     facts: dict[str, Any]
-    bears_missing: bool = False
+    takes_missing: bool = False
     seen: Seen | None = None
 
     def run(self, batch: EpisodeBatch, parameters: Parameters) -> Array:
@@ -93,10 +93,10 @@ class Baseline:
         return found
 
     def _piece(self, estimator: Estimator, y: Array, u: Array, parameters: Parameters) -> Array:
-        return estimator.run(y if self.bears_missing else hold_missing(y), u, parameters)
+        return estimator.run(y if self.takes_missing else hold_missing(y), u, parameters)
 
 
-def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) -> Baseline:
+def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Array) -> Baseline:
     """Tune the extended Kalman filter of a nominal model: process noise over eight decades, of two shapes, all run side by side.
 
     Raises
@@ -104,7 +104,7 @@ def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) 
     SynthesisError
         When every candidate diverges on the training episodes.
     """
-    judge, lifting, n = tuning.read(), models.lifting, models.lifting.n_states
+    data, lifting, n = training.read(), models.lifting, models.lifting.n_states
     row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
     shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2), RESIDUAL: models.residual_covariance.mean(axis=0)[:n, :n]}
     sized = {name: shape * like_measurement_noise(shape[np.ix_(C, C)], R) for name, shape in shapes.items()}
@@ -114,7 +114,7 @@ def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) 
     filters = ExtendedKalman(
         lifting, models.A[row], models.B[row], models.measured, models.recorded_inputs, np.stack([Q for *_, Q in tried]), R, start, values
     )
-    short = judge.first(_EXTENDED_S / models.sample_period_s)
+    short = data.first(_EXTENDED_S / models.sample_period_s)
     percents = [
         error_percent(estimate, short.batch.states, short.batch.lengths).mean(axis=0)
         for estimate in filters.run_all(short.measurements(models.measured), short.batch.inputs, short.parameters)
@@ -127,10 +127,10 @@ def make_extended(tuning: TuningSet, models: ModelSet, unit: str, noise: Array) 
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
     shape_name, level, Q = tried[first]
     facts = {"status": "tuned", "process_noise_level": 10**level, "process_noise_shape": shape_name}
-    return Baseline({"": replace(filters, Q=Q)}, models.measured, tuple(range(n)), facts, bears_missing=True, seen=tuning.seen)
+    return Baseline({"": replace(filters, Q=Q)}, models.measured, tuple(range(n)), facts, takes_missing=True, seen=training.seen)
 
 
-def make_difference(tuning: TuningSet, measured: tuple[int, ...]) -> Baseline:
+def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
     """Choose the cut-off of the filtered difference and find its scale.
 
     Which state is the rate of which measurement the recordings say, and units of measure such as rad and rad/s where these do not.
@@ -140,8 +140,8 @@ def make_difference(tuning: TuningSet, measured: tuple[int, ...]) -> Baseline:
     ConfigError
         When no state is found to be the rate of a measured one.
     """
-    population, judge = tuning.population, tuning.read()
-    states, y, lengths = judge.batch.states, judge.measurements(measured), judge.batch.lengths
+    population, data = training.population, training.read()
+    states, y, lengths = data.batch.states, data.measurements(measured), data.batch.lengths
     channels = [c for c in population.channels if c.name in population.states]
     pairs = followed(y, states, lengths, measured, population.sample_period_s)
     pairs = pairs or rates(channels, [population.states[i] for i in measured])
@@ -156,14 +156,14 @@ def make_difference(tuning: TuningSet, measured: tuple[int, ...]) -> Baseline:
     best: tuple[float, FilteredDifference] | None = None
     for cutoff in cutoffs_hz(population.sample_period_s):
         trial = FilteredDifference(len(channels), pairs, float(cutoff), population.sample_period_s).scaled_to(y, states, lengths)
-        error = float(error_percent(trial.run(y, judge.batch.inputs)[..., estimated], truth, lengths).mean())
+        error = float(error_percent(trial.run(y, data.batch.inputs)[..., estimated], truth, lengths).mean())
         if best is None or error < best[0]:
             best = (error, trial)
     assert best is not None
-    return Baseline({"": best[1]}, measured, tuple(estimated), {"status": "tuned", "cutoff_hz": best[1].cutoff_hz}, seen=tuning.seen)
+    return Baseline({"": best[1]}, measured, tuple(estimated), {"status": "tuned", "cutoff_hz": best[1].cutoff_hz}, seen=training.seen)
 
 
-def make_learned(tuning: TuningSet, lifting: Lifting, measured: tuple[int, ...]) -> Baseline:
+def make_learned(training: TrainingSet, lifting: Lifting, measured: tuple[int, ...]) -> Baseline:
     """Train the learned estimator on the training episodes of all units, once for every unit without it.
 
     Raises
@@ -171,11 +171,11 @@ def make_learned(tuning: TuningSet, lifting: Lifting, measured: tuple[int, ...])
     DataError
         When every state is measured, there is one unit only, or episodes are too short.
     """
-    judge = tuning.read()
-    batch, y = judge.batch, judge.measurements(measured)
+    data = training.read()
+    batch, y = data.batch, data.measurements(measured)
     features = Features.of(lifting, measured, y, batch.inputs)
     units = [key.unit for key in batch.keys]
-    moments = Moments.of(features, batch.states, batch.inputs, batch.lengths, units, judge.parameters)
+    moments = Moments.of(features, batch.states, batch.inputs, batch.lengths, units, data.parameters)
     estimators: dict[str, Learned] = {unit: moments.estimator([unit]) for unit in moments.units}
     facts = {"status": "trained", "taps": features.taps, "left_out": "the unit under test"}
-    return Baseline(estimators | {"": moments.estimator()}, measured, moments.estimated, facts, seen=tuning.seen)
+    return Baseline(estimators | {"": moments.estimator()}, measured, moments.estimated, facts, seen=training.seen)

@@ -1,10 +1,18 @@
-"""The methods of a study, in one table: in which order they are told, which start first, which is handed over, and which models they are for."""
+"""The methods of observer design, in one table: what they do, in which order they are named, which start first, and which are preferred."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+
+from ..core.errors import SynthesisError
+from .gains import design_kalman_tuned, design_kalman_white, design_luenberger, design_open_loop
+from .predictor import design_predictor
+from .published import design_published
+from .residual_shaped import design_residual_h2
+from .robust import design_mixed, design_worst_case_h2, design_worst_case_hinf
+from .task import DesignResult, DesignTask
 
 log = logging.getLogger(__name__)
 
@@ -16,15 +24,18 @@ class Method:
     Parameters
     ----------
     name : str
+    design : callable
+        From a task to a result.
     seconds : float
         Roughly what it takes: those that take longest start first, so that no worker waits for them in the end.
     rank : int
-        The observer of the lowest rank is handed over where the study names none.
+        The observer of the lowest rank is deployed where none is named and others are no better.
     not_refined, refined_only : str
         Why it is not made for refined models, or for these alone; empty where it is made for all.
     """
 
     name: str
+    design: Callable[[DesignTask], DesignResult]
     seconds: float
     rank: int
     not_refined: str = ""
@@ -32,30 +43,39 @@ class Method:
 
 
 _LIFTED = "the paper's problem spends its correction on lifted modes that the observer as it runs does not have"
+_FITTED = "it is fitted to recordings, not to models, and would be that of the refined ones again"
 METHODS = (
-    Method("open_loop", 0.0, 9),
-    Method("kalman_white", 0.0, 8),
-    Method("kalman_tuned", 1.0, 6),
-    Method("luenberger", 0.5, 7),
-    Method("mixed", 0.9, 3, _LIFTED),
-    Method("paper", 1.5, 10, _LIFTED),
-    Method("worst_case_h2", 4.0, 1),
-    Method("worst_case_hinf", 8.0, 2),
-    Method("residual_h2", 2.0, 4),
-    Method("memory", 5.0, 5, refined_only="it is fitted to recordings, not to models, and would be that of the refined ones again"),
+    Method("open_loop", design_open_loop, 0.0, 9),
+    Method("kalman_white", design_kalman_white, 0.0, 8),
+    Method("kalman_tuned", design_kalman_tuned, 1.0, 6),
+    Method("luenberger", design_luenberger, 0.5, 7),
+    Method("mixed", design_mixed, 0.9, 3, not_refined=_LIFTED),
+    Method("paper", design_published, 1.5, 10, not_refined=_LIFTED),
+    Method("worst_case_h2", design_worst_case_h2, 4.0, 1),
+    Method("worst_case_hinf", design_worst_case_hinf, 8.0, 2),
+    Method("residual_h2", design_residual_h2, 2.0, 4),
+    Method("memory", design_predictor, 5.0, 5, refined_only=_FITTED),
 )
-_BY_NAME = {method.name: method for method in METHODS}
+BY_NAME = {method.name: method for method in METHODS}
 
 
-def suitable(wanted: Iterable[str], model: str, refined: bool) -> list[Method]:
+def design(task: DesignTask) -> DesignResult:
+    """Design one observer; a failure is a result too, with its reason."""
+    try:
+        return BY_NAME[task.method].design(task)
+    except SynthesisError as error:
+        return DesignResult(task.name, None, None, {"status": "failed", "reason": str(error)}, task.problem)
+
+
+def suitable(wanted: Iterable[str], kind: str, refined: bool) -> list[Method]:
     """Return the methods that are made for a kind of model, in the order of the table; those that are left out are logged with the reason."""
     found = []
     for method in METHODS:
         if method.name in set(wanted):
             if refined and method.not_refined:
-                log.info("%s/%s is not made for refined models: %s.", model, method.name, method.not_refined)
+                log.info("%s/%s is not made for refined models: %s.", kind, method.name, method.not_refined)
             elif method.refined_only and not refined:
-                log.info("%s/%s is made for refined models alone: %s.", model, method.name, method.refined_only)
+                log.info("%s/%s is made for refined models alone: %s.", kind, method.name, method.refined_only)
             else:
                 found.append(method)
     return found
@@ -63,10 +83,10 @@ def suitable(wanted: Iterable[str], model: str, refined: bool) -> list[Method]:
 
 def slowest_first(names: list[str]) -> list[int]:
     """Return the order in which to start methods."""
-    return sorted(range(len(names)), key=lambda i: -_BY_NAME[names[i]].seconds)
+    return sorted(range(len(names)), key=lambda i: -BY_NAME[names[i]].seconds)
 
 
 def preferred(observers: list[str]) -> str | None:
-    """Return the first observer ``<model>/<method>`` of the lowest rank; None where no method is of the table."""
-    ranks = {name: _BY_NAME[name.rpartition("/")[2]].rank for name in observers if name.rpartition("/")[2] in _BY_NAME}
+    """Return the first observer ``<kind of model>/<method>`` of the lowest rank; None where no method is of the table."""
+    ranks = {name: BY_NAME[name.rpartition("/")[2]].rank for name in observers if name.rpartition("/")[2] in BY_NAME}
     return min(ranks, key=lambda name: ranks[name], default=None)

@@ -1,68 +1,57 @@
-"""Maker of the observer with a memory: identified from training episodes, tuned on most of them, and kept as it was where tuning does no good."""
+"""The observer with states of its own: a predictor identified from training episodes by a subspace method, tuned where that is better."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..core.errors import KrosError, SynthesisError
 from ..lifting import Lifting
 from ..observer import Observer, driven_coordinates, observer_with_memory
-from ..synthesis import Status
-from .certificates import LOST
-from .residual_shaped import OwnModel
+from ..synthesis import Status, Synthesis
+from .certificates import DIVERGED
+from .task import DesignResult, DesignTask
 from .tuned import tuned_where_better
-from .validation import Judge, hidden_mean
+from .validation import ValidationSet, hidden_mean
 
-if TYPE_CHECKING:
-    from .task import Made, Task
-
+UNCOVERED = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
 _CIRCLE = {"sin": "cos", "cos": "sin"}
-_REASON = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
 
 
-def make_memory(task: Task) -> Made:
+def design_predictor(task: DesignTask) -> DesignResult:
     """An observer whose hidden states are identified from the past of what it sees, with states that remember it.
 
     Raises
     ------
     SynthesisError
-        Where the lifting reads what is not measured or past, everything is measured, recordings are too short, or the observer loses the machine.
+        Where the lifting reads what is not measured or past, everything is measured, recordings are too short, or the observer diverges.
     """
-    began, judge = time.perf_counter(), task.tuning.read()
+    began, data = time.perf_counter(), task.training.read()
     recipe = partial(identified, task, on_the_circle(task.models.lifting))
     try:
-        kept, facts = tuned_where_better(
-            task, judge, recipe(judge, iterations=0), lambda seen, _: recipe(seen), partial(in_coordinates, task)
-        )
+        kept, facts = tuned_where_better(task, data, recipe(data, iterations=0), lambda seen, _: recipe(seen), partial(in_coordinates, task))
     except (KrosError, np.linalg.LinAlgError) as error:
         raise SynthesisError(str(error)) from error
-    percent = float(hidden_mean(judge.percent(kept), kept.measured))
-    if not percent < LOST:
+    percent = float(hidden_mean(data.percent(kept), kept.measured))
+    if not percent < DIVERGED:
         raise SynthesisError(
-            f"Observer with a memory: it loses the machine on training episodes (error {percent:.3g} % of the largest value); "
+            f"Subspace-identified predictor: it diverges on training episodes (error {percent:.3g} % of the largest value); "
             "lifted functions that say nearly the same as the measurement do that, take them out of the lifting."
         )
-    solve_s = time.perf_counter() - began
-    model: dict[str, Any] = {
-        "A": kept.A,
-        "B": kept.B,
-        "lifting": kept.lifting,
-        "reason": _REASON,
-        "replaces": kept.replaces,
-        "internal": kept.internal,
-    }
-    made = OwnModel("memory", kept.controller, Status.CERTIFIED, kept.injection, solve_s=solve_s, **model)
-    return made, {"memory_states": task.memory.states, **facts}, task.problem
+    synthesis = Synthesis("memory", kept.controller, Status.CERTIFIED, kept.injection, solve_s=time.perf_counter() - began)
+    facts = {"memory_states": task.predictor.states, **facts}
+    nominal = {name: float(values[task.models.index(task.unit)]) for name, values in task.models.parameters.items()}
+    observer = replace(kept, parameters=nominal, seen=task.training.seen)
+    return DesignResult(task.name, observer, synthesis, facts, task.problem, UNCOVERED)
 
 
-def identified(task: Task, lifting: Lifting, judge: Judge, **options: Any) -> Observer:
+def identified(task: DesignTask, lifting: Lifting, data: ValidationSet, **options: Any) -> Observer:
     """Return the observer that episodes give; `options` as in `observer_with_memory`."""
-    models, batch = task.models, judge.batch
+    models, batch = task.models, data.batch
     return observer_with_memory(
         task.name,
         lifting,
@@ -73,10 +62,10 @@ def identified(task: Task, lifting: Lifting, judge: Judge, **options: Any) -> Ob
         batch.lengths,
         [key.unit for key in batch.keys],
         models.sample_period_s,
-        judge.parameters if lifting.parameters else None,
-        task.memory.states,
-        [task.memory.importance.get(name, 1.0) for i, name in enumerate(models.lifting.states) if i not in models.measured],
-        **({"episodes": task.memory.episodes, "iterations": task.memory.steps} | options),
+        data.parameters if lifting.parameters else None,
+        task.predictor.states,
+        [task.predictor.importance.get(name, 1.0) for i, name in enumerate(models.lifting.states) if i not in models.measured],
+        **({"episodes": task.predictor.episodes, "iterations": task.predictor.steps} | options),
     )
 
 
@@ -90,8 +79,8 @@ def on_the_circle(lifting: Lifting) -> Lifting:
     return replace(lifting, functions=tuple(dict.fromkeys(functions)))
 
 
-def in_coordinates(task: Task, judge: Judge, observer: Observer) -> Observer:
+def in_coordinates(task: DesignTask, data: ValidationSet, observer: Observer) -> Observer:
     """Return the observer in coordinates in which recordings drive its memory."""
-    values = judge.parameters if observer.lifting.parameters else None
+    values = data.parameters if observer.lifting.parameters else None
     sizes = task.models.output_scale[: len(observer.recorded)]
-    return driven_coordinates(observer, judge.batch.states, judge.batch.inputs, sizes, values)
+    return driven_coordinates(observer, data.batch.states, data.batch.inputs, sizes, values)

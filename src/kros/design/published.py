@@ -1,21 +1,17 @@
-"""Maker of the paper's own observer: its weights, entry by entry, in its mixed problem."""
+"""The paper's own observer: its weights, entry by entry, in its mixed problem."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ..core.lti import StateSpace, gain
 from ..synthesis import Injection, ObserverProblem, mixed
 from ..uncertainty import EntrywiseWeight, Structure, quantify_systems
 
-if TYPE_CHECKING:
-    from .task import Made, Task
+from .task import DesignResult, DesignTask
 
-
-def make_paper(task: Task) -> Made:
+def design_published(task: DesignTask) -> DesignResult:
     """Mixed synthesis with a weight for every entry of the residual in front of a full perturbation, as in the paper's Figures 8 and 10.
 
     Such weights do not cover the residuals (`EntrywiseWeight.unstructured_excess` says by how much); what the record calls certified is the filter, on
@@ -28,14 +24,14 @@ def make_paper(task: Task) -> Made:
     """
     problem = task.require_problem()
     weight = entrywise_weight(task)
-    found = mixed(as_published(problem, weight.matrix()), time_limit_s=task.time_limit_s)
+    found = mixed(as_published(problem, weight.matrix()), time_limit_s=task.settings.time_limit_s)
     excess = weight.unstructured_excess
     note = f"The weights bound entries: they are exceeded {excess:.3g} times in front of a full perturbation."
-    told = replace(found, method="paper", worst_case_h2=None, quadrature_error=None, notes=(*found.notes, note))
-    return told, {"unstructured_excess": excess}, task.problem
+    published = replace(found, method="paper", worst_case_h2=None, quadrature_error=None, notes=(*found.notes, note))
+    return task.designed(published, unstructured_excess=excess)
 
 
-def entrywise_weight(task: Task) -> EntrywiseWeight:
+def entrywise_weight(task: DesignTask) -> EntrywiseWeight:
     """Return bounds of all entries of the residuals of the units that the study's own set covers."""
     models = task.models
     found = quantify_systems(

@@ -1,31 +1,29 @@
-"""Population tuning in a study: an observer improved on training episodes, kept as it was where anything speaks against that."""
+"""An observer improved on training episodes, kept as it was where anything speaks against that."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..core.errors import DataError, KrosError
 from ..data.population import EpisodeKey
 from ..observer import Observer, relift_certificate
-from .certificates import LOST, blind_percent, scales_of
-from .validation import Judge, hidden_mean
-
-if TYPE_CHECKING:
-    from .task import Task
+from .certificates import DIVERGED, dropout_error_percent, scales_of
+from .task import DesignTask
+from .validation import ValidationSet, hidden_mean
 
 log = logging.getLogger(__name__)
 
 
 def tuned_where_better(
-    task: Task,
-    judge: Judge,
+    task: DesignTask,
+    data: ValidationSet,
     start: Observer,
-    tune: Callable[[Judge, Observer], Observer],
-    settle: Callable[[Judge, Observer], Observer] = lambda _, observer: observer,
+    tune: Callable[[ValidationSet, Observer], Observer],
+    settle: Callable[[ValidationSet, Observer], Observer] = lambda _, observer: observer,
 ) -> tuple[Observer, dict[str, Any]]:
     """Tune an observer on most training episodes, and return what is better on the others.
 
@@ -34,8 +32,8 @@ def tuned_where_better(
 
     Parameters
     ----------
-    task : Task
-    judge : Judge
+    task : DesignTask
+    data : ValidationSet
         Training episodes.
     start : Observer
     tune : callable
@@ -49,20 +47,20 @@ def tuned_where_better(
     dict
         For the records: whether the tuned one was kept, and the errors that decided.
     """
-    held = held_out(judge.batch.keys)
-    unseen = judge.part([i for i in range(len(held)) if held[i]])
-    first = judge.part([i for i, key in enumerate(judge.batch.keys) if key.unit not in {k.unit for k in judge.batch.keys[:i]}])
+    held = held_out(data.batch.keys)
+    unseen = data.part([i for i in range(len(held)) if held[i]])
+    first = data.part([i for i, key in enumerate(data.batch.keys) if key.unit not in {k.unit for k in data.batch.keys[:i]}])
     try:
         if all(held):
             raise DataError("tuning needs a second training episode, to be judged on.")
-        tuned = tune(judge.part([i for i in range(len(held)) if not held[i]]), start)
+        tuned = tune(data.part([i for i in range(len(held)) if not held[i]]), start)
     except (KrosError, np.linalg.LinAlgError) as error:
         log.info("%s stays as it was: %s", task.name, error)
         return settle(first, start), {"tuned": False}
     before, after = hidden_mean(unseen.percent_of_all([start, tuned]), start.measured).tolist()
-    blind = blind_percent([start, tuned], first, task.models.sample_period_s)
+    without = dropout_error_percent([start, tuned], first, task.models.sample_period_s)
     settled = settle(first, tuned)
-    better = after <= before and bool(blind[1] < LOST or blind[0] >= LOST)
+    better = after <= before and bool(without[1] < DIVERGED or without[0] >= DIVERGED)
     kept = better and relift_certificate(settled, scales=scales_of([settled], first, task)[0], mismatch=False).certified
     facts = {"tuned": kept, "held_out_percent": {"before": before, "after": after}}
     return settled if kept else settle(first, start), facts

@@ -1,16 +1,19 @@
-"""Training episodes as a judge: every tuned observer is chosen on the same ones, held-out episodes never take part."""
+"""Training episodes that observers are tuned and chosen on: the same ones for all, and never those that are held out."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
+from ..data.scaled import scale_population
 from ..evaluate import error_percent
+from ..identify import ModelSet
+from ..identify.identified import IdentifiedModels
 from ..observer import Observer, Seen, run_observer, run_observers
 
 Array = npt.NDArray[np.float64]
@@ -21,23 +24,42 @@ SIDE_BY_SIDE = 20  # keeps a study of twelve units below 200 MB
 
 
 @dataclass(frozen=True, eq=False)
-class TuningSet:
-    """The first training episodes of some units, cut short, with each unit's lifting parameters; `seen` are the sizes in all training episodes."""
+class TrainingSet:
+    """Training episodes of some units, with each unit's lifting parameters; `seen` are the sizes in all training episodes."""
 
     population: Population
     keys: tuple[EpisodeKey, ...]
     parameters: dict[str, dict[str, float]]
     seen: Seen | None = None
 
-    def read(self) -> Judge:
-        """Read the episodes."""
+    @classmethod
+    def of(cls, identified: IdentifiedModels, models: ModelSet) -> TrainingSet:
+        """Take some of the first units, and of each some episodes from the first to the last: those recorded one after the other may be alike."""
+        facts, known = identified.facts, identified.parameters
+        units = [u for u in facts.pooled if u in models.unit_ids][:TUNING_UNITS]
+        keys = tuple(k for u in units for k in spread(facts.keys("train", u, facts.identify_on), TUNING_EPISODES))
+        return cls(identified.population.select(units), keys, {u: known[u] for u in units}, seen_by(identified, models.measured))
+
+    def normalised(self, models: ModelSet) -> TrainingSet:
+        """Return the same in channels divided by the ranges of models."""
+        outputs, inputs = models.output_scale[list(models.measured)], models.input_scale[: len(models.recorded_inputs)]
+        seen = None if self.seen is None else self.seen.times(1 / outputs, 1 / inputs)
+        return replace(self, population=scale_population(self.population, models.sizes), seen=seen)
+
+    def first_of_units(self) -> TrainingSet:
+        """Return the first episode of every unit."""
+        firsts = {key.unit: key for key in reversed(self.keys)}
+        return replace(self, keys=tuple(key for key in self.keys if firsts[key.unit] == key))
+
+    def read(self) -> ValidationSet:
+        """Read the episodes, cut short."""
         limit = round(TUNING_S / self.population.sample_period_s)
         batch = EpisodeBatch.read(self.population, self.keys, limit, self.parameters)
-        return Judge(batch)
+        return ValidationSet(batch)
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
+class ValidationSet:
     """Training episodes in memory."""
 
     batch: EpisodeBatch
@@ -47,13 +69,13 @@ class Judge:
         """Lifting parameters, shape (batch,) each."""
         return self.batch.parameters
 
-    def first(self, n_samples: float) -> Judge:
+    def first(self, n_samples: float) -> ValidationSet:
         """Return the same episodes, cut to so many samples."""
-        return Judge(self.batch.head(round(n_samples)))
+        return ValidationSet(self.batch.head(round(n_samples)))
 
-    def part(self, rows: Sequence[int]) -> Judge:
+    def part(self, rows: Sequence[int]) -> ValidationSet:
         """Return some of the episodes."""
-        return Judge(self.batch.take(rows))
+        return ValidationSet(self.batch.take(rows))
 
     def measurements(self, measured: Sequence[int]) -> Array:
         """Return the measured states, shape (n_samples, batch, q)."""
@@ -79,6 +101,19 @@ class Judge:
         n = self.batch.states.shape[-1]
         found = [error_percent(estimate[..., :n], self.batch.states, self.batch.lengths).mean(axis=0) for estimate in estimates]
         return np.where(np.isfinite(found), found, np.inf)
+
+
+def seen_by(identified: IdentifiedModels, measured: Sequence[int]) -> Seen:
+    """Return the sizes of the measured states and of the inputs, beyond which an observer believes less."""
+    states, inputs, sizes = identified.population.states, identified.population.inputs, identified.sizes
+    return Seen(np.array([sizes[states[i]] for i in measured]), np.array([sizes[name] for name in inputs]))
+
+
+def spread(keys: Sequence[EpisodeKey], count: int) -> list[EpisodeKey]:
+    """Return so many episodes from the first to the last."""
+    if len(keys) <= count:
+        return list(keys)
+    return [keys[i] for i in np.linspace(0, len(keys) - 1, count).round().astype(int)]
 
 
 def hidden_mean(values: Array, measured: Sequence[int]) -> Array:

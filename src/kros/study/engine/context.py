@@ -12,6 +12,7 @@ from ...identify import PhaseSpec
 from ...identify.identified import IdentifiedModels, recordings_of
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...lifting import Lifting
+from ...uncertainty.quantify import UncertainModels
 from ..config import StudyConfig
 from .store import Store
 
@@ -48,3 +49,8 @@ class Context:
     def identified(self) -> IdentifiedModels:
         """What the identify stage left."""
         return IdentifiedModels.load_models(self.store.folder, self.population, self.facts)
+
+    @cached_property
+    def uncertain(self) -> UncertainModels:
+        """What the quantify stage left."""
+        return UncertainModels.load_sets(self.store.folder, self.identified)

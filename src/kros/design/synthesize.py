@@ -1,0 +1,290 @@
+"""The verb: from uncertain models to an observer with its certificates.
+
+    uncertain models --a task for every kind of model and method--> observers
+    observers --on every member of the uncertain set, and as they run--> certificates --the most accurate one that is safe--> deployed
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.artifacts import load_artifact, save_artifact
+from ..core.errors import ConfigError, SynthesisError
+from ..core.loading import loader
+from ..core.work import Work
+from ..identify import ModelSet
+from ..identify.identified import IdentifiedModels
+from ..observer import Observer, ReliftCertificate, in_sizes
+from ..synthesis import ObserverProblem, Synthesis
+from ..uncertainty.quantify import UncertainModels
+from .certificates import DIVERGED, Running, certify_running
+from .methods import BY_NAME, design, preferred, slowest_first, suitable
+from .settings import ObserverSettings, PredictorSettings, SynthesisSettings
+from .task import DesignResult, DesignTask
+from .uncertain_set import certificate, usable_problem
+from .validation import TrainingSet
+
+log = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
+_AS_GOOD = 1.01  # ratio of errors that is no reason to prefer one observer to another
+_SURROUNDED = "worst_case_h2"  # all observers of a kind of model are certified with the disturbance model of this one, where it is designed
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Design:
+    """One observer with what is known about it, in the recordings' units.
+
+    Parameters
+    ----------
+    name : str
+        ``<kind of model>/<method>``.
+    observer : Observer
+    synthesis : Synthesis
+    certificate : ReliftCertificate
+        Of the observer as it runs, re-lifted at every step; it says itself whether it holds.
+    facts : dict
+        What the metrics of a study say.
+    """
+
+    name: str
+    observer: Observer
+    synthesis: Synthesis
+    certificate: ReliftCertificate
+    facts: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        error, holds = self.facts.get("hidden_error_percent"), "certified" if self.certificate.certified else "not certified"
+        return f"<Design {self.name}: {self.facts['order']} states beside the recorded ones, training error {error:.3g} %, {holds} as it runs>"
+
+    @property
+    def lower_bound(self) -> float | None:
+        """No observer of this kind has a smaller worst-case norm; None where nothing is proven."""
+        return self.synthesis.lower_bound if self.synthesis.bounded_in_h2 else None
+
+    def save(self, folder: Path | str) -> None:
+        """Write the observer, its synthesis and its certificate."""
+        folder = Path(folder)
+        self.observer.save(folder / "observer.json")
+        self.synthesis.save(folder / "synthesis")
+        self.certificate.save(folder / "certificate")
+        save_artifact(folder, "design", {"name": self.name, "facts": self.facts})
+
+    @classmethod
+    @loader
+    def load(cls, folder: Path) -> Design:
+        """Read what `save` wrote."""
+        folder = Path(folder)
+        content, _ = load_artifact(folder, "design")
+        synthesis, proof = Synthesis.load(folder / "synthesis"), ReliftCertificate.load(folder / "certificate")
+        return cls(content["name"], Observer.load(folder / "observer.json"), synthesis, proof, content["facts"])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Designs:
+    """All observers of a population.
+
+    Parameters
+    ----------
+    designs : mapping of str to Design
+        By name, those that could be made.
+    deployed : str
+        The one that goes into machines.
+    facts : dict
+        What is known about every observer by name, the reason among it where one could not be made.
+    running : tuple of Running
+        Certificates as they run, with what they say about every unit.
+    """
+
+    designs: Mapping[str, Design]
+    deployed: str
+    facts: Mapping[str, dict[str, Any]]
+    running: tuple[Running, ...]
+
+    def __repr__(self) -> str:
+        return f"<Designs: {', '.join(self.designs)}; deployed is {self.deployed}>"
+
+
+def synthesize(
+    uncertain: UncertainModels,
+    method: str | None = None,
+    *,
+    observer: Mapping[str, Any] | None = None,
+    predictor: Mapping[str, Any] | None = None,
+    robust: bool = False,
+    work: Work | None = None,
+    **settings: Any,
+) -> Design:
+    """Design an observer for a population.
+
+    Parameters
+    ----------
+    uncertain : UncertainModels
+        Of `kros.quantify`.
+    method : str, optional
+        A method such as ``worst_case_h2``, for the first kind of model that it is for, or a name such as ``koopman_edmd/mixed``. Default: all are
+        tried, and the most accurate one on training episodes that is certified as it runs and tolerates dropouts is returned.
+    observer, predictor : mapping, optional
+        As ``[observer]`` and ``[predictor]`` of a study.
+    robust : bool
+        Whether only observers that are certified for the uncertain set are deployed, where there are any.
+    work : Work, optional
+        Where it runs.
+    **settings
+        Of `SynthesisSettings`: ``methods``, ``injection``, ``input_weight``, ``noise``, ``penalty``, ``max_states``, ``tune``, ``time_limit_s``.
+
+    Returns
+    -------
+    Design
+
+    Raises
+    ------
+    SynthesisError
+        When it cannot be made, with the reason.
+    ConfigError
+        When there is no such method.
+    """
+    asked = SynthesisSettings.of(settings, "Synthesize")
+    among, of = ObserverSettings.of(observer or {}, "Synthesize, observer"), PredictorSettings.of(predictor or {}, "Synthesize, predictor")
+    if method is None:
+        found = synthesize_all(uncertain, asked, among, of, robust=robust, work=work)
+        return found.designs[found.deployed]
+    name = named(uncertain, method)
+    kind, _, short = name.rpartition("/")
+    with_set = {short, _SURROUNDED} if _SURROUNDED in asked.methods else {short}
+    tasks = tasks_of(uncertain, kind, with_set, asked, of)
+    results = designed(tasks, work or Work())
+    failed = {found.name: found.facts["reason"] for found in results if found.observer is None}
+    if name in failed:
+        raise SynthesisError(f"{name} could not be made: {failed[name]}")
+    return certified(tasks, results, work or Work())[0][name]
+
+
+def synthesize_all(
+    uncertain: UncertainModels,
+    settings: SynthesisSettings | None = None,
+    observer: ObserverSettings | None = None,
+    predictor: PredictorSettings | None = None,
+    *,
+    robust: bool = False,
+    work: Work | None = None,
+) -> Designs:
+    """Design all observers that settings ask for, certify them, and choose the one that is deployed.
+
+    Raises
+    ------
+    SynthesisError
+        When none can be made, or not the one that is to be deployed.
+    """
+    settings, observer, predictor, work = (
+        settings or SynthesisSettings(),
+        observer or ObserverSettings(),
+        predictor or PredictorSettings(),
+        work or Work(),
+    )
+    wanted = {*observer.baselines, *settings.methods}
+    tasks = [task for kind in uncertain.models.kinds for task in tasks_of(uncertain, kind, wanted, settings, predictor)]
+    results = designed(tasks, work)
+    for task, found in zip(tasks, results, strict=True):
+        if found.observer is None and found.facts["reason"] != task.refusal:
+            log.warning("%s could not be made: %s", task.name, found.facts["reason"])
+    designs, running = certified(tasks, results, work)
+    facts = {found.name: dict(designs[found.name].facts) if found.name in designs else dict(found.facts) for found in results}
+    eligible = robust_of(running, facts) if robust else running
+    return Designs(designs, choose_deployed(observer.deployed, list(designs), eligible), facts, tuple(running))
+
+
+def named(uncertain: UncertainModels, method: str) -> str:
+    """Return the full name of an observer: that of a method for the first kind of model that it is for."""
+    kinds, edmd = uncertain.models.kinds, uncertain.models.edmd_kinds
+    every = [f"{kind}/{m.name}" for kind in kinds for m in suitable(BY_NAME, kind, refined=kind not in edmd)]
+    found = [name for name in every if method in (name, name.rpartition("/")[2])]
+    if not found:
+        raise ConfigError(f"Synthesize: there is no method {method!r}; known are {', '.join(every)}.")
+    return found[0]
+
+
+def tasks_of(
+    uncertain: UncertainModels, kind: str, wanted: Iterable[str], settings: SynthesisSettings, predictor: PredictorSettings
+) -> list[DesignTask]:
+    """Return a task for every observer of one kind of model, in channels divided by their ranges."""
+    identified = uncertain.models
+    recorded, own = identified.models(kind), uncertain.sets[kind]
+    models = recorded.normalised()
+    noise = measurement_noise(identified, recorded, settings) / recorded.output_scale[list(recorded.measured)]
+    problem, refusal = usable_problem(models, own, noise, settings)
+    shared: dict[str, Any] = {"models": models, "unit": uncertain.nominal, "problem": problem, "refusal": refusal, "noise": noise}
+    shared |= {"training": TrainingSet.of(identified, recorded).normalised(recorded), "covered": own.unit_ids}
+    shared |= {"max_order": uncertain.max_order, "settings": settings, "predictor": predictor}
+    methods = suitable(wanted, kind, refined=kind not in identified.edmd_kinds)
+    return [DesignTask(f"{kind}/{method.name}", method.name, **shared) for method in methods]
+
+
+def measurement_noise(identified: IdentifiedModels, models: ModelSet, settings: SynthesisSettings) -> Array:
+    """Return the standard deviation of every measurement's noise: as declared, else that of the quantisation found in the data."""
+    names = [models.lifting.states[i] for i in models.measured]
+    return np.array([settings.noise.get(n, identified.facts.resolution[n] / np.sqrt(12)) for n in names])
+
+
+def designed(tasks: list[DesignTask], work: Work) -> list[DesignResult]:
+    """Design the observers of all tasks; those that take longest start first, so that no worker waits for them in the end."""
+    order = slowest_first([task.method for task in tasks])
+    made = dict(zip(order, work.map("synthesize", design, [tasks[i] for i in order]), strict=True))
+    return [made[i] for i in range(len(tasks))]
+
+
+def certified(tasks: list[DesignTask], results: list[DesignResult], work: Work) -> tuple[dict[str, Design], list[Running]]:
+    """Certify the observers that were made: on every member of the uncertain set, and as they run."""
+    pairs = [(task, found) for task, found in zip(tasks, results, strict=True) if found.observer is not None]
+    on_the_set = work.run("certify", [partial(certificate, task, found, certified_problem(task, pairs)) for task, found in pairs])
+    kinds = [[pair for pair in pairs if pair[0].models.name == kind] for kind in dict.fromkeys(task.models.name for task in tasks)]
+    as_they_run = [partial(certify_running, kind[0][0], [found for _, found in kind]) for kind in kinds if kind]
+    running = [one for of_kind in work.run("certify as it runs", as_they_run) for one in of_kind]
+    by_name = {one.name: one for one in running}
+    designs = {}
+    for (_, found), holds in zip(pairs, on_the_set, strict=True):
+        assert found.observer is not None
+        assert found.synthesis is not None
+        observer, one = in_sizes(found.observer, {}), by_name[found.name]
+        synthesis = replace(found.synthesis, controller=observer.controller)
+        designs[found.name] = Design(found.name, observer, synthesis, one.certificate, {**found.facts, **holds, **one.facts()})
+    return designs, running
+
+
+def certified_problem(task: DesignTask, pairs: Sequence[tuple[DesignTask, DesignResult]]) -> ObserverProblem | None:
+    """Return the set that all observers of a kind of model are certified for: that of its worst-case synthesis, where there is one."""
+    for other, found in pairs:
+        if other.models.name == task.models.name and other.method == _SURROUNDED:
+            return found.problem
+    return task.problem
+
+
+def choose_deployed(wanted: str | None, made: list[str], running: Sequence[Running]) -> str:
+    """Return the observer that is deployed: the one asked for, else the most accurate one that is certified as it runs and tolerates dropouts.
+
+    Accuracy is that on training episodes, of the states that are not measured. Where no observer tolerates dropouts, those that are certified
+    compete; where there is none either, the best guarantee of the best model decides.
+    """
+    if wanted is not None:
+        if wanted not in made:
+            raise SynthesisError(f"observer.deployed = {wanted!r}: there is no such observer, only {', '.join(made)}; name one of them.")
+        return wanted
+    safe = [r for r in running if r.certificate.certified and np.isfinite(r.hidden_percent)]
+    candidates = [r for r in safe if r.dropout_percent < DIVERGED] or safe
+    least = min((r.hidden_percent for r in candidates), default=np.inf)
+    best = preferred([r.name for r in candidates if r.hidden_percent <= _AS_GOOD * least] or made)
+    if best is None:
+        raise SynthesisError("No observer could be made; see the reasons above.")
+    return best
+
+
+def robust_of(running: Sequence[Running], facts: Mapping[str, Mapping[str, Any]]) -> Sequence[Running]:
+    """Return the observers that are certified for the uncertain set; all where none is."""
+    return [r for r in running if facts[r.name].get("worst_case_h2") is not None] or running

@@ -1,0 +1,70 @@
+"""What the uncertain set says about an observer, however it was designed."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import SynthesisError
+from ..identify import ModelSet
+from ..synthesis import Injection, ObserverProblem, check_units
+from ..synthesis.worst_case.certificate import certify
+from ..uncertainty import UncertainModel
+from .settings import SynthesisSettings
+from .task import DesignResult, DesignTask
+
+log = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
+WORST_CASE = ("worst_case_h2", "worst_case_hinf")
+
+
+def usable_problem(
+    models: ModelSet, uncertain: UncertainModel, noise: Array, settings: SynthesisSettings
+) -> tuple[ObserverProblem | None, str]:
+    """Return the synthesis problem of one kind of model, or None and why there is none."""
+    try:
+        problem = ObserverProblem.from_uncertain(
+            models, uncertain, noise, injection=Injection(settings.injection), correction_penalty=settings.penalty
+        )
+        problem.require_sound()
+        return problem, ""
+    except SynthesisError as error:
+        log.warning("%s: there are no robust observers and no certificates: %s", models.name, error)
+        return None, str(error)
+
+
+def certificate(task: DesignTask, found: DesignResult, problem: ObserverProblem | None) -> dict[str, Any]:
+    """Return what holds for an observer on every member of the set, and whether it holds for every unit's model."""
+    observer, synthesis = found.observer, found.synthesis
+    assert observer is not None
+    assert synthesis is not None
+    order = observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
+    facts: dict[str, Any] = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
+    if found.uncovered:
+        return facts | {"reason": found.uncovered}
+    if problem is None:
+        return facts | {"reason": task.refusal}
+    problem = replace(problem, injection=synthesis.injection)
+    loop = float(problem.error_system(synthesis.controller).spectral_radius())
+    facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
+    try:
+        facts["worst_case_h2"] = certify(problem, synthesis.controller)[0]
+        return facts | (of_units(task, found, problem) if task.method in WORST_CASE else {})
+    except SynthesisError as error:
+        log.warning("%s: no certificate, %s", task.name, error)
+        return facts | {"reason": str(error)}
+
+
+def of_units(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> dict[str, Any]:
+    """Return the bound in the other norm, and whether both hold for the models of all units."""
+    assert found.synthesis is not None
+    units = check_units(problem, found.synthesis.controller, task.models.systems(task.covered), task.covered)
+    if not units.holds:
+        log.warning("%s: the error of a unit's model is %.3g times its certified bound", task.name, units.largest_ratio)
+    gain = units.worst_case_hinf if np.isfinite(units.worst_case_hinf) else None
+    facts = {"worst_case_hinf": gain, "causal_h2": found.synthesis.causal_h2, "bound_holds": units.holds}
+    return facts | {"unit_to_bound_max": units.largest_ratio, "unit_to_density_max": float(units.density_ratio.max(initial=0.0))}

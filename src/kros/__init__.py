@@ -2,6 +2,8 @@
 
 Recordings of nominally identical machines go in; one observer that works on all of them comes out, with a statement of how well and why.
 
+    recordings --kros.read--> population --kros.identify--> models --kros.quantify--> uncertain models --kros.synthesize--> observer
+
 Importing this package imports nothing else: ``kros.synthesis``, ``kros.uncertainty`` and the others load when first used.
 """
 
@@ -28,7 +30,14 @@ _SUBPACKAGES = (
     "uncertainty",
 )
 
-_VERBS = {"read": "data", "from_arrays": "data", "from_frame": "data"}  # name -> subpackage
+_VERBS = {
+    "read": "data",
+    "from_arrays": "data",
+    "from_frame": "data",
+    "quantify": "uncertainty",
+    "synthesize": "design",
+    "run": "study",
+}  # beside `identify`, a subpackage that can be called
 
 __all__ = ["__version__", *_SUBPACKAGES, *_VERBS]
 

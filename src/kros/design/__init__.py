@@ -1,1 +1,6 @@
 """Observer design: from uncertain models to an observer, by any method, with what is certified about it."""
+
+from .settings import ObserverSettings, PredictorSettings, SynthesisSettings
+from .synthesize import Design, Designs, synthesize, synthesize_all
+
+__all__ = ["Design", "Designs", "ObserverSettings", "PredictorSettings", "SynthesisSettings", "synthesize", "synthesize_all"]

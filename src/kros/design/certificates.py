@@ -28,7 +28,6 @@ from ..observer import (
 from .task import DesignResult, DesignTask
 from .validation import ValidationSet, hidden_mean
 
-
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 _EPISODE_S = 5.0

@@ -33,7 +33,9 @@ def design_predictor(task: DesignTask) -> DesignResult:
     began, data = time.perf_counter(), task.training.read()
     recipe = partial(identified, task, on_the_circle(task.models.lifting))
     try:
-        kept, facts = tuned_where_better(task, data, recipe(data, iterations=0), lambda seen, _: recipe(seen), partial(in_coordinates, task))
+        kept, facts = tuned_where_better(
+            task, data, recipe(data, iterations=0), lambda seen, _: recipe(seen), partial(in_coordinates, task)
+        )
     except (KrosError, np.linalg.LinAlgError) as error:
         raise SynthesisError(str(error)) from error
     percent = float(hidden_mean(data.percent(kept), kept.measured))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+
 import numpy as np
 
 from ..core.lti import StateSpace, gain
 from ..synthesis import Injection, ObserverProblem, mixed
 from ..uncertainty import EntrywiseWeight, Structure, quantify_systems
-
 from .task import DesignResult, DesignTask
+
 
 def design_published(task: DesignTask) -> DesignResult:
     """Mixed synthesis with a weight for every entry of the residual in front of a full perturbation, as in the paper's Figures 8 and 10.

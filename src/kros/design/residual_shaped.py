@@ -38,7 +38,9 @@ def design_residual_h2(task: DesignTask) -> DesignResult:
     ranks = task.ranked(observers)
     best = first_of(ranks)
     if not np.isfinite(ranks[best][1]):
-        raise SynthesisError("Residual-shaped observer: it diverges on the training episodes, where it is retracted and re-lifted at every step.")
+        raise SynthesisError(
+            "Residual-shaped observer: it diverges on the training episodes, where it is retracted and re-lifted at every step."
+        )
     facts: dict[str, Any] = {
         "training_error_to_open_loop": ranks[best][1],
         "order_reduction_percent": syntheses[best].gap_percent,

@@ -14,7 +14,7 @@ from ..core.errors import SynthesisError
 from ..synthesis import Injection, ObserverProblem, Synthesis, mixed, reduce_controller, worst_case_h2, worst_case_hinf
 from ..synthesis.worst_case.causal import causal_h2
 from ..uncertainty import fit_magnitude
-from .disturbance_model import IDENTITY, TUNED, DisturbanceModel, candidates
+from .disturbance_model import TUNED, DisturbanceModel, candidates
 from .task import DesignResult, DesignTask, first_of
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +36,9 @@ def design_worst_case_h2(task: DesignTask) -> DesignResult:
     rough = partial(worst_case_h2, tolerance_db=3.0, refinements=0, fit=remembering(fit_magnitude), causal=False)
     model = best_model(task, problem, partial(rough, bounded=False, max_order=1))
     assumed = model.of(problem)
-    _, synthesis = best_design(task, [partial(rough, assumed, max_order=order) for order in (1, 2)])  # order 2 in the search takes twice as long
+    _, synthesis = best_design(
+        task, [partial(rough, assumed, max_order=order) for order in (1, 2)]
+    )  # order 2 in the search takes twice as long
     synthesis = replace(synthesis, causal_h2=causal_h2(assumed, synthesis.controller))
     return task.designed(of_few_states(task, assumed, synthesis), assumed, **model.facts())
 

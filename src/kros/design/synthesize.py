@@ -1,7 +1,7 @@
 """The verb: from uncertain models to an observer with its certificates.
 
-    uncertain models --a task for every kind of model and method--> observers
-    observers --on every member of the uncertain set, and as they run--> certificates --the most accurate one that is safe--> deployed
+uncertain models --a task for every kind of model and method--> observers
+observers --on every member of the uncertain set, and as they run--> certificates --the most accurate one that is safe--> deployed
 """
 
 from __future__ import annotations
@@ -62,7 +62,9 @@ class Design:
 
     def __repr__(self) -> str:
         error, holds = self.facts.get("hidden_error_percent"), "certified" if self.certificate.certified else "not certified"
-        return f"<Design {self.name}: {self.facts['order']} states beside the recorded ones, training error {error:.3g} %, {holds} as it runs>"
+        return (
+            f"<Design {self.name}: {self.facts['order']} states beside the recorded ones, training error {error:.3g} %, {holds} as it runs>"
+        )
 
     @property
     def lower_bound(self) -> float | None:

@@ -1,4 +1,11 @@
-"""Identification: phase calibration, triangular factors, EDMD, free run. The stage's result is a `ModelSet`."""
+"""Identification: from recordings to models of every unit. ``kros.identify(population)`` calls the verb `identify` of this package.
+
+Python binds a package's name to the package, so the package itself is made callable.
+"""
+
+import sys
+from types import ModuleType
+from typing import Any
 
 from .bootstrap import ModelSamples, bootstrap_edmd, bootstrap_refined, episode_weights, one_step_deviations
 from .calibration import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
@@ -6,11 +13,15 @@ from .edmd import KoopmanMatrices, edmd, residual_covariance, smallest_stabilisi
 from .episode_factors import episode_factors
 from .factors import Factor, combine, lifted_factor, reduce_episode
 from .free_run import free_run
+from .identified import EpisodeFactors, IdentifiedModels
+from .identify import identify
 from .model_set import ModelSet
 from .ranges import Ranges
 
 __all__ = [
+    "EpisodeFactors",
     "Factor",
+    "IdentifiedModels",
     "KoopmanMatrices",
     "ModelSamples",
     "ModelSet",
@@ -27,6 +38,7 @@ __all__ = [
     "episode_weights",
     "find_segments",
     "free_run",
+    "identify",
     "lifted_factor",
     "one_step_deviations",
     "reduce_episode",
@@ -35,3 +47,14 @@ __all__ = [
     "smallest_stabilising_alpha",
     "unit_phase",
 ]
+
+
+class _CallablePackage(ModuleType):
+    """The package, which called is its verb."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> IdentifiedModels:
+        """Identify models of a population: see `kros.identify.identify`."""
+        return identify(*arguments, **options)
+
+
+sys.modules[__name__].__class__ = _CallablePackage

@@ -62,7 +62,7 @@ def _timing(context: Context, done: list[Stage], total_s: float | None) -> dict[
 def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
     facts = context.facts
     calibration = calibrate.load(context) if Stage.CALIBRATE in done else None
-    models = context.identified.models(context.identified.kinds[0]) if Stage.IDENTIFY in done else None
+    models = context.identified.models() if Stage.IDENTIFY in done else None
     rows = []
     for unit, group in facts.groups.items():
         keys = [*facts.keys("train", unit), *facts.keys("test", unit)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,9 @@ from typing import Any
 from ..core.artifacts import read_json
 from ..core.errors import ConfigError
 from ..core.work import Progress, Silent, Work
-from .config import Stage, StudyConfig
+from ..data import Population, detect_reader
+from ..observer import Observer
+from .config import Stage, StudyConfig, load_config, validate_config
 from .engine.context import Context
 from .engine.executors import open_executor
 from .engine.run_folder import load_run as load_run  # where readers of runs look for it
@@ -29,13 +32,21 @@ STEPS = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RunResult:
     """What a run left behind."""
 
     folder: Path
     metrics: dict[str, Any]
     violations: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return f"<RunResult {self.folder}: {self.metrics['study']['units']} units, deployed is {self.metrics['study'].get('deployed')}>"
+
+    @property
+    def observer(self) -> Observer:
+        """The observer that is deployed."""
+        return Observer.load(self.folder / "observers" / "deployed.json")
 
 
 def run_study(
@@ -45,6 +56,7 @@ def run_study(
     workers: int = 1,
     scheduler: str | None = None,
     progress: Progress | None = None,
+    population: Population | None = None,
 ) -> RunResult:
     """Run a study into a folder.
 
@@ -61,6 +73,8 @@ def run_study(
         Address of a Dask scheduler, instead of processes.
     progress : Progress, optional
         Told which stage runs and how far it is.
+    population : Population, optional
+        Recordings in place of those that the study names.
 
     Returns
     -------
@@ -73,26 +87,76 @@ def run_study(
     """
     out, until = Path(out), stage_of(until)
     require_own(out, config)
-    require_usable(config, until)
+    require_usable(config, until, population)
     with open_run(out, config) as store:
-        return run_in(store, config, until, workers, scheduler, progress)
+        return run_in(store, config, until, workers, scheduler, progress, population)
 
 
-def require_usable(config: StudyConfig, until: Stage) -> None:
+def run(
+    source: Population | StudyConfig | Path | str,
+    out: Path | str,
+    *,
+    until: Stage | str = Stage.REPORT,
+    workers: int = 1,
+    progress: Progress | None = None,
+    **sections: Any,
+) -> RunResult:
+    """Make a whole study into a folder, as ``kros run``.
+
+    Parameters
+    ----------
+    source : Population, Path or StudyConfig
+        Recordings as `kros.read` and `kros.from_arrays` return them, a folder of them, or a study: a TOML file or what `load_config` returns.
+    out : Path or str
+        Run folder; a stage that finds its own earlier result there is skipped.
+    until, workers, progress
+        As in `run_study`.
+    **sections
+        Tables of a study in place of its own, for example ``lifting={"functions": ["sin(100*position + phase)"]}``, or ``lifting=[...]``.
+
+    Returns
+    -------
+    RunResult
+    """
+    tables: dict[str, Any] = dict(sections)
+    if isinstance(tables.get("lifting"), list | tuple):
+        tables["lifting"] = {"functions": tables["lifting"]}
+    if isinstance(source, Population):
+        raw = {"name": Path(out).name, **tables, "data": {**tables.get("data", {}), "source": read.ARRAYS, "reader": read.ARRAYS}}
+        return run_study(validate_config(raw, Path(), "of arrays"), out, until, workers, None, progress, source)
+    if isinstance(source, StudyConfig):
+        raw, base = source.dump(), Path()
+    elif Path(source).is_dir():
+        reader = detect_reader(Path(source))
+        raw, base = {"name": Path(out).name, "data": {"source": str(source), **({} if reader is None else {"reader": reader})}}, Path()
+    else:
+        raw, base = load_config(source).dump(), Path(source).parent
+    for name, table in tables.items():
+        raw[name] = {**raw.get(name, {}), **table} if isinstance(table, Mapping) else table
+    return run_study(validate_config(raw, base, str(source)), out, until, workers, None, progress)
+
+
+def require_usable(config: StudyConfig, until: Stage, population: Population | None = None) -> None:
     """Refuse what can be refused from the names of recordings alone."""
-    population = read.open_source(config)
+    population = population or read.open_source(config)
     read.check_source(config, population, single_allowed=list(Stage).index(until) <= list(Stage).index(Stage.IDENTIFY))
     if left_out.wanted(config):
         left_out.check_folds(config, population)
 
 
 def run_in(
-    store: Store, config: StudyConfig, until: Stage, workers: int, scheduler: str | None = None, progress: Progress | None = None
+    store: Store,
+    config: StudyConfig,
+    until: Stage,
+    workers: int,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+    given: Population | None = None,
 ) -> RunResult:
     """Run a study in its run folder, which is open."""
     began = time.perf_counter()
     with open_executor(workers, scheduler) as executor:
-        context = Context(config, store, Work(executor, progress or Silent()))
+        context = Context(config, store, Work(executor, progress or Silent()), given)
         run_steps(context, STEPS, until)
         metrics = kept_metrics(store, collect_metrics(context, until, time.perf_counter() - began))
     return RunResult(store.folder, metrics, violations(config, metrics))

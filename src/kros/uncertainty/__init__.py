@@ -7,6 +7,7 @@ from .model import ResponseUncertainty, UncertainModel, scale_system
 from .nominal.choice import Criterion, NominalChoice, choose_nominal, choose_nominals
 from .outliers.model import OutlierModel, score_outliers
 from .outliers.score import OutlierScore, Status
+from .quantify import UncertainModels, quantify
 from .residuals import bounds, completion, misfit
 from .responses import quantify_responses
 from .small_matrices import sigma_max
@@ -36,6 +37,7 @@ __all__ = [
     "Structure",
     "Tightness",
     "UncertainModel",
+    "UncertainModels",
     "VariationAndNoise",
     "Weight",
     "bounds",
@@ -51,6 +53,7 @@ __all__ = [
     "magnitude_tightness",
     "misfit",
     "optimal_cover",
+    "quantify",
     "quantify_responses",
     "quantify_systems",
     "rebuild",

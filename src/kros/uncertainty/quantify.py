@@ -25,8 +25,8 @@ from .model import UncertainModel
 from .nominal.choice import choose_nominals
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
-from .residuals import sigma_max
 from .settings import UncertaintySettings
+from .small_matrices import sigma_max
 from .systems import quantify_systems
 
 _KIND = "choice"

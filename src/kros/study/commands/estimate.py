@@ -20,6 +20,7 @@ from ...observer import Observer, run_observer
 from ..config import Stage, StudyConfig, validate_config
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
+from ..stages.read import ARRAYS
 
 log = logging.getLogger(__name__)
 _BATCH = 64
@@ -34,7 +35,7 @@ def open_data(config: StudyConfig, data: Path) -> Population:
         section = validate_config({"data": raw.get("data", {})}, data.parent, str(data)).data
     else:
         section = section.model_copy(update={"source": data})
-    return read(section.source, section.reader, prepare=section.prepare, mapping=section.csv)
+    return read(section.source, None if section.reader == ARRAYS else section.reader, prepare=section.prepare, mapping=section.csv)
 
 
 def check_channels(population: Population, observer: Observer) -> None:

@@ -19,11 +19,12 @@ from .store import Store
 
 @dataclass(frozen=True)
 class Context:
-    """Surroundings of a stage."""
+    """What a stage gets: the study, its run folder, where work runs, and recordings that are given as arrays."""
 
     config: StudyConfig
     store: Store
     work: Work
+    given: Population | None = None
 
     @cached_property
     def facts(self) -> RecordingFacts:

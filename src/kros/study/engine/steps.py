@@ -6,6 +6,9 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
+
+import numpy as np
 
 from ..config import Stage, StudyConfig
 from .context import Context
@@ -89,5 +92,12 @@ def _outdate(context: Context, steps: Sequence[Step]) -> None:
 
 def _key(context: Context, step: Step, upstream: str) -> str:
     dumped = context.config.dump()
-    inputs = source_key(context.config.data.source) if step.stage is Stage.READ else ""
+    inputs = _inputs_key(context) if step.stage is Stage.READ else ""
     return hash_of([upstream, inputs, {name: dumped[name] for name in step.sections}])
+
+
+def _inputs_key(context: Context) -> str:
+    given = context.given
+    if given is None:
+        return source_key(context.config.data.source)
+    return hash_of([repr(given), [[str(k), sha256(np.ascontiguousarray(given.read(k)).tobytes()).hexdigest()] for k in given.episodes]])

@@ -14,6 +14,7 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
 from ...design.estimators import Baseline
+from ...design.synthesize import measurement_noise
 from ...evaluate import (
     Disturbance,
     DisturbedEpisodes,
@@ -28,6 +29,7 @@ from ...observer import Observer, run_observers
 from ..config import EvaluateConfig
 from ..engine.context import Context
 from .members import member_work
+from .together import alike
 
 Array = npt.NDArray[np.float64]
 FEW_UNITS, FEW_S, ALL_S = 3, 3.0, 10.0
@@ -99,7 +101,7 @@ def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, di
     record = load_artifact(context.store.path("observers"), "observers")[0]
     kind = str(record["deployed"]).rpartition("/")[0]
     names = tuple(name for name in record["names"] if everything or name.rpartition("/")[0] == kind)
-    models = context.identified.models(context.identified.kinds[0])
+    models = context.identified.models()
     firsts = {(k.unit, k.condition): k for k in reversed(keys) if roles[k.unit] != "outlier"}
     chosen = [k for k in keys if firsts.get((k.unit, k.condition)) == k and (everything or k.condition == context.facts.identify_on)]
     dt = context.population.sample_period_s
@@ -116,9 +118,7 @@ def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, di
 
 def noise_draws(context: Context, keys: Sequence[EpisodeKey], measured: Sequence[int]) -> tuple[Disturbance, ...]:
     """Return realisations of the noise that the study assumes, as declared or that of the quantisation; the largest share of a largest value counts."""
-    from .synthesize import measurement_noise
-
-    noise = measurement_noise(context, context.identified.models(context.identified.kinds[0]))
+    noise = measurement_noise(context.identified, context.identified.models(), context.config.synthesis)
     y = np.concatenate([context.population.read_parts(k)[0][:, list(measured)] for k in keys])
     size = np.abs(y).max(axis=0)
     severity = float(np.max(noise / np.where(size > 0, size, np.inf)))
@@ -134,8 +134,6 @@ def run_disturbed(
     """
     if trial is None:
         return
-    from .evaluate import alike
-
     config, folder = context.config.evaluate, context.store.draft("disturbed")
     chosen = {name: observer for name, observer in observers.items() if name in trial.names}
     groups = alike(chosen.values())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,20 +16,20 @@ from ...core.errors import KrosError
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
 from ...design.estimators import Baseline, make_difference, make_extended, make_learned
+from ...design.synthesize import measurement_noise
+from ...design.validation import TrainingSet
 from ...evaluate import ErrorSummary, summarise
 from ...identify import ModelSet, free_run
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer, run_observers
 from ..engine.context import Context
-from . import calibrate
 from .disturbed import Trial, make_trial, run_disturbed
 from .load import run_load
-from .synthesize import measurement_noise, tuning_set
+from .together import alike
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 UnitParameters = dict[str, dict[str, float]]
-_SIDE_BY_SIDE = 8  # observers of one piece of work: few enough to keep all processes busy
 _SAMPLES_AT_ONCE = 20_000_000  # of all estimates that are in memory, 160 MB
 
 
@@ -68,23 +68,6 @@ def evaluate_observers(
         estimates = run_observers(observers[start : start + together], y, batch.inputs, parameters)
         found += [_outcome(e[..., : len(population.states)], batch, population.sample_period_s, shown) for e in estimates]
     return found
-
-
-def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
-    """Return observers in groups that can run side by side: of one lifting, with the same parameters, measured states and inputs."""
-    groups: list[list[Observer]] = []
-    for observer in observers:
-        key = _model_of(observer)
-        group = next((g for g in groups if len(g) < _SIDE_BY_SIDE and _model_of(g[0]) == key), None)
-        if group is None:
-            groups.append([observer])
-        else:
-            group.append(observer)
-    return groups
-
-
-def _model_of(observer: Observer) -> tuple[Any, ...]:
-    return observer.lifting, dict(observer.parameters), observer.measured, observer.inputs
 
 
 def evaluate_baseline(
@@ -131,10 +114,8 @@ def _outcome(estimate: Array, batch: EpisodeBatch, dt: float, shown: tuple[int, 
 def run(context: Context) -> None:
     """Evaluate and save errors, spectra and the trajectories that are shown."""
     facts, population = context.facts, context.population
-    calibration = calibrate.load(context)
-    units: UnitParameters = {
-        u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in _usable(context)
-    }
+    known = context.identified.parameters
+    units: UnitParameters = {u: known[u] for u in _usable(context)}
     keys = tuple(k for k in facts.test if k.unit in units)
     on = tuple(k for k in keys if k.condition == facts.identify_on)
     roles = unit_roles(context)
@@ -199,17 +180,17 @@ def baseline_makers(context: Context) -> dict[str, Callable[[], Baseline]]:
     """Return what makes every baseline that is no correction of a model: the extended filter of the first lifted model, and those without a model."""
     models = {name: context.identified.models(name) for name in context.identified.kinds}
     asked, first = context.config.observer.baselines, next(iter(models.values()))
-    nominal = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
-    tuning = tuning_set(context, first)
+    nominal, training = context.uncertain.nominal, TrainingSet.of(context.identified, first)
     makers: dict[str, Callable[[], Baseline]] = {}
     if "ekf" in asked:
         lifted = [name for name, found in models.items() if found.lifting.functions or found.lifting.input_functions]
         for name in lifted[:1]:
-            makers[f"{name}/ekf"] = partial(make_extended, tuning, models[name], nominal, measurement_noise(context, models[name]))
+            noise = measurement_noise(context.identified, models[name], context.config.synthesis)
+            makers[f"{name}/ekf"] = partial(make_extended, training, models[name], nominal, noise)
     if "filtered_difference" in asked:
-        makers["filtered_difference"] = partial(make_difference, tuning, first.measured)
+        makers["filtered_difference"] = partial(make_difference, training, first.measured)
     if "learned" in asked:
-        makers["learned"] = partial(make_learned, tuning, context.lifting, first.measured)
+        makers["learned"] = partial(make_learned, training, context.lifting, first.measured)
     return makers
 
 
@@ -222,7 +203,7 @@ def facts_of(name: str, result: Outcome | str) -> dict[str, Any]:
 
 
 def _usable(context: Context) -> list[str]:
-    ids = context.identified.models(context.identified.kinds[0]).unit_ids
+    ids = context.identified.models().unit_ids
     return [u for u in context.facts.groups if u in ids]
 
 
@@ -231,14 +212,14 @@ def band_hz(context: Context) -> tuple[float, float] | None:
     spec = context.phase_spec
     if spec is None:
         return None
-    first = context.identified.models(context.identified.kinds[0])
+    first = context.identified.models()
     top_speed = float(first.input_scale[first.inputs.index(spec.reference)]) if spec.reference in first.inputs else 0.0
     return gearbox_band_hz(context.config.calibrate, context.population, top_speed)
 
 
 def unit_roles(context: Context) -> dict[str, str]:
     """Return for every unit whether it is the nominal one, another of the population, or filed as an outlier."""
-    nominal = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
+    nominal = context.uncertain.nominal
     pooled = context.facts.pooled
     return {u: "nominal" if u == nominal else ("off_nominal" if u in pooled else "outlier") for u in context.facts.groups}
 
@@ -247,7 +228,7 @@ def showcase(context: Context, keys: tuple[EpisodeKey, ...], roles: dict[str, st
     """Choose the episodes that are shown: nominal, worst off-nominal, and the nominal unit in every other condition."""
     facts = context.facts
     nominal = next(u for u, role in roles.items() if role == "nominal")
-    worst = load_artifact(context.store.path("uncertainty"), "choice")[0]["worst_off_nominal"]
+    worst = context.uncertain.worst_off_nominal
     wanted = [(nominal, facts.identify_on), (worst, facts.identify_on)]
     wanted += [(nominal, c) for c in sorted({k.condition for k in keys}) if c != facts.identify_on]
     firsts = [next((i for i, k in enumerate(keys) if (k.unit, k.condition) == w), None) for w in wanted]

@@ -61,7 +61,7 @@ def parted(units: Sequence[str], folds: int) -> list[list[str]]:
 
 def run(context: Context) -> None:
     """Make the study once for every fold, and collect what its observers do on the units that it does not know."""
-    models = context.identified.models(context.identified.kinds[0])
+    models = context.identified.models()
     folds = parted([u for u in context.facts.pooled if u in models.unit_ids], context.config.evaluate.folds)
     for surplus in context.store.runs(FOLDER):
         if surplus.folder.name not in map(str, range(len(folds))):

@@ -19,6 +19,7 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey
+from ...design.validation import seen_by
 from ...lifting import Lifting
 from ...motor_drive import (
     AngleLoad,
@@ -60,7 +61,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
         try:
             calibration = study.calibration(lifting)
             observer = load_observer(f"{kind}/load", calibration, study.context.population.inputs, context.config.load.memories)
-            observer = replace(observer, seen=context.seen(observer.measured))
+            observer = replace(observer, seen=seen_by(context.identified, observer.measured))
         except KrosError as error:
             facts[f"{kind}/load"] = {"status": "failed", "reason": str(error)}
             log.info("%s/load could not be made: %s", kind, error)

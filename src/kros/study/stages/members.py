@@ -11,10 +11,11 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact
 from ...core.lti import StateSpace
-from ...design.task import IDENTITY, Surroundings
+from ...design.disturbance_model import DisturbanceModel
+from ...design.synthesize import measurement_noise
+from ...design.uncertain_set import usable_problem
 from ...evaluate import Candidate, sample_errors
 from ...synthesis import ObserverProblem, Synthesis
-from ...uncertainty import UncertainModel
 from ..engine.context import Context
 
 Array = npt.NDArray[np.float64]
@@ -22,33 +23,25 @@ Members = dict[str, tuple[dict[str, Any], dict[str, Array]]]
 _SHARES = (0.05, 0.5, 0.95)
 
 
-def member_work(context: Context, model: str, members: int) -> Callable[[], Members]:
+def member_work(context: Context, kind: str, members: int) -> Callable[[], Members]:
     """Return the work of running the certified observers of one kind of model on random members of its set; it finds nothing where nothing is certified."""
-    from .synthesize import measurement_noise, usable_problem
-
-    record = load_artifact(context.store.path("observers"), "observers")[0]
+    facts = load_artifact(context.store.path("observers"), "observers")[0]["facts"]
     bounds = {
-        name: float(facts["worst_case_h2"])
-        for name, facts in record["facts"].items()
-        if name.rpartition("/")[0] == model and facts.get("worst_case_h2") is not None
+        name: float(own["worst_case_h2"])
+        for name, own in facts.items()
+        if name.rpartition("/")[0] == kind and own.get("worst_case_h2") is not None
     }
     if not bounds:
         return dict
-    models, uncertain = context.identified.models(model), UncertainModel.load(context.store.path("uncertainty", model))
-    unit = load_artifact(context.store.path("uncertainty"), "choice")[0]["nominal"]
-    base, _ = usable_problem(models, unit, uncertain, measurement_noise(context, models), context)
+    models, uncertain, settings = context.identified.models(kind), context.uncertain.sets[kind], context.config.synthesis
+    base, _ = usable_problem(models, uncertain, measurement_noise(context.identified, models, settings), settings)
     assert base is not None  # there are bounds
-    problem = certified_for(base, record["facts"].get(f"{model}/worst_case_h2", {}))
+    assumed = DisturbanceModel.recorded(
+        facts.get(f"{kind}/worst_case_h2", {})
+    )  # observers are certified with what the worst-case synthesis chose
+    problem = base if assumed is None else assumed.of(base)
     syntheses = {name: Synthesis.load(context.store.path("synthesis", name)) for name in bounds}
     return partial(run_on_members, problem, syntheses, bounds, members, models.systems(uncertain.unit_ids))
-
-
-def certified_for(base: ObserverProblem, facts: Mapping[str, Any]) -> ObserverProblem:
-    """Return the set that observers are certified for: in the surroundings that the worst-case synthesis chose, where it was made."""
-    if "process_noise" not in facts:
-        return base
-    corner = facts["input_weight_hz"]
-    return Surroundings(IDENTITY if corner is None else corner, facts["process_noise"], facts["measurement_noise"]).of(base)
 
 
 def run_on_members(

@@ -10,12 +10,14 @@ from ...identify.presets import resolve_lifting, resolve_phase
 from ..config import StudyConfig
 from ..engine.context import Context
 
-PARQUET = "parquet"
+PARQUET, ARRAYS = "parquet", "arrays"
 
 
 def open_source(config: StudyConfig) -> Population:
     """Open the study's recordings, lazily, without the units that are excluded."""
     data = config.data
+    if data.reader == ARRAYS:
+        raise ConfigError("Study of arrays: they are gone with the program that held them; give the population to kros.run again.")
     population = read(data.source, data.reader, mapping=data.csv, prepare=data.prepare)
     unknown = [unit for unit in data.exclude if unit not in population.unit_ids]
     if unknown:
@@ -39,7 +41,9 @@ def run(context: Context) -> None:
     config = context.config
     in_place = config.data.reader == PARQUET and not config.data.prepare
     folder = None if in_place else context.store.draft("recordings")
-    _, facts = survey(open_source(config), config.split.test, config.data.identify_on, config.data.on_nan, folder, context.work)
+    _, facts = survey(
+        context.given or open_source(config), config.split.test, config.data.identify_on, config.data.on_nan, folder, context.work
+    )
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them first with on_nan = 'drop_episode'.")
     content = {"recordings": config.data.source if in_place else "recordings", **facts.content()}

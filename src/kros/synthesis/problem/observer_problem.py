@@ -28,6 +28,8 @@ import numpy.typing as npt
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
+from ...identify import ModelSet
+from ...uncertainty import Structure, UncertainModel
 from ...uncertainty.forms import Form, as_form
 from ..assumptions import unreachable_modes
 from ..generalized_plant import GeneralizedPlant
@@ -101,6 +103,55 @@ class ObserverProblem:
     injection: Injection = Injection.STATE
     process_noise: Array | None = None
     form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE
+
+    @classmethod
+    def from_uncertain(
+        cls,
+        models: ModelSet,
+        uncertain: UncertainModel,
+        noise: npt.ArrayLike,
+        *,
+        injection: Injection | str = Injection.STATE,
+        correction_penalty: float = 1e-3,
+    ) -> ObserverProblem:
+        """Return the problem of an uncertain set around the nominal unit of some models: its weights, its form and its remainder.
+
+        Parameters
+        ----------
+        models : ModelSet
+            In the same channels as the set is of, or divided by their ranges.
+        uncertain : UncertainModel
+        noise : array_like, shape (q,)
+            As above, in the units of `models`.
+        injection, correction_penalty
+            As above.
+
+        Raises
+        ------
+        SynthesisError
+            When the weights are no bound for a full perturbation.
+        """
+        if uncertain.weight.structure is Structure.ENTRYWISE:
+            raise SynthesisError(
+                "the weights are entrywise, made for a diagonal perturbation, and synthesis is for a full one; "
+                "set uncertainty.structure to 'auto', 'diagonal' or 'scalar'"
+            )
+        remainder = uncertain.remainder
+        return cls(
+            nominal=models.systems([uncertain.nominal_id])[0],
+            C=np.eye(models.lifting.n_lifted)[list(models.measured)],
+            W_L=uncertain.weight.left,
+            W_R=uncertain.weight.right,
+            input_scale=models.input_scale,
+            output_scale=models.output_scale,
+            noise=np.asarray(noise, dtype=float),
+            n_original=models.lifting.n_states,
+            correction_penalty=correction_penalty,
+            remainder_left=None if remainder is None else remainder.left,
+            remainder_right=None if remainder is None else remainder.right,
+            injection=Injection(injection),
+            form=uncertain.form,
+        )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "form", as_form(self.form))

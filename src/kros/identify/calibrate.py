@@ -8,7 +8,7 @@ from ..core.errors import IdentificationError
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
 from ..data.survey import RecordingFacts
-from .phase import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
+from .calibration import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
 
 log = logging.getLogger(__name__)
 Task = tuple[Population, tuple[EpisodeKey, ...], PhaseSpec]

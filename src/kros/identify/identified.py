@@ -18,9 +18,9 @@ from ..core.loading import loader
 from ..data.population import Population
 from ..data.survey import RecordingFacts
 from ..lifting import Lifting
+from .calibration import PhaseCalibration
 from .factors import Factor
 from .model_set import ModelSet
-from .phase import PhaseCalibration
 from .refine.model import RefinedModels
 
 Array = npt.NDArray[np.float64]

@@ -23,12 +23,12 @@ from ..data.population import EpisodeKey, Population
 from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibrate import calibrate
+from .calibration import PhaseCalibration
 from .edmd import KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
 from .excitation import require_excitation, require_independent
 from .factors import Factor, combine, lifted_factor, reduce_episode
 from .identified import EpisodeFactors, IdentifiedModels, edmd_kinds
 from .model_set import ModelSet
-from .phase import PhaseCalibration
 from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .ranges import Ranges
 from .refine import RefinedModels, RefineOptions, refine_population

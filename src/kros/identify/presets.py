@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 from ..data.population import Population, split_episodes
 from ..lifting import Formula, Lifting, concatenate, family
-from .phase import PhaseSpec
+from .calibration import PhaseSpec
 from .settings import CalibrationSettings, LiftingSettings
 
 Array = npt.NDArray[np.float64]

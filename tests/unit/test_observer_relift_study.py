@@ -102,8 +102,8 @@ def test_the_report_tells_gains_bounds_and_failures(tmp_path: Path) -> None:
     found = section(RunFolder(tmp_path), metrics)
     assert found is not None
     assert any("No certificate was found for" in text and "grows" in text for text in found.paragraphs)
-    assert [row[1].text for row in found.tables[0].rows] == ["10.0", "none"]
-    assert [row[0].text for row in found.tables[1].rows] == ["a", "b"]
+    assert [row[1].text for row in found.tables[0].cells] == ["10.0", "none"]
+    assert [row[0].text for row in found.tables[1].cells] == ["a", "b"]
     assert section(RunFolder(tmp_path), {"study": {}, "observers": {}}) is None
 
 

@@ -8,8 +8,7 @@ from typing import Any
 from .caveats import confounded_text, small_set_text
 from .error_tables import ErrorTable, error_table
 from .names import condition_label, model_label, number, observer_label, split_observer
-
-_MANY = 0.5  # share of noise from which on longer recordings are advised
+from .sections.uncertainty import MANY
 
 
 def advice(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[str]:
@@ -29,15 +28,15 @@ def _outliers(metrics: Mapping[str, Any]) -> list[str]:
         first.setdefault(row["unit"], row)
     units = [f"{u} ({_where(r)})" for u, r in first.items()]
     if not units:
-        return _silent(metrics)
+        return _undecided(metrics)
     filed = {row["unit"] for row in metrics.get("units", []) if row["group"] == "outliers"}
     text = f"Inspect {', '.join(units[:5])}{' and others' if len(units) > 5 else ''} before shipping."
     if any(u not in filed for u in first):
         text += " Flagged units still count in the design; set uncertainty.drop_outliers = true to leave them out."
-    return [text, *_silent(metrics)]
+    return [text, *_undecided(metrics)]
 
 
-def _silent(metrics: Mapping[str, Any]) -> list[str]:
+def _undecided(metrics: Mapping[str, Any]) -> list[str]:
     """Say what it would take for a score to mean something."""
     rows = metrics.get("outliers", [])
     short = [r for r in rows if r.get("status") == "not enough data"]
@@ -105,7 +104,7 @@ def _recordings(metrics: Mapping[str, Any]) -> list[str]:
         return []
     share, where = entry["noise_share"]["at_peak"], number(entry["noise_share"]["peak_hz"])
     differ = f"of how much {model_label(model)} models differ, where they do most ({where} Hz),"
-    if share >= _MANY:
+    if share >= MANY:
         return [f"Record longer or more episodes: {100 * share:.0f} % {differ} comes from the recordings' length."]
     return [
         f"Longer recordings of these units would change little: {100 * (1 - share):.0f} % {differ} is there whatever is drawn from the episodes."

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,9 @@ class Cell:
     bar: float | None = None
 
 
+Cells = Sequence[Cell | str]
+
+
 @dataclass(frozen=True)
 class Table:
     """A table; the first column names the rows.
@@ -35,6 +38,7 @@ class Table:
     ----------
     head : sequence of str
     rows : sequence of sequence of Cell
+        A plain text stands for a cell.
     caption : str
     groups : sequence of (str, int)
         Titles over several columns each, the first column included; none by default.
@@ -47,12 +51,17 @@ class Table:
     """
 
     head: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
+    rows: Sequence[Cells]
     caption: str = ""
     groups: Sequence[tuple[str, int]] = ()
     folded: bool = False
     emphasised: Sequence[int] = ()
     prose: bool = False
+
+    @property
+    def cells(self) -> list[list[Cell]]:
+        """All rows as cells."""
+        return [[Cell(c) if isinstance(c, str) else c for c in row] for row in self.rows]
 
 
 @dataclass(frozen=True)
@@ -78,10 +87,10 @@ class Section:
     paragraphs: Sequence[str] = ()
     tables: Sequence[Table] = ()
     figures: Sequence[str] = ()
-    folded: Sequence[tuple[str, str]] = field(default=())
-    more: Sequence[tuple[str, Sequence[str]]] = field(default=())
+    folded: Sequence[tuple[str, str]] = ()
+    more: Sequence[tuple[str, Sequence[str]]] = ()
 
 
-def text_cells(*texts: str) -> list[Cell]:
-    """Return plain cells."""
-    return [Cell(t) for t in texts]
+def where(names: Iterable[str], name: str | None) -> list[int]:
+    """Return the places of a name, for rows that are set off."""
+    return [i for i, one in enumerate(names) if one == name]

@@ -9,7 +9,7 @@ from ..data.population import DEFAULT_CONDITION
 from .caveats import conditions_apart, confounded_text
 from .error_tables import ErrorTable, error_table, left_out_tables
 from .names import BASELINES, channel_units, condition_label, form_label, minus, number, observer_label, split_observer
-from .sections.outliers import flagged_text, silence_text
+from .sections.outliers import flagged_text, undecided_text
 
 Metrics = Mapping[str, Any]
 
@@ -158,7 +158,7 @@ def _flagged(metrics: Metrics) -> list[str]:
     if not flagged and not metrics["outliers"]:
         return ["There are too few units to look for outliers."]
     text = f"Flagged as not belonging to the batch: {flagged_text(flagged)}." if flagged else "No unit is flagged as an outlier."
-    return [text, *silence_text(metrics["outliers"])]
+    return [text, *undecided_text(metrics["outliers"])]
 
 
 def _join(parts: list[str]) -> str:

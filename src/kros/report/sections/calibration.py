@@ -6,38 +6,28 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ..content import Cell, Section, Table
+from ..content import Cell, Cells, Section, Table
+from ..figures.recordings.phase import GOOD
 from ..names import minus, number
 from ..run_folder import RunFolder
-
-_GOOD = 0.8
 
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     """Return the calibration; None for a plant without a phase."""
     if not run.calibrated:
         return None
-    calibration = run.calibration
-    spec = calibration.spec
+    calibration, spec = run.calibration, run.calibration.spec
     text = (
-        f"The gearbox disturbance is modelled as sin({spec.ratio:g} · {spec.angle} + {spec.parameter}); the phase is fixed when a "
-        "unit is assembled, so every unit "
-        "has its own. It is found in closed form from constant-velocity segments, forward and reverse apart, and the half turn "
-        "that this leaves open is settled "
-        f"for the whole population at once. Mean lag of the loop: {minus(format(math.degrees(calibration.lag_rad), '.1f'))}°."
+        f"The gearbox disturbance is modelled as sin({spec.ratio:g} · {spec.angle} + {spec.parameter}); the phase is fixed when a unit is assembled, so every "
+        "unit has its own. It is found in closed form from constant-velocity segments, forward and reverse apart, and the half turn that this leaves open is "
+        f"settled for the whole population at once. Mean lag of the loop: {minus(format(math.degrees(calibration.lag_rad), '.1f'))}°."
     )
-    rows = []
+    rows: list[Cells] = []
     for unit, found in calibration.units.items():
-        weak = found.concentration < _GOOD
-        angles = [Cell(f"{math.degrees(found.phase_rad):.1f}"), Cell(minus(f"{math.degrees(found.lag_rad):.1f}"))]
-        rows.append(
-            [
-                Cell(unit),
-                *angles,
-                Cell(number(found.concentration, 4), strong=weak, note="low" if weak else ""),
-                Cell(str(found.n_segments)),
-            ]
-        )
+        weak = found.concentration < GOOD
+        concentration = Cell(number(found.concentration, 4), strong=weak, note="low" if weak else "")
+        phase, lag = (minus(f"{math.degrees(value):.1f}") for value in (found.phase_rad, found.lag_rad))
+        rows.append([unit, phase, lag, concentration, str(found.n_segments)])
     missing = [row["unit"] for row in metrics.get("units", []) if row["status"] == "not calibrated"]
     paragraphs = [text] + ([f"Not calibrated, and left out of what follows: {', '.join(missing)}."] if missing else [])
     table = Table(["unit", "phase (°)", "lag (°)", "concentration", "segments"], rows, "Phase of every unit", folded=True)

@@ -1,4 +1,4 @@
-"""Observers on units that took no part in their making."""
+"""Observers on units that took no part in their design."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...data.population import DEFAULT_CONDITION
-from ..content import Cell, Section, Table
+from ..content import Cell, Section, Table, where
 from ..error_tables import PAPER, ErrorCell, ErrorTable, left_out_tables
 from ..names import condition_label, minus, number, observer_label
 from ..run_folder import RunFolder
@@ -19,7 +19,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         return None
     folds = len(found["folds"])
     text = (
-        f"The units are parted into {folds} folds, and for each fold the whole study is made on all other units: calibration, models, weights, observers, "
+        f"The units are divided into {folds} folds, and for each fold the whole study is repeated on all other units: calibration, models, weights, observers, "
         "their tuning, and what is learned. Its observers run on the fold's own units, as they would on new machines: a unit's phase comes from its own "
         "training episodes. Errors in percent of the largest value on held-out episodes: mean over the units with its 95 % interval, and the worst unit."
     )
@@ -28,9 +28,11 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "for every machine inside the uncertain set of the fold's units. Both count folds."
     )
     paragraphs = [text, certified, *(f"Fold {int(n) + 1} failed: {reason}" for n, reason in found["failed"].items())]
-    measured, study = run.measured_states, metrics["study"]
-    shown = left_out_tables(found["rows"], study["identify_on"])
-    tables = [_table(table, found["observers"], folds, measured, study.get("deployed")) for table in shown]
+    study = metrics["study"]
+    tables = [
+        _table(table, found["observers"], folds, run.measured_states, study.get("deployed"))
+        for table in left_out_tables(found["rows"], study["identify_on"])
+    ]
     return Section("left-out", "On units that were left out", paragraphs, tables, ["left_out"])
 
 
@@ -41,33 +43,26 @@ def _table(table: ErrorTable, facts: Mapping[str, Mapping[str, Any]], folds: int
     for observer, cells in table.cells.items():
         own = facts[observer]
         made = "" if own["made"] == folds else f"in {own['made']} of {folds} folds"
-        row = [Cell(observer_label(observer), note=made), Cell("/".join(map(str, own["orders"])) or "–")]
-        row += [Cell(_count(own[key], folds)) for key in ("relift_certified", "robust")]
+        row: list[Cell | str] = [Cell(observer_label(observer), note=made), "/".join(map(str, own["orders"])) or "–"]
+        row += ["–" if own[key] is None else f"{own[key]}/{folds}" for key in ("relift_certified", "robust")]
         for channel in channels:
-            row += _cells(table, channel, cells.get(channel), powers)
+            row += _cells(table, channel, cells.get(channel, ErrorCell()), powers)
         rows.append(row)
     head = ["mean", "95 %", "worst", *(["band (dB)"] if powers else [])]
     titles = [c.replace("_", " ") + ("" if c in table.ranked else " (not ranked)") for c in channels]
     groups = [("", 2), ("certified", 2), *((title, len(head)) for title in titles)]
-    where = "" if table.condition == DEFAULT_CONDITION else f", {condition_label(table.condition)}"
-    caption = f"Errors on units that were left out, percent of the largest value{where}. Best in bold."
+    condition = "" if table.condition == DEFAULT_CONDITION else f", {condition_label(table.condition)}"
+    caption = f"Errors on units that were left out, percent of the largest value{condition}. Best in bold."
     if powers:
         caption += f" Band: power of the error around the gearbox frequency, relative to “{observer_label(PAPER)}”."
-    emphasised = [i for i, observer in enumerate(table.cells) if observer == deployed]
     head = ["observer", "states", "as it runs", "for the set", *(head * len(channels))]
-    return Table(head, rows, caption, groups, emphasised=emphasised)
+    return Table(head, rows, caption, groups, emphasised=where(table.cells, deployed))
 
 
-def _count(value: int | None, folds: int) -> str:
-    return "–" if value is None else f"{value}/{folds}"
-
-
-def _cells(table: ErrorTable, channel: str, cell: ErrorCell | None, powers: bool) -> list[Cell]:
-    extra = [Cell("–" if cell is None or cell.band_db is None else minus(f"{cell.band_db:.1f}"))] if powers else []
-    if cell is None:
-        return [Cell("–")] * 3 + extra
+def _cells(table: ErrorTable, channel: str, cell: ErrorCell, powers: bool) -> list[Cell | str]:
+    extra = ["–" if cell.band_db is None else minus(f"{cell.band_db:.1f}")] if powers else []
     if cell.mean is None:
-        return [Cell("diverged"), Cell("–"), Cell("–"), *extra]
+        return ["diverged" if cell.diverged else "–", "–", "–", *extra]
     interval = "–" if cell.interval is None else "–".join(map(number, cell.interval))
     mean, worst = (Cell(number(getattr(cell, what)), strong=getattr(cell, what) == table.best(channel, what)) for what in ("mean", "worst"))
-    return [mean, Cell(interval), worst, *extra]
+    return [mean, interval, worst, *extra]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ...core.linalg import radius_text
-from ..content import Cell, Section, Table
+from ..content import Cell, Cells, Section, Table
 from ..names import minus, model_label, number
 from ..run_folder import RunFolder
 
@@ -31,29 +31,24 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     lifted = next((m.lifting.functions for m in run.models.values() if m.lifting.functions), ())
     if lifted:
         text += f"Lifted functions: {', '.join(lifted)}."
-    units = metrics.get("units", [])
-    unstable = [f"{row['unit']} ({row['status']})" for row in units if row["status"] not in ("ok", "not calibrated")]
-    paragraphs = [text] + ([f"Units with a remark: {'; '.join(unstable)}."] if unstable else [])
+    units = [f"{row['unit']} ({row['status']})" for row in metrics.get("units", []) if row["status"] not in ("ok", "not calibrated")]
+    paragraphs = [text] + ([f"Units with a remark: {'; '.join(units)}."] if units else [])
     return Section("models", "Models", paragraphs, [_table(models)], ["models", "free_run", "free_run_spectra", "trade_off"])
 
 
 def _table(models: Mapping[str, Any]) -> Table:
-    channels = list(dict.fromkeys(c for entry in models.values() for c in entry.get("freerun_error_percent", {})))
-    best = {(c, s): _least(models, c, s) for c in channels for s in ("median", "worst")}
-    rows = []
-    for name, entry in models.items():
-        errors = entry.get("freerun_error_percent", {})
-        cells = [Cell(model_label(name)), Cell(str(entry["order"])), Cell(minus(radius_text(entry["spectral_radius_max"])))]
-        for c in channels:
-            for statistic in ("median", "worst"):
-                value = errors.get(c, {}).get(statistic)
-                cells.append(Cell(number(value), strong=value is not None and value == best[c, statistic]))
-        rows.append(cells)
-    head = ["model", "states", "largest pole", *(["median", "worst"] * len(channels))]
+    errors = {name: entry.get("freerun_error_percent", {}) for name, entry in models.items()}
+    channels = list(dict.fromkeys(c for of_model in errors.values() for c in of_model))
+    columns = [(c, statistic) for c in channels for statistic in ("median", "worst")]
+    values = {name: [of_model.get(c, {}).get(statistic) for c, statistic in columns] for name, of_model in errors.items()}
+    best = [min((v for v in column if v is not None), default=None) for column in zip(*values.values(), strict=True)]
+    rows: list[Cells] = [
+        [
+            *(model_label(name), str(entry["order"]), minus(radius_text(entry["spectral_radius_max"]))),
+            *(Cell(number(v), strong=v is not None and v == least) for v, least in zip(values[name], best, strict=True)),
+        ]
+        for name, entry in models.items()
+    ]
+    head = ["model", "states", "largest pole", *(statistic for _, statistic in columns)]
     caption = "Free run of every held-out episode, error in percent of the largest value, over units. Best in bold."
     return Table(head, rows, caption if channels else "", [("", 3), *((c, 2) for c in channels)] if channels else ())
-
-
-def _least(models: Mapping[str, Any], channel: str, statistic: str) -> float | None:
-    values = [v for m in models.values() if (v := m.get("freerun_error_percent", {}).get(channel, {}).get(statistic)) is not None]
-    return min(values, default=None)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..content import Cell, Section, Table
-from ..figures.residuals import entry_names, short
+from ..figures.residuals import Names, entry_names, short
 from ..names import condition_label, number
 from ..run_folder import NotShownError, RunFolder
 
@@ -28,13 +28,13 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "Scores look at the recordings only, never at serial or group. Some unit always sticks out most, so there is a threshold; above it a unit is flagged."
     )
     verdict = f"Flagged: {flagged_text(flagged)}." if flagged else "No unit is flagged."
-    paragraphs = [text, verdict, *silence_text(rows), _MEANING, *(conspicuous_text(r, _names(run, r)) for r in flagged[:_MOST])]
+    paragraphs = [text, verdict, *undecided_text(rows), _MEANING, *(conspicuous_text(r, _names(run, r)) for r in flagged[:_MOST])]
     more = [("As in the paper, entry by entry", ["outlier_residuals"])]
     return Section("outliers", "Outliers", paragraphs, [_scores(run, rows)], ["outlier_scores", "outlier_ratio"], more=more)
 
 
-def silence_text(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say about which units the scores say nothing, and why; nothing where there are none."""
+def undecided_text(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return about which units the scores say nothing, and why; nothing where there are none."""
     texts = []
     for status, why in (("not enough data", "too little was recorded of it"), ("cannot tell", "the others are too few, or too unlike")):
         silent = [r for r in rows if r.get("status") == status]
@@ -43,7 +43,7 @@ def silence_text(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return texts
 
 
-def conspicuous_text(row: Mapping[str, Any], names: tuple[Sequence[str], Sequence[str]] | None) -> str:
+def conspicuous_text(row: Mapping[str, Any], names: Names | None) -> str:
     """Say where and how clearly a flagged unit sticks out."""
     text = f"Unit {row['unit']} ({condition_label(row['condition'])}) scores {number(row['score'])} dB"
     if row.get("freq_hz") is None:
@@ -56,7 +56,7 @@ def conspicuous_text(row: Mapping[str, Any], names: tuple[Sequence[str], Sequenc
     return f"{text}."
 
 
-def _entry(row: Mapping[str, Any], names: tuple[Sequence[str], Sequence[str]] | None, pattern: str) -> str:
+def _entry(row: Mapping[str, Any], names: Names | None, pattern: str) -> str:
     """Name the entry of the residual that is largest, with its row and column."""
     if names is None or row.get("entry") is None:
         return ""
@@ -64,7 +64,7 @@ def _entry(row: Mapping[str, Any], names: tuple[Sequence[str], Sequence[str]] | 
     return pattern.format(short(names[0][i]), short(names[1][j]))
 
 
-def _names(run: RunFolder, row: Mapping[str, Any]) -> tuple[Sequence[str], Sequence[str]] | None:
+def _names(run: RunFolder, row: Mapping[str, Any]) -> Names | None:
     """Signals behind the entries of the residuals that units are scored by; None where the run does not know."""
     try:
         model = run.outlier_models[row["condition"]]
@@ -78,12 +78,14 @@ def _scores(run: RunFolder, rows: Sequence[Mapping[str, Any]]) -> Table:
     conditions = list(dict.fromkeys(r["condition"] for r in rows))
     found = {(r["unit"], r["condition"]): r for r in rows}
     names = {c: _names(run, {"condition": c}) for c in conditions}
-    order = sorted(dict.fromkeys(r["unit"] for r in rows), key=lambda u: -max((_score(found, u, c) for c in conditions), default=0.0))
-    cells = [[Cell(u), *(cell for c in conditions for cell in _cells(found.get((u, c)), names[c]))] for u in order]
-    head = [
-        "unit",
-        *(["score (dB)", "over nominals (dB)", "at (Hz)", "entry", "status", "flagged from (dB)", "gain (%)"] * len(conditions)),
-    ]
+    scores = {
+        u: [float(r["score"]) for r in rows if r["unit"] == u and r.get("score") is not None]
+        for u in dict.fromkeys(r["unit"] for r in rows)
+    }
+    order = sorted(scores, key=lambda u: -max(scores[u], default=float("-inf")))
+    cells = [[u, *(cell for c in conditions for cell in _cells(found.get((u, c)), names[c]))] for u in order]
+    columns = ["score (dB)", "over nominals (dB)", "at (Hz)", "entry", "status", "flagged from (dB)", "gain (%)"]
+    head = ["unit", *(columns * len(conditions))]
     caption = "Outlier scores, highest first; with their range over all nominals, frequency and entry of the residual, and what would have been flagged"
     return Table(head, cells, caption, [("", 1), *((condition_label(c), 7) for c in conditions)], folded=True)
 
@@ -96,23 +98,18 @@ def flagged_text(flagged: list[Mapping[str, Any]]) -> str:
     return ", ".join(f"{unit} ({', '.join(conditions)})" for unit, conditions in units.items())
 
 
-def _score(found: Mapping[tuple[str, str], Mapping[str, Any]], unit: str, condition: str) -> float:
-    score = found.get((unit, condition), {}).get("score")
-    return float("-inf") if score is None else float(score)
-
-
-def _cells(row: Mapping[str, Any] | None, names: tuple[Sequence[str], Sequence[str]] | None) -> list[Cell]:
+def _cells(row: Mapping[str, Any] | None, names: Names | None) -> list[Cell | str]:
     if row is None:
-        return [Cell("–")] * 7
+        return ["–"] * 7
     known = row.get("lowest_db") is not None
     shift = row["score"] - row["excess_db"] if known else 0.0  # as the score itself is referred to the threshold
     span = f"{number(row['lowest_db'] + shift)} to {number(row['highest_db'] + shift)}" if known else "–"
     return [
         Cell(number(row["score"]), strong=row["outlier"], note="flagged" if row["outlier"] else ""),
-        Cell(span),
-        Cell(number(row.get("freq_hz"))),
-        Cell(_entry(row, names, "{1} → {0}") or "–"),
+        span,
+        number(row.get("freq_hz")),
+        _entry(row, names, "{1} → {0}") or "–",
         Cell(row.get("status", "–"), strong=row.get("status", "ok") != "ok"),
-        Cell(number(row.get("detectable_db"))),
-        Cell(number(row.get("detectable"), 2)),
+        number(row.get("detectable_db")),
+        number(row.get("detectable"), 2),
     ]

@@ -7,21 +7,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...core.artifacts import load_artifact
-from ..content import Cell, Section, Table
+from ..content import Cell, Section, Table, where
 from ..names import number, observer_label
 from ..run_folder import RunFolder
 
+Rows = Sequence[Mapping[str, Any]]
 _TEXT = (
-    "An observer that cuts its estimate back to the original states and re-lifts it at every step is not linear, and no linear "
-    "certificate covers it. Its error is driven by the one-step residual alone: what the nominal model misses from one sample to the "
-    "next, whatever the reason. For every unit, known or not, the error's RMS is at most the gain times the residual's, plus what the "
-    "first error costs. The residual is divided by its size in this population and errors by the ranges: on a unit with the typical "
-    "residual the gain itself bounds the error."
+    "An observer that cuts its estimate back to the original states and re-lifts it at every step is not linear, and no linear certificate covers it. Its "
+    "error is driven by the one-step residual alone: what the nominal model misses from one sample to the next, whatever the reason. For every unit, known or "
+    "not, the error's RMS is at most the gain times the residual's, plus what the first error costs. The residual is divided by its size in this population "
+    "and errors by the ranges: on a unit with the typical residual the gain itself bounds the error."
 )
 _BOUND = (
-    "The gain holds for the worst course of the residual. From the residual as it was, two things follow: the response of the observer "
-    "with the lifted functions' slopes in the middle of their interval, and, times the mismatch gain, what their movement can add. The "
-    "bounds below take the smaller of both, on the first five seconds of a training episode of every unit."
+    "The gain holds for the worst course of the residual. From the residual as it was, two things follow: the response of the observer with the lifted "
+    "functions' slopes in the middle of their interval, and, times the mismatch gain, what their movement can add. The bounds below take the smaller of both, "
+    "on the first five seconds of a training episode of every unit."
 )
 
 
@@ -39,28 +39,28 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     ]
     rows = [_row(name, entry, record["rows"].get(name, [])) for name, entry in observers.items()]
     head = ["observer", "gain", "mismatch gain", "bound", "error", "bound", "error"]
-    emphasised = [i for i, name in enumerate(observers) if name == deployed]
     caption = "Errors in percent of the largest value, RMS over time, the states' squares added."
-    table = Table(head, rows, caption, [("", 3), ("median unit", 2), ("worst unit", 2)], emphasised=emphasised)
+    groups = [("", 3), ("median unit", 2), ("worst unit", 2)]
+    table = Table(head, rows, caption, groups, emphasised=where(observers, deployed))
     assumptions = record["certificates"].get(deployed, {}).get("assumptions", [])
     conditions = [f"Assumed for “{observer_label(deployed)}”: {'; '.join(assumptions)}."] if deployed and assumptions else []
     tables = [table, *_units(deployed, record["rows"].get(deployed, []))]
     return Section("relift", "Certified as it runs", [_TEXT, _BOUND, *conditions, *failed], tables)
 
 
-def _row(name: str, entry: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[Cell]:
+def _row(name: str, entry: Mapping[str, Any], rows: Rows) -> list[Cell | str]:
     if not rows:
-        return [Cell(observer_label(name)), Cell("none", strong=True), *([Cell("–")] * 5)]
+        return [observer_label(name), Cell("none", strong=True), *(["–"] * 5)]
     values = [statistics.median(row[key] for row in rows) for key in ("bound", "error")]
     values += [max(row[key] for row in rows) for key in ("bound", "error")]
-    gains = [Cell(number(entry["relift_gain"])), Cell(number(entry.get("relift_mismatch_gain")))]
-    return [Cell(observer_label(name)), *gains, *(Cell(number(100 * v)) for v in values)]
+    gains = number(entry["relift_gain"]), number(entry.get("relift_mismatch_gain"))
+    return [observer_label(name), *gains, *(number(100 * v) for v in values)]
 
 
-def _units(deployed: str | None, rows: Sequence[Mapping[str, Any]]) -> list[Table]:
+def _units(deployed: str | None, rows: Rows) -> list[Table]:
     if deployed is None or not rows:
         return []
     keys = ("gain_bound", "bound", "error")
-    cells = [[Cell(row["unit"]), Cell(number(row["residual"])), *(Cell(number(100 * row[key])) for key in keys)] for row in rows]
+    cells = [[row["unit"], number(row["residual"]), *(number(100 * row[key]) for key in keys)] for row in rows]
     head = ["unit", "residual", "bound by the gain (%)", "bound (%)", "error (%)"]
     return [Table(head, cells, f"Every unit, “{observer_label(deployed)}”; residual relative to the population's.", folded=True)]

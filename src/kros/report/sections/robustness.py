@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from ...evaluate import Kind, severity_of_growth
-from ..content import Cell, Section, Table
-from ..disturbances import AXES, Curves, curves, severity_text
+from ..content import Cell, Cells, Section, Table, where
+from ..disturbances import AXES, Curve, curves, severity_text
 from ..names import condition_label, number, observer_label
 from ..run_folder import RunFolder
 
+Rows = Sequence[Mapping[str, Any]]
 _TEXT = (
     "Recordings are made with care; machines in the field lose samples, are badly calibrated, or have a cheaper encoder. Here the measurements of "
-    "held-out episodes are made worse in one way at a time, and nobody tells the observers."
+    "held-out episodes are disturbed in one way at a time, and the observers are not informed."
 )
 _MEMBERS = (
     "A worst case is a bound. Random members of the set show what is typical in it, and how close the bound is: they stand exactly where the certificate "
@@ -28,89 +29,60 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     rows, found = metrics.get("robustness", []), metrics.get("monte_carlo", {})
     if not rows and not found:
         return None
-    deployed, home = metrics["study"].get("deployed"), metrics["study"]["identify_on"]
-    sets, noise = found.get("sets", []), found.get("noise", [])
-    paragraphs = [*([_TEXT] if rows else []), *([_MEMBERS] if sets else []), *_exceeded(sets)]
-    tables = [t for t in (_doubling(rows, home, run.measured_states, deployed), _sets(sets, deployed), _noise(noise, deployed)) if t]
+    deployed, sets, noise = metrics["study"].get("deployed"), found.get("sets", []), found.get("noise", [])
+    beyond = ", ".join(observer_label(row["observer"]) for row in sets if row["exceeded"])
+    wrong = f"A member of the set exceeds the certified bound of {beyond}: the certificate is wrong; please report it."
+    paragraphs = [*([_TEXT] if rows else []), *([_MEMBERS] if sets else []), *([wrong] if beyond else [])]
+    tables = [
+        *([_doubling(rows, metrics["study"]["identify_on"], run.measured_states, deployed)] if rows else []),
+        *([_sets(sets, deployed)] if sets else []),
+        *([_noise(noise, deployed)] if noise else []),
+    ]
     figures = [*(["robustness"] if rows else []), *(["members"] if sets else [])]
     more = [("The second state that is not measured", ["robustness_second"])] if rows else []
-    return Section("robustness", "Robust against what", paragraphs, tables, figures, more=more)
+    return Section("robustness", "Robustness", paragraphs, tables, figures, more=more)
 
 
-def _exceeded(sets: Sequence[Mapping[str, Any]]) -> list[str]:
-    beyond = [observer_label(row["observer"]) for row in sets if row["exceeded"]]
-    return (
-        [f"A member of the set exceeds the certified bound of {', '.join(beyond)}: the certificate is wrong; please report it."]
-        if beyond
-        else []
-    )
-
-
-def _doubling(rows: Sequence[Mapping[str, Any]], condition: str, measured: Sequence[str], deployed: str | None) -> Table | None:
-    if not rows:
-        return None
+def _doubling(rows: Rows, condition: str, measured: Sequence[str], deployed: str | None) -> Table:
     found = curves(rows, condition)
     kinds = [kind for kind in Kind if any(kind in c for c in found.values())]
-    cells = [[Cell(observer_label(name)), *(Cell(_doubled(found, name, kind, measured)) for kind in kinds)] for name in found]
-    where = condition_label(condition)
+    cells = [[observer_label(name), *(_doubled(kind, own.get(kind, {}), measured) for kind in kinds)] for name, own in found.items()]
     caption = (
-        f"Severity at which the error doubles, {where}: geometric mean over the states that are not measured. A dash: not within what was tried. "
-        "Gaps take a tenth of the time."
+        f"Severity at which the error doubles, {condition_label(condition)}: geometric mean over the states that are not measured. A dash: not within what "
+        "was tried. Gaps take a tenth of the time."
     )
-    emphasised = [i for i, name in enumerate(found) if name == deployed]
-    return Table(["observer", *(AXES[kind].title for kind in kinds)], cells, caption, emphasised=emphasised)
+    return Table(["observer", *(AXES[kind].title for kind in kinds)], cells, caption, emphasised=where(found, deployed))
 
 
-def _doubled(found: Curves, name: str, kind: Kind, measured: Sequence[str]) -> str:
-    by_channel = found[name].get(kind, {})
-    hidden = [c for c in by_channel if c not in measured] or list(by_channel)
+def _doubled(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str]) -> str:
+    hidden = [curve for c, curve in by_channel.items() if c not in measured] or list(by_channel.values())
     if not hidden:
         return "–"
     with np.errstate(divide="ignore"):
-        errors = np.exp(np.mean([np.log(by_channel[c].errors) for c in hidden], axis=0))
-    severities = by_channel[hidden[0]].severities
+        errors = np.exp(np.mean([np.log(curve.errors) for curve in hidden], axis=0))
+    severities = hidden[0].severities
     return severity_text(kind, severity_of_growth(severities, errors), float(severities[1]))
 
 
-def _sets(sets: Sequence[Mapping[str, Any]], deployed: str | None) -> Table | None:
-    if not sets:
-        return None
-    rows = [
+def _sets(sets: Rows, deployed: str | None) -> Table:
+    rows: list[Cells] = [
         [
-            Cell(observer_label(row["observer"])),
-            Cell(number(row["bound"], 4)),
-            Cell(number(row["largest"], 4), strong=row["exceeded"]),
-            *(Cell(number(row[key], 4)) for key in ("unit_worst", "unit_median")),
-            Cell(number(row["quantiles"]["0.5"], 4)),
-            Cell(number(row["noise"], 4)),
+            *(observer_label(row["observer"]), number(row["bound"], 4), Cell(number(row["largest"], 4), strong=row["exceeded"])),
+            *(number(value, 4) for value in (row["unit_worst"], row["unit_median"], row["quantiles"]["0.5"], row["noise"])),
         ]
         for row in sets
     ]
-    head = [
-        "observer",
-        "certified bound",
-        f"largest of {sets[0]['members']} members",
-        "worst unit",
-        "median unit",
-        "median member",
-        "noise alone",
-    ]
+    largest = f"largest of {sets[0]['members']} members"
+    head = ["observer", "certified bound", largest, "worst unit", "median unit", "median member", "noise alone"]
     caption = "H2 norm of the error, every channel over its largest value, noise included. The largest member is computed again by a Lyapunov equation."
-    return Table(head, rows, caption, emphasised=[i for i, row in enumerate(sets) if row["observer"] == deployed])
+    return Table(head, rows, caption, emphasised=where((row["observer"] for row in sets), deployed))
 
 
-def _noise(rows: Sequence[Mapping[str, Any]], deployed: str | None) -> Table | None:
-    if not rows:
-        return None
+def _noise(rows: Rows, deployed: str | None) -> Table:
     cells = [
         [
-            Cell(observer_label(row["observer"])),
-            Cell(row["channel"].replace("_", " ")),
-            Cell(number(row["error_percent"])),
-            *(
-                Cell("–" if row[key] is None else f"{number(row[key][0])} – {number(row[key][1])}")
-                for key in ("over_noise", "over_units", "over_both")
-            ),
+            *(observer_label(row["observer"]), row["channel"].replace("_", " "), number(row["error_percent"])),
+            *("–" if row[key] is None else " – ".join(map(number, row[key])) for key in ("over_noise", "over_units", "over_both")),
         ]
         for row in rows
     ]
@@ -118,7 +90,5 @@ def _noise(rows: Sequence[Mapping[str, Any]], deployed: str | None) -> Table | N
         f"Mean error in percent of the largest value over {rows[0]['units']} units with fresh measurement noise of the assumed level, on top of the "
         "recordings' own, and its 95 % intervals: over the noise alone, over the units alone, over both."
     )
-    emphasised = [i for i, row in enumerate(rows) if row["observer"] == deployed]
-    return Table(
-        ["observer", "channel", "error", "over noise", "over units", "over both"], cells, caption, folded=True, emphasised=emphasised
-    )
+    head = ["observer", "channel", "error", "over noise", "over units", "over both"]
+    return Table(head, cells, caption, folded=True, emphasised=where((row["observer"] for row in rows), deployed))

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,11 +31,16 @@ from ...core.norms import hinf_norm
 from ...identify import ModelSet
 from ...uncertainty import Structure, UncertainModel
 from ...uncertainty.forms import Form, as_form
+from ...uncertainty.weights.cover import Structure
 from ..assumptions import unreachable_modes
 from ..generalized_plant import GeneralizedPlant
 from ..result import Injection
 from . import observer_plants
 from .perturbation import PLACES, Place
+
+if TYPE_CHECKING:
+    from ...identify.model_set import ModelSet
+    from ...uncertainty.model import UncertainModel
 
 Array = npt.NDArray[Any]
 _WEIGHTS = ("W_L", "W_R", "W_u", "W_p", "remainder_left", "remainder_right")
@@ -194,6 +199,66 @@ class ObserverProblem:
         sizes: dict[str, tuple[int | None, int | None]] = {"W_L": (rows, None), "W_R": (None, columns), "W_u": (m, m), "W_p": (None, n)}
         for name, size in (sizes | {"remainder_left": (n, None), "remainder_right": (None, m)}).items():
             self._check_weight(name, *size)
+
+    @classmethod
+    def from_uncertain(
+        cls,
+        models: ModelSet,
+        uncertain: UncertainModel,
+        noise: npt.ArrayLike,
+        *,
+        injection: Injection = Injection.STATE,
+        correction_penalty: float = 1e-3,
+    ) -> ObserverProblem:
+        """Return the problem of the nominal unit and the set around it, remainder included.
+
+        Parameters
+        ----------
+        models : ModelSet
+            The models that were quantified, in the recordings' units or divided by their ranges.
+        uncertain : UncertainModel
+        noise : array_like, shape (q,)
+            Standard deviation of every measurement's noise, in the units of `models`.
+        injection : Injection
+        correction_penalty : float
+
+        Raises
+        ------
+        SynthesisError
+            For entrywise weights, and a nominal that is none of the models' units or not the model that the set surrounds.
+        DimensionError
+            When the noise does not fit the measured channels.
+        """
+        if uncertain.weight.structure is Structure.ENTRYWISE:
+            raise SynthesisError(
+                "the weights are entrywise, made for a diagonal perturbation, and synthesis is for a full one; "
+                "set uncertainty.structure to 'auto', 'diagonal' or 'scalar'"
+            )
+        unit, remainder = uncertain.nominal_id, uncertain.remainder
+        if unit not in models.unit_ids:
+            raise SynthesisError(f"Observer problem: the nominal {unit!r} is none of the models' units; quantify with one of them as nominal.")
+        problem = cls(
+            nominal=models.systems([unit])[0],
+            C=np.eye(models.lifting.n_lifted)[list(models.measured)],
+            W_L=uncertain.weight.left,
+            W_R=uncertain.weight.right,
+            input_scale=models.input_scale,
+            output_scale=models.output_scale,
+            noise=np.asarray(noise, dtype=float),
+            n_original=models.lifting.n_states,
+            correction_penalty=correction_penalty,
+            remainder_left=remainder.left if remainder is not None else None,
+            remainder_right=remainder.right if remainder is not None else None,
+            injection=injection,
+            form=uncertain.form,
+        )
+        expected = uncertain.scaled_nominal().frequency_response(uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // 8)])
+        found = problem.scaled_model.frequency_response(uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // 8)])
+        if found.shape != expected.shape or np.abs(found - expected).max() > 1e-6 * np.abs(expected).max():
+            raise SynthesisError(
+                f"Observer problem: the model of {unit!r} is not the nominal that the uncertain set surrounds; quantify these very models."
+            )
+        return problem
 
     def _check_weight(self, name: str, rows: int | None, columns: int | None) -> None:
         weight = getattr(self, name)

@@ -6,7 +6,7 @@ import logging
 import math
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from enum import Enum
 from numbers import Real
@@ -46,7 +46,7 @@ def parse_on_nan(value: OnNan | str) -> OnNan:
         raise ConfigError(f"data.on_nan should be one of {[p.value for p in OnNan]}, found {value!r}; correct it.") from error
 
 
-def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel], min_samples: int = MIN_SAMPLES) -> None:
+def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel]) -> None:
     """Check one episode's samples.
 
     Parameters
@@ -54,8 +54,6 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
     values : ndarray, shape (n_samples, n_channels)
     key : EpisodeKey
     channels : sequence of Channel
-    min_samples : int
-        Fewest samples that can be used, for example one more than the lifting's delays.
 
     Raises
     ------
@@ -70,9 +68,9 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
             f"{title(key)}: {len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape "
             f"{values.shape}; transpose or correct it."
         )
-    if len(values) < min_samples:
+    if len(values) < MIN_SAMPLES:
         raise DataError(
-            f"{title(key)}: at least {min_samples} samples are needed, found {len(values)}; leave the episode out or record longer."
+            f"{title(key)}: at least {MIN_SAMPLES} samples are needed, found {len(values)}; leave the episode out or record longer."
         )
     if not np.isfinite(values).all():
         check_finite(values, key, channels)
@@ -255,13 +253,12 @@ def check_population(population: Population, allow_single: bool = False) -> None
             )
 
 
-def scan_population(population: Population, min_samples: int = MIN_SAMPLES, on_nan: OnNan | str = OnNan.ERROR) -> Population:
+def scan_population(population: Population, on_nan: OnNan | str = OnNan.ERROR) -> Population:
     """Read every episode once and check it.
 
     Parameters
     ----------
     population : Population
-    min_samples : int
     on_nan : OnNan or str
         With ``drop_episode``, episodes with NaN or infinity are left out and logged.
 
@@ -274,38 +271,37 @@ def scan_population(population: Population, min_samples: int = MIN_SAMPLES, on_n
     ------
     DataError
     """
-    kept = [key for key, _ in scan_prints(population, min_samples, on_nan)]
+    kept = [key for key, _ in scan_prints(population, on_nan)]
     left = {key.unit for key in kept}
     return replace(population, episodes=tuple(kept), units=tuple(u for u in population.units if u.id in left))
 
 
-def scan_prints(
-    population: Population, min_samples: int = MIN_SAMPLES, on_nan: OnNan | str = OnNan.ERROR
-) -> list[tuple[EpisodeKey, Print]]:
+def scan_prints(population: Population, on_nan: OnNan | str = OnNan.ERROR) -> list[tuple[EpisodeKey, Print]]:
     """Do the same, and return the episodes that are left with what they are recognised by."""
-    policy = parse_on_nan(on_nan)
-    kept: list[tuple[EpisodeKey, Print]] = []
-    for unit, condition, keys in population.groups():
-        watch = RestWatch(population.channels)
-        for key in keys:
-            values = read_or_drop(population, key, policy)
-            if values is not None:
-                check_episode(values, key, population.channels, min_samples)
-                watch.add(values)
-                kept.append((key, print_of(values, population.channels)))
-        watch.check(unit, condition)
+    kept = [(key, mark) for _, _, keys in population.groups() for key, _, mark in usable_episodes(population, keys, on_nan)]
     refuse_copies(kept)
     return kept
 
 
-def read_or_drop(population: Population, key: EpisodeKey, on_nan: OnNan) -> npt.NDArray[np.float64] | None:
-    """Read and check for NaN; None where the episode is to be dropped, which is logged."""
-    try:
-        values = population.read(key)
-        check_episode(values, key, population.channels)
-    except NonFiniteError as error:
-        if on_nan is OnNan.ERROR:
-            raise
-        logger.warning("Dropped, as data.on_nan asks: %s", error)
-        return None
-    return values
+def usable_episodes(
+    population: Population, keys: Iterable[EpisodeKey], on_nan: OnNan | str
+) -> Iterator[tuple[EpisodeKey, npt.NDArray[np.float64], Print]]:
+    """Yield the episodes of one unit and condition that pass all checks, their samples and what they are recognised by.
+
+    After the last one, what never moved in any of them is refused.
+    """
+    policy, watch = parse_on_nan(on_nan), RestWatch(population.channels)
+    key = None
+    for key in keys:
+        try:
+            values = population.read(key)
+            check_episode(values, key, population.channels)
+        except NonFiniteError as error:
+            if policy is OnNan.ERROR:
+                raise
+            logger.warning("Dropped, as data.on_nan asks: %s", error)
+            continue
+        watch.add(values)
+        yield key, values, print_of(values, population.channels)
+    if key is not None:
+        watch.check(key.unit, key.condition)

@@ -1,14 +1,35 @@
-"""A folder that appears whole or not at all."""
+"""A folder that appears whole or not at all, filled by threads."""
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TypeVar
 
 from ...core.errors import DataError
 from ...core.locks import locked
+
+Progress = Callable[[int, int], None]
+T = TypeVar("T")
+
+
+def in_threads(work: Sequence[Callable[[], T]], workers: int | None, progress: Progress | None) -> list[T]:
+    """Do pieces of work in threads, by default one per processor; `progress` is told how many of how many are done."""
+    done: list[T] = []
+    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+        tasks = [pool.submit(piece) for piece in work]
+        try:
+            for task in tasks:
+                done.append(task.result())
+                if progress is not None:
+                    progress(len(done), len(tasks))
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+    return done
 
 
 @contextmanager

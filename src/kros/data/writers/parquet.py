@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -24,15 +24,14 @@ import numpy.typing as npt
 from ...core.artifacts import save_artifact
 from ...core.errors import DataError
 from ..arrow import from_numpy, repeated
-from ..checks import OnNan, RestWatch, check_structure, parse_on_nan, read_or_drop
-from ..copies import Print, print_of, refuse_copies
+from ..checks import check_structure, usable_episodes
+from ..copies import Print, refuse_copies
 from ..population import EpisodeKey, Population
 from ..readers.parquet import INDEX, KEYS
-from .folders import whole_folder
+from .folders import Progress, in_threads, whole_folder
 
 logger = logging.getLogger(__name__)
 
-Progress = Callable[[int, int], None]
 _INDEXED = ("unit", "condition", "file", "episodes", "samples")
 LONGEST_NAME = 200  # file systems allow 255 bytes, and a temporary name is longer
 # Signals of sensors as bytes of equal weight side by side, then LZ4: 57 % of the size for 0.03 s more per 91 MB; zstd: 55 % for 0.08 s.
@@ -102,13 +101,11 @@ def write_group(population: Population, unit: str, condition: str, folder: Path 
         raise DataError(f"Asked to write unit {unit} ({condition}); the population has no episode of it.")
     path = Path(folder) / group_file(unit, condition)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    watch = RestWatch(population.channels)
     try:
-        written = list(_write_episodes(population, keys, temporary, parse_on_nan(on_nan), watch))
+        written = list(_write_episodes(population, keys, temporary, on_nan))
         if not written:
             logger.warning("Unit %s (%s) is left out: no episode of %d is left after dropping those with NaN.", unit, condition, len(keys))
             return GroupRecord(unit, condition, "", (), ())
-        watch.check(unit, condition)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -175,22 +172,12 @@ def write_parquet(
         `out` exists, or an episode cannot be used.
     """
     groups = [(unit, condition) for unit, condition, _ in population.groups()]
-    with whole_folder(Path(out), overwrite) as folder, ThreadPoolExecutor(workers or os.cpu_count()) as pool:
-        tasks = [pool.submit(write_group, population, unit, condition, folder, on_nan) for unit, condition in groups]
-        records = []
-        try:
-            for task in tasks:
-                records.append(task.result())
-                if progress is not None:
-                    progress(len(records), len(groups))
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    with whole_folder(Path(out), overwrite) as folder:
+        records = in_threads([partial(write_group, population, *group, folder, on_nan) for group in groups], workers, progress)
         write_index(population, records, folder)
 
 
-def _write_episodes(
-    population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: OnNan, watch: RestWatch
-) -> Iterable[tuple[str, int, Print]]:
+def _write_episodes(population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: str) -> Iterable[tuple[str, int, Print]]:
     from pyarrow import parquet
 
     names = [c.name for c in population.channels]
@@ -203,12 +190,9 @@ def _write_episodes(
         "write_page_checksum": True,
     }
     with parquet.ParquetWriter(path, schema, column_encoding=encoding, **options) as writer:
-        for key in keys:
-            values = read_or_drop(population, key, on_nan)
-            if values is not None:
-                watch.add(values)
-                writer.write_table(_table(key, values, schema), row_group_size=len(values))
-                yield key.episode, len(values), print_of(values, population.channels)
+        for key, values, mark in usable_episodes(population, keys, on_nan):
+            writer.write_table(_table(key, values, schema), row_group_size=len(values))
+            yield key.episode, len(values), mark
 
 
 def _schema(names: Sequence[str]) -> Any:

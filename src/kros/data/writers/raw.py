@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import io
-import os
 import re
-from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,7 @@ from ...core.errors import DataError
 from ..arrow import from_numpy
 from ..population import OUTLIERS, EpisodeKey, Population
 from ..readers.motor_drive_raw import CHANNELS, MOTOR_DEG_TO_RAD, PERCENT, TARGET_LAG
-from .folders import whole_folder
-from .parquet import Progress
+from .folders import Progress, in_threads, whole_folder
 
 HEADER = b"time_s,position_deg,velocity_deg_per_s,torque_percent,target_position_deg,target_velocity_deg_per_s\n"
 DECIMALS = (6, 6, 5, 4, 6, 5)  # time, position, velocity, torque, target position, target velocity
@@ -57,15 +55,8 @@ def write_raw(
     for _, _, keys in groups:
         for key in keys:
             _check_names(key)
-    with whole_folder(Path(out), overwrite) as folder, ThreadPoolExecutor(workers or os.cpu_count()) as pool:
-        tasks = [pool.submit(_write_folder, population, keys, folder, i) for i, (_, _, keys) in enumerate(groups)]
-        try:
-            for done, task in enumerate(tasks, 1):
-                task.result()
-                if progress is not None:
-                    progress(done, len(tasks))
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    with whole_folder(Path(out), overwrite) as folder:
+        in_threads([partial(_write_folder, population, keys, folder, i) for i, (_, _, keys) in enumerate(groups)], workers, progress)
 
 
 def _check_names(key: EpisodeKey) -> None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError
+from ...data import prepare
 from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
-from ..recordings import REST_SAMPLES, Prepared, Recordings
+from ...data.steps import Offset, Trim
+from ..recordings import Recordings
 from ..simulated import SimulatedPopulation
 from .control import CURRENT_NOISE, GAINS, SAMPLE_PERIOD_S, Loop
 from .parameters import GEAR_RATIO, DriveParameters, concatenate, draw_outlier, draw_parameters
@@ -28,6 +30,9 @@ CHANNELS = (
     Channel("target_position", Role.INPUT, "rad"),
     Channel("target_velocity", Role.INPUT, "rad/s"),
 )
+REST_SAMPLES = 1000
+# As a reader of raw recordings prepares them: offset found at rest, rest dropped; undoing the lag of the targets costs it the last sample.
+PREPARATION = (Offset("position", "target_position", 500, 1000), Trim(start=REST_SAMPLES, tail=1))
 OUTLIER_SERIAL = "000000"
 FIRST_SERIAL = 1001
 RECORDING_STREAM = 3  # first word of the spawn key of noise and offsets
@@ -119,7 +124,7 @@ class HarmonicDrivePopulation:
         raw = Population(CHANNELS, SAMPLE_PERIOD_S, units, keys, recordings, {"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO})
         load_rows = {key: i for i, key in enumerate(k for k in keys if k.condition == "load")}
         truth = Truth(tuple(u.id for u in units), parameters, loop, GAINS[loop], load_rows, signals.load_torque[:, REST_SAMPLES:-1])
-        return SimulatedPopulation(replace(raw, source=Prepared(recordings, measured=0, target=3)), raw, truth)
+        return SimulatedPopulation(prepare(raw, PREPARATION), raw, truth)
 
     def _units(self) -> tuple[tuple[Unit, ...], DriveParameters]:
         units = tuple(Unit(f"{FIRST_SERIAL + k:06d}", "population") for k in range(self.n_units))

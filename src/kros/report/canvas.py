@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from math import ceil, floor, log10
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -13,11 +13,13 @@ from .names import RAISED
 from .theme import WIDTH_IN, Tone
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    from matplotlib.axes import Axes as Axes
     from matplotlib.axis import Axis
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Figure
+else:  # for annotations alone: matplotlib is imported when something is drawn
+    Axes = Figure = Any
 
-Array = npt.NDArray[Any]
+Array: TypeAlias = npt.NDArray[Any]
 _BUCKETS = 700  # pairs of points that a line across the page can show
 _POINTS = 220  # of a frequency line
 _LEGEND_IN = 0.21  # height of a row of a legend

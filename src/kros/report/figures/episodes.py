@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...data.population import OUTLIERS, Channel, EpisodeKey, Role
-from ..canvas import grid, label_below, legend, thin
+from ..canvas import Array, Axes, Figure, grid, label_below, legend, thin
 from ..names import Look, axis_label, paper_pair
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import Tone
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-Array = npt.NDArray[Any]
 Line = tuple[str, Array, Look]
 
 TRUTH = Look(Tone.INK.light, weight=2.2, opacity=0.38)

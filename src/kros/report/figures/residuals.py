@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...identify import ModelSet
 from ...uncertainty import Form, UncertainModel
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
-from ..canvas import decibel, frequency_axis, grid, label_below, legend, lines_of_units, note
+from ..canvas import Array, Axes, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note
 from ..names import model_label, shorten
 from ..theme import Tone
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-Array = npt.NDArray[Any]
 Names = tuple[Sequence[str], Sequence[str]]
 _FLOOR_DB = 80.0
 _LOWEST_DB = -25.0  # of ratios: units that are far inside the weights say no more

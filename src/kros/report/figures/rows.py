@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ..canvas import fit_log_axis, grid, label_below, name_rows, note
+from ..canvas import Array, Axes, Figure, fit_log_axis, grid, label_below, name_rows, note
 from ..error_tables import ErrorCell
 from ..names import observer_label
 from ..theme import Tone
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 def best_last(cells: Mapping[str, Mapping[str, ErrorCell]], channels: Sequence[str]) -> list[str]:
@@ -33,7 +27,7 @@ def best_last(cells: Mapping[str, Mapping[str, ErrorCell]], channels: Sequence[s
     return sorted(cells, key=lambda observer: -behind(observer))
 
 
-def row_panels(channels: Sequence[str], order: Sequence[str], deployed: str | None) -> tuple[Figure, npt.NDArray[Any]]:
+def row_panels(channels: Sequence[str], order: Sequence[str], deployed: str | None) -> tuple[Figure, Array]:
     """Return a figure and its panels; the deployed observer in bold."""
     figure, axes = grid(1, len(channels), 0.36 * len(order) + 0.75, sharey=True)
     for panel, channel in zip(axes[0], channels, strict=True):

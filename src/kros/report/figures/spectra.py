@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ...data.population import Channel
 from ...evaluate.errors import error_spectrum
-from ..canvas import frequency_axis, grid, label_below, legend, logarithmic
+from ..canvas import Array, Figure, frequency_axis, grid, label_below, legend, logarithmic
 from ..names import Look, axis_label, number, observer_label, observer_look, split_observer, squared
 from ..run_folder import RunFolder, Shown
 from ..theme import Tone
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = npt.NDArray[Any]
 _MOST = 4  # states that are shown
 _ABOVE_HZ = 10.0  # offsets below would flatten the rest of a linear scale of a study with a gearbox
 

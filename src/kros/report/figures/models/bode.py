@@ -5,16 +5,11 @@ Needs: models.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from ....identify import ModelSet
-from ...canvas import decibel, frequency_axis, grid, legend, limit_decibels, lines_of_units
+from ...canvas import Figure, decibel, frequency_axis, grid, legend, limit_decibels, lines_of_units
 from ...names import best_models, is_koopman, model_label, model_look, shorten
 from ...run_folder import RunFolder
 from ...theme import Tone
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _POINTS = 140
 

@@ -5,15 +5,11 @@ Needs: the evaluation's kept episodes with models.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from ...canvas import Figure
 from ...names import best_models, episode_title, is_koopman, model_label, model_look, number
 from ...run_folder import NotShownError, RunFolder
 from ..episodes import TRUTH, overview_and_zoom
 from ..spectra import band_shares
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _MOST = 6  # states that are shown
 

@@ -5,14 +5,10 @@ Needs: the evaluation's model spectra.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from ...canvas import Figure
 from ...names import best_models, model_label, model_look
 from ...run_folder import NotShownError, RunFolder
 from ..spectra import SpectraRow, share_text, spectra_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def draw(run: RunFolder) -> tuple[Figure, str]:

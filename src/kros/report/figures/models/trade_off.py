@@ -5,19 +5,13 @@ Needs: refined models.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ....identify.refine import RefinedModels
-from ...canvas import grid, legend, note
+from ...canvas import Axes, Figure, grid, legend, note
 from ...names import model_label, model_look, number
 from ...run_folder import RunFolder
 from ...theme import Tone
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _APART_DB = 3.0  # labels nearer than this would overlap
 

@@ -5,16 +5,11 @@ Needs: the evaluation.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from ...canvas import Axes, Figure
 from ...error_tables import ErrorCell, error_table
 from ...names import condition_label, observer_look
 from ...run_folder import NotShownError, RunFolder
 from ..rows import best_last, keep_comparable, row_panels, say_diverged
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 def draw(run: RunFolder) -> tuple[Figure, str]:

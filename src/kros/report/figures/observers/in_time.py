@@ -5,14 +5,10 @@ Needs: the evaluation's kept episodes with observers.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from ...canvas import Figure
 from ...names import deployed_pair, is_koopman, observer_label, observer_look, shorten
 from ...run_folder import NotShownError, RunFolder, Shown
 from ..episodes import TRUTH, overview_and_zoom, require_paper_pair
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _ROWS = 3  # states of one unit
 

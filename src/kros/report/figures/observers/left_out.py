@@ -6,18 +6,14 @@ Needs: the evaluation, and units that were left out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...canvas import Axes, Figure
 from ...error_tables import ErrorTable, left_out_tables
 from ...names import condition_label, observer_look
 from ...run_folder import NotShownError, RunFolder
 from ..rows import best_last, keep_comparable, row_panels, say_diverged
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _APART = 0.16
 

@@ -5,20 +5,15 @@ Needs: a study with ``[load] moment``.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ....core.artifacts import read_arrays, read_json
 from ....evaluate.errors import error_spectrum
-from ...canvas import frequency_axis, grid, legend, logarithmic
+from ...canvas import Figure, frequency_axis, grid, legend, logarithmic
 from ...names import Look, condition_label, model_label
 from ...run_folder import NotShownError, RunFolder
 from ...theme import Tone
 from ..episodes import TRUTH, clip_to, draw_lines, hide_times
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _SEGMENT = 4096
 _HIGHEST_HZ = 200.0

@@ -5,14 +5,10 @@ Needs: the evaluation's kept episodes in a second condition.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from ...canvas import Figure
 from ...names import condition_label, deployed_pair, episode_title, observer_label, observer_look
 from ...run_folder import NotShownError, RunFolder, Shown
 from ..episodes import overview_and_zoom, require_paper_pair
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def draw(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:

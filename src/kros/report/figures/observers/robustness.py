@@ -6,20 +6,15 @@ Needs: disturbed runs.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ....evaluate import Kind
-from ...canvas import grid, log_ticks, logarithmic
+from ...canvas import Axes, Figure, grid, log_ticks, logarithmic
 from ...disturbances import AXES, Curve, curves, look, shown_observers
 from ...names import condition_label, method_label, model_label, split_observer
 from ...run_folder import NotShownError, RunFolder
 from ...theme import Tone
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _COLUMNS, _AS_LARGE = 4, 100.0
 _ZERO = 0.06  # place of "not disturbed" on a logarithmic axis, as a share of the smallest severity

@@ -5,15 +5,11 @@ Needs: the evaluation's kept episodes with observers, and its observer spectra.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from ...canvas import Figure
 from ...names import deployed_pair, paper_pair
 from ...run_folder import RunFolder
 from ..spectra import observer_row, of_episode, share_sentence, spectra_figure
 from .in_time import kept_episodes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def draw(run: RunFolder) -> tuple[Figure, str]:

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ....evaluate.errors import ErrorSummary
-from ...canvas import frequency_axis, grid, legend, lines_of_units
+from ...canvas import Figure, frequency_axis, grid, legend, lines_of_units
 from ...names import number
 from ...theme import Tone
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def summary_figure(errors: ErrorSummary) -> Figure:

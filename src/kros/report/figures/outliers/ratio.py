@@ -5,18 +5,13 @@ Needs: outlier scores, residuals beside the cover of the others.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ....uncertainty.unit_residuals import UnitResiduals
-from ...canvas import decibel, grid, legend
+from ...canvas import Figure, decibel, grid, legend
 from ...names import condition_label, form_label, model_label, number
 from ...run_folder import RunFolder
 from ..residuals import ratio_panel
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def draw(run: RunFolder) -> tuple[Figure, str]:

@@ -5,14 +5,10 @@ Needs: outlier scores, models and residuals in the condition of the highest scor
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from ...canvas import Figure
 from ...names import condition_label, form_label
 from ...run_folder import RunFolder
 from ..residuals import entries_figure, entry_names
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def draw(run: RunFolder) -> tuple[Figure, str]:

@@ -6,20 +6,15 @@ Needs: outlier scores.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ....data.population import natural_key
 from ....uncertainty import OutlierModel, OutlierScore
-from ...canvas import grid, note, units_axis
+from ...canvas import Axes, Figure, grid, note, units_axis
 from ...names import condition_label, form_label, number
 from ...run_folder import RunFolder
 from ...theme import Tone
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 def draw(run: RunFolder) -> tuple[Figure, str]:

@@ -5,19 +5,14 @@ Needs: the phase calibration.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ....data.population import OUTLIERS
 from ....identify import PhaseCalibration
-from ...canvas import grid, units_axis
+from ...canvas import Figure, grid, units_axis
 from ...names import minus
 from ...run_folder import RunFolder
 from ...theme import Tone
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 GOOD = 0.8
 

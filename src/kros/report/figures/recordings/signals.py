@@ -5,20 +5,15 @@ Needs: the evaluation's kept episodes, or the recordings.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ....core.errors import ConfigError
 from ....data.population import Population, Role
-from ...canvas import grid, legend
+from ...canvas import Figure, grid, legend
 from ...names import Look, axis_label, episode_title
 from ...run_folder import RunFolder
 from ...theme import Tone
 from ..episodes import clip_to, draw_lines, hide_times, label_rows, recorded_episodes, reference_columns, shade, steady_window
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light)
 _ZOOM_S = 0.4

@@ -5,22 +5,15 @@ Needs: the phase calibration, the evaluation's kept episodes, or the recordings.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
-import numpy.typing as npt
 
 from ....evaluate.errors import error_spectrum
-from ...canvas import grid, legend, logarithmic, note
+from ...canvas import Array, Figure, grid, legend, logarithmic, note
 from ...names import episode_title, squared
 from ...run_folder import NotShownError, RunFolder, Shown
 from ...theme import Tone
 from ..episodes import recorded_episodes, steady_stretches
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = npt.NDArray[Any]
 _SEGMENT = 1024
 
 

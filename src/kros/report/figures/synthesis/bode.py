@@ -5,24 +5,16 @@ Needs: models, uncertain models, syntheses.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
-import numpy.typing as npt
 
 from ....core.lti import StateSpace
 from ....identify import ModelSet
 from ....synthesis.result import Injection, Synthesis
-from ...canvas import decibel, end_labels, frequency_axis, grid, limit_decibels, zero_line
+from ...canvas import Axes, Figure, decibel, end_labels, frequency_axis, grid, limit_decibels, zero_line
 from ...names import BASELINES, best_models, method_label, model_label, observer_look, split_observer
 from ...run_folder import NotShownError, RunFolder
 from ...theme import Tone
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-Array = npt.NDArray[Any]
 _NO_FILTER = ("memory",)  # measurements take the place of estimates: there is no correction of a model to draw
 _POINTS = 260
 _FLOOR_DB = 220.0  # filters for almost noiseless measurements and small weights are far apart

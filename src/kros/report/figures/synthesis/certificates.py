@@ -6,15 +6,11 @@ Needs: observers with their facts.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
-from ...canvas import fit_log_axis, grid, name_rows
+from ...canvas import Figure, fit_log_axis, grid, name_rows
 from ...names import observer_label, observer_look
 from ...run_folder import NotShownError, RunFolder
 from ...theme import Tone
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def draw(run: RunFolder) -> tuple[Figure, str]:

@@ -9,13 +9,11 @@ import numpy as np
 
 from ....core.lti import StateSpace
 from ....synthesis.result import Synthesis
-from ...canvas import decibel, frequency_axis, grid, legend, note
+from ...canvas import Figure, decibel, frequency_axis, grid, legend, note
 from ...names import method_label, number, observer_label
 from ...theme import Tone
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from ....observer import Observer
 
 

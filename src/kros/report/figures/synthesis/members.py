@@ -6,19 +6,14 @@ Needs: Monte Carlo over the set.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ...canvas import grid, legend, name_rows
+from ...canvas import Array, Axes, Figure, grid, legend, name_rows
 from ...names import observer_label, observer_look, split_observer
 from ...run_folder import NotShownError, RunFolder
 from ...theme import Tone
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _BINS, _MOST, _HEIGHT = 40, 8, 0.62
 
@@ -55,7 +50,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     )
 
 
-def _row(panel: Axes, place: int, row: Mapping[str, Any], members: npt.NDArray[Any], units: npt.NDArray[Any], colour: str) -> None:
+def _row(panel: Axes, place: int, row: Mapping[str, Any], members: Array, units: Array, colour: str) -> None:
     counts, edges = np.histogram(np.minimum(members / row["bound"], 1.0), bins=_BINS, range=(0, 1))  # quadrature may round up
     heights = _HEIGHT * counts / max(counts.max(), 1)
     panel.stairs(place + heights, edges, baseline=place, fill=True, color=colour, alpha=0.45)

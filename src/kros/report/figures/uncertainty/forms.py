@@ -6,23 +6,16 @@ Needs: uncertain models; models, for the paper's variants.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ....identify import ModelSet
 from ....uncertainty import Form, UncertainModel, bounds
-from ...canvas import decibel, end_labels, frequency_axis, grid, note, thin_log, zero_line
+from ...canvas import Array, Axes, Figure, decibel, end_labels, frequency_axis, grid, note, thin_log, zero_line
 from ...names import best_models, form_label, model_label, number
 from ...run_folder import RunFolder
 from ...theme import Tone
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-Array = npt.NDArray[Any]
 _PAPER_POINTS = 60
 _FLOOR_DB = 80.0
 FORM_TONES = {

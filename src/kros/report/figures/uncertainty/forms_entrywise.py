@@ -5,22 +5,15 @@ Needs: uncertain models, models.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
-import numpy.typing as npt
 
 from ....identify import ModelSet
 from ....uncertainty import Form, UncertainModel, residual
-from ...canvas import decibel, frequency_axis, grid, label_below, zero_line
+from ...canvas import Array, Figure, decibel, frequency_axis, grid, label_below, zero_line
 from ...names import best_models, form_label, model_label
 from ...run_folder import NotShownError, RunFolder
 from .forms import FORM_TONES, window
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = npt.NDArray[Any]
 _POINTS = 120
 
 

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from ....core.errors import ConfigError
 from ....identify import ModelSet
 from ....uncertainty import UncertainModel
-from ...canvas import decibel, end_labels, frequency_axis, grid, thin_log
+from ...canvas import Axes, Figure, decibel, end_labels, frequency_axis, grid, thin_log
 from ...names import form_label
 from ..residuals import beside, entries_figure, entry_names, ratio_panel
 from .forms import FORM_TONES, draw_forms, window
 from .weights import TONES, in_gauge
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entries: bool = False) -> Figure:

@@ -6,19 +6,14 @@ Needs: variation and noise.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ....uncertainty import VariationAndNoise
-from ...canvas import decibel, frequency_axis, grid, legend, lines_of_units, note
+from ...canvas import Axes, Figure, decibel, frequency_axis, grid, legend, lines_of_units, note
 from ...names import form_label, model_label
 from ...run_folder import RunFolder
 from ...theme import Tone
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _FLOOR_DB = 60.0
 

@@ -6,17 +6,13 @@ Needs: overbounds over orders, uncertain models.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ....uncertainty import Structure, Tightness, UncertainModel
-from ...canvas import grid, legend
+from ...canvas import Axes, Figure, grid, legend
 from ...names import model_label
 from ...run_folder import RunFolder
 from ...theme import Tone
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _TOP_DB = 8.0
 

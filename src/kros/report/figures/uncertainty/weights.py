@@ -6,24 +6,17 @@ Needs: uncertain models; residuals of the units, for the last column.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ....uncertainty import Cover, Form, Structure, UncertainModel, sigma_max
 from ....uncertainty.unit_residuals import UnitResiduals
-from ...canvas import decibel, frequency_axis, grid, label_below, note, thin_log
+from ...canvas import Array, Axes, Figure, decibel, frequency_axis, grid, label_below, note, thin_log
 from ...names import best_models, model_label, number
 from ...run_folder import NotShownError, RunFolder
 from ...theme import Tone
 from ..residuals import ratio_panel, short
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-Array = npt.NDArray[Any]
 TONES = (Tone.BLUE, Tone.ORANGE, Tone.GREEN, Tone.PURPLE, Tone.GOLD, Tone.SKY, Tone.GREY, Tone.INK)
 _INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
 

@@ -5,15 +5,11 @@ Needs: residuals of the units, models.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from ....uncertainty.unit_residuals import UnitResiduals
+from ...canvas import Figure
 from ...names import best_models, form_label, model_label, number
 from ...run_folder import RunFolder
 from ..residuals import entries_figure, entry_names
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def draw(run: RunFolder) -> tuple[Figure, str]:

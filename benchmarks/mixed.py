@@ -24,14 +24,15 @@ import numpy as np
 from kros.core import KrosError, gain
 from kros.core.artifacts import read_json
 from kros.core.work import Work
-from kros.design.task import Task, make_mixed, open_loop
+from kros.design.robust import design_mixed
+from kros.design.synthesize import tasks_of
+from kros.design.task import DesignTask
 from kros.study import run_study, validate_config
 from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.engine.store import Store
-from kros.study.stages.synthesize import tasks_of
 from kros.synthesis.worst_case.certificate import certify
 
 
@@ -77,29 +78,32 @@ def populations(root: Path, options: argparse.Namespace) -> Iterator[tuple[str, 
         yield label, out / "run"
 
 
-def tasks(folder: Path) -> list[Task]:
+def tasks(folder: Path) -> list[DesignTask]:
     """Return a synthesis task for every kind of model of a run."""
     config = validate_config(read_json(folder / "study.json"), folder)
     with open_executor(1) as executor:
         context = Context(config, Store(folder), Work(executor))
-        return [replace(tasks_of(context, name)[0], name=f"{name}/mixed", method="mixed") for name in context.identified.kinds]
+        found = context.uncertain
+        first = [tasks_of(found, kind, ("open_loop",), config.synthesis, config.predictor)[0] for kind in found.models.kinds]
+        return [replace(task, name=f"{task.models.name}/mixed", method="mixed") for task in first]
 
 
-def solve(task: Task) -> tuple[str, float, bool]:
+def solve(task: DesignTask) -> tuple[str, float, bool]:
     """Synthesise one observer; return what to print, the processor seconds, and whether it failed."""
     if task.problem is None:
         return f"no usable set: {task.refusal}", 0.0, True
     n_states = task.problem.mixed_plant().sizes[0]
     wall, start = time.perf_counter(), time.process_time()
     try:
-        found, _, problem = make_mixed(task)
+        result = design_mixed(task)
     except KrosError as error:
         return f"{n_states:2d} states FAILED after {time.perf_counter() - wall:.2f} s: {error}", time.process_time() - start, True
     wall, used = time.perf_counter() - wall, time.process_time() - start
-    judge, idle = task.tuning.read(), open_loop(task)[0]
-    assert problem is not None
-    nothing, _ = certify(problem, gain(np.zeros((task.models.lifting.n_lifted, len(task.models.measured))), task.models.sample_period_s))
-    error, free = judge.percent(task.observer(found)), judge.percent(task.observer(idle))
+    judge, found = task.training.read(), result.synthesis
+    nothing, _ = certify(
+        result.problem, gain(np.zeros((task.models.lifting.n_lifted, len(task.models.measured))), task.models.sample_period_s)
+    )
+    error, free = judge.percent(result.observer), judge.percent(task.open_loop())
     return (
         f"{n_states:2d} states, K {found.controller.n_states:2d} {found.status.value:10s} {used:6.2f} s ({wall:6.2f} s wall) {found.solver:9s} "
         f"H2 {found.h2_norm:.4g} Hinf {found.hinf_norm:.4f} worst case {found.worst_case_h2:.4g} (open {nothing:.4g}) "

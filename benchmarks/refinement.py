@@ -28,7 +28,6 @@ from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.engine.store import Store
-from kros.study.stages import calibrate
 from kros.uncertainty import UncertainModel
 
 
@@ -94,7 +93,7 @@ def facts(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
 
 def percent(context: Context, models: ModelSet, pooled: KoopmanMatrices | None = None) -> np.ndarray:
     """Return the free-run error of every unit on its held-out episodes, with its own model or the pooled one, shape (unit, n)."""
-    calibration = calibrate.load(context)
+    calibration = context.identified.calibration
     out = np.zeros((len(models.unit_ids), models.lifting.n_states))
     for row, unit in enumerate(models.unit_ids):
         A, B = (models.A[row], models.B[row]) if pooled is None else (pooled.A, pooled.B)

@@ -24,7 +24,8 @@ import numpy as np
 from kros.core.artifacts import read_json, write_json
 from kros.core.work import Work
 from kros.data import EpisodeBatch, read_parquet
-from kros.design.task import produce
+from kros.design.methods import design
+from kros.design.synthesize import tasks_of
 from kros.observer import Observer, ReliftScales, one_step_residual, relift_certificate, relift_report
 from kros.study import run_study, validate_config
 from kros.study.commands.demo import simulate_to
@@ -32,8 +33,6 @@ from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.engine.store import Store
-from kros.study.stages import calibrate
-from kros.study.stages.synthesize import tasks_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 from adversary import attack, attack_running
@@ -88,11 +87,12 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
         run_study(config, run, until=Stage.QUANTIFY, workers=options.workers)
         with open_executor(options.workers) as executor:
             context = Context(config, Store(run), Work(executor))
-            tasks = [task for kind in KINDS for task in tasks_of(context, kind)]
+            wanted = {*config.observer.baselines, *config.synthesis.methods}
+            tasks = [task for kind in KINDS for task in tasks_of(context.uncertain, kind, wanted, config.synthesis, config.predictor)]
             made = []
-            for task, product in zip(tasks, context.map("synthesize", produce, tasks), strict=True):
-                if product.synthesis is not None:
-                    task.observer(product.synthesis).save(run / "observers" / f"{task.name}.json")
+            for task, product in zip(tasks, context.work.map("synthesize", design, tasks), strict=True):
+                if product.observer is not None:
+                    product.observer.save(run / "observers" / f"{task.name}.json")
                 made.append([task.name, product.facts.get("reason")])
         write_json(run / "observers" / "made.json", made)
     return run
@@ -103,7 +103,7 @@ def certified(folder: Path, run: Path, options: argparse.Namespace) -> dict[str,
     config = validate_config({**STUDY, "data": {"source": str((folder / "recordings").absolute()), "reader": "parquet"}}, folder)
     with open_executor(1) as executor:
         context = Context(config, Store(run), Work(executor))
-        facts, calibration, population = context.facts, calibrate.load(context), read_parquet(folder / "recordings")
+        facts, calibration, population = context.facts, context.identified.calibration, read_parquet(folder / "recordings")
         keys = [facts.keys("train", unit, facts.identify_on)[0] for unit in facts.pooled]
         batch = EpisodeBatch.read(population, keys)
     phases = {} if calibration is None else {"phase": np.array([calibration.units[k.unit].phase_rad for k in keys])}

@@ -34,8 +34,8 @@ from kros.study.commands.demo import simulate_to
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.engine.store import Store
-from kros.study.stages import calibrate
-from kros.study.stages.evaluate import alike, baseline_makers, load_observers
+from kros.study.stages.evaluate import baseline_makers, load_observers
+from kros.study.stages.together import alike
 
 UNITS, EPISODES, SECONDS = 12, 10, 20.0
 HIDDEN = ("velocity", "current")
@@ -104,7 +104,7 @@ def study(folder: Path, loop: str, options: argparse.Namespace) -> tuple[dict[st
 
 def errors_on(context: Context, population: Population, condition: str) -> dict[str, list[float]]:
     """Return the mean error of every observer in velocity and current, and the worst unit's, on the last episode of every unit."""
-    calibration = calibrate.load(context)
+    calibration = context.identified.calibration
     assert calibration is not None
     units = {u: {calibration.spec.parameter: calibration.units[u].phase_rad} for u in context.facts.pooled}
     last = {k.unit: k for k in population.episodes if k.condition == condition and k.unit in units}

@@ -22,7 +22,7 @@ import numpy as np
 from kros.core.artifacts import load_artifact
 from kros.data import EpisodeBatch, Population, read_parquet, split_episodes
 from kros.design.estimators import make_difference, make_extended, make_learned
-from kros.design.validation import TuningSet
+from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent, unit_interval
 from kros.identify import ModelSet
 from kros.lifting import Lifting
@@ -94,7 +94,7 @@ def judged(recordings: Population, held: Sequence[str], folder: Path, memories: 
     """Run everything on the episodes of drives that were left out."""
     others = recordings.select([u for u in recordings.unit_ids if u not in held])
     train = tuple(k for s in split_episodes(others).values() for k in s.train)
-    tuning = TuningSet(others, train, {u: {} for u in others.unit_ids})
+    training = TrainingSet(others, train, {u: {} for u in others.unit_ids})
     table: dict[str, list[Row]] = {}
     for drive in held:
         keys = [k for k in recordings.keys(drive) if np.ptp(recordings.read(k)[:, 0]) > STILL_RAD]
@@ -104,11 +104,11 @@ def judged(recordings: Population, held: Sequence[str], folder: Path, memories: 
             percent = error_percent(estimate[..., : batch.states.shape[-1]], batch.states, batch.lengths).mean(axis=0)
             table.setdefault(name, []).append(Row(drive, percent, *facts))
 
-        for name, observer, facts in [*of_study(folder), *with_memory(tuning, memories)]:
+        for name, observer, facts in [*of_study(folder), *with_memory(training, memories)]:
             own = observer.controller.n_states + observer.lifting.n_states - batch.states.shape[-1]
             run = run_observer(observer, batch.states[..., list(observer.measured)], batch.inputs)
             add(name, run, own, facts["relift_certified"], facts.get("worst_case_h2") is not None)
-        for name, make in baselines(tuning, folder).items():
+        for name, make in baselines(training, folder).items():
             add(name, make().run(batch, {}), None, None, None)
     return table
 
@@ -119,9 +119,9 @@ def of_study(folder: Path) -> list[tuple[str, Observer, Mapping[str, Any]]]:
     return [(name, Observer.load(folder / "observers" / f"{name}.json"), record["facts"][name]) for name in record["names"]]
 
 
-def with_memory(tuning: TuningSet, memories: Sequence[int]) -> list[tuple[str, Observer, Mapping[str, Any]]]:
+def with_memory(training: TrainingSet, memories: Sequence[int]) -> list[tuple[str, Observer, Mapping[str, Any]]]:
     """Return linear observers with a memory from all training episodes, as regression gives them and tuned."""
-    batch, population = tuning.read().batch, tuning.population
+    batch, population = training.read().batch, training.population
     units = [k.unit for k in batch.keys]
     found = []
     for count in memories:
@@ -135,7 +135,7 @@ def with_memory(tuning: TuningSet, memories: Sequence[int]) -> list[tuple[str, O
     return found
 
 
-def baselines(tuning: TuningSet, folder: Path) -> dict[str, Any]:
+def baselines(training: TrainingSet, folder: Path) -> dict[str, Any]:
     """Return what makes the baselines that are no correction of a model."""
     names = [n for n in ("koopman", "koopman_edmd") if (folder / "models" / n).exists()]
     models = ModelSet.load(folder / "models" / names[0])
@@ -143,10 +143,10 @@ def baselines(tuning: TuningSet, folder: Path) -> dict[str, Any]:
     resolution = load_artifact(folder / "population", "facts")[0]["resolution"]
     noise = np.array([resolution[models.lifting.states[i]] / np.sqrt(12) for i in models.measured])
     return {
-        f"{names[0]}/ekf": partial(make_extended, tuning, models, nominal, noise),
-        "filtered_difference": partial(make_difference, tuning, models.measured),
-        "learned": partial(make_learned, tuning, models.lifting, models.measured),
-        "learned, linear": partial(make_learned, tuning, Lifting(models.lifting.states), models.measured),
+        f"{names[0]}/ekf": partial(make_extended, training, models, nominal, noise),
+        "filtered_difference": partial(make_difference, training, models.measured),
+        "learned": partial(make_learned, training, models.lifting, models.measured),
+        "learned, linear": partial(make_learned, training, Lifting(models.lifting.states), models.measured),
     }
 
 

@@ -10,7 +10,7 @@ import pytest
 from kros.evaluate.errors import error_spectrum, summarise
 from kros.lifting import Lifting
 from kros.observer import Observer
-from kros.study.stages.evaluate import alike
+from kros.study.stages.together import alike
 
 DT = 1e-3
 

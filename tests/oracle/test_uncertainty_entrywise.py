@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from kros.core.lti import StateSpace, gain
-from kros.study.stages.synthesize import usable_problem
+from kros.design.settings import SynthesisSettings
+from kros.design.uncertain_set import usable_problem
 from kros.uncertainty import (
     EntrywiseWeight,
     Method,
@@ -121,7 +122,7 @@ def test_models_keep_their_weights_and_synthesis_refuses_them(tmp_path: Path) ->
     assert isinstance(model.weight, EntrywiseWeight)
     assert loaded.unstructured_excess == pytest.approx(model.weight.unstructured_excess)
     np.testing.assert_array_equal(loaded.matrix().frequency_response(GRID), model.weight.matrix().frequency_response(GRID))
-    problem, reason = usable_problem(SimpleNamespace(name="models"), "0", model, np.zeros(1), SimpleNamespace())  # type: ignore[arg-type]
+    problem, reason = usable_problem(SimpleNamespace(name="models"), model, np.zeros(1), SynthesisSettings())  # type: ignore[arg-type]
     assert problem is None
     assert "entrywise" in reason
     assert "diagonal perturbation" in reason

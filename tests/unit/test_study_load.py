@@ -7,12 +7,12 @@ import pytest
 
 from kros.core.errors import ConfigError
 from kros.data import split_episodes
+from kros.data.survey import RecordingFacts
 from kros.lifting import Lifting
-from kros.observer import Observer, Seen
+from kros.observer import Observer
 from kros.plants import HarmonicDrivePopulation
 from kros.report.figures.observers import load_torque
 from kros.study.config import LoadConfig
-from kros.study.engine.context import Facts
 from kros.study.engine.store import Store
 from kros.study.stages.load import load_metrics, run_load
 
@@ -24,17 +24,20 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
     population = POPULATION
     splits = split_episodes(population).values()
     train, test = (tuple(k for s in splits for k in getattr(s, part)) for part in ("train", "test"))
-    facts = Facts(folder, "noload", dict.fromkeys(population.unit_ids, "population"), train, test, {})
+    facts = RecordingFacts("noload", dict.fromkeys(population.unit_ids, "population"), train, test, {})
     return SimpleNamespace(
         config=SimpleNamespace(load=LoadConfig(**options)),
         facts=facts,
         population=population,
         phase_spec=None,
         lifting=Lifting(population.states),
-        model_names=("linear",),
-        models=lambda name: SimpleNamespace(measured=(0,)),
+        identified=SimpleNamespace(
+            kinds=("linear",),
+            models=lambda name=None: SimpleNamespace(measured=(0,)),
+            population=population,
+            sizes=dict.fromkeys(population.states + population.inputs, 7.0),
+        ),
         store=Store(folder),
-        seen=lambda measured: Seen([7.0], [7.0] * len(population.inputs)),
     )
 
 

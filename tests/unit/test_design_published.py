@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from kros.core.lti import StateSpace, gain
-from kros.design.published import as_published, entrywise_weight, make_paper
+from kros.design.published import as_published, design_published, entrywise_weight
+from kros.design.task import DesignResult
 from kros.synthesis import Injection, ObserverProblem
 from kros.synthesis.problem.paper_plant import reduced_plant
 from kros.uncertainty import residual
@@ -29,8 +30,17 @@ def task():
     wide = gain(0.3 * np.eye(2), DT)
     problem = ObserverProblem(nominal, np.eye(2)[[0]], wide, gain(np.eye(2), DT), np.ones(2), np.ones(2), np.array([1e-3]))
     models = SimpleNamespace(systems=lambda ids: systems, output_scale=np.ones(2), input_scale=np.ones(2))
+    settings = SimpleNamespace(time_limit_s=20.0)
     return SimpleNamespace(
-        models=models, require_problem=lambda: problem, problem=problem, covered=UNITS, unit="b", max_order=2, time_limit_s=20.0
+        name="koopman_edmd/paper",
+        models=models,
+        require_problem=lambda: problem,
+        problem=problem,
+        covered=UNITS,
+        unit="b",
+        max_order=2,
+        settings=settings,
+        designed=lambda synthesis, **facts: DesignResult("paper", None, synthesis, facts, problem),
     )
 
 
@@ -54,7 +64,8 @@ def test_the_plant_is_the_published_one_with_noise_and_penalty(task):
 
 
 def test_what_is_made_says_that_its_weights_cover_nothing(task):
-    made, facts, problem = make_paper(task)
+    found = design_published(task)
+    made, facts, problem = found.synthesis, found.facts, found.problem
     assert made.method == "paper"
     assert made.worst_case_h2 is None  # nothing is certified for the set of these weights
     assert facts["unstructured_excess"] > 1

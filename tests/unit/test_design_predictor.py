@@ -8,17 +8,18 @@ import pytest
 
 from kros.data.population import EpisodeKey
 from kros.design.certificates import certify_running
+from kros.design.methods import design
 from kros.design.predictor import on_the_circle
-from kros.design.residual_shaped import OwnModel, tuned
-from kros.design.settings import PredictorSettings
-from kros.design.task import Task, produce
+from kros.design.residual_shaped import TUNED, tuned
+from kros.design.settings import PredictorSettings, SynthesisSettings
+from kros.design.task import DesignResult, DesignTask
 from kros.design.tuned import held_out, tuned_where_better
-from kros.design.validation import TuningSet
+from kros.design.uncertain_set import certificate
+from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import observer_with_memory, relift_certificate
 from kros.plants import PLANTS
 from kros.report.verdict import verdict
-from kros.study.stages.synthesize import certificate
 from kros.synthesis import kalman
 
 STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "target_velocity")
@@ -30,7 +31,7 @@ def tuning():
     made = PLANTS["harmonic-drive"](n_units=3, n_episodes=3, seconds=3.0, seed=1).simulate()
     truth = made.truth.as_dict()["units"]
     keys = tuple(k for k in made.population.episodes if k.condition == "noload")
-    return TuningSet(made.population, keys, {u: {"phase": truth[u]["phase_rad"][0]} for u in made.population.unit_ids})
+    return TrainingSet(made.population, keys, {u: {"phase": truth[u]["phase_rad"][0]} for u in made.population.unit_ids})
 
 
 def task(tuning, lifting=DRIVE, measured=(0,), name="koopman/memory", method="memory", **settings):
@@ -47,21 +48,14 @@ def task(tuning, lifting=DRIVE, measured=(0,), name="koopman/memory", method="me
         B=np.zeros((1, lifting.n_lifted, 2)),
         index=lambda unit: 0,
     )
-    options = {
-        "input_weight": "identity",
-        "time_limit_s": 1.0,
-        "max_order": 2,
-        "max_states": None,
-        "memory": PredictorSettings(states=4),
-        **settings,
-    }
-    return Task(name, method, models, "001001", None, "there is no set", np.array([1e-5]), tuning, **options)
+    options = {"settings": SynthesisSettings(**settings), "predictor": PredictorSettings(states=4)}
+    return DesignTask(name, method, models, "001001", None, "there is no set", np.array([1e-5]), tuning, **options)
 
 
 @pytest.fixture(scope="module")
 def made(tuning):
     own = task(tuning)
-    return own, produce(own)
+    return own, design(own)
 
 
 def test_a_calibrated_angle_is_seen_as_a_whole():
@@ -82,10 +76,10 @@ def test_the_last_episodes_are_held_out():
 
 
 def test_a_study_makes_what_the_recipe_makes(made, tuning):
-    own, product = made
+    _, product = made
     assert product.facts["memory_states"] == 4
     assert set(product.facts["held_out_percent"]) == {"before", "after"}
-    observer = own.observer(product.synthesis)
+    observer = product.observer
     assert observer.recorded == STATES
     assert observer.lifting.functions == ("sin(100*position + phase)", "cos(100*position + phase)")
     judge = tuning.read()
@@ -111,12 +105,12 @@ def test_a_study_makes_what_the_recipe_makes(made, tuning):
 
 def test_it_is_certified_as_it_runs_and_its_order_counts_the_memory(made):
     own, product = made
-    running = certify_running([own], [product])[0]
+    running = certify_running(own, [product])[0]
     assert running.certificate.certified
     assert running.rows
     assert all(row.holds for row in running.rows)
-    assert running.blind_percent < 100
-    facts = certificate(own, product.synthesis, None)
+    assert running.dropout_percent < 100
+    facts = certificate(own, product, None)
     assert facts["order"] == 4
     assert "states of its own" in facts["reason"]
 
@@ -132,7 +126,7 @@ def test_it_is_certified_as_it_runs_and_its_order_counts_the_memory(made):
     ],
 )
 def test_where_there_is_none_the_reason_is_told(tuning, lifting, measured, words):
-    product = produce(task(tuning, lifting, measured))
+    product = design(task(tuning, lifting, measured))
     assert product.synthesis is None
     assert product.facts["status"] == "failed"
     assert words in product.facts["reason"]
@@ -140,10 +134,10 @@ def test_where_there_is_none_the_reason_is_told(tuning, lifting, measured, words
 
 def test_tuning_is_kept_where_nothing_speaks_against_it(tuning, made):
     own, product = made
-    start, judge = own.observer(product.synthesis), tuning.read()
+    start, judge = product.observer, tuning.read()
 
     def changed(factor):
-        return replace(start, A=np.concatenate([start.A[:1], factor * start.A[1:2], start.A[2:]]))
+        return replace(start, A=np.concatenate([start.A[:1], factor * start.A[1:2], start.A[2:]]), replaces=False)
 
     worse, facts = tuned_where_better(own, judge, start, lambda seen, o: changed(0.5))
     assert worse is start
@@ -162,18 +156,20 @@ def test_tuning_is_kept_where_nothing_speaks_against_it(tuning, made):
 
 
 def test_a_correction_filter_is_tuned_the_same_way(tuning):
-    own, judge = task(tuning, name="linear/residual_h2", method="residual_h2", lifting=Lifting(STATES)), tuning.read()
+    own = task(tuning, name="linear/residual_h2", method="residual_h2", lifting=Lifting(STATES))
+    judge = tuning.read()
     x, u = judge.batch.states, judge.batch.inputs
     seen, following = np.concatenate([x, u], axis=-1)[:-1].reshape(-1, 5), x[1:].reshape(-1, 3)
     rows = np.linalg.lstsq(seen, following, rcond=None)[0].T
     covariance = np.cov((following - seen @ rows.T).T)
     own.models.A[0], own.models.B[0] = 0.999 * rows[:, :3], rows[:, 3:]
     start = kalman(own.models.A[0], np.eye(1, 3), covariance, np.array([[1e-10]]), 0.001)
-    kept, facts = tuned(own, judge, start)
+    kept = tuned(own, DesignResult(own.name, own.observer(start), start, {}))
+    facts = kept.facts
     assert facts["tuned"]
     assert facts["held_out_percent"]["after"] < 0.9 * facts["held_out_percent"]["before"]
-    assert isinstance(kept, OwnModel)
-    assert kept.controller.n_states == start.controller.n_states
+    assert kept.uncovered == TUNED
+    assert kept.synthesis.controller.n_states == start.controller.n_states
     assert "tuned on training episodes" in certificate(own, kept, None)["reason"]
 
 
@@ -189,7 +185,7 @@ def test_the_verdict_claims_no_set_for_it():
 
 
 def test_an_observer_that_loses_the_machine_is_not_made(made, monkeypatch):
-    monkeypatch.setattr("kros.design.predictor.LOST", 0.0)
-    product = produce(made[0])
+    monkeypatch.setattr("kros.design.predictor.DIVERGED", 0.0)
+    product = design(made[0])
     assert product.synthesis is None
-    assert "loses the machine" in product.facts["reason"]
+    assert "it diverges" in product.facts["reason"]

@@ -12,13 +12,13 @@ import pytest
 from kros.core.errors import DimensionError, SynthesisError
 from kros.core.lti import gain
 from kros.data.population import EpisodeKey
-from kros.design.certificates import Running, certify, first_episodes, save_running
-from kros.design.validation import TuningSet
+from kros.design.certificates import Running, certify, save_running
+from kros.design.synthesize import choose_deployed, robust_of
+from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certificate, relift_report
 from kros.report.run_folder import RunFolder
 from kros.report.sections.relift import section
-from kros.study.stages.synthesize import choose_deployed, robust_of
 from kros.synthesis import Injection
 
 
@@ -72,8 +72,8 @@ def test_global_slopes_need_no_box_and_no_phase(task: Any) -> None:
 
 def test_one_episode_of_every_unit() -> None:
     keys = tuple(EpisodeKey(unit, "on", episode) for unit in ("a", "b") for episode in ("1", "2"))
-    tuning = TuningSet(None, keys, {})  # type: ignore[arg-type]
-    assert [(k.unit, k.episode) for k in first_episodes(tuning).keys] == [("a", "1"), ("b", "1")]
+    tuning = TrainingSet(None, keys, {})  # type: ignore[arg-type]
+    assert [(k.unit, k.episode) for k in tuning.first_of_units().keys] == [("a", "1"), ("b", "1")]
 
 
 def test_an_observer_without_certificate_has_no_report() -> None:
@@ -107,7 +107,7 @@ def test_the_report_tells_gains_bounds_and_failures(tmp_path: Path) -> None:
     assert section(RunFolder(tmp_path), {"study": {}, "observers": {}}) is None
 
 
-def test_handed_over_is_the_most_accurate_observer_that_is_certified_as_it_runs() -> None:
+def test_deployed_is_the_most_accurate_observer_that_is_certified_as_it_runs() -> None:
     good, bad = observer("koopman/open_loop", "sin(x)", 0.1), observer("koopman/worst_case_h2", "sin(x)", 0.5)
     certificate, refused = relift_certificate(good), relift_certificate(bad)
     assert certificate.certified

@@ -129,7 +129,7 @@ def drives() -> tuple[RefinedModels, Factor, np.ndarray, Problem]:
     whole = combine(factors)
     models = refine_population(population, keys, KOOPMAN, phase, whole, options=OPTIONS)
     T, n_samples = models.whitening, whole.n_samples
-    segments = read_segments(population, keys, max(OPTIONS.horizons), OPTIONS.segments, OPTIONS.seed)
+    segments = read_segments(population, keys, max(OPTIONS.horizons), OPTIONS.segments, 0)
     one_step = OneStep.of(whole.R, T, 3, 4, n_samples, np.arange(3))
     problem = Problem(KOOPMAN, phase, segments, T, models.sigma, one_step, OPTIONS.margin)
     prior = ResponsePrior(

@@ -123,7 +123,7 @@ def test_normal_equations_by_episode_add_up_with_delays() -> None:
     population, keys, factor, _ = machines(2, 0.05, seed=8)
     models = refine_population(population, keys, BILINEAR, {}, factor, options=replace(OPTIONS, strengths=(1.0,)))
     by_episode = episode_normals(models, population, keys, BILINEAR, {}, episode_factors(population, keys, BILINEAR), OPTIONS)
-    segments = read_segments(population, keys, 80, OPTIONS.segments, OPTIONS.seed, BILINEAR.history)
+    segments = read_segments(population, keys, 80, OPTIONS.segments, 0, BILINEAR.history)
     W = np.concatenate([models.units.A, models.units.B], axis=-1)
     V = np.swapaxes(np.linalg.solve(models.whitening, np.swapaxes(W, -1, -2)), -1, -2)
     whole = normal_equations(V[:, :2], models.whitening, BILINEAR, {}, segments, models.sigma)

@@ -14,20 +14,9 @@ Array = npt.NDArray[np.float64]
 
 
 def stability_barrier(V: Array, T: Array, guard: float, weight: float) -> Array:
-    """Return ``[J r]^T [J r]`` of the cost above.
+    """Return ``[J r]^T [J r]`` of the cost above, shape (problem, n p + 1, n p + 1), for V (problem, n, p) and T (p, p).
 
-    Parameters
-    ----------
-    V : ndarray, shape (problem, n, p)
-    T : ndarray, shape (p, p)
-    guard : float
-        Width of the edge.
-    weight : float
-        Cost of an eigenvalue on the unit circle.
-
-    Returns
-    -------
-    ndarray, shape (problem, n p + 1, n p + 1)
+    `guard` is the width of the edge, `weight` the cost of an eigenvalue on the unit circle.
     """
     problems, n, p = V.shape
     values, right = np.linalg.eig((V @ T.T)[..., :n])

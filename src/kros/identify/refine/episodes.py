@@ -17,7 +17,7 @@ from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
 from ..factors import Factor, combine
 from .model import RefinedModels
-from .options import RefineOptions
+from .options import SEED, RefineOptions
 from .problem import _ROW_WEIGHT, OneStep, Problem
 from .segments import Segments, held_segments, read_segments
 from .sensitivity import normal_equations
@@ -76,7 +76,7 @@ def episode_normals(
         )
     W = np.concatenate([models.units.A, models.units.B], axis=-1)
     V = np.swapaxes(np.linalg.solve(T, np.swapaxes(W, -1, -2)), -1, -2)
-    segments = read_segments(population, keys, max(options.horizons), options.segments, options.seed, lifting.history)
+    segments = read_segments(population, keys, max(options.horizons), options.segments, SEED, lifting.history)
     whole = combine(factors)
     rows = np.arange(units) if pooled is None else np.flatnonzero(pooled)
     own = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters}

@@ -59,7 +59,7 @@ class RefinedModels:
     sigma : ndarray, shape (n_states,)
         Errors that count as one.
     converged : ndarray of bool, shape (unit,)
-        Whether the last step gained less than `RefineOptions.least_gain`; the others ran out of iterations, and are no less valid.
+        Whether the last step gained less than `options.LEAST_GAIN`; the others ran out of iterations, and are no less valid.
     information : ndarray, shape (unit, P, P)
         Gauss-Newton matrix of every unit's cost, prior included, for parameters V with ``[A B] = V T^T``.
     whitening : ndarray, shape (p, p)

@@ -6,6 +6,13 @@ from dataclasses import dataclass
 
 from ...core.errors import ConfigError
 
+NEGLIGIBLE_RESIDUAL = 0.1  # peak residual up to which less uncertainty is worth nothing, so that accuracy alone decides
+TOLERANCE = 0.1  # the strongest prior whose held-out error exceeds the lowest by no more than this share is chosen
+GUARD = 2e-3  # spectral radii above one less this are penalised, so that the search slides along the edge of stability
+ALPHA_FACTOR = 4.0  # the start is a pooled EDMD model with this times the smallest alpha that stabilises it
+LEAST_GAIN = 1e-3  # relative decrease of the cost below which a horizon is done
+SEED = 0  # where the segments start
+
 
 @dataclass(frozen=True)
 class RefineOptions:
@@ -23,40 +30,24 @@ class RefineOptions:
     largest_residual : float
         Priors so weak that the peak residual within the population (inverse input multiplicative form) exceeds this are not chosen: the
         set of models that covers such a population is too large for a robust observer.
-    negligible_residual : float
-        Peak residual up to which less uncertainty is worth nothing, so that accuracy alone decides.
-    tolerance : float
-        The strongest prior whose held-out error exceeds the lowest by no more than this share is chosen.
     balance : float
         A state's error counts in units of ``start**balance * range**(1 - balance)``, with `start` the free-run error of the EDMD
         model and `range` that of the state: 0 weighs states by their range, 1 asks every state for the same improvement.
     starts : tuple of (int, float)
         First horizons and weighings from which the pooled model is sought; the end whose whole free runs are best is taken.
-    level : float
-        Residual of the inverse input multiplicative form beyond which the prior bites.
-    power : int
-        How suddenly it bites: 1 is quadratic.
     pooled_segments : int
         Segments of all units together from which the pooled model is sought; it is finished on all.
-    guard : float
-        Spectral radii above ``1 - guard`` are penalised, so that the search slides along the edge of stability.
     margin : float
         Stable means a spectral radius below ``1 - margin``.
-    alpha_factor : float
-        The start is a pooled EDMD model with this times the smallest alpha that stabilises it.
     iterations : int
         Most steps of Levenberg-Marquardt per horizon of the pooled model, and of the units at the strength chosen.
     path_iterations : int
         Most steps at each strength before one is chosen; each starts where the stronger prior ended.
-    least_gain : float
-        Relative decrease of the cost below which a horizon is done.
     bound : float
         A free run on training episodes may reach this times the range of the states.
     validation_samples : int, optional
         At most this many samples of each training episode are run freely to choose the strength and to see that runs stay bounded; None
         runs whole episodes. For plants that no model follows for long, such as those that are unstable in open loop.
-    seed : int
-        Where the segments start.
 
     Raises
     ------
@@ -68,22 +59,14 @@ class RefineOptions:
     segments: int = 24
     strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)
     largest_residual: float = 0.5
-    negligible_residual: float = 0.1
-    tolerance: float = 0.1
     balance: float = 0.65
     starts: tuple[tuple[int, float], ...] = ((5, 0.8), (320, 0.8))
-    level: float = 0.3
-    power: int = 2
     pooled_segments: int = 120
-    guard: float = 2e-3
     margin: float = 1e-5
-    alpha_factor: float = 4.0
     iterations: int = 15
     path_iterations: int = 8
-    least_gain: float = 1e-3
     bound: float = 10.0
     validation_samples: int | None = None
-    seed: int = 0
 
     def __post_init__(self) -> None:
         good = {
@@ -91,18 +74,11 @@ class RefineOptions:
             "segments": self.segments >= 1,
             "strengths": len(self.strengths) > 0 and min(self.strengths, default=0.0) > 0,
             "largest_residual": self.largest_residual > 0,
-            "negligible_residual": self.negligible_residual > 0,
-            "tolerance": self.tolerance >= 0,
             "balance": 0 <= self.balance <= 1,
             "starts": len(self.starts) > 0 and all(0 <= balance <= 1 for _, balance in self.starts),
-            "level": self.level > 0,
-            "power": self.power >= 1,
             "pooled_segments": self.pooled_segments >= 1,
-            "guard": 0 < self.guard < 1,
             "margin": 0 <= self.margin < 1,
-            "alpha_factor": self.alpha_factor >= 1,
             "iterations": min(self.iterations, self.path_iterations) >= 1,
-            "least_gain": self.least_gain > 0,
             "bound": self.bound >= 1,
             "validation_samples": self.validation_samples is None or self.validation_samples >= 2,
         }

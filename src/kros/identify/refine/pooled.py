@@ -17,7 +17,7 @@ from ..factors import Factor
 from ..ranges import Ranges
 from .barrier import stability_barrier
 from .marquardt import minimise
-from .options import RefineOptions
+from .options import ALPHA_FACTOR, GUARD, LEAST_GAIN, RefineOptions
 from .problem import OneStep, Problem
 from .segments import Segments
 
@@ -40,7 +40,7 @@ def start_pooled(
     nl, n = lifting.n_lifted, lifting.n_states
     R = qr_triangle(factor.R[rows].reshape(-1, factor.R.shape[-1]))
     p = R.shape[-1] - nl
-    alpha = options.alpha_factor * smallest_stabilising_alpha([(R[None], nl)], options.margin)
+    alpha = ALPHA_FACTOR * smallest_stabilising_alpha([(R[None], nl)], options.margin)
     matrices = edmd(R, nl, alpha)
     T = _whitening(R[:p, :p], int(factor.n_samples[rows].sum()))
     V = np.linalg.solve(T, np.concatenate([matrices.A, matrices.B], axis=-1).T).T[None]
@@ -70,12 +70,12 @@ def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, score: 
         grown = _grow(V, replace(few, sigma=_sigma(error, span, balance)), options, few.finite, first)
         if grown is None:
             continue
-        end = minimise(few.evaluate, few.finite, grown, options.iterations, options.least_gain)
+        end = minimise(few.evaluate, few.finite, grown, options.iterations, LEAST_GAIN)
         stable = _stabilise(end.V, few, options)
         if stable is not None and np.isfinite(end.cost).all():
-            sigma = sigma if found else normalised(few, stable, options).sigma
-            edged = replace(few, sigma=sigma, guard=options.guard)
-            kept = minimise(edged.evaluate, edged.admissible, stable, _COMPARED, options.least_gain)
+            sigma = sigma if found else normalised(few, stable).sigma
+            edged = replace(few, sigma=sigma, guard=GUARD)
+            kept = minimise(edged.evaluate, edged.admissible, stable, _COMPARED, LEAST_GAIN)
             found.append((score(kept.V[0]), float(kept.cost[0]), kept.V))
             log.debug("pooled model from horizon %d and balance %g: score %.6g, cost %.6g", first, balance, *found[-1][:2])
     if not found:
@@ -87,9 +87,9 @@ def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, score: 
                 "horizons, or leave out lifting functions that grow."
             )
         return np.asarray(grown[0])
-    edged = replace(problem, sigma=sigma, guard=options.guard)
+    edged = replace(problem, sigma=sigma, guard=GUARD)
     best = min(found, key=lambda row: row[:2])[2]
-    return np.asarray(minimise(edged.evaluate, edged.admissible, best, options.iterations, options.least_gain).V[0])
+    return np.asarray(minimise(edged.evaluate, edged.admissible, best, options.iterations, LEAST_GAIN).V[0])
 
 
 def _grow(
@@ -100,18 +100,18 @@ def _grow(
     V[:, problem.lifting.n_states :] = problem.one_step.rows if admissible == problem.finite else V[:, problem.lifting.n_states :]
     for horizon in (h for h in options.horizons if h >= min(first, options.horizons[-1])):
         now = problem.at(horizon)
-        solution = minimise(now.evaluate, admissible, V, options.iterations, options.least_gain)
+        solution = minimise(now.evaluate, admissible, V, options.iterations, LEAST_GAIN)
         if not np.isfinite(solution.cost).all():
             return None
         V = solution.V
     return V
 
 
-def normalised(problem: Problem, V: Array, options: RefineOptions) -> Problem:
+def normalised(problem: Problem, V: Array) -> Problem:
     """The problem with errors in units of those that a pooled model V leaves, and with a soft edge of stability."""
     normal = problem.run(V)
     size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, _LEAST_ERROR**2))
-    return replace(problem, sigma=problem.sigma * size, guard=options.guard)
+    return replace(problem, sigma=problem.sigma * size, guard=GUARD)
 
 
 def _stabilise(V: Array, problem: Problem, options: RefineOptions) -> Array | None:
@@ -125,7 +125,7 @@ def _stabilise(V: Array, problem: Problem, options: RefineOptions) -> Array | No
     for factor in np.linspace(1.0, 0.0, 21):
         shortened.append(V.copy())
         shortened[-1][:, n:] *= factor
-    for margin in (max(options.guard, problem.margin), problem.margin):
+    for margin in (max(GUARD, problem.margin), problem.margin):
         for trial in shortened:
             if replace(problem, margin=margin).admissible(trial).all():
                 return trial
@@ -134,9 +134,9 @@ def _stabilise(V: Array, problem: Problem, options: RefineOptions) -> Array | No
     for heavier in 10.0 ** np.arange(_HEAVIER):
 
         def evaluate(trial: Array, share: float = heavier) -> Array:
-            return problem.evaluate(trial) + share * stability_barrier(trial, problem.T, options.guard, weight)
+            return problem.evaluate(trial) + share * stability_barrier(trial, problem.T, GUARD, weight)
 
-        found = minimise(evaluate, problem.finite, V, options.iterations, options.least_gain)
+        found = minimise(evaluate, problem.finite, V, options.iterations, LEAST_GAIN)
         if not np.isfinite(found.cost).all():
             return None
         V = found.V

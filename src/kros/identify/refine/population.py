@@ -26,7 +26,7 @@ from ..ranges import Ranges
 from .marquardt import Solution, minimise
 from .metric import ResponsePrior
 from .model import RefinedModels, TradeOff
-from .options import RefineOptions
+from .options import GUARD, LEAST_GAIN, NEGLIGIBLE_RESIDUAL, SEED, TOLERANCE, RefineOptions
 from .pooled import matrices_of, normalised, ranges, refine_pooled, restrict, start_pooled
 from .problem import Problem
 from .segments import held_segments, read_segments
@@ -95,7 +95,7 @@ def _refine(
     options: RefineOptions,
 ) -> RefinedModels:
     """Refine in channels divided by their ranges."""
-    segments = read_segments(population, keys, max(options.horizons), options.segments, options.seed, lifting.history)
+    segments = read_segments(population, keys, max(options.horizons), options.segments, SEED, lifting.history)
     held = held_segments(options.segments, keys)
     fitted = segments.first(options.segments - held)
     rows = np.flatnonzero(pooled)
@@ -103,7 +103,7 @@ def _refine(
     spans = ranges(factor, rows, lifting)
     validation = ValidationSet(population, keys, lifting, parameters, rows, problem, spans, options.validation_samples)
     common = refine_pooled(start, restrict(problem, rows), error, span, lambda V: validation.trade_off([V], (np.inf,))[0].score, options)
-    prepared = _with_prior(problem, common, factor, rows, options)
+    prepared = _with_prior(problem, common, factor, rows)
     validation = replace(validation, problem=prepared)
     path, trade_off = _path(prepared, common, validation, options)
     choice = _choose(trade_off, options)
@@ -158,12 +158,12 @@ def _check(
         )
 
 
-def _with_prior(problem: Problem, common: Array, factor: Factor, rows: npt.NDArray[np.int64], options: RefineOptions) -> Problem:
+def _with_prior(problem: Problem, common: Array, factor: Factor, rows: npt.NDArray[np.int64]) -> Problem:
     """The problem of all units at the longest horizon, errors in units of those of the pooled model, with a prior around it."""
-    edged = normalised(restrict(problem, rows), common[None], options)
+    edged = normalised(restrict(problem, rows), common[None])
     model = matrices_of(common, problem.T, problem.lifting.n_lifted)
-    prior = ResponsePrior(model.A, model.B, problem.T, *ranges(factor, rows, problem.lifting), level=options.level, power=options.power)
-    return replace(problem, sigma=edged.sigma, guard=options.guard, prior=prior)
+    prior = ResponsePrior(model.A, model.B, problem.T, *ranges(factor, rows, problem.lifting))
+    return replace(problem, sigma=edged.sigma, guard=GUARD, prior=prior)
 
 
 def _strengthen(problem: Problem, strength: float) -> Problem:
@@ -181,11 +181,11 @@ def _path(problem: Problem, common: Array, validation: ValidationSet, options: R
     rows: list[TradeOff] = []
     for strength in sorted(options.strengths, reverse=True):
         now = _strengthen(problem, strength)
-        V = minimise(now.evaluate, now.admissible, V, options.path_iterations, options.least_gain).V
+        V = minimise(now.evaluate, now.admissible, V, options.path_iterations, LEAST_GAIN).V
         path.append(V)
         rows += validation.trade_off([V], (strength,))
         log.debug("prior of strength %g: held-out score %.4g, peak residual %.1f dB", strength, rows[-1].score, rows[-1].peak_db)
-        idle = len(rows) > _PATIENCE and rows[-1].score > (1 - options.tolerance / 2) * rows[-1 - _PATIENCE].score
+        idle = len(rows) > _PATIENCE and rows[-1].score > (1 - TOLERANCE / 2) * rows[-1 - _PATIENCE].score
         if idle or _too_uncertain(rows[-1], options):
             break
     return path, rows
@@ -193,13 +193,13 @@ def _path(problem: Problem, common: Array, validation: ValidationSet, options: R
 
 def _settle(problem: Problem, V: Array, options: RefineOptions) -> Solution:
     """Fit all units to the end: those that have not converged go on by themselves."""
-    solution = minimise(problem.evaluate, problem.admissible, V, options.iterations, options.least_gain)
+    solution = minimise(problem.evaluate, problem.admissible, V, options.iterations, LEAST_GAIN)
     for _ in range(_ROUNDS):
         rows = np.flatnonzero(~solution.converged)
         if not rows.size:
             break
         part = replace(restrict(problem, rows), pooled=False)
-        more = minimise(part.evaluate, part.admissible, solution.V[rows], options.iterations, options.least_gain)
+        more = minimise(part.evaluate, part.admissible, solution.V[rows], options.iterations, LEAST_GAIN)
         solution = solution.updated(rows, more)
     return solution
 
@@ -227,7 +227,7 @@ def _keep_bounded(
         log.warning("%s; fitted again with a prior of strength %g", "; ".join(found[i] for i in sorted(found)), strength)
         part = replace(restrict(_strengthen(problem, strength), rows), pooled=False)
         V = np.repeat(common[None], len(rows), axis=0)
-        solution = solution.updated(rows, minimise(part.evaluate, part.admissible, V, options.iterations, options.least_gain))
+        solution = solution.updated(rows, minimise(part.evaluate, part.admissible, V, options.iterations, LEAST_GAIN))
     raise IdentificationError(
         f"Refinement: {next(iter(found.values()))}, even with a prior of strength {strength:g}; use longer horizons, or functions that stay bounded."
     )
@@ -249,8 +249,8 @@ def _choose(rows: Sequence[TradeOff], options: RefineOptions) -> int:
             "Refinement: at every strength of the prior a free run over a held-out training episode diverges; add strengths above "
             f"{max(row.strength for row in rows):g}."
         )
-    choice = next(i for i, row in enumerate(rows) if row.score <= (1 + options.tolerance) * best)
-    negligible = 20 * np.log10(min(options.negligible_residual, options.largest_residual))
+    choice = next(i for i, row in enumerate(rows) if row.score <= (1 + TOLERANCE) * best)
+    negligible = 20 * np.log10(min(NEGLIGIBLE_RESIDUAL, options.largest_residual))
     free = [i for i, row in enumerate(rows) if i >= choice and row.peak_db <= negligible]
     return min(free, key=lambda i: rows[i].score, default=choice)
 

@@ -58,24 +58,7 @@ class Normal:
 def normal_equations(
     V: Array, T: Array, lifting: Lifting, parameters: Mapping[str, Array], segments: Segments, sigma: Array, stride: int = 1
 ) -> Normal:
-    """Run all segments with their unit's model and accumulate the normal equations.
-
-    Parameters
-    ----------
-    V : ndarray, shape (unit, n, p)
-    T : ndarray, shape (p, p)
-    lifting : Lifting
-    parameters : mapping of str to ndarray, shape (unit,)
-    segments : Segments
-    sigma : ndarray, shape (n,)
-        Scale of every state's error.
-    stride : int
-        Every how many steps the error counts.
-
-    Returns
-    -------
-    Normal
-    """
+    """Run all segments with their unit's model and accumulate the normal equations, errors in units of sigma (n,), at every `stride`-th step."""
     n, nl, h = lifting.n_states, lifting.n_lifted, segments.history
     n_samples, m, units, per_unit = segments.inputs.shape
     batch, p = units * per_unit, V.shape[-1]

@@ -29,28 +29,10 @@ def free_run_errors(
     keys: Sequence[EpisodeKey],
     validation_samples: int | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Return what the free runs of several models differ by from one episode of every unit.
+    """Return what the free runs of several models, A (model, unit, n_lifted, n_lifted), differ by from one episode of every unit.
 
-    Parameters
-    ----------
-    A : ndarray, shape (model, unit, n_lifted, n_lifted)
-    B : ndarray, shape (model, unit, n_lifted, m)
-    lifting : Lifting
-    parameters : mapping of str to ndarray, shape (unit,)
-    population : Population
-    keys : sequence of EpisodeKey
-        One for every unit.
-    validation_samples : int, optional
-        Samples of each episode that are run, those before a free run's start not counted; all by default.
-
-    Returns
-    -------
-    rms : ndarray, shape (model, unit, n)
-        Of the error; infinite where a run diverged.
-    top : ndarray, shape (unit, n)
-        Largest magnitude recorded.
-    reached : ndarray, shape (model, unit, n)
-        Largest magnitude of the free run.
+    That is the RMS of the error (model, unit, n), infinite where a run diverged, the largest magnitude recorded (unit, n), and that of the run
+    (model, unit, n). Of each episode `validation_samples` are run, those before a free run's start not counted; all by default.
     """
     n, h, models = lifting.n_states, lifting.history, len(A)
     rms, reached, top = np.full((models, len(keys), n), np.inf), np.full((models, len(keys), n), np.inf), np.zeros((len(keys), n))
@@ -90,25 +72,9 @@ def find_unbounded(
     limit: Array,
     validation_samples: int | None = None,
 ) -> dict[int, str]:
-    """Run every unit's model over all of its training episodes, and find those that leave the limit.
+    """Run every unit's model, A (unit, n_lifted, n_lifted), over all of its training episodes, and find those whose states leave the limit (n,).
 
-    Parameters
-    ----------
-    A : ndarray, shape (unit, n_lifted, n_lifted)
-    B : ndarray, shape (unit, n_lifted, m)
-    lifting : Lifting
-    parameters : mapping of str to ndarray, shape (unit,)
-    population : Population
-    keys : mapping of str to sequence of EpisodeKey
-    limit : ndarray, shape (n,)
-        Largest magnitude of every state that is still bounded.
-    validation_samples : int, optional
-        As in `free_run_errors`.
-
-    Returns
-    -------
-    dict of int to str
-        For the rows of units that leave it: the episode, the state and how far it goes.
+    Returned are, for the rows of these units, the episode, the state and how far it goes.
     """
     found: dict[int, str] = {}
     flat = [(row, key) for row, episodes in enumerate(keys.values()) for key in episodes]

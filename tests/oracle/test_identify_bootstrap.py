@@ -23,6 +23,7 @@ from kros.identify.refine import RefinedModels, RefineOptions, refine_population
 from kros.identify.refine.episodes import episode_normals, segment_owners
 from kros.identify.refine.marquardt import minimise
 from kros.identify.refine.metric import ResponsePrior
+from kros.identify.refine.options import GUARD
 from kros.identify.refine.pooled import ranges
 from kros.identify.refine.problem import OneStep, Problem
 from kros.identify.refine.segments import Segments, read_segments
@@ -132,10 +133,8 @@ def drives() -> tuple[RefinedModels, Factor, np.ndarray, Problem]:
     segments = read_segments(population, keys, max(OPTIONS.horizons), OPTIONS.segments, 0)
     one_step = OneStep.of(whole.R, T, 3, 4, n_samples, np.arange(3))
     problem = Problem(KOOPMAN, phase, segments, T, models.sigma, one_step, OPTIONS.margin)
-    prior = ResponsePrior(
-        models.pooled.A, models.pooled.B, T, *ranges(whole, np.arange(3), KOOPMAN), level=OPTIONS.level, power=OPTIONS.power
-    )
-    problem = replace(problem, guard=OPTIONS.guard, prior=prior.scaled(models.strength * problem.residuals))
+    prior = ResponsePrior(models.pooled.A, models.pooled.B, T, *ranges(whole, np.arange(3), KOOPMAN))
+    problem = replace(problem, guard=GUARD, prior=prior.scaled(models.strength * problem.residuals))
     # Refits compare minima, so the models are first taken all the way to theirs.
     V = settle(problem.evaluate, minimise(problem.evaluate, problem.admissible, whitened(models), 60, 1e-12).V)
     W = V @ T.T

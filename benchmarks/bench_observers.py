@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from kros.core.lti import StateSpace, gain
+from kros.data import EpisodeBatch, EpisodeKey
 from kros.evaluate import summarise
 from kros.lifting import Lifting
 from kros.observer import (
@@ -68,7 +69,7 @@ def main() -> None:
         for order, count in zip(ORDERS, COUNTS, strict=True):
             work = partial(run_observers, [observer(lifting, order)] * TOGETHER, y, u, values)
             estimate = timed(f"{count} {name} observers, {order} filter states", work, count // TOGETHER)[0]
-        work = partial(run_observer, observer(with_memory(lifting), 0), y, u, values)
+        work = partial(run_observer, observer(with_internal(lifting), 0), y, u, values)
         timed(f"1 {name} observer with a memory of {MEMORIES} states", work)
     A = np.pad(0.3 * rng.normal(size=(3, 4)), ((0, 1), (0, 0)))
     extended = ExtendedKalman(KOOPMAN, A, np.zeros((4, 2)), (0,), ("a", "b"), 0.01 * np.eye(3), np.eye(1), np.eye(3))
@@ -76,11 +77,10 @@ def main() -> None:
     timed("filtered difference", lambda: FilteredDifference(3, ((0, 1),), 100.0, DT).run(y, u))
     features = Features.of(KOOPMAN, (0,), y, u)
     few = {"phase": phase["phase"][:36]}
+    batch = EpisodeBatch(tuple(EpisodeKey("a", "", str(i)) for i in range(shape[1])), lengths, states, u, DT, phase)
     moments = timed(
         "learned estimator, moments of 36 episodes of 10 s",
-        lambda: Moments.of(
-            features, states[:10_000, :36], u[:10_000, :36], [min(10_000, shape[0])] * min(36, shape[1]), ["a"] * min(36, shape[1]), few
-        ),
+        lambda: Moments.of(features, batch.take(range(min(36, shape[1]))).head(10_000)),
     )
     timed("learned estimator", lambda: moments.estimator().run(y, u, phase))
     estimates = 2 * (sum(COUNTS) + 1) + 3
@@ -95,7 +95,7 @@ def main() -> None:
     timed("phase-locked loop", lambda: track_parameter(observer(KOOPMAN, 9), y, u, phase))
 
 
-def with_memory(lifting: Lifting) -> Lifting:
+def with_internal(lifting: Lifting) -> Lifting:
     """The same lifting with states of the observer's own."""
     return replace(lifting, states=(*lifting.states, *(f"memory_{i + 1}" for i in range(MEMORIES))))
 

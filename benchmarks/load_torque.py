@@ -38,8 +38,8 @@ from kros.motor_drive import (
 )
 from kros.observer import (
     Observer,
+    identify_predictor,
     noise_covariances,
-    observer_with_memory,
     one_step_residual,
     one_step_rows,
     relift_certificate,
@@ -135,7 +135,8 @@ class Drives:
         train = [k for k in self.population.episodes if k.episode not in last and (k.condition == "noload" or k.unit in self.known)]
         test = [k for k in self.population.episodes if k.episode in last and k.unit not in self.known]
         self.phase = self.phases([k for k in train if k.condition == "noload"])
-        self.train, self.test = (EpisodeBatch.read(self.population, keys) for keys in (train, test))
+        phases = {unit: {"phase": value} for unit, value in self.phase.items()}
+        self.train, self.test = (EpisodeBatch.read(self.population, keys, parameters=phases) for keys in (train, test))
         self.loads = [self.load(batch) for batch in (self.train, self.test)]
         self.limited = np.abs(self.test.states[..., CURRENT]).max(axis=0) >= LIMIT
         self.loaded = np.array([k.condition == "load" for k in test])
@@ -159,7 +160,7 @@ class Drives:
 
     def parameters(self, kind: str, batch: EpisodeBatch) -> dict[str, Array] | None:
         """Phases of a batch."""
-        return {"phase": np.array([self.phase[k.unit] for k in batch.keys])} if kind == "koopman" else None
+        return batch.parameters if kind == "koopman" else None
 
     def rows(self) -> list[dict[str, Any]]:
         """A row for every estimator."""
@@ -178,11 +179,8 @@ class Drives:
         calibration = calibrate_load(
             lifting,
             (0,),
-            self.train.states,
-            self.train.inputs,
+            self.train,
             self.loads[0],
-            self.dt,
-            self.parameters(kind, self.train),
             CURRENT,
             level_s,
             REAL_HZ,
@@ -204,18 +202,12 @@ class Drives:
         """An observer with as many states that knows no load: what its current is worth."""
         lifting = Lifting(self.population.states, FUNCTIONS[kind], ("phase",) if FUNCTIONS[kind] else ())
         free = [i for i, k in enumerate(self.train.keys) if k.condition == "noload"]
-        own = self.parameters(kind, self.train)
-        observer = observer_with_memory(
+        observer = identify_predictor(
             f"{kind}/memory",
             lifting,
             (0,),
             self.population.inputs,
-            self.train.states[:, free],
-            self.train.inputs[:, free],
-            self.train.lengths[free],
-            [self.train.keys[i].unit for i in free],
-            self.dt,
-            None if own is None else {"phase": own["phase"][free]},
+            self.train.take(free),
             self.options.memories[0] + 1,
             iterations=self.options.iterations,
         )
@@ -226,13 +218,11 @@ class Drives:
         """One-step model of all units without load and the covariance of what it misses."""
         lifting = Lifting(self.population.states, FUNCTIONS[kind], ("phase",) if FUNCTIONS[kind] else ())
         free = [i for i, k in enumerate(self.train.keys) if k.condition == "noload"]
-        own = self.parameters(kind, self.train)
-        values = None if own is None else {"phase": own["phase"][free]}
-        x, u = self.train.states[:, free], self.train.inputs[:, free]
-        A, B = one_step_rows(lifting, x, u, self.train.lengths[free], values)
+        batch = self.train.take(free)
+        A, B = one_step_rows(lifting, batch)
         functions = len(lifting.functions)
         A, B = (np.vstack([M, np.zeros((functions, M.shape[1]))]) for M in (A, B))
-        residual = one_step_residual(lifting, A, B, x, u, values).reshape(-1, len(A) - functions)
+        residual = one_step_residual(lifting, A, B, batch.states, batch.inputs, batch.parameters).reshape(-1, len(A) - functions)
         return Observer.open_loop(kind, lifting, A, B, (0,), self.population.inputs, self.dt), np.cov(residual.T)
 
     def modelled(self, kind: str) -> dict[str, Any]:

@@ -105,8 +105,8 @@ def certified(folder: Path, run: Path, options: argparse.Namespace) -> dict[str,
         context = Context(config, Store(run), Work(executor))
         facts, calibration, population = context.facts, context.identified.calibration, read_parquet(folder / "recordings")
         keys = [facts.keys("train", unit, facts.identify_on)[0] for unit in facts.pooled]
-        batch = EpisodeBatch.read(population, keys)
-    phases = {} if calibration is None else {"phase": np.array([calibration.units[k.unit].phase_rad for k in keys])}
+        units = {} if calibration is None else {unit: {"phase": phase.phase_rad} for unit, phase in calibration.units.items()}
+        batch = EpisodeBatch.read(population, keys, parameters=units)
     noise = np.array([facts.resolution["position"] / np.sqrt(12)])
     found = {}
     for name, reason in read_json(run / "observers" / "made.json"):
@@ -114,7 +114,7 @@ def certified(folder: Path, run: Path, options: argparse.Namespace) -> dict[str,
             found[name] = {"reason": reason}
             continue
         observer = Observer.load(run / "observers" / f"{name}.json")
-        values = phases if observer.lifting.parameters else None
+        values = batch.parameters if observer.lifting.parameters else None
         found[name] = judged(observer, batch, values, noise, options)
     return found
 
@@ -131,7 +131,7 @@ def judged(observer: Observer, batch: EpisodeBatch, values: Any, noise: np.ndarr
     }
     if certificate.gain is None:
         return told | {"certified": False, "reason": certificate.reason}
-    rows = relift_report(certificate, observer, batch.states, batch.inputs, [k.unit for k in batch.keys], batch.lengths, values)
+    rows = relift_report(certificate, observer, batch)
     start = time.process_time()
     worst = attack(certificate, observer, steps=options.steps)
     share, steps = attack_running(certificate, observer, worst.disturbance, batch.states[0], batch.inputs, values)

@@ -26,7 +26,7 @@ from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent, unit_interval
 from kros.identify import ModelSet
 from kros.lifting import Lifting
-from kros.observer import Observer, observer_with_memory, relift_certificate, run_observer
+from kros.observer import Observer, identify_predictor, relift_certificate, run_observer
 from kros.study import Stage, StudyConfig, load_config, run_study
 
 HERE = Path(__file__).parent
@@ -122,15 +122,13 @@ def of_study(folder: Path) -> list[tuple[str, Observer, Mapping[str, Any]]]:
 def with_memory(training: TrainingSet, memories: Sequence[int]) -> list[tuple[str, Observer, Mapping[str, Any]]]:
     """Return linear observers with a memory from all training episodes, as regression gives them and tuned."""
     batch, population = training.read().batch, training.population
-    units = [k.unit for k in batch.keys]
     found = []
     for count in memories:
         for steps, how in ((0, ""), (25, ", tuned")):
             name = f"all training episodes, memory of {count}{how}"
-            observer = observer_with_memory(
-                name, Lifting(population.states), (0,), population.inputs, batch.states, batch.inputs, batch.lengths, units,
-                population.sample_period_s, memories=count, episodes=len(units), iterations=steps,
-            )  # fmt: skip
+            observer = identify_predictor(
+                name, Lifting(population.states), (0,), population.inputs, batch, count, episodes=len(batch.keys), iterations=steps
+            )
             found.append((name, observer, {"relift_certified": relift_certificate(observer, mismatch=False).certified}))
     return found
 

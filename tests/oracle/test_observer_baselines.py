@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from batches import batch_of
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
@@ -123,7 +124,7 @@ def test_learned_estimator_finds_what_is_linear_in_the_past():
     features = Features.of(lifting, (0,), y, u, taps=6)
     assert features.visible == (0,)
     np.testing.assert_allclose(features.static, [[0.3, 2.0]], atol=0.05)
-    learned = Moments.of(features, states, u, [900], ["a"], phases, thin=1).estimator(ridge=1e-12)
+    learned = Moments.of(features, batch_of(states, u, DT, phases), thin=1).estimator(ridge=1e-12)
     found = learned.run(y, u, phases)
     assert np.isnan(found[..., 0]).all()
     np.testing.assert_allclose(found[10:, :, 1], states[10:, :, 1], atol=1e-6)
@@ -132,10 +133,10 @@ def test_learned_estimator_finds_what_is_linear_in_the_past():
 def test_a_unit_that_is_left_out_leaves_no_trace():
     lifting, states, u, phases = linear_in_the_past()
     features = Features.of(lifting, (0,), states[..., :1], u, taps=6)
-    moments = Moments.of(features, states, u, [900, 900, 700], ["a", "b", "c"], phases)
+    moments = Moments.of(features, batch_of(states, u, DT, phases, [900, 900, 700], list("abc")))
     changed = states.copy()
     changed[:, 1] *= -3
-    others = Moments.of(features, changed, u, [900, 900, 700], ["a", "b", "c"], phases)
+    others = Moments.of(features, batch_of(changed, u, DT, phases, [900, 900, 700], list("abc")))
     y = states[..., :1]
     kept, again = (m.estimator(["b"]).run(y, u, phases)[..., 1] for m in (moments, others))
     np.testing.assert_array_equal(kept, again)
@@ -148,10 +149,10 @@ def test_learned_estimator_refuses_what_it_cannot_use():
     lifting, states, u, phases = linear_in_the_past()
     both = Features.of(lifting, (0, 1), states, u)
     with pytest.raises(DataError, match="every state is measured"):
-        Moments.of(both, states, u, [900] * 3, list("abc"), phases)
+        Moments.of(both, batch_of(states, u, DT, phases))
     one = Features.of(lifting, (0,), states[..., :1], u)
     with pytest.raises(DataError, match="unit c has 40 samples"):
-        Moments.of(one, states, u, [900, 900, 40], list("abc"), phases)
+        Moments.of(one, batch_of(states, u, DT, phases, [900, 900, 40], list("abc")))
     with pytest.raises(DimensionError, match="expected 1 measurements"):
         one.channels(states, u, phases)
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from adversary import attack, attack_running
+from batches import batch_of
 
 from kros.core.errors import DimensionError
 from kros.lifting import Lifting
@@ -14,13 +15,12 @@ from kros.observer import (
     ReliftScales,
     driven_coordinates,
     one_step_residual,
-    refit_measured_rows,
     relift_certificate,
     relift_report,
-    remembering_observer,
     run_observer,
-    with_memory,
+    with_internal,
 )
+from kros.observer.predictor import embedded
 from kros.synthesis.residual_shaped.shaping import Bank
 
 DT, SIZES, UNITS = 0.01, (1.0, 0.5), list("aabbcc")
@@ -47,8 +47,9 @@ def remembering(functions=("sin(5*p + phase)", "cos(5*p + phase)")):
     x, u, phase = machine()
     lifting = Lifting(("p", "c"), functions, ("phase",) if functions else ())
     values = phase if functions else None
-    past = Past.of(lifting, (0,), x, u, [1500] * 6, UNITS, values, Bank(15))
-    return remembering_observer("o", past, 3, ("target",), x, u, DT, values), x, u, values
+    batch = batch_of(x, u, DT, values, units=UNITS)
+    past = Past.of(lifting, (0,), batch, Bank(15))
+    return embedded("o", past, past.model(4), ("target",), batch), x, u, values
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +59,12 @@ def made():
 
 def settled(made):
     observer, x, u, values = made
-    return driven_coordinates(observer, x, u, SIZES, values)
+    return driven_coordinates(observer, batch_of(x, u, DT, values), SIZES)
 
 
 def test_the_memory_is_what_the_observer_s_own_rows_make_of_the_recordings(made):
     observer, x, u, phase = made
-    found, n = with_memory(observer, x[:40], u[:40], phase), 5
+    found, n = with_internal(observer, x[:40], u[:40], phase), 5
     m = observer.initial(x[0, :, :1], phase)[:, 2:]
     for k in range(39):
         np.testing.assert_allclose(found[k, :, 2:], m, rtol=1e-9, atol=1e-9)
@@ -72,9 +73,9 @@ def test_the_memory_is_what_the_observer_s_own_rows_make_of_the_recordings(made)
     np.testing.assert_array_equal(found[..., :2], x[:40])
     residual = one_step_residual(observer.lifting, observer.A, observer.B, found, u[:40], phase)
     assert np.abs(residual[..., 2:]).max() < 1e-9 * np.abs(found).max()
-    assert with_memory(observer, found, u[:40], phase) is found
+    assert with_internal(observer, found, u[:40], phase) is found
     with pytest.raises(DimensionError, match="driven by the 2 states p, c, found 3"):
-        with_memory(observer, found[..., :3], u[:40], phase)
+        with_internal(observer, found[..., :3], u[:40], phase)
 
 
 def test_other_coordinates_change_no_estimate(made):
@@ -84,7 +85,7 @@ def test_other_coordinates_change_no_estimate(made):
     np.testing.assert_allclose(
         run_observer(own, x[..., :1], u, phase)[..., :2], run_observer(observer, x[..., :1], u, phase)[..., :2], atol=1e-10
     )
-    memory = with_memory(own, x, u, phase)[..., 2:]
+    memory = with_internal(own, x, u, phase)[..., 2:]
     np.testing.assert_allclose(np.sqrt(np.mean(memory**2, axis=(0, 1))), 1.0, rtol=1e-6)
 
 
@@ -99,17 +100,17 @@ def test_a_memory_that_recordings_would_drive_away_is_turned_until_they_do_not()
         start = Observer.open_loop("o", plain, A, rng.normal(size=(5, 1)), (0,), ("u",), DT)
         observer = replace(start, controller=replace(start.controller, D=A[:, :1]), replaces=True, internal=3)
         assert observer.recorded == ("p", "c")
-        found = driven_coordinates(observer, 0.1 * rng.normal(size=(200, 2, 2)), rng.normal(size=(200, 2, 1)), SIZES)
+        found = driven_coordinates(observer, batch_of(0.1 * rng.normal(size=(200, 2, 2)), rng.normal(size=(200, 2, 1)), DT), SIZES)
         assert np.abs(np.linalg.eigvals(found.A[2:, 2:])).max() < 1
         np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(found.A[1:, 1:])), np.sort_complex(np.linalg.eigvals(F)), atol=1e-6)
 
 
 def test_without_lifted_functions_the_bound_is_the_error():
     observer, x, u, _ = remembering(functions=())
-    own = driven_coordinates(observer, x, u, SIZES)
+    own = driven_coordinates(observer, batch_of(x, u, DT), SIZES)
     other, v, _ = machine(seed=2, gain=0.5, cubic=0.05)
-    certificate = relift_certificate(own, scales=ReliftScales(np.array(SIZES), np.array([1e-3, 1e-2]), np.array([1e-4])).with_memory(3))
-    rows = relift_report(certificate, own, other, v, UNITS)
+    certificate = relift_certificate(own, scales=ReliftScales(np.array(SIZES), np.array([1e-3, 1e-2]), np.array([1e-4])).with_internal(3))
+    rows = relift_report(certificate, own, batch_of(other, v, DT))
     for row in rows:
         assert row.frozen == pytest.approx(row.error, rel=1e-8)
         assert row.error <= row.gain_bound
@@ -119,19 +120,19 @@ def test_without_lifted_functions_the_bound_is_the_error():
 def test_no_error_exceeds_its_bound_on_machines_of_any_kind(made, unlike):
     own = settled(made)
     x, u, phase = machine(seed=3, **unlike)
-    residual = one_step_residual(own.lifting, own.A, own.B, with_memory(own, x, u, phase), u, phase)[..., :2]
-    scales = ReliftScales.typical(SIZES, residual, 1e-4).with_memory(3)
+    residual = one_step_residual(own.lifting, own.A, own.B, with_internal(own, x, u, phase), u, phase)[..., :2]
+    scales = ReliftScales.typical(SIZES, residual, 1e-4).with_internal(3)
     certificate = relift_certificate(own, scales=scales)
     assert certificate.certified
     np.testing.assert_array_equal(certificate.system(own).C[2:], 0.0)
-    for row in relift_report(certificate, own, x, u, UNITS, parameters=phase):
+    for row in relift_report(certificate, own, batch_of(x, u, DT, phase)):
         assert row.holds
         assert row.error <= row.bound <= row.gain_bound
 
 
 def test_nobody_exceeds_the_gain_and_it_is_nearly_attained(made):
     own, rng = settled(made), np.random.default_rng(0)
-    certificate = relift_certificate(own, scales=ReliftScales(np.array(SIZES), np.array([1e-3, 1e-2]), np.array([1e-4])).with_memory(3))
+    certificate = relift_certificate(own, scales=ReliftScales(np.array(SIZES), np.array([1e-3, 1e-2]), np.array([1e-4])).with_internal(3))
     found = attack(certificate, own)
     assert 0.5 < found.share <= 1
     inputs = rng.normal(size=(len(found.disturbance) + 1, 4, 1))
@@ -140,24 +141,9 @@ def test_nobody_exceeds_the_gain_and_it_is_nearly_attained(made):
     assert share <= 1
 
 
-def test_rows_of_measured_states_are_fitted_to_what_tuning_left(made):
-    observer, x, u, phase = made
-    turned = observer.A.copy()
-    turned[2:, 1:5] *= 0.9  # tuning changes the memory, and leaves the measured state's row as it was
-    tuned = replace(observer, A=turned)
-    found = refit_measured_rows(tuned, x, u, phase)
-    estimates = [run_observer(o, x[..., :1], u, phase) for o in (tuned, found)]
-    left = [np.mean((e[300:, :, 0] - x[300:, :, 0]) ** 2) for e in estimates]
-    regressors = np.concatenate([estimates[0][..., 1:], x[..., :1], u, observer.lifting.lift(estimates[0], phase)[..., 5:]], axis=-1)
-    _, least, *_ = np.linalg.lstsq(regressors[300:-1].reshape(-1, 8), np.diff(x[..., 0], axis=0)[300:].ravel(), rcond=None)
-    assert left[1] < left[0]
-    assert left[1] == pytest.approx(least[0] / regressors[300:-1, :, 0].size, rel=0.05)
-
-
 def test_an_observer_without_memory_is_left_alone(made):
     x, u = machine()[:2]
     plain = Observer.open_loop("o", Lifting(("p", "c")), 0.5 * np.eye(2), np.ones((2, 1)), (0,), ("u",), DT)
     assert plain.recorded == ("p", "c")
-    assert driven_coordinates(plain, x, u, SIZES) is plain
-    assert refit_measured_rows(plain, x, u) is plain
-    assert with_memory(plain, x, u) is x
+    assert driven_coordinates(plain, batch_of(x, u, DT), SIZES) is plain
+    assert with_internal(plain, x, u) is x

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from adversary import attack_running
+from batches import batch_of
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
@@ -341,7 +342,7 @@ def test_no_certificate_covers_a_delay_or_limits(what):
     states = np.concatenate([y, y], axis=-1)
     for claim in (
         lambda: certificate.system(declared),
-        lambda: relift_report(certificate, declared, states, u, ["unit"]),
+        lambda: relift_report(certificate, declared, batch_of(states, u, DT)),
         lambda: attack_running(certificate, declared, np.zeros((20, 3)), np.zeros((1, 2)), u),
     ):
         with pytest.raises(Exception, match=what):

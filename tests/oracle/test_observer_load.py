@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from batches import batch_of
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.lifting import Lifting
@@ -138,7 +139,7 @@ def drives() -> SimpleNamespace:
 
     known, others = read(train), read(test)
     lifting = Lifting(population.states, ("sin(100*position + phase)",), ("phase",))
-    calibration = calibrate_load(lifting, (0,), known.x, known.u, known.load, DT, known.phase, 2, corner_hz=20.0)
+    calibration = calibrate_load(lifting, (0,), batch_of(known.x, known.u, DT, known.phase), known.load, 2, corner_hz=20.0)
     observer = load_observer("koopman/load", calibration, population.inputs, 6, samples=3000, iterations=2)
     estimate = run_observer(observer, others.x[..., :1], others.u, others.phase)
     leveled = AngleLoad(calibration.level_s, DT).run(estimate[..., 3], estimate[..., 2], others.x[..., 0])
@@ -178,10 +179,10 @@ def test_the_load_observer_is_certified_as_it_runs(drives: SimpleNamespace) -> N
 def test_calibration_says_what_it_misses(drives: SimpleNamespace) -> None:
     known, lifting = drives.known, Lifting(("position", "velocity", "current"))
     with pytest.raises(DataError, match="with and without load"):
-        calibrate_load(lifting, (0,), known.x, known.u, 0 * known.load, DT)
+        calibrate_load(lifting, (0,), batch_of(known.x, known.u, DT), 0 * known.load)
     with pytest.raises(DataError, match="come to the current's limit"):
-        calibrate_load(lifting, (0,), known.x, known.u, known.load, DT, current=2, limit=0.1)
+        calibrate_load(lifting, (0,), batch_of(known.x, known.u, DT), known.load, current=2, limit=0.1)
     with pytest.raises(DimensionError, match="agree"):
-        calibrate_load(lifting, (0,), known.x, known.u, known.load[:-1], DT)
+        calibrate_load(lifting, (0,), batch_of(known.x, known.u, DT), known.load[:-1])
     with pytest.raises(DataError, match="0 of"):
         load_accuracy(known.load, 0 * known.load, DT)

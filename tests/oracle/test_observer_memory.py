@@ -2,19 +2,18 @@
 
 import numpy as np
 import pytest
+from batches import batch_of
 
 from kros.core.errors import DataError, DimensionError
 from kros.lifting import Lifting
 from kros.observer import (
     Observer,
     Past,
-    observer_with_memory,
+    identify_predictor,
     relift_certificate,
-    remembering_observer,
     run_observer,
-    tune_memory,
-    tune_observer,
 )
+from kros.observer.predictor import embedded, tune_predictor
 from kros.synthesis import Injection, kalman
 from kros.synthesis.residual_shaped.shaping import Bank
 
@@ -51,25 +50,13 @@ def size(values):
 @pytest.fixture(scope="module")
 def made():
     x, u, phase = controlled()
-    past = Past.of(LIFTING, (0,), x, u, [2500] * 6, list("aabbcc"), phase, Bank(20))
+    past = Past.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Bank(20))
     return past, x, u, phase
-
-
-def test_the_integrator_of_a_controller_is_found(made):
-    past, x, u, phase = made
-    rough = remembering_observer("o", past, 1, NAMES, x, u, DT, phase)
-    tuned = tune_observer(rough, x, u, phase, least_gain=1e-4)
-    fresh, v, other = controlled(seed=1)
-    errors = [size((o.run(fresh[..., :1], v, other)[..., :2] - fresh)[..., 1]) for o in (rough, tuned.observer)]
-    assert errors[1] < 0.05 * 5 * 0.003  # c and one memory make the next c, but for the wave, which is lifted from the predicted p
-    assert errors[1] < 0.1 * errors[0]
-    poles = np.sort(np.linalg.eigvals((tuned.observer.A[:3, :3] - tuned.observer.controller.D[:3] @ np.eye(1, 3))[1:, 1:]).real)
-    np.testing.assert_allclose(poles, [0.5, 0.99], atol=2e-3)
 
 
 def test_what_runs_is_an_observer_like_any_other(made, tmp_path):
     past, x, u, phase = made
-    observer = remembering_observer("o", past, 3, NAMES, x, u, DT, phase)
+    observer = embedded("o", past, past.model(4), NAMES, batch_of(x, u, DT, phase, units=UNITS))
     assert observer.lifting.states == ("p", "c", "memory_1", "memory_2", "memory_3")
     assert relift_certificate(observer, mismatch=False).certified
     observer.save(tmp_path / "o.json")
@@ -90,7 +77,7 @@ def test_reduced_models_are_stable(made, order):
 
 def test_leaving_a_unit_out_is_as_if_it_had_not_been_recorded(made):
     past, x, u, phase = made
-    others = Past.of(LIFTING, (0,), x[:, :4], u[:, :4], [2500] * 4, list("aabb"), {"phase": phase["phase"][:4]}, Bank(20))
+    others = Past.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS).take(range(4)), Bank(20))
     same = Past(past.lifting, past.measured, past.bank, past.static, past.free, others.units, past.gram[:2], past.cross[:2], past.power[:2])
     F, G, H = past.model(4, without=["c"])
     for found, expected in zip((F, G, H), same.model(4), strict=True):
@@ -104,28 +91,20 @@ def test_a_linear_system_gets_the_kalman_predictor():
     for k in range(3999):
         x[k + 1] = x[k] @ F.T + u[k] @ G.T + rng.normal(size=(6, 2)) * np.sqrt(np.diag(Q))
     plain = Lifting(("x", "v"))
-    past = Past.of(plain, (0,), x, u, [4000] * 6, list("abcdef"), bank=Bank(30))
-    found = remembering_observer("o", past, 3, ("u",), x, u, DT)
+    past = Past.of(plain, (0,), batch_of(x, u, DT), Bank(30))
+    found = embedded("o", past, past.model(4), ("u",), batch_of(x, u, DT))
     best = kalman(F, np.eye(1, 2), Q, np.array([[1e-15]]), DT)
     ideal = Observer("k", plain, F, G, (0,), ("u",), best.controller, Injection.STATE, DT)
     errors = [size((run_observer(o, x[..., :1], u)[..., :2] - x)[..., 1]) for o in (found, ideal)]
     assert errors[0] == pytest.approx(errors[1], rel=0.02)
 
 
-def test_tuning_leaves_measured_rows_of_such_observers_alone(made):
-    past, x, u, phase = made
-    rough = remembering_observer("o", past, 1, NAMES, x, u, DT, phase)
-    tuned = tune_observer(rough, x, u, phase, iterations=2, importance=(1.0,)).observer
-    np.testing.assert_array_equal(tuned.A[0], rough.A[0])
-    np.testing.assert_array_equal(tuned.A[:, 0], tuned.controller.D[:, 0])
-
-
 def test_what_cannot_be_done_is_refused(made):
     past, x, u, phase = made
     with pytest.raises(DimensionError, match="alone"):
-        Past.of(Lifting(("p", "c"), ("sin(c)",)), (0,), x, u, [2500] * 6, list("aabbcc"))
+        Past.of(Lifting(("p", "c"), ("sin(c)",)), (0,), batch_of(x, u, DT))
     with pytest.raises(DataError, match="not measured"):
-        Past.of(LIFTING, (0, 1), x, u, [2500] * 6, list("aabbcc"), phase)
+        Past.of(LIFTING, (0, 1), batch_of(x, u, DT, phase))
     with pytest.raises(DataError, match="no unit is left"):
         past.model(3, without=["a", "b", "c"])
     with pytest.raises(DimensionError, match="at least as many"):
@@ -134,7 +113,7 @@ def test_what_cannot_be_done_is_refused(made):
 
 def test_it_starts_at_rest(made):
     past, x, u, phase = made
-    observer = remembering_observer("o", past, 3, NAMES, x, u, DT, phase)
+    observer = embedded("o", past, past.model(4), NAMES, batch_of(x, u, DT, phase, units=UNITS))
     y = np.full((5, 6, 1), 0.7)
     u = np.concatenate([y / past.static[0, 0], np.zeros_like(y)], axis=-1)  # target and measurement in balance, no push
     estimates = run_observer(observer, y, u, phase)
@@ -144,8 +123,8 @@ def test_it_starts_at_rest(made):
 
 def test_tuning_finds_the_controller_of_which_the_hidden_state_is_the_command():
     x, u, phase = controlled(home=3.0)
-    past = Past.of(LIFTING, (0,), x, u, [2500] * 6, UNITS, phase, Bank(20))
-    (F, _, _), criterion = tune_memory(past.model(2), past, x, u, UNITS, phase, iterations=40, least_gain=1e-6)
+    past = Past.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Bank(20))
+    (F, _, _), criterion = tune_predictor(past.model(2), past, batch_of(x, u, DT, phase, units=UNITS), iterations=40, least_gain=1e-6)
     assert list(criterion) == sorted(criterion, reverse=True)
     np.testing.assert_allclose(np.sort(np.linalg.eigvals(F).real), [0.5, 0.99], atol=2e-3)
 
@@ -153,10 +132,10 @@ def test_tuning_finds_the_controller_of_which_the_hidden_state_is_the_command():
 def test_deviation_is_what_recordings_of_machines_that_deviate_would_say():
     x, u, phase = controlled()
     make = [
-        Past.of(Lifting(("p", "c"), (f"{a}*sin(5*p + phase)",), ("phase",)), (0,), x, u, [2500] * 6, UNITS, phase, Bank(20))
+        Past.of(Lifting(("p", "c"), (f"{a}*sin(5*p + phase)",), ("phase",)), (0,), batch_of(x, u, DT, phase, units=UNITS), Bank(20))
         for a in (0.6, 1.4)
     ]
-    plain = Past.of(LIFTING, (0,), x, u, [2500] * 6, UNITS, phase, Bank(20))
+    plain = Past.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Bank(20))
     both = Past(
         LIFTING,
         (0,),
@@ -172,7 +151,7 @@ def test_deviation_is_what_recordings_of_machines_that_deviate_would_say():
 
 def test_the_whole_way_gives_an_observer_that_is_certified():
     x, u, phase = controlled(home=3.0)
-    observer = observer_with_memory("o", LIFTING, (0,), NAMES, x, u, [2500] * 6, UNITS, DT, phase, memories=1, deviation=0.0)
+    observer = identify_predictor("o", LIFTING, (0,), NAMES, batch_of(x, u, DT, phase, units=UNITS), internal=1, deviation=0.0)
     fresh, v, other = controlled(seed=1, home=3.0)
     missed = (observer.run(fresh[..., :1], v, other)[..., :2] - fresh)[..., 1]
     assert size(missed) < 0.02 * size(fresh[..., 1])  # one memory is all there is to know: what is left are starts, forgotten as 0.99^k
@@ -181,7 +160,7 @@ def test_the_whole_way_gives_an_observer_that_is_certified():
 
 def test_a_model_that_is_not_stable_is_refused():
     x, u, phase = controlled(n_samples=700)
-    past = Past.of(LIFTING, (0,), x, u, [700] * 6, UNITS, phase, Bank(20))
+    past = Past.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Bank(20))
     F, G, H = past.model(2)
     with pytest.raises(DataError, match="not stable"):
-        tune_memory((1.5 * F / np.abs(np.linalg.eigvals(F)).max(), G, H), past, x, u, UNITS, phase)
+        tune_predictor((1.5 * F / np.abs(np.linalg.eigvals(F)).max(), G, H), past, batch_of(x, u, DT, phase, units=UNITS))

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from batches import batch_of
 
 from kros.lifting import Lifting
-from kros.observer import Observer, Past, observer_with_memory, run_observer, tune_memory
-from kros.observer.predictor.blocks import blocks_of, joined
+from kros.observer import Observer, Past, identify_predictor, run_observer
+from kros.observer.predictor import tune_predictor
 from kros.observer.predictor.tuning import _slowing
+from kros.observer.tuning.blocks import blocks_of, joined
 from kros.synthesis import Injection, kalman
 from kros.synthesis.residual_shaped.shaping import Bank
 
@@ -70,8 +72,8 @@ def test_tuning_reaches_the_kalman_predictor_from_a_poor_model():
     for k in range(3999):
         x[k + 1] = x[k] @ F.T + u[k] @ G.T + rng.normal(size=(6, 2)) * np.sqrt(np.diag(Q))
     plain = Lifting(("x", "v"))
-    past = Past.of(plain, (0,), x, u, [4000] * 6, list("abcdef"), bank=Bank(2))
-    _, criterion = tune_memory(past.model(2), past, x, u, list("abcdef"), least_gain=1e-5)
+    past = Past.of(plain, (0,), batch_of(x, u, DT), Bank(2))
+    _, criterion = tune_predictor(past.model(2), past, batch_of(x, u, DT), least_gain=1e-5)
     best = kalman(F, np.eye(1, 2), Q, np.array([[1e-15]]), DT)
     ideal = Observer("k", plain, F, G, (0,), ("u",), best.controller, Injection.STATE, DT)
     least = np.sqrt(np.mean((run_observer(ideal, x[..., :1], u) - x)[..., 1] ** 2))
@@ -98,8 +100,8 @@ def test_with_deviation_a_machine_unlike_those_recorded_is_estimated_better():
     other, push = ripple(np.full(4, 2.5), seed=1)
     errors = []
     for deviation in (0.0, 0.6):
-        observer = observer_with_memory(
-            "o", plain, (0,), ("push",), x, u, [2500] * 6, list("aabbcc"), DT, memories=2, deviation=deviation, iterations=8
+        observer = identify_predictor(
+            "o", plain, (0,), ("push",), batch_of(x, u, DT, units=list("aabbcc")), internal=2, deviation=deviation, iterations=8
         )
         errors.append(np.std((observer.run(other[..., :1], push)[..., :2] - other)[400:, :, 1]))
     assert errors[1] < 0.95 * errors[0]

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 from adversary import attack, attack_running
+from batches import batch_of
 from scipy.optimize import minimize
 
 from kros.core.lti import StateSpace, gain
@@ -190,7 +191,7 @@ def test_the_error_system_is_the_observer_as_it_runs(functions: tuple[str, ...],
     states, inputs = np.cumsum(0.1 * rng.standard_normal((400, 5, 3)), axis=0), rng.standard_normal((400, 5, 1))
     found = relift_certificate(observer)
     assert found.certified, found.reason
-    rows = relift_report(found, observer, states, inputs, list("vwxyz"))
+    rows = relift_report(found, observer, batch_of(states, inputs, 0.01))
     assert all(row.holds for row in rows)
     estimates = run_observer(observer, states[..., :1], inputs)
     assert [row.error for row in rows] == pytest.approx(np.sqrt(np.mean(np.sum((states - estimates) ** 2, axis=2), axis=0)), rel=1e-12)

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from batches import batch_of
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
@@ -150,7 +151,7 @@ def test_phase_locked_loop_finds_the_phase_of_a_simulated_drive():
     states, inputs = values[..., :3], np.ascontiguousarray(values[..., 3:])
     true = plain(simulated.truth.as_dict())["units"]["001001"]["phase_rad"][0]
     lifting = Lifting(("position", "velocity", "current"), ("sin(100*position + phase)",), ("phase",))
-    rows = one_step_rows(lifting, states, inputs, [len(states)], {"phase": [true]})
+    rows = one_step_rows(lifting, batch_of(states, inputs, DT, {"phase": [true]}))
     A, B = np.vstack([rows[0], np.zeros((1, 4))]), np.vstack([rows[1], np.zeros((1, 2))])
     K = kalman(A[:3, :3], np.eye(1, 3), np.diag([1e-13, 1e-6, 1e-5]), np.array([[1e-12]]), DT).controller
     o = Observer("o", lifting, A, B, (0,), ("a", "b"), gain(np.vstack([K.D, [[0.0]]]), DT), Injection.STATE, DT)

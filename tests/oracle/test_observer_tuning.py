@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from batches import batch_of
 
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
 from kros.evaluate import unit_interval
 from kros.lifting import Lifting
 from kros.observer import Observer, one_step_rows, residual_models, run_observer, tune_observer
-from kros.observer.tune import with_delay_line
 from kros.synthesis import Injection, kalman, residual_h2
 
 DT = 0.01
@@ -30,7 +30,7 @@ def recordings(process=0.02, n_samples=1500, batch=4, seed=0):
 
 def test_rows_fitted_to_single_steps_are_the_true_ones():
     x, u, phase = recordings(process=0.0)
-    found = one_step_rows(LIFTING, x, u, [1500, 1500, 1500, 900], phase)
+    found = one_step_rows(LIFTING, batch_of(x, u, DT, phase, [1500, 1500, 1500, 900]))
     np.testing.assert_allclose(found[0], A[:2], atol=1e-9)
     np.testing.assert_allclose(found[1], B[:2], atol=1e-9)
 
@@ -39,7 +39,7 @@ def test_rows_that_help_come_first_and_their_promise_is_kept():
     x, u, phase = recordings()
     wrong = A + np.array([[0, 0.02, 0.05], [0.1, -0.1, 0.0], [0, 0, 0]])
     scale, noise = np.array([1.0, 1.0]), np.array([1e-4])
-    models = residual_models(LIFTING, wrong, B, (0,), x, u, [1500] * 4, list("abcd"), phase, noise, scale, DT)
+    models = residual_models(LIFTING, wrong, B, (0,), batch_of(x, u, DT, phase), noise, scale)
     assert [m.refitted for m in models][-1] == ()
     assert sorted(m.refitted for m in models) == [(), (0,), (0, 1)]
     best = models[0]
@@ -61,35 +61,27 @@ def test_tuning_finds_the_kalman_filter_of_a_linear_system():
     rough = Observer(
         "o", plain, F + np.array([[0, 0.02], [0.05, -0.1]]), 0.9 * G, (0,), ("u",), gain([[0.3], [0.0]], DT), Injection.STATE, DT
     )
-    tuned = tune_observer(rough, x, u)
-    assert list(tuned.criterion) == sorted(tuned.criterion, reverse=True)
+    tuned, criterion = tune_observer(rough, batch_of(x, u, DT))
+    assert list(criterion) == sorted(criterion, reverse=True)
     fresh = np.random.default_rng(2)
     y, w = np.zeros((4000, 6, 2)), fresh.normal(size=(4000, 6, 1))
     for k in range(3999):
         y[k + 1] = y[k] @ F.T + w[k] @ G.T + fresh.normal(size=(6, 2)) * np.sqrt(np.diag(Q))
     ideal = Observer("k", plain, F, G, (0,), ("u",), best.controller, Injection.STATE, DT)
-    errors = [np.sqrt(np.mean((run_observer(o, y[..., :1], w) - y)[100:, :, 1] ** 2)) for o in (rough, tuned.observer, ideal)]
+    errors = [np.sqrt(np.mean((run_observer(o, y[..., :1], w) - y)[100:, :, 1] ** 2)) for o in (rough, tuned, ideal)]
     assert errors[1] == pytest.approx(errors[2], rel=0.01)
     assert errors[0] > 1.2 * errors[2]
-
-
-def test_a_delay_line_changes_nothing_until_it_is_used():
-    x, u, phase = recordings(n_samples=100)
-    o = Observer("o", LIFTING, A, B, (0,), ("u",), gain([[0.2], [0.1], [0.0]], DT), Injection.STATE, DT)
-    longer = with_delay_line(o, 3)
-    assert longer.controller.n_states == 3
-    np.testing.assert_allclose(run_observer(longer, x[..., :1], u, phase), run_observer(o, x[..., :1], u, phase), atol=1e-14)
 
 
 def test_what_cannot_be_tuned_is_refused():
     x, u, phase = recordings(n_samples=700)
     K = gain([[0.2], [0.1], [0.0]], DT)
     with pytest.raises(DimensionError, match="through the state"):
-        tune_observer(Observer("o", LIFTING, A, B, (0,), ("u",), gain([[0.2]], DT), Injection.INPUT, DT), x, u, phase)
+        tune_observer(Observer("o", LIFTING, A, B, (0,), ("u",), gain([[0.2]], DT), Injection.INPUT, DT), batch_of(x, u, DT, phase))
     with pytest.raises(DataError, match="diverges"):
-        tune_observer(Observer("o", LIFTING, 3 * A, B, (0,), ("u",), K, Injection.STATE, DT), x, u, phase)
+        tune_observer(Observer("o", LIFTING, 3 * A, B, (0,), ("u",), K, Injection.STATE, DT), batch_of(x, u, DT, phase))
     with pytest.raises(DataError, match="more than 600 samples"):
-        tune_observer(Observer("o", LIFTING, A, B, (0,), ("u",), K, Injection.STATE, DT), x[:500], u[:500], phase)
+        tune_observer(Observer("o", LIFTING, A, B, (0,), ("u",), K, Injection.STATE, DT), batch_of(x[:500], u[:500], DT, phase))
 
 
 def test_bootstrap_interval_is_that_of_the_normal_distribution_for_many_units():

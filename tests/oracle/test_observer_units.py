@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from batches import batch_of
 
 from kros.core.linalg import least_squares, solve_balanced
 from kros.core.lti import StateSpace, gain
@@ -95,10 +96,10 @@ def signals(seed=3):
 @pytest.mark.parametrize("factors", [(1, 1, 1), (180 / np.pi, 30 / np.pi, 1), (1e-9, 1e9, 1e9), (1e9, 1e-9, 1)])
 def test_the_filtered_difference_learns_pair_and_scale(factors):
     states = signals()
-    lengths = [3000, 2500]
     scaled = states * factors
-    assert followed(scaled[..., :1], scaled, lengths, (0,), DT) == ((0, 1),)
-    plain = FilteredDifference(3, ((0, 1),), 20.0, DT).scaled_to(scaled[..., :1], scaled, lengths)
+    batch = batch_of(scaled, scaled[..., :0], DT, lengths=[3000, 2500])
+    assert followed(batch, (0,)) == ((0, 1),)
+    plain = FilteredDifference(3, ((0, 1),), 20.0, DT).scaled_to(batch, (0,))
     assert plain.scales[0] == pytest.approx(factors[1] / factors[0], rel=0.02)
     found = plain.run(scaled[..., :1], scaled[..., :0])[..., 1] / factors[1]
     assert np.abs(found[100:] - states[100:, :, 1]).max() < 0.1
@@ -106,8 +107,8 @@ def test_the_filtered_difference_learns_pair_and_scale(factors):
 
 def test_what_is_no_rate_is_not_taken_for_one():
     states = signals()
-    assert followed(states[..., 2:], states, [3000, 3000], (2,), DT) == ()
-    assert followed(states[..., :2], states[..., :2], [3000, 3000], (0, 1), DT) == ()
+    assert followed(batch_of(states, states[..., :0], DT), (2,)) == ()
+    assert followed(batch_of(states[..., :2], states[..., :0], DT), (0, 1)) == ()
 
 
 @pytest.mark.parametrize("factors", [np.array([1e9, 1e-9]), np.array([1e-9, 1e9])])

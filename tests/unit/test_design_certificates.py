@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from batches import batch_of
 
 from kros.core.errors import DimensionError, SynthesisError
 from kros.core.lti import gain
@@ -79,7 +80,7 @@ def test_one_episode_of_every_unit() -> None:
 def test_an_observer_without_certificate_has_no_report() -> None:
     square = observer("square", "x**2", 0.1)
     with pytest.raises(DimensionError, match="certify it first"):
-        relift_report(relift_certificate(square), square, np.zeros((5, 1, 1)), np.zeros((5, 1, 1)), ["a"])
+        relift_report(relift_certificate(square), square, batch_of(np.zeros((5, 1, 1)), np.zeros((5, 1, 1)), 1.0))
 
 
 def test_wrong_scales_are_refused() -> None:
@@ -93,7 +94,7 @@ def test_the_report_tells_gains_bounds_and_failures(tmp_path: Path) -> None:
     good, bad = observer("koopman/open_loop", "sin(x)", 0.1), observer("koopman/worst_case_h2", "sin(x)", 0.5)
     states = np.cumsum(np.random.default_rng(0).standard_normal((50, 2, 1)), axis=0)
     certificate = relift_certificate(good)
-    rows = relift_report(certificate, good, states, np.zeros((50, 2, 1)), ["a", "b"])
+    rows = relift_report(certificate, good, batch_of(states, np.zeros((50, 2, 1)), 1.0, units=["a", "b"]))
     running = [Running(good.name, certificate, rows, 1.0, 5.0), Running(bad.name, relift_certificate(bad), [], 2.0, 5.0)]
     assert [r.facts()["relift_certified"] for r in running] == [True, False]
     assert running[0].facts()["relift_bound_worst"] == max(r.bound for r in rows)

@@ -17,7 +17,7 @@ from kros.design.tuned import held_out, tuned_where_better
 from kros.design.uncertain_set import certificate
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
-from kros.observer import observer_with_memory, relift_certificate
+from kros.observer import identify_predictor, relift_certificate
 from kros.plants import PLANTS
 from kros.report.verdict import verdict
 from kros.synthesis import kalman
@@ -84,17 +84,12 @@ def test_a_study_makes_what_the_recipe_makes(made, tuning):
     assert observer.lifting.functions == ("sin(100*position + phase)", "cos(100*position + phase)")
     judge = tuning.read()
     seen = judge.part([i for i, held in enumerate(held_out(judge.batch.keys)) if not held]) if product.facts["tuned"] else judge
-    expected = observer_with_memory(
+    expected = identify_predictor(
         "o",
         on_the_circle(DRIVE),
         (0,),
         INPUTS,
-        seen.batch.states,
-        seen.batch.inputs,
-        seen.batch.lengths,
-        [k.unit for k in seen.batch.keys],
-        0.001,
-        seen.parameters,
+        seen.batch,
         4,
         episodes=1,
         iterations=4 if product.facts["tuned"] else 0,
@@ -137,7 +132,8 @@ def test_tuning_is_kept_where_nothing_speaks_against_it(tuning, made):
     start, judge = product.observer, tuning.read()
 
     def changed(factor):
-        return replace(start, A=np.concatenate([start.A[:1], factor * start.A[1:2], start.A[2:]]), replaces=False)
+        A = np.concatenate([start.A[:1], factor * start.A[1:2], start.A[2:]])
+        return replace(start, A=A, controller=replace(start.controller, D=A[:, :1]))
 
     worse, facts = tuned_where_better(own, judge, start, lambda seen, o: changed(0.5))
     assert worse is start
@@ -149,8 +145,8 @@ def test_tuning_is_kept_where_nothing_speaks_against_it(tuning, made):
     assert facts["tuned"]
     alone = judge.part([0])
     assert tuned_where_better(own, alone, start, lambda seen, o: changed(0.5)) == (start, {"tuned": False})
-    lost = replace(start, A=np.concatenate([1.5 * start.A[:1], start.A[1:]]))  # what predicts the measurement matters where there is none
-    lost = replace(lost, controller=replace(lost.controller, D=lost.A[:, :1]))
+    A = np.concatenate([1.5 * start.A[:1], start.A[1:]])  # what predicts the measurement matters where there is none
+    lost = replace(start, A=A, controller=replace(start.controller, D=A[:, :1]))
     assert tuned_where_better(own, judge, start, lambda seen, o: lost)[0] is start
     assert relift_certificate(start, mismatch=False).certified
 

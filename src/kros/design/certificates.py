@@ -23,7 +23,7 @@ from ..observer import (
     relift_certificate,
     relift_report,
     run_observers,
-    with_memory,
+    with_internal,
 )
 from .task import DesignResult, DesignTask
 from .validation import ValidationSet, hidden_mean
@@ -83,14 +83,10 @@ def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:
 def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[Running]:
     """Certify observers of one lifting, and compare with what they do; certificates come back in the recordings' units."""
     first, batch = observers[0], data.batch
-    values, units = data.parameters if first.lifting.parameters else None, [key.unit for key in batch.keys]
     scales = scales_of(observers, data, task)
     certificates = [certify(observer, own, task) for observer, own in zip(observers, scales, strict=True)]
-    estimates = run_observers(observers, data.measurements(first.measured), batch.inputs, values)
-    rows = [
-        relift_report(c, o, batch.states, batch.inputs, units, batch.lengths, values, estimates=x) if c.certified else []
-        for o, c, x in zip(observers, certificates, estimates, strict=True)
-    ]
+    estimates = run_observers(observers, data.measurements(first.measured), batch.inputs, first.own(batch.parameters))
+    rows = [relift_report(c, o, batch, x) if c.certified else [] for o, c, x in zip(observers, certificates, estimates, strict=True)]
     hidden = hidden_mean(data.compare(estimates), first.measured)
     dropout = dropout_error_percent(observers, data, task.models.sample_period_s)
     certificates = [c.in_sizes(o, {}) for o, c in zip(observers, certificates, strict=True)]
@@ -103,11 +99,11 @@ def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTa
     for observer in observers:
         model, n = observer.A.tobytes() + observer.B.tobytes(), len(observer.recorded)
         if model not in known:
-            values, batch = data.parameters if observer.lifting.parameters else None, data.batch
-            driven = with_memory(observer, batch.states, batch.inputs, values)
+            batch, values = data.batch, observer.own(data.batch.parameters)
+            driven = with_internal(observer, batch.states, batch.inputs, values)
             residual = one_step_residual(observer.lifting, observer.A, observer.B, driven, batch.inputs, values)[..., :n]
             typical = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
-            known[model] = typical.with_memory(observer.lifting.n_states - n)
+            known[model] = typical.with_internal(observer.lifting.n_states - n)
     return [known[observer.A.tobytes() + observer.B.tobytes()] for observer in observers]
 
 

@@ -143,7 +143,7 @@ def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baselin
     population, data = training.population, training.read()
     states, y, lengths = data.batch.states, data.measurements(measured), data.batch.lengths
     channels = [c for c in population.channels if c.name in population.states]
-    pairs = followed(y, states, lengths, measured, population.sample_period_s)
+    pairs = followed(data.batch, measured)
     pairs = pairs or rates(channels, [population.states[i] for i in measured])
     if not pairs:
         units = ", ".join(f"{c.name} ({c.unit or 'no unit'})" for c in channels)
@@ -155,7 +155,7 @@ def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baselin
     truth = states[..., estimated]
     best: tuple[float, FilteredDifference] | None = None
     for cutoff in cutoffs_hz(population.sample_period_s):
-        trial = FilteredDifference(len(channels), pairs, float(cutoff), population.sample_period_s).scaled_to(y, states, lengths)
+        trial = FilteredDifference(len(channels), pairs, float(cutoff), population.sample_period_s).scaled_to(data.batch, measured)
         error = float(error_percent(trial.run(y, data.batch.inputs)[..., estimated], truth, lengths).mean())
         if best is None or error < best[0]:
             best = (error, trial)
@@ -174,8 +174,7 @@ def make_learned(training: TrainingSet, lifting: Lifting, measured: tuple[int, .
     data = training.read()
     batch, y = data.batch, data.measurements(measured)
     features = Features.of(lifting, measured, y, batch.inputs)
-    units = [key.unit for key in batch.keys]
-    moments = Moments.of(features, batch.states, batch.inputs, batch.lengths, units, data.parameters)
+    moments = Moments.of(features, batch)
     estimators: dict[str, Learned] = {unit: moments.estimator([unit]) for unit in moments.units}
     facts = {"status": "trained", "taps": features.taps, "left_out": "the unit under test"}
     return Baseline(estimators | {"": moments.estimator()}, measured, moments.estimated, facts, seen=training.seen)

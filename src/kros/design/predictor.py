@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.errors import KrosError, SynthesisError
 from ..lifting import Lifting
-from ..observer import Observer, driven_coordinates, observer_with_memory
+from ..observer import Observer, driven_coordinates, identify_predictor
 from ..synthesis import Status, Synthesis
 from .certificates import DIVERGED
 from .task import DesignResult, DesignTask
@@ -52,19 +52,14 @@ def design_predictor(task: DesignTask) -> DesignResult:
 
 
 def identified(task: DesignTask, lifting: Lifting, data: ValidationSet, **options: Any) -> Observer:
-    """Return the observer that episodes give; `options` as in `observer_with_memory`."""
-    models, batch = task.models, data.batch
-    return observer_with_memory(
+    """Return the observer that episodes give; `options` as in `identify_predictor`."""
+    models = task.models
+    return identify_predictor(
         task.name,
         lifting,
         models.measured,
         models.recorded_inputs,
-        batch.states,
-        batch.inputs,
-        batch.lengths,
-        [key.unit for key in batch.keys],
-        models.sample_period_s,
-        data.parameters if lifting.parameters else None,
+        data.batch,
         task.predictor.states,
         [task.predictor.importance.get(name, 1.0) for i, name in enumerate(models.lifting.states) if i not in models.measured],
         **({"episodes": task.predictor.episodes, "iterations": task.predictor.steps} | options),
@@ -82,7 +77,5 @@ def on_the_circle(lifting: Lifting) -> Lifting:
 
 
 def in_coordinates(task: DesignTask, data: ValidationSet, observer: Observer) -> Observer:
-    """Return the observer in coordinates in which recordings drive its memory."""
-    values = data.parameters if observer.lifting.parameters else None
-    sizes = task.models.output_scale[: len(observer.recorded)]
-    return driven_coordinates(observer, data.batch.states, data.batch.inputs, sizes, values)
+    """Return the observer in coordinates in which recordings drive its internal states."""
+    return driven_coordinates(observer, data.batch, task.models.output_scale[: len(observer.recorded)])

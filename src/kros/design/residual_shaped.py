@@ -64,27 +64,21 @@ def tuned(task: DesignTask, found: DesignResult) -> DesignResult:
 
 
 def _steps(data: ValidationSet, start: Observer) -> Observer:
-    values = data.parameters if start.lifting.parameters else None
-    return tune_observer(start, data.batch.states, data.batch.inputs, values, iterations=_STEPS).observer
+    return tune_observer(start, data.batch, _STEPS)[0]
 
 
 def promising(task: DesignTask) -> list[ResidualModel]:
     """Return the models that may be run, the one that promises the smallest errors first; those that promise nothing are left out."""
     models, row, data = task.models, task.models.index(task.unit), task.training.read()
-    n, batch = models.lifting.n_states, data.batch
+    n = models.lifting.n_states
     found = residual_models(
         models.lifting,
         models.A[row],
         models.B[row],
         models.measured,
-        batch.states,
-        batch.inputs,
-        batch.lengths,
-        [key.unit for key in batch.keys],
-        data.parameters if models.lifting.parameters else None,
+        data.batch,
         task.noise,
         models.output_scale[:n],
-        models.sample_period_s,
     )
     usable = [model for model in found if np.isfinite(model.promised).all()]
     if not usable:

@@ -10,13 +10,15 @@ The past of what is seen then needs one lag with the same forgetting: the integr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError
+from ..data import EpisodeBatch
+from ..data.population import EpisodeKey
 from ..lifting import Lifting
 from ..observer.predictor import Past
 from ..synthesis.residual_shaped.shaping import Bank
@@ -24,7 +26,7 @@ from .signals import low_passed, without_level
 
 Array = npt.NDArray[np.float64]
 LOAD = "load"
-_LOADED, _UNLOADED = "loaded", "unloaded"
+_LOADED, _UNLOADED, _DELAYS = "loaded", "unloaded", 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,45 +37,30 @@ class LoadCalibration:
     ----------
     past : Past
         Of the recorded states and the load, its "units" the two kinds of recordings.
-    states : ndarray, shape (n_samples, batch, n + 1)
-        Recorded states, the load's share taken off the current, and the load, both as far as they can be seen.
-    inputs : ndarray, shape (n_samples, batch, m)
-    parameters : mapping of str to ndarray, shape (batch,)
+    batch : EpisodeBatch
+        Recorded states, the load's share taken off the current, and the load, both as far as they can be seen; its "units" are the kinds.
     level_s : float
         Time after which a constant load is forgotten.
-    sample_period_s : float
     used, left_out : tuple of int
         Episodes that count, and those in which the current came to its limit.
     """
 
     past: Past
-    states: Array
-    inputs: Array
-    parameters: Mapping[str, Array]
+    batch: EpisodeBatch
     level_s: float
-    sample_period_s: float
     used: tuple[int, ...]
     left_out: tuple[int, ...]
-
-    @property
-    def kinds(self) -> list[str]:
-        """Kind of every recording that counts."""
-        return [_LOADED if np.any(self.states[:, i, -1]) else _UNLOADED for i in range(self.states.shape[1])]
 
 
 def calibrate_load(
     lifting: Lifting,
     measured: Sequence[int],
-    states: Array,
-    inputs: Array,
+    batch: EpisodeBatch,
     load: Array,
-    sample_period_s: float,
-    parameters: Mapping[str, npt.ArrayLike] | None = None,
     current: int | None = None,
     level_s: float = 10.0,
     corner_hz: float | None = None,
     limit: float | None = None,
-    delays: int = 20,
 ) -> LoadCalibration:
     """Collect how a known load shows.
 
@@ -82,13 +69,10 @@ def calibrate_load(
     lifting : Lifting
         Of the recorded states; its functions read measured ones alone.
     measured : sequence of int
-    states : ndarray, shape (n_samples, batch, n)
+    batch : EpisodeBatch
         Recordings of equal length that start at rest, with and without load.
-    inputs : ndarray, shape (n_samples, batch, m)
     load : ndarray, shape (n_samples, batch)
         Torque of the known load in any unit, zero in recordings without load.
-    sample_period_s : float
-    parameters : mapping of str to array_like, shape (batch,)
     current : int, optional
         State that carries the load, in the load's unit; None where none does, or the units differ.
     level_s : float, s
@@ -96,7 +80,6 @@ def calibrate_load(
         What is faster in the known load, vibrations of the gear for instance, does not count as load.
     limit : float, optional
         Episodes in which the current comes so far are left out: a controller at its limit no longer does what its errors say.
-    delays : int
 
     Raises
     ------
@@ -105,9 +88,10 @@ def calibrate_load(
     DataError
         When recordings of a kind are missing, or all come to the limit.
     """
-    if states.shape[:2] != load.shape or states.shape[:2] != inputs.shape[:2] or LOAD in lifting.states:
+    states, dt = batch.states, batch.sample_period_s
+    if states.shape[:2] != load.shape or LOAD in lifting.states:
         raise DimensionError(
-            f"Load calibration: states {states.shape}, inputs {inputs.shape} and load {load.shape} should agree in (n_samples, batch), "
+            f"Load calibration: states {states.shape} and load {load.shape} should agree in (n_samples, batch), "
             f"and no state be named {LOAD!r}, found {', '.join(lifting.states)}."
         )
     at_limit = np.zeros(load.shape[1], bool) if limit is None or current is None else np.abs(states[..., current]).max(axis=0) >= limit
@@ -118,16 +102,13 @@ def calibrate_load(
             f"Load calibration: needs recordings with and without load, found {int(loaded.sum())} and {int((~loaded).sum())} that count; "
             f"{int(at_limit.sum())} of {len(at_limit)} come to the current's limit; take a smaller load or slower moves."
         )
-    torque = load[:, used] if corner_hz is None else low_passed(load[:, used], corner_hz, sample_period_s)
-    seen = without_level(torque, level_s, sample_period_s)
+    torque = load[:, used] if corner_hz is None else low_passed(load[:, used], corner_hz, dt)
+    seen = without_level(torque, level_s, dt)
     widened = np.concatenate([states[:, used], seen[..., None]], axis=-1)
     if current is not None:
-        widened[..., current] -= load[:, used] - without_level(load[:, used], level_s, sample_period_s)
-    own = {name: np.asarray(values, dtype=float)[used] for name, values in (parameters or {}).items()}
+        widened[..., current] -= load[:, used] - without_level(load[:, used], level_s, dt)
     with_load = replace(lifting, states=(*lifting.states, LOAD))
-    kinds = [_LOADED if found else _UNLOADED for found in loaded]
-    bank = Bank(delays, (float(np.exp(-sample_period_s / level_s)),))
-    recorded, lengths = inputs[:, used], [len(states)] * len(used)
-    past = Past.of(with_load, tuple(measured), widened, recorded, lengths, kinds, own or None, bank)
-    left = tuple(int(i) for i in np.flatnonzero(at_limit))
-    return LoadCalibration(past, widened, recorded, own, level_s, sample_period_s, tuple(int(i) for i in used), left)
+    keys = tuple(EpisodeKey(_LOADED if found else _UNLOADED, "", str(i)) for i, found in zip(used, loaded, strict=True))
+    seen_batch = replace(batch.take(used.tolist()), keys=keys, states=widened)
+    past = Past.of(with_load, tuple(measured), seen_batch, Bank(_DELAYS, (float(np.exp(-dt / level_s)),)))
+    return LoadCalibration(past, seen_batch, level_s, tuple(used.tolist()), tuple(np.flatnonzero(at_limit).tolist()))

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from ..observer.observer import Observer
-from ..observer.predictor import tune_memory
-from ..observer.predictor.build import embedded
+from ..observer.predictor import embedded, tune_predictor
 from ..observer.predictor.moments import hidden_of
 from .calibrate import LoadCalibration
 
@@ -20,8 +18,7 @@ def load_observer(
     name: str,
     calibration: LoadCalibration,
     inputs: Sequence[str],
-    memories: int = 8,
-    importance: npt.ArrayLike | None = None,
+    internal: int = 8,
     deviation: float = 0.15,
     samples: int = 6000,
     iterations: int = 10,
@@ -33,9 +30,8 @@ def load_observer(
     name : str
     calibration : LoadCalibration
     inputs : sequence of str
-    memories : int
-    importance : array_like, shape (h,)
-        Weights of the hidden states' errors, the load's last; by default a tenth for all but the load.
+    internal : int
+        States besides the recorded ones and the load.
     deviation : float
         Share by which the lifted functions' effect may differ from machine to machine.
     samples : int
@@ -50,9 +46,8 @@ def load_observer(
     """
     past = calibration.past
     hidden = len(hidden_of(past.lifting, past.measured))
-    importance = np.append(np.full(hidden - 1, _OTHERS), 1.0) if importance is None else importance
-    model = past.model(hidden + memories, importance=importance, deviation=deviation)
-    x, u = calibration.states[:samples], calibration.inputs[:samples]
+    importance = np.append(np.full(hidden - 1, _OTHERS), 1.0)
+    model, batch = past.model(hidden + internal, importance=importance, deviation=deviation), calibration.batch.head(samples)
     if iterations:
-        model, _ = tune_memory(model, past, x, u, calibration.kinds, calibration.parameters, importance, deviation, iterations=iterations)
-    return embedded(name, past, model, inputs, x, u, calibration.sample_period_s, calibration.parameters or None)
+        model, _ = tune_predictor(model, past, batch, importance, deviation, iterations=iterations)
+    return embedded(name, past, model, inputs, batch)

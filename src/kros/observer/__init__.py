@@ -9,8 +9,7 @@ from .certificate.error import ReliftScales
 from .certificate.report import ReliftRow, relift_report
 from .certificate.status import Dropped, ReliftStatus
 from .observer import Observer
-from .predictor import Past, observer_with_memory, remembering_observer, tune_memory
-from .predictor.driven import driven_coordinates, refit_measured_rows, with_memory
+from .predictor import Past, driven_coordinates, identify_predictor, with_internal
 from .residual.models import ResidualModel, one_step_rows, residual_models
 from .residual.one_step import mean_error_dynamics, one_step_residual, residual_spectra
 from .running import Estimate, RunningObserver
@@ -19,7 +18,7 @@ from .samples import SampleStatus
 from .screen import sample_status
 from .simulate import EstimateKind, run_observer, run_observers
 from .tracking import Tracked, track_parameter
-from .tune import Tuned, tune_observer
+from .tuning.observer_rows import tune_observer
 from .units import in_sizes
 
 __all__ = [
@@ -43,24 +42,21 @@ __all__ = [
     "SampleStatus",
     "Seen",
     "Tracked",
-    "Tuned",
     "cutoffs_hz",
     "driven_coordinates",
     "followed",
+    "identify_predictor",
     "in_sizes",
     "kalman_candidates",
     "like_measurement_noise",
     "luenberger_candidates",
     "mean_error_dynamics",
     "noise_covariances",
-    "observer_with_memory",
     "one_step_residual",
     "one_step_rows",
     "rates",
-    "refit_measured_rows",
     "relift_certificate",
     "relift_report",
-    "remembering_observer",
     "residual_models",
     "residual_spectra",
     "run_observer",
@@ -68,7 +64,6 @@ __all__ = [
     "sample_status",
     "start_covariance",
     "track_parameter",
-    "tune_memory",
     "tune_observer",
-    "with_memory",
+    "with_internal",
 ]

@@ -168,6 +168,10 @@ class ObserverData:
             x[..., others] = solve_balanced(still, held.reshape(-1, len(others)).T).T.reshape(held.shape)
         return x
 
+    def own(self, parameters: Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
+        """Return those parameters of many that the lifting has."""
+        return {name: parameters[name] for name in self.lifting.parameters if name in parameters}
+
     def values(self, parameters: Mapping[str, npt.ArrayLike] | None = None, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
         """Return the lifting's parameters: those that are given, the observer's own for the others.
 

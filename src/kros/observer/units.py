@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.lti import StateSpace
 from ..synthesis.result import Injection
-from .observer import Observer
+from .data import ObserverData
 from .runtime import Runtime
 
 Array = npt.NDArray[np.float64]
+O = TypeVar("O", bound=ObserverData)  # noqa: E741
 
 
-def in_sizes(observer: Observer, sizes: Mapping[str, float]) -> Observer:
+def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
     """Return the observer for states and inputs divided by sizes.
 
     Parameters
@@ -41,7 +43,7 @@ def in_sizes(observer: Observer, sizes: Mapping[str, float]) -> Observer:
     )
 
 
-def factors(observer: Observer, sizes: Mapping[str, float]) -> tuple[Array, Array]:
+def factors(observer: ObserverData, sizes: Mapping[str, float]) -> tuple[Array, Array]:
     """Return what lifted states and inputs are multiplied by where other sizes take the place of an observer's own."""
     old, new = observer.lifting, observer.lifting.in_sizes(sizes)
     inputs = (*observer.inputs, *old.input_functions)

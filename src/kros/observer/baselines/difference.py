@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError, DimensionError
+from ...data import EpisodeBatch
 from ...data.population import Channel
 
 Array = npt.NDArray[np.float64]
@@ -77,17 +78,17 @@ class FilteredDifference:
             estimate[..., state] = (self.scales[number] if self.scales else 1.0) * lfilter(b, a, rate, axis=0)
         return estimate
 
-    def scaled_to(self, y: Array, states: Array, lengths: npt.ArrayLike) -> FilteredDifference:
+    def scaled_to(self, batch: EpisodeBatch, measured: Sequence[int]) -> FilteredDifference:
         """Return the same with the scales that recordings give by least squares, so that units of measure do not matter.
 
         Parameters
         ----------
-        y : ndarray, shape (n_samples, batch, q)
-        states : ndarray, shape (n_samples, batch, n)
-        lengths : array_like of int, shape (batch,)
-            Samples of every episode that count.
+        batch : EpisodeBatch
+        measured : sequence of int
+            Indices of the measured states.
         """
-        inside = (np.arange(len(y))[:, None] < np.asarray(lengths)).astype(float)
+        states, y = batch.states, batch.states[..., list(measured)]
+        inside = (np.arange(len(y))[:, None] < batch.lengths).astype(float)
         found = replace(self, scales=()).run(y, y[..., :0])
         slopes = []
         for _, state in self.pairs:
@@ -125,9 +126,7 @@ def rates(channels: Iterable[Channel], measured: Sequence[str]) -> tuple[tuple[i
     return tuple(pairs)
 
 
-def followed(
-    y: Array, states: Array, lengths: npt.ArrayLike, measured: Sequence[int], sample_period_s: float
-) -> tuple[tuple[int, int], ...]:
+def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, int], ...]:
     """Return which states recordings show to be rates of measured ones, whatever the units of measure.
 
     Of all states that are not measured the one counts that a difference of the measurement, at its best cut-off, explains best, and by more than half
@@ -135,20 +134,18 @@ def followed(
 
     Parameters
     ----------
-    y : ndarray, shape (n_samples, batch, q)
-    states : ndarray, shape (n_samples, batch, n)
-    lengths : array_like of int, shape (batch,)
+    batch : EpisodeBatch
     measured : sequence of int
         Indices of the measured states.
-    sample_period_s : float
 
     Returns
     -------
     tuple of (int, int)
         As `rates`.
     """
+    states, y, sample_period_s = batch.states, batch.states[..., list(measured)], batch.sample_period_s
     hidden = [j for j in range(states.shape[-1]) if j not in measured]
-    inside = np.arange(len(y))[:, None] < np.asarray(lengths)
+    inside = np.arange(len(y))[:, None] < batch.lengths
     share = np.zeros((len(measured), len(hidden)))
     for i, j in np.ndindex(share.shape):
         truth = states[..., hidden[j]][inside]

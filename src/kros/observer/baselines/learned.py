@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from ...core.errors import DataError, DimensionError
 from ...core.linalg import least_squares
+from ...data import EpisodeBatch
 from ...lifting import Lifting
 
 Array = npt.NDArray[np.float64]
@@ -114,11 +115,7 @@ class Moments:
     def of(
         cls,
         features: Features,
-        states: Array,
-        inputs: Array,
-        lengths: npt.ArrayLike,
-        units: Sequence[str],
-        parameters: Mapping[str, npt.ArrayLike] | None = None,
+        batch: EpisodeBatch,
         thin: int = 4,
     ) -> Moments:
         """Collect the moments of training episodes.
@@ -126,11 +123,7 @@ class Moments:
         Parameters
         ----------
         features : Features
-        states : ndarray, shape (n_samples, batch, n)
-        inputs : ndarray, shape (n_samples, batch, m)
-        lengths : array_like of int, shape (batch,)
-        units : sequence of str, length batch
-        parameters : mapping of str to array_like, shape (batch,)
+        batch : EpisodeBatch
         thin : int
             Every so many samples count.
 
@@ -139,7 +132,7 @@ class Moments:
         DataError
             When every state is measured, or an episode is no longer than the past.
         """
-        lengths = np.asarray(lengths, dtype=int)
+        states, lengths, units = batch.states, batch.lengths, batch.units
         estimated = tuple(i for i in range(states.shape[-1]) if i not in features.measured)
         if not estimated:
             raise DataError("Learned estimator: every state is measured, there is nothing to estimate.")
@@ -147,7 +140,7 @@ class Moments:
             raise DataError(
                 f"Learned estimator: an episode of unit {units[int(lengths.argmin())]} has {lengths.min()} samples, more than {features.taps} are needed."
             )
-        z = features.channels(states[..., list(features.measured)], inputs, parameters)
+        z = features.channels(states[..., list(features.measured)], batch.inputs, batch.parameters)
         names = tuple(dict.fromkeys(units))
         f, h = 1 + z.shape[-1] * features.taps, len(estimated)
         gram, cross, counts = np.zeros((len(names), f, f)), np.zeros((len(names), f, h)), np.zeros(len(names))

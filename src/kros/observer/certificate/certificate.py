@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.loading import loader
-from ..observer import Observer
+from ..data import ObserverData
 from ..units import factors
 from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, UncoveredRuntimeError, error_system, without_measurement
 from .search import MOST_CORNERS, frozen_gain, mismatch_gain, prove
@@ -92,7 +92,7 @@ class ReliftCertificate:
     method: str
     solve_s: float
 
-    def system(self, observer: Observer) -> ErrorSystem:
+    def system(self, observer: ObserverData) -> ErrorSystem:
         """Return the error dynamics that the certificate is about."""
         return error_system(observer, self.scales, self.box, self.parameters, clipped=self.clipped)
 
@@ -108,7 +108,7 @@ class ReliftCertificate:
         energies = [np.sum((e @ R[:, : e.shape[-1]].T) ** 2, axis=-1) for R in self.roots]
         return np.asarray(np.max(energies, axis=0))
 
-    def in_sizes(self, observer: Observer, sizes: Mapping[str, float]) -> ReliftCertificate:
+    def in_sizes(self, observer: ObserverData, sizes: Mapping[str, float]) -> ReliftCertificate:
         """Return what the certificate of an observer says of the same observer for signals divided by other sizes (`kros.observer.in_sizes`)."""
         x, u = factors(observer, sizes)
         n, lifting = observer.lifting.n_states, observer.lifting
@@ -147,7 +147,7 @@ _PLAIN = tuple(name for name in ReliftCertificate.__dataclass_fields__ if name n
 
 
 def relift_certificate(
-    observer: Observer,
+    observer: ObserverData,
     box: Box | None = None,
     scales: ReliftScales | None = None,
     parameters: Box | None = None,
@@ -163,7 +163,7 @@ def relift_certificate(
 
     Parameters
     ----------
-    observer : Observer
+    observer : ObserverData
         Without a delay and limits in its `runtime`: with them there is no certificate, and `reason` says so.
     box : mapping of str to (lower, upper), optional
         Ranges of states (and of inputs, for input functions) inside which true and estimated values stay; needed where slopes have no global bound.
@@ -255,7 +255,7 @@ _WITHOUT = {
 }
 
 
-def _assumptions(observer: Observer, box: Box | None, parameters: Box | None, dropped: Dropped, *, clipped: bool) -> tuple[str, ...]:
+def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None, dropped: Dropped, *, clipped: bool) -> tuple[str, ...]:
     """Return what has to hold, in words."""
     told = ["the machine and the observer have the same inputs", "machine and observer lift with the same parameters"]
     if parameters:

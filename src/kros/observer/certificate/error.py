@@ -32,7 +32,7 @@ from ...core.errors import DimensionError, KrosError
 from ...core.lti import StateSpace
 from ...lifting.continuity import break_of, slope_bounds_of
 from ...synthesis.result import Injection
-from ..observer import Observer
+from ..data import ObserverData
 from .status import Dropped
 
 Array = npt.NDArray[np.float64]
@@ -93,15 +93,15 @@ class ReliftScales:
         rms = np.sqrt(np.mean(residual.reshape(-1, n) ** 2, axis=0))
         return cls(np.asarray(ranges, dtype=float), rms * np.sqrt(n), sigma * np.sqrt(len(sigma)))
 
-    def with_memory(self, count: int) -> ReliftScales:
-        """Return the scales for an observer with a memory of so many states: they have no residual, and their errors do not count."""
+    def with_internal(self, count: int) -> ReliftScales:
+        """Return the scales for an observer with so many internal states: they have no residual, and their errors do not count."""
         return ReliftScales(np.append(self.error, np.full(count, np.inf)), np.append(self.residual, np.zeros(count)), self.noise)
 
     @classmethod
-    def ones(cls, observer: Observer) -> ReliftScales:
+    def ones(cls, observer: ObserverData) -> ReliftScales:
         """Return the scales that change nothing."""
         n = len(observer.recorded)
-        return cls(np.ones(n), np.ones(n), np.ones(len(observer.measured))).with_memory(observer.lifting.n_states - n)
+        return cls(np.ones(n), np.ones(n), np.ones(len(observer.measured))).with_internal(observer.lifting.n_states - n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,13 +169,18 @@ class ErrorSystem:
 
 
 def error_system(
-    observer: Observer, scales: ReliftScales | None = None, box: Box | None = None, parameters: Box | None = None, *, clipped: bool = False
+    observer: ObserverData,
+    scales: ReliftScales | None = None,
+    box: Box | None = None,
+    parameters: Box | None = None,
+    *,
+    clipped: bool = False,
 ) -> ErrorSystem:
     """Return the error dynamics of an observer as it runs.
 
     Parameters
     ----------
-    observer : Observer
+    observer : ObserverData
     scales : ReliftScales, optional
         One by default.
     box : mapping of str to (lower, upper), optional
@@ -229,7 +234,7 @@ def error_system(
     return ErrorSystem(A, L, B, M, np.zeros((len(moving), n + q)), C, observer.sample_period_s, told)
 
 
-def require_covered(observer: Observer) -> None:
+def require_covered(observer: ObserverData) -> None:
     """Refuse an observer whose `runtime` changes what runs: the error then obeys other equations than those that are certified."""
     if declared := observer.runtime.changes:
         raise UncoveredRuntimeError(
@@ -239,7 +244,7 @@ def require_covered(observer: Observer) -> None:
 
 
 def slope_box(
-    observer: Observer, names: Sequence[str], box: Box | None = None, parameters: Box | None = None, *, clipped: bool = False
+    observer: ObserverData, names: Sequence[str], box: Box | None = None, parameters: Box | None = None, *, clipped: bool = False
 ) -> tuple[Array, Array]:
     """Return bounds of the slopes of lifted and input functions by some entries of the window, each of shape (p + r, len(names)).
 
@@ -260,7 +265,7 @@ def slope_box(
     return (np.minimum(lower, 0.0), np.maximum(upper, 0.0)) if clipped else (lower, upper)
 
 
-def without_measurement(observer: Observer, system: ErrorSystem, dropped: Dropped) -> list[ErrorSystem]:
+def without_measurement(observer: ObserverData, system: ErrorSystem, dropped: Dropped) -> list[ErrorSystem]:
     """Return the dynamics of a step whose measurement is missing, one system for each thing that the observer may do then."""
     K, n, q = observer.controller, observer.lifting.n_states, len(observer.measured)
     h = len(system.A) - K.n_states

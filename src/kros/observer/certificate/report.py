@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -10,15 +10,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DimensionError
-from ..observer import Observer
-from ..predictor.driven import with_memory
+from ...data import EpisodeBatch
+from ..data import ObserverData
+from ..predictor.driven import with_internal
 from ..residual.one_step import one_step_residual
 from ..simulate import run_observer
 from .certificate import ReliftCertificate
 from .error import ErrorSystem
 
 Array = npt.NDArray[np.float64]
-# Rounding: a memory takes differences of positions a thousand times, and where slopes are constant the bound is the error itself.
+# Rounding: a predictor takes differences of positions a thousand times, and where slopes are constant the bound is the error itself.
 _CLOSE = 1 + 1e-6
 
 
@@ -60,12 +61,8 @@ class ReliftRow:
 
 def relift_report(
     certificate: ReliftCertificate,
-    observer: Observer,
-    states: Array,
-    inputs: Array,
-    units: Sequence[str],
-    lengths: npt.ArrayLike | None = None,
-    parameters: Mapping[str, npt.ArrayLike] | None = None,
+    observer: ObserverData,
+    batch: EpisodeBatch,
     estimates: Array | None = None,
 ) -> list[ReliftRow]:
     """Compare bounds and errors, episode by episode; recorded states stand for the true ones, so their noise is part of the residual.
@@ -74,32 +71,20 @@ def relift_report(
     ----------
     certificate : ReliftCertificate
         Of this observer; certified.
-    observer : Observer
-    states : ndarray, shape (n_samples, batch, n)
-        Of an observer with a memory the recorded states, which drive the memory of the machine (`with_memory`).
-    inputs : ndarray, shape (n_samples, batch, m)
-    units : sequence of str
-        Unit of every episode.
-    lengths : array_like, shape (batch,), optional
-        Samples of every episode; all by default.
-    parameters : mapping of str to array_like, shape (batch,)
-        Lifting parameters of the machine behind each episode.
+    observer : ObserverData
+        Internal states of the machine are those that recordings drive (`with_internal`).
+    batch : EpisodeBatch
     estimates : ndarray, shape (n_samples, batch, n), optional
         What `run_observer` returned; it is run where they are missing.
     """
     if certificate.gain is None:
         raise DimensionError(f"Re-lift report of observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")
-    n_samples, batch = states.shape[:2]
-    lengths = np.full(batch, n_samples) if lengths is None else np.asarray(lengths, dtype=int)
-    if len(units) != batch or lengths.shape != (batch,):
-        raise DimensionError(
-            f"Re-lift report of observer {observer.name}: {batch} episodes need as many units ({len(units)}) and lengths {lengths.shape}."
-        )
-    values = {**observer.parameters, **(parameters or {})} if observer.lifting.parameters else None
+    states, inputs, lengths, n_samples = batch.states, batch.inputs, batch.lengths, len(batch.states)
+    values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
     if estimates is None:
         estimates = run_observer(observer, states[..., list(observer.measured)], inputs, values)
     scales, omega = certificate.scales, held_residual(observer, states, inputs, values)
-    states = with_memory(observer, states, inputs, values)
+    states = with_internal(observer, states, inputs, values)
     system = certificate.system(observer)
     first = first_error(observer, states[0] - estimates[0], len(system.A) - observer.controller.n_states)
     n = observer.lifting.n_states
@@ -119,25 +104,25 @@ def relift_report(
     )
     root = np.sqrt(lengths)
     columns = (np.sqrt(energy["w"]), by_gain, np.sqrt(energy["z"]), np.minimum(by_gain, by_frozen), np.sqrt(energy["e"]))
-    return [ReliftRow(unit, *(float(c[i] / root[i]) for c in columns)) for i, unit in enumerate(units)]
+    return [ReliftRow(unit, *(float(c[i] / root[i]) for c in columns)) for i, unit in enumerate(batch.units)]
 
 
-def held_residual(observer: Observer, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
+def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
     """Return the one-step residual from the first sample on, shape (n_samples - 1, batch, n); earlier values equal the first ones, as in the observer.
 
-    That of a memory is zero: recorded states drive it through the observer's own rows.
+    That of internal states is zero: recorded states drive it through the observer's own rows.
     """
     h = observer.lifting.history
     if h:
         states, inputs = (np.concatenate([np.repeat(v[:1], h, axis=0), v]) for v in (states, inputs))
     residual = one_step_residual(
-        observer.lifting, observer.A, observer.B, with_memory(observer, states, inputs, parameters), inputs, parameters
+        observer.lifting, observer.A, observer.B, with_internal(observer, states, inputs, parameters), inputs, parameters
     )
     residual[..., states.shape[-1] :] = 0.0
     return residual
 
 
-def first_error(observer: Observer, error: Array, width: int) -> Array:
+def first_error(observer: ObserverData, error: Array, width: int) -> Array:
     """Return the first error with the earlier ones that the lifting reads behind it, which equal it; shape (batch, width)."""
     states = observer.lifting.states
     earlier = [states.index(name.partition("[")[0]) for name in observer.lifting.window.earlier if name.partition("[")[0] in states]

@@ -1,18 +1,18 @@
-r"""Observers with a memory of what they saw: low-order models for hidden states, identified from recordings in which these are known.
+r"""Subspace-identified predictors: low-order models for hidden states, identified from recordings in which these are known.
 
-A correction filter sees innovations only, and a model of the recorded states cannot hold what a machine remembers besides: the integrator of its
+A correction filter sees innovations only, and a model of the recorded states does not hold a machine's other states: the integrator of its
 controller, the load. Here the hidden states are regressed on the past of what the observer sees,
 
 .. math:: z = [\,y - M u;\; u_f;\; \sigma(y)\,],
 
-(u_f the inputs that no measurement follows: where a drive stands says nothing) through a bank of delays of all and slow lags of the first
+(u_f the inputs that no measurement follows) through a bank of delays of all and slow lags of the first
 (as for `shaping_filter`), ``s+ = S s + E z``, ``x_h = W s``. Only few directions of s matter: with P the second moment of s *as recorded* and
 Q the observability Gramian of (W, S), the leading eigenvectors of ``Q^(1/2) P Q^(1/2)`` span the states that are kept. In the
 coordinates where Q is the identity S is a contraction, and so is any orthogonal projection of it: the reduced model is *always stable*.
 
 The hidden states become coordinates of it, the other directions states ``memory_1, ...`` of the observer's model. The measured state enters as
-``y = y_hat + nu``, equal columns of A and of the gain. So the result is an `Observer` like any other, which runs, is tuned (`tune_observer`) and certified
-(`relift_certificate`) as all are: extra states start at zero and nothing has to be recorded for them.
+``y = y_hat + nu``, equal columns of A and of the gain. So the result is an `Observer` like any other, which runs and is certified (`relift_certificate`)
+as all are: extra states start at zero and nothing has to be recorded for them.
 
 References
 ----------
@@ -21,16 +21,16 @@ D. F. Enns, "Model reduction with balanced realizations: an error bound and a fr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
 
 from ...core.errors import DataError, DimensionError
 from ...core.linalg import least_squares
 from ...core.norms import gramian
+from ...data import EpisodeBatch
 from ...lifting import Lifting
 from ...synthesis.residual_shaped.shaping import Bank
 
@@ -78,11 +78,7 @@ class Past:
         cls,
         lifting: Lifting,
         measured: Sequence[int],
-        states: Array,
-        inputs: Array,
-        lengths: npt.ArrayLike,
-        units: Sequence[str],
-        parameters: Mapping[str, npt.ArrayLike] | None = None,
+        batch: EpisodeBatch,
         bank: Bank | None = None,
     ) -> Past:
         """Collect moments of recordings.
@@ -92,11 +88,7 @@ class Past:
         lifting : Lifting
             Its functions read measured states alone; no delays, no functions of inputs.
         measured : sequence of int
-        states : ndarray, shape (n_samples, batch, n)
-        inputs : ndarray, shape (n_samples, batch, m)
-        lengths : array_like of int, shape (batch,)
-        units : sequence of str, length batch
-        parameters : mapping of str to array_like, shape (batch,)
+        batch : EpisodeBatch
         bank : Bank, optional
             By default 40 delays, and a lag of the tracking errors that forgets in a twenty-fifth of the shortest episode: controllers
             integrate.
@@ -111,12 +103,12 @@ class Past:
         seen = {lifting.states[i] for i in measured} | set(lifting.parameters)
         if lifting.history or lifting.input_functions or any(set(f.used) - seen for f in lifting.formulas):
             raise DimensionError(
-                f"Observer with memory: functions of the lifting should read {', '.join(sorted(seen))} alone, found {', '.join(lifting.functions)}."
+                f"Predictor: functions of the lifting should read {', '.join(sorted(seen))} alone, found {', '.join(lifting.functions)}."
             )
-        hidden, lengths = hidden_of(lifting, measured), np.asarray(lengths, dtype=int)
+        hidden, lengths, states, inputs = hidden_of(lifting, measured), batch.lengths, batch.states, batch.inputs
         if not hidden or lengths.min() <= 2 * SKIP:
             raise DataError(
-                f"Observer with memory: needs a state that is not measured and episodes of more than {2 * SKIP} samples, "
+                f"Predictor: needs a state that is not measured and episodes of more than {2 * SKIP} samples, "
                 f"found {len(hidden)} and {lengths.min()}."
             )
         bank = bank or Bank(DELAYS, (1 - SHORT / int(lengths.min()),))
@@ -124,8 +116,8 @@ class Past:
         static = _static(inputs, y)
         share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
         free = tuple(int(j) for j in np.flatnonzero(share.max(axis=0) < _FOLLOWS))
-        z = seen_by(lifting, tuple(measured), static, free, y, inputs, parameters)
-        names = tuple(dict.fromkeys(units))
+        z = _channels(lifting, tuple(measured), static, free, batch)
+        names = tuple(dict.fromkeys(batch.units))
         size = bank.delays * z.shape[-1] + len(bank.poles) * len(measured)
         gram, cross, power = (
             np.zeros((len(names), size, size)),
@@ -133,7 +125,7 @@ class Past:
             np.zeros((len(names), len(hidden))),
         )
         counts = np.zeros(len(names))
-        for i, unit in enumerate(units):
+        for i, unit in enumerate(batch.units):
             rows, k = np.arange(SKIP, lengths[i], THIN), names.index(unit)
             s, truth = _bank_states(bank, z[:, i], rows, len(measured)), states[rows, i][:, hidden]
             gram[k] += s.T @ s
@@ -162,10 +154,10 @@ class Past:
         """
         rows = [i for i, unit in enumerate(self.units) if unit not in without]
         if not rows:
-            raise DataError(f"Observer with memory: no unit is left without {', '.join(sorted(without))}; record more units.")
+            raise DataError(f"Predictor: no unit is left without {', '.join(sorted(without))}; record more units.")
         P, cross, power = self.gram[rows].mean(axis=0), self.cross[rows].mean(axis=0), self.power[rows].mean(axis=0)
         if not cross.shape[1] <= order:
-            raise DimensionError(f"Observer with memory: {cross.shape[1]} hidden states need an order of at least as many, found {order}.")
+            raise DimensionError(f"Predictor: {cross.shape[1]} hidden states need an order of at least as many, found {order}.")
         q, delays = len(self.measured), self.bank.delays
         channels = (len(P) - len(self.bank.poles) * q) // delays
         S, E = self.bank.system(channels)
@@ -187,6 +179,10 @@ class Past:
         scale = np.sqrt(np.diag(down @ P @ down.T))
         down, up = down / scale[:, None], up * scale
         return down @ S @ up, down @ E, W @ up
+
+    def channels(self, batch: EpisodeBatch) -> Array:
+        """Return the channels z along recordings, shape (n_samples, batch, channels)."""
+        return _channels(self.lifting, self.measured, self.static, self.free, batch)
 
     def _channel_sizes(self, P: Array, channels: int) -> Array:
         """Size of the channel that every state of the bank is of: what is negligible must not depend on units of measure."""
@@ -216,23 +212,16 @@ def _static(inputs: Array, y: Array) -> Array:
     return least_squares(_centred(rows), _centred(values), rcond=1e-9).T
 
 
-def seen_by(
-    lifting: Lifting,
-    measured: tuple[int, ...],
-    static: Array,
-    free: tuple[int, ...],
-    y: Array,
-    u: Array,
-    parameters: Mapping[str, npt.ArrayLike] | None,
-) -> Array:
-    """The channels z, shape (n_samples, batch, channels)."""
-    x = np.zeros((*y.shape[:-1], lifting.n_states))
+def _channels(lifting: Lifting, measured: tuple[int, ...], static: Array, free: tuple[int, ...], batch: EpisodeBatch) -> Array:
+    y, u, x = batch.states[..., list(measured)], batch.inputs, np.zeros((*batch.states.shape[:-1], lifting.n_states))
     x[..., list(measured)] = y
-    return np.concatenate([y - u @ static.T, u[..., list(free)], lifting.lift(x, parameters)[..., lifting.n_states :]], axis=-1)
+    return np.concatenate([y - u @ static.T, u[..., list(free)], lifting.lift(x, batch.parameters)[..., lifting.n_states :]], axis=-1)
 
 
 def _bank_states(bank: Bank, z: Array, rows: npt.NDArray[np.intp], slow: int) -> Array:
     """States s of one episode at some samples: delays of all channels, then lags of the first few, shape (rows, N)."""
+    from scipy.signal import lfilter
+
     delayed = [z[np.maximum(rows - j, 0)] for j in range(1, bank.delays + 1)]
     lags = [lfilter([0.0, np.sqrt(1 - p**2)], [1.0, -p], z[:, :slow], axis=0)[rows] for p in bank.poles]
     return np.concatenate([*delayed, *lags], axis=1)

@@ -1,11 +1,11 @@
 r"""Tuning of linear models for hidden states: all coefficients, dynamics included, by Gauss-Newton steps.
 
-The estimates are ``x_h = H (q I - F)^-1 G z`` with z as recorded (`seen_by`): no observer has to be run for a step. The criterion is
+The estimates are ``x_h = H (q I - F)^-1 G z`` with z as recorded (`Past.channels`): no observer has to be run for a step. The criterion is
 
 .. math:: \sum_i s_i \log \bigl( \operatorname{mean}_u \overline{e_{iu}^2} \bigr)^{1/2},
 
 with :math:`\overline{e_{iu}^2}` the mean square error of hidden state i on unit u. Every episode counts twice, with the lifted functions larger and smaller
-by a share: machines on which they act more or less than on the mean machine look like that, and an observer that relied on what it was told of
+by a share: machines on which they act more or less than on the mean machine look like that, and an observer that relied on what recordings say of
 them would fail where others adapt. Steps are taken in coordinates in which the states are white along the recordings, all coefficients free: of the many
 models with the same estimates, the nearest one. In those of companion forms or of single modes the search ends early.
 
@@ -17,7 +17,7 @@ identification", Automatica 40 (2004) 1629-1635.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,30 +25,28 @@ import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from ...core.errors import DataError
-from .blocks import Array, Block, Model, blocks_of, joined
-from .moments import Past, hidden_of, seen_by
+from ...data import EpisodeBatch
+from ..tuning.blocks import Array, Block, Model, blocks_of, joined
+from ..tuning.gauss_newton import MEMORIES, Damping, mean_log, scaled, search, whitening
+from .moments import Past, hidden_of
 
-_DAMPING = (1e-7, 1e-3, 1e4)
+_DAMPING = Damping(1e-7, 1e-3, 1e4, 4.0)
 _THIN, _SIDE_BY_SIDE = 8, 4  # episodes: keeps derivatives in some ten megabytes
 _ALIKE = 1e-13  # share of a direction below which rounding decides
 _BOUND, _AT_BOUND = 1e4, 1 - 1e-6  # a pole at its bound stays there instead of ending the search
-_MEMORIES = 3  # models forget within this part of an episode: what is slower, recordings of this length cannot judge
 
 
-def tune_memory(
+def tune_predictor(
     model: Model,
     past: Past,
-    states: Array,
-    inputs: Array,
-    units: Sequence[str],
-    parameters: Mapping[str, npt.ArrayLike] | None = None,
+    batch: EpisodeBatch,
     importance: npt.ArrayLike = 1.0,
     deviation: float = 0.0,
     slowest: float | None = None,
     iterations: int = 25,
     least_gain: float = 1e-4,
 ) -> tuple[Model, tuple[float, ...]]:
-    """Improve a model of `Past.model` on recordings.
+    """Improve a model of `Past.model` on recordings of one length.
 
     Parameters
     ----------
@@ -56,10 +54,7 @@ def tune_memory(
         A stable one.
     past : Past
         Says what the channels are.
-    states : ndarray, shape (n_samples, batch, n)
-    inputs : ndarray, shape (n_samples, batch, m)
-    units : sequence of str, length batch
-    parameters : mapping of str to array_like, shape (batch,)
+    batch : EpisodeBatch
     importance : array_like, shape (h,)
         Weights s of the logarithms.
     deviation : float
@@ -80,102 +75,67 @@ def tune_memory(
     Raises
     ------
     DataError
-        When the model diverges on the recordings.
+        When the model is not stable.
     """
-    problem = _Tuning.of(past, states, inputs, units, parameters, importance, deviation)
-    low, damping, high = _DAMPING
-    blocks, own = blocks_of(*model), float(np.abs(np.linalg.eigvals(model[0])).max())
-    slowest = max(own, 1 - _MEMORIES / len(states) if slowest is None else slowest)
-    if not slowest < 1:
-        raise DataError("Tuning an observer with memory: the model is not stable; start from one that is.")
-    error = problem.errors(blocks)
-    criterion = [problem.criterion(error)]
-    for _ in range(iterations):
-        H, g, outward, change = problem.normal_equations(blocks, error)
-        bounded = np.outer(outward, outward) * _BOUND if _radius(blocks) > slowest * _AT_BOUND else np.zeros_like(H)
-        while damping <= high:
-            damped = H + damping * np.eye(len(g))
-            step = np.linalg.solve(damped, g)
-            if outward @ step > 0:
-                step = np.linalg.solve(damped + bounded, g)
-            trial = [b.within(slowest) for b in blocks_of(*_sum(joined(blocks), change(np.asarray(step, dtype=float))))]
-            error_then = problem.errors(trial)
-            if problem.criterion(error_then) < criterion[-1]:
-                break
-            damping *= 4
-        else:
-            break
-        blocks, error, damping = trial, error_then, max(damping / 10, low)
-        criterion.append(problem.criterion(error))
-        if len(criterion) > 2 and criterion[-3] - criterion[-1] < least_gain:
-            break
-    return joined(blocks), tuple(criterion)
+    problem = _Tuning(past, batch, importance, deviation)
+    own = float(np.abs(np.linalg.eigvals(model[0])).max())
+    problem.slowest = max(own, 1 - MEMORIES / len(batch.states) if slowest is None else slowest)
+    if not problem.slowest < 1:
+        raise DataError("Tuning a predictor: the model is not stable; start from one that is.")
+    found, criterion = search(problem.at(blocks_of(*model)), problem.steps, _DAMPING, iterations, least_gain, patience=2)
+    return joined(found.blocks), criterion
 
 
 @dataclass(frozen=True, eq=False)
+class _Point:
+    """A model in blocks, and its mean square errors, shape (unit, h)."""
+
+    blocks: list[Block]
+    errors: Array
+    criterion: float
+
+
 class _Tuning:
     """Recordings to tune on, samples on the last axis."""
 
-    z: Array
-    truth: Array
-    rest: Array
-    unit: npt.NDArray[np.intp]
-    share: Array
-
-    @classmethod
-    def of(
-        cls,
-        past: Past,
-        states: Array,
-        inputs: Array,
-        units: Sequence[str],
-        parameters: Mapping[str, npt.ArrayLike] | None,
-        importance: npt.ArrayLike,
-        deviation: float,
-    ) -> _Tuning:
-        """Collect the channels, twice where machines deviate."""
+    def __init__(self, past: Past, batch: EpisodeBatch, importance: npt.ArrayLike, deviation: float) -> None:
         hidden = hidden_of(past.lifting, past.measured)
-        seen = seen_by(past.lifting, past.measured, past.static, past.free, states[..., list(past.measured)], inputs, parameters)
-        z, truth = (np.ascontiguousarray(np.moveaxis(a, 0, 2).swapaxes(0, 1)) for a in (seen, states[..., hidden]))
-        names = list(dict.fromkeys(units))
-        unit = np.array([names.index(u) for u in units])
+        seen, truth = past.channels(batch), batch.states[..., hidden]
+        z, truth = (np.ascontiguousarray(np.moveaxis(a, 0, 2).swapaxes(0, 1)) for a in (seen, truth))
+        names = list(dict.fromkeys(batch.units))
+        unit = np.array([names.index(u) for u in batch.units])
         lifted = slice(len(z) - len(past.lifting.functions), None)
-        if deviation and past.lifting.functions:
+        if deviation and past.lifting.functions:  # twice where machines deviate
             sign = np.where(np.arange(len(unit)) % 2 == 0, deviation, -deviation)[:, None]
             both = [z.copy(), z.copy()]
             both[0][lifted] *= 1 + sign
             both[1][lifted] *= 1 - sign
             z, truth, unit = np.concatenate(both, axis=1), np.concatenate([truth, truth], axis=1), np.tile(unit, 2)
-        rest = np.zeros(z.shape[:2])
-        rest[lifted] = z[lifted, :, 0]
         share = np.broadcast_to(np.asarray(importance, dtype=float), len(hidden))
-        return cls(z, truth, rest, unit, share / share.sum())
+        self.z, self.truth, self.unit, self.share, self.slowest = z, truth, unit, share / share.sum(), 1.0
+        self.rest = np.zeros(z.shape[:2])
+        self.rest[lifted] = z[lifted, :, 0]
 
-    def errors(self, blocks: Sequence[Block]) -> Array:
-        """Mean square errors, shape (unit, h)."""
+    def at(self, blocks: list[Block]) -> _Point:
+        """Run a model."""
         found, counts = np.zeros((self.unit.max() + 1, len(self.truth))), np.bincount(self.unit)
         with np.errstate(over="ignore", invalid="ignore"):
             for part in self._parts():
-                missed = self._missed(blocks, part)[2]
-                np.add.at(found, self.unit[part], np.mean(missed**2, axis=-1).T)
-        return found / counts[:, None]
+                np.add.at(found, self.unit[part], np.mean(self._missed(blocks, part)[2] ** 2, axis=-1).T)
+            errors = found / counts[:, None]
+            return _Point(blocks, errors, mean_log(self.share, errors.mean(axis=0)))
 
-    def criterion(self, error: Array) -> float:
-        """The criterion of mean square errors by unit; infinite where the model diverges."""
-        if not np.isfinite(error).all():
-            return np.inf
-        return float(self.share @ np.log(error.mean(axis=0)) / 2)
-
-    def normal_equations(self, blocks: Sequence[Block], error: Array) -> tuple[Array, Array, Array, Callable[[Array], Model]]:
-        """Gauss-Newton matrix and right side for scaled coefficients, the direction that slows the slowest pole, and what takes a step to F, G, H.
+    def steps(self, point: _Point) -> Callable[[float], _Point]:
+        """Gauss-Newton steps, bounded where they slow down the slowest pole.
 
         Coefficients are those of all states and channels, white along the recordings, in the rows of white states: directions that change no
         estimate, and those between nearly alike channels, cost nothing.
         """
-        n, outputs = sum(len(b.F) for b in blocks), len(self.truth)
+        blocks, model = point.blocks, joined(point.blocks)
+        n, outputs = len(model[0]), len(self.truth)
         into, out = self._whitening(blocks)
         width = into.shape[1]
-        weight = self.share / error.sum(axis=0) / np.bincount(self.unit)[:, None]
+        weight = self.share / point.errors.sum(axis=0) / np.bincount(self.unit)[:, None]
         H, g = np.zeros((n * (width + outputs),) * 2), np.zeros(n * (width + outputs))
         for part in self._parts():
             h, rest, missed = self._missed(blocks, part)
@@ -189,17 +149,24 @@ class _Tuning:
             H += X @ X.T
             g += X @ (missed[..., ::_THIN] * root).ravel()
         turn = block_diag(np.kron(np.linalg.pinv(out).T, np.eye(width)), np.kron(np.eye(outputs), out))
-        H, g = turn.T @ H @ turn, turn.T @ g
-        size = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
+        H, g, size = scaled(turn.T @ H @ turn, turn.T @ g)
+        slows = np.hstack([_slowing(model[0]), np.zeros((n, len(self.z)))]) @ into
+        outward = turn.T @ np.concatenate([slows.ravel(), np.zeros(outputs * n)]) / size
+        outward /= np.linalg.norm(outward)
+        radius = max(float(np.abs(np.linalg.eigvals(b.F)).max()) for b in blocks)
+        bounded = np.outer(outward, outward) * _BOUND if radius > self.slowest * _AT_BOUND else np.zeros_like(H)
 
-        def change(step: Array) -> Model:
+        def trial(damping: float) -> _Point:
+            damped = H + damping * np.eye(len(g))
+            step = np.linalg.solve(damped, g)
+            if outward @ step > 0:
+                step = np.linalg.solve(damped + bounded, g)
             inner, direct = np.split(turn @ (step / size), [n * width])
             moved = inner.reshape(n, width) @ into.T
-            return moved[:, :n], moved[:, n:], direct.reshape(outputs, n)
+            changed = model[0] + moved[:, :n], model[1] + moved[:, n:], model[2] + direct.reshape(outputs, n)
+            return self.at([b.within(self.slowest) for b in blocks_of(*changed)])
 
-        slows = np.hstack([_slowing(joined(blocks)[0]), np.zeros((n, len(self.z)))]) @ into
-        outward = turn.T @ np.concatenate([slows.ravel(), np.zeros(outputs * n)]) / size
-        return H / np.outer(size, size), g / size, outward / np.linalg.norm(outward), change
+        return trial
 
     def _whitening(self, blocks: Sequence[Block]) -> tuple[Array, Array]:
         """What makes all states and channels white along the recordings, and what makes the states so."""
@@ -209,7 +176,7 @@ class _Tuning:
             flat = np.concatenate([self._missed(blocks, part)[0][..., ::_THIN], self.z[:, part, ::_THIN]]).reshape(len(moments), -1)
             moments += flat @ flat.T
         moments *= _THIN / self.z[0].size
-        return _white(moments), _white(moments[:n, :n])
+        return whitening(moments, _ALIKE), whitening(moments[:n, :n], _ALIKE)
 
     def _missed(self, blocks: Sequence[Block], part: slice) -> tuple[Array, Array, Array]:
         """States of all blocks on some episodes, their rest, and what the estimates miss."""
@@ -221,25 +188,9 @@ class _Tuning:
         return [slice(i, i + _SIDE_BY_SIDE) for i in range(0, len(self.unit), _SIDE_BY_SIDE)]
 
 
-def _sum(model: Model, change: Model) -> Model:
-    return model[0] + change[0], model[1] + change[1], model[2] + change[2]
-
-
-def _radius(blocks: Sequence[Block]) -> float:
-    return max(float(np.abs(np.linalg.eigvals(b.F)).max()) for b in blocks)
-
-
 def _slowing(F: Array) -> Array:
     """Derivative of the spectral radius by F, shape (n, n)."""
     values, vectors = np.linalg.eig(F)
     k = int(np.abs(values).argmax())
     turn = np.conj(values[k]) / np.abs(values[k])
     return np.asarray((turn * np.outer(np.linalg.inv(vectors)[k], vectors[:, k])).real)
-
-
-def _white(moments: Array) -> Array:
-    """T with ``T' moments T`` the identity, of full column rank where moments lack some."""
-    size = np.sqrt(np.maximum(np.diag(moments), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(moments / np.outer(size, size))
-    kept = values > _ALIKE * values[-1]
-    return np.asarray(vectors[:, kept] / np.sqrt(values[kept]) / size[:, None])

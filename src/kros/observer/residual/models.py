@@ -12,7 +12,7 @@ with rows of both kinds is no member of any uncertain set, and need not be stabl
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...core.linalg import least_squares
+from ...data import EpisodeBatch
 from ...lifting import Lifting
 from ...synthesis.residual_shaped.shaped import promised_errors
 from .one_step import mean_error_dynamics, one_step_residual, residual_spectra
@@ -57,19 +58,13 @@ class ResidualModel:
     promised: Array
 
 
-def one_step_rows(
-    lifting: Lifting, states: Array, inputs: Array, lengths: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None
-) -> tuple[Array, Array]:
+def one_step_rows(lifting: Lifting, batch: EpisodeBatch) -> tuple[Array, Array]:
     """Fit the original states' rows of the model to single steps of all recordings by least squares.
 
     Parameters
     ----------
     lifting : Lifting
-    states : ndarray, shape (n_samples, batch, n)
-    inputs : ndarray, shape (n_samples, batch, m)
-    lengths : array_like of int, shape (batch,)
-        Samples of every episode that count.
-    parameters : mapping of str to array_like, shape (batch,)
+    batch : EpisodeBatch
 
     Returns
     -------
@@ -81,9 +76,9 @@ def one_step_rows(
     DataError
         When there are fewer steps than coefficients.
     """
-    h, lengths = lifting.history, np.asarray(lengths, dtype=int)
-    x, u = np.swapaxes(states, 0, 1), np.swapaxes(inputs, 0, 1)
-    values = {name: np.asarray(value, dtype=float)[..., None] for name, value in (parameters or {}).items()}
+    h, lengths = lifting.history, batch.lengths
+    x, u = np.swapaxes(batch.states, 0, 1), np.swapaxes(batch.inputs, 0, 1)
+    values = {name: value[..., None] for name, value in batch.parameters.items()}
     window, u = lifting.windows(x, u)[:, :-1], u[:, h:-1]
     regressors = np.concatenate([lifting.lift(window, values), lifting.lift_inputs(u, window, values)], axis=-1)
     counted = np.arange(regressors.shape[1]) < (lengths - h - 1)[:, None]
@@ -100,14 +95,9 @@ def residual_models(
     A: Array,
     B: Array,
     measured: Sequence[int],
-    states: Array,
-    inputs: Array,
-    lengths: npt.ArrayLike,
-    units: Sequence[str],
-    parameters: Mapping[str, npt.ArrayLike] | None,
+    batch: EpisodeBatch,
     noise: Array,
     scale: Array,
-    dt: float,
 ) -> list[ResidualModel]:
     """Return the model as identified and with rows fitted to single steps, the one that promises the smallest hidden errors first.
 
@@ -119,32 +109,27 @@ def residual_models(
     A : ndarray, shape (n_lifted, n_lifted)
     B : ndarray, shape (n_lifted, m)
     measured : sequence of int
-    states : ndarray, shape (n_samples, batch, n)
-    inputs : ndarray, shape (n_samples, batch, m)
-    lengths : array_like of int, shape (batch,)
-    units : sequence of str, length batch
-    parameters : mapping of str to array_like, shape (batch,)
+    batch : EpisodeBatch
     noise : ndarray, shape (q,)
         Standard deviation of the measurement noise.
     scale : ndarray, shape (n,)
         Range of every state.
-    dt : float, s
     """
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(range(n))
-    fitted = one_step_rows(lifting, states, inputs, lengths, parameters)
+    fitted, x, u, values = one_step_rows(lifting, batch), batch.states, batch.inputs, batch.parameters
     both = [(A, B), (np.vstack([fitted[0], A[n:]]), np.vstack([fitted[1], B[n:]]))]
-    residual = np.concatenate([one_step_residual(lifting, *model, states, inputs, parameters) for model in both], axis=-1)
-    spectra = residual_spectra(residual, np.asarray(lengths) - 1 - lifting.history, units)
+    residual = np.concatenate([one_step_residual(lifting, *model, x, u, values) for model in both], axis=-1)
+    spectra = residual_spectra(residual, batch.lengths - 1 - lifting.history, batch.units)
     models = []
     for rows in _choices(tuple(measured), hidden):
         picked = [i + n * (i in rows) for i in range(n)]
         own = [M.copy() for M in both[0]]
         for matrix, other in zip(own, both[1], strict=True):
             matrix[list(rows)] = other[list(rows)]
-        dynamics = mean_error_dynamics(lifting, own[0], states, inputs, parameters)
+        dynamics = mean_error_dynamics(lifting, own[0], x, u, values)
         chosen = spectra[..., picked, :][..., picked]
-        promised = promised_errors(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, dt)
+        promised = promised_errors(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, batch.sample_period_s)
         models.append(ResidualModel(rows, own[0], own[1], dynamics, chosen, promised))
     return sorted(models, key=lambda m: float(np.sum(np.log(np.maximum(m.promised[hidden], np.finfo(float).tiny)))))
 

@@ -173,11 +173,8 @@ class LoadStudy:
         return calibrate_load(
             lifting,
             self._measured,
-            self.train.states,
-            self.train.inputs,
+            self.train,
             self.truth[0],
-            self.dt,
-            self.parameters(lifting, self.train),
             self.places[1],
             self.config.level_s,
             REAL_HZ,

@@ -1,14 +1,12 @@
 """Uncertainty of a population: six forms, residuals, nominal, cover and weights, outliers. The stage's result is an `UncertainModel`."""
 
-from .fits.magnitude import FittedMagnitude, Side, fit_magnitude, invert
-from .fits.tightness import Tightness, magnitude_tightness
-from .forms import Form, existence, rebuild, residual, residual_shape
+from .fits.magnitude import FittedMagnitude, Side, Tightness, fit_magnitude, invert, magnitude_tightness
+from .forms import Form, bounds, completion, existence, misfit, rebuild, residual, residual_shape
 from .model import ResponseUncertainty, UncertainModel, scale_system
 from .nominal.choice import Criterion, NominalChoice, choose_nominal, choose_nominals
 from .outliers.model import OutlierModel, score_outliers
 from .outliers.score import OutlierScore, Status
 from .quantify import UncertainModels, quantify
-from .residuals import bounds, completion, misfit
 from .responses import quantify_responses
 from .small_matrices import sigma_max
 from .systems import quantify_systems

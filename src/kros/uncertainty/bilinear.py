@@ -27,18 +27,11 @@ _DEFAULT_POINTS = 1000
 
 @dataclass(frozen=True)
 class BilinearAxis:
-    """Map between a continuous and a discrete frequency axis.
+    """Map between a continuous and a discrete frequency axis."""
 
-    Parameters
-    ----------
-    period_s : float, s
-        Period T of the map.
-    last_hz : float, Hz
-        End of the grid, from which on residuals count as constant, infinity included: numerically a strictly proper plant has no
-        pseudo-inverse there, and an additive residual vanishes faster than a weight with a stable inverse may.
-    """
-
-    period_s: float
+    period_s: float  # s: period T of the map
+    # Hz: end of the grid, from which on residuals count as constant, infinity included: numerically a strictly proper plant has no
+    # pseudo-inverse there, and an additive residual vanishes faster than a weight with a stable inverse may
     last_hz: float
 
     @classmethod
@@ -85,13 +78,7 @@ def beyond(freqs_hz: Array) -> Array:
 
 
 def continuous_grid(system: StateSpace) -> Array:
-    """Return 1000 logarithmic points from a hundredth of the slowest to ten times the fastest pole, Hz.
-
-    Raises
-    ------
-    ConfigError
-        When there are no poles.
-    """
+    """Return 1000 logarithmic points from a hundredth of the slowest to ten times the fastest pole, Hz; without poles a `ConfigError`."""
     sizes = np.abs(system.poles()) / (2 * np.pi)
     sizes = sizes[sizes > 0]
     if not sizes.size:

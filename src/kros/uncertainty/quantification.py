@@ -18,9 +18,8 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 from ..core.norms import hinf_norm
 from .bilinear import BilinearAxis
-from .forms import Form, as_form, member, residual
+from .forms import Form, as_form, completion, member, misfit, residual
 from .nominal.choice import Criterion, NominalChoice, choose_nominal, choose_nominals
-from .residuals import completion, misfit
 from .small_matrices import sigma_max
 from .weights.check import Residuals, between_points
 from .weights.cover import Cover, Structure, as_structure
@@ -43,15 +42,9 @@ _LOOSEST = 3.0  # overbound in tolerances at which a diagonal weight is loose
 
 @dataclass(frozen=True, eq=False)
 class Bounded:
-    """Weights of a form and, where the form leaves something out, of the additive remainder; fields as in `Uncertainty`.
+    """Weights of a form and, where the form leaves something out, of the additive remainder; fields as in `Uncertainty`."""
 
-    Parameters
-    ----------
-    bound : ndarray, shape (frequency,)
-        Largest residual over the units.
-    """
-
-    bound: Array
+    bound: Array  # (frequency,): largest residual over the units
     cover: Cover
     weight: Weight
     misfit: Array
@@ -80,13 +73,7 @@ class Quantification:
         tolerance_db: float,
         density: int = 10,
     ) -> Quantification:
-        """Check the options.
-
-        Raises
-        ------
-        ConfigError
-            Unknown form, criterion or structure, an order or tolerance out of range.
-        """
+        """Check the options; unknown ones, or an order or tolerance out of range, are a `ConfigError`."""
         if not (isinstance(max_order, (int, np.integer)) and max_order >= 0 and tolerance_db >= 0 and density >= 1):
             raise ConfigError(
                 f"Quantify: max_order = {max_order!r} should be a whole number from 0, tolerance_db = {tolerance_db} not negative, "
@@ -122,12 +109,8 @@ class Quantification:
         freqs_hz : ndarray, shape (frequency,), Hz
         time : float, s, or BilinearAxis
             Sampling period, or the map of the axis for continuous time.
-        systems : ResidualSystems, optional
-            The discrete systems behind the responses, for a proof between grid points, also of the remainder's weight.
-        also_hz : ndarray, shape (n,), Hz, optional
-            Where the bound is checked besides; on the mapped axis for continuous time.
-        sampled : bool
-            The responses are known at `freqs_hz` only, and nominal and units are asked for no others.
+        systems, also_hz, sampled
+            As of `fit_weight`; on the mapped axis for continuous time. Sampled responses are asked for at no frequencies but those given.
         """
         if isinstance(time, BilinearAxis):
             back = time.continuous_hz

@@ -12,11 +12,10 @@ import numpy.typing as npt
 from ..core.errors import DataError, DimensionError
 from ..core.frequency import check_grid
 from .bilinear import BilinearAxis
-from .forms import Form
+from .forms import Form, check_responses
 from .model import ResponseUncertainty
 from .nominal.choice import Criterion
 from .quantification import AUTO, Quantification
-from .residuals import check_responses
 from .validation import check_ids, check_names, check_scale, find_nominal
 from .weights.check import nearest
 from .weights.cover import Structure
@@ -56,17 +55,12 @@ def quantify_responses(
     form : Form or str
     sample_period_s : float, s
         Of the systems behind the responses, and of the weights; zero for continuous time, in which weights are fitted through the bilinear map of the axis.
-    unit_ids : sequence of str, optional
-    output_scale, input_scale : array_like, shape (p,) and (m,), optional
-        Ranges; residuals and weights are in these units.
     nominal : int, str or array_like of shape (frequency, p, m), optional
         A unit, the name of a candidate, or a response of its own; by default the best by `criterion`.
-    criterion : {"peak", "area"}
-        See `choose_nominal`.
     extra : mapping of str to array_like, shape (frequency, p, m), optional
         Further candidates for the nominal by name.
-    structure, max_order, tolerance_db
-        Of the weights, as of `quantify_systems`.
+    unit_ids, output_scale, input_scale, criterion, structure, max_order, tolerance_db
+        As of `quantify_systems`.
 
     Returns
     -------

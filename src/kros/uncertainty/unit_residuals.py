@@ -114,26 +114,14 @@ def unit_residuals(
 
     Parameters
     ----------
-    form : Form
-    nominal : ndarray, shape (frequency, p, m), complex
-        In scaled coordinates, as `responses`.
-    responses : ndarray, shape (unit, frequency, p, m), complex
+    nominal, responses : ndarray, shape (frequency, p, m) and (unit, frequency, p, m), complex
+        In scaled coordinates.
     weights : Weight or Cover
         Systems, or magnitudes at the frequencies.
-    freqs_hz : ndarray, shape (frequency,), Hz
-    sample_period_s : float, s
-    unit_ids : sequence of str
-    nominal_id : str
     outside : collection of str
         Units that the weights need not cover; they take no part in the entrywise bounds.
-    max_order : int
-        Of the bound of one entry.
-    tolerance_db : float, dB
-        Overbound at which a lower order is good enough.
-
-    Returns
-    -------
-    UnitResiduals
+    max_order, tolerance_db
+        Of the bound of one entry, as of `fit_magnitude`.
 
     Raises
     ------
@@ -171,14 +159,7 @@ def unit_residuals(
 
 
 def weight_ratio(weights: Weight | Cover, E: Array, freqs_hz: Array) -> Array:
-    """Return ``sigma_max(W_L^-1 E W_R^-1)``, shape (unit, frequency); the largest ratio of an entry where the weights are entrywise.
-
-    Parameters
-    ----------
-    weights : Weight or Cover
-    E : ndarray, shape (unit, frequency, p', m'), complex
-    freqs_hz : ndarray, shape (frequency,), Hz
-    """
+    """Return ``sigma_max(W_L^-1 E W_R^-1)``, shape (unit, frequency); the largest ratio of an entry where the weights are entrywise."""
     if isinstance(weights, EntrywiseWeight):
         size = np.abs(weights.matrix().frequency_response(freqs_hz))
         return np.asarray(np.divide(np.abs(E), size, out=np.zeros(E.shape), where=size > 0).max(axis=(-2, -1)))

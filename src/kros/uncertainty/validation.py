@@ -46,12 +46,7 @@ def check_ids(unit_ids: Sequence[str] | None, count: int) -> tuple[str, ...]:
 def stack_systems(models: Any) -> StateSpace:
     """Return a batch from a batch, or from a sequence of systems with the same outputs, inputs and sampling period.
 
-    Systems with fewer states than others get further ones that are stable and do nothing.
-
-    Raises
-    ------
-    DimensionError
-        When they differ, or a single system without the unit axis is given.
+    Systems with fewer states than others get further ones that are stable and do nothing. Others raise a `DimensionError`.
     """
     if not isinstance(models, StateSpace):
         if isinstance(models, str) or not isinstance(models, Iterable):
@@ -109,7 +104,7 @@ def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
     """Return ranges as an array, ones by default, or say what is wrong with them."""
     scale = np.ones(size) if values is None else np.asarray(values, float)
     if scale.shape != (size,) or not (np.isfinite(scale) & (scale > 0)).all():
-        raise DimensionError(f"Quantify: {side}_scale needs {size} positive ranges, found {np.array2string(scale, threshold=10)}.")
+        raise DimensionError(f"Uncertainty: {side}_scale needs {size} positive numbers, found {np.array2string(scale, threshold=10)}.")
     return scale
 
 

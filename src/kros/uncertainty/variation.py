@@ -23,12 +23,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
-from ..core.errors import ConfigError, DataError, DimensionError
+from ..core.errors import ConfigError, DataError
 from ..core.frequency import check_grid
 from ..core.loading import check_shapes, loader
 from ..identify import ModelSamples
 from .forms import Form, as_form, residual
 from .small_matrices import sigma_max, squared
+from .validation import check_scale
 
 Array = npt.NDArray[Any]
 
@@ -146,7 +147,7 @@ def variation_and_noise(
     """
     form, freqs = as_form(form), check_grid(freqs_hz, sample_period_s)
     units, draws, n, m = _require(models, nominal, level)
-    scale = _scale(output_scale, n)[:, None] / _scale(input_scale, m)
+    scale = check_scale("output", output_scale, n)[:, None] / check_scale("input", input_scale, m)
     # Responses of the estimates, scaled: (unit, frequency, n, m).
     G = models.estimate.responses(freqs, sample_period_s) / scale
     noise, band = np.zeros(len(freqs)), np.empty((units, len(freqs)))
@@ -201,13 +202,6 @@ def _require(models: ModelSamples, nominal: int, level: float) -> tuple[int, int
 
 def _matrices(models: ModelSamples) -> tuple[Array, ...]:
     return models.estimate.A, models.estimate.B, models.samples.A, models.samples.B
-
-
-def _scale(scale: npt.ArrayLike | None, size: int) -> Array:
-    values = np.ones(size) if scale is None else np.asarray(scale, dtype=float)
-    if values.shape != (size,) or not (np.isfinite(values).all() and (values > 0).all()):
-        raise DimensionError(f"Variation and noise: a scale should hold {size} positive numbers, found {values.tolist()}.")
-    return values
 
 
 def _parts(count: int, size: int) -> Iterator[slice]:

@@ -54,23 +54,13 @@ _ENOUGH = 0.95  # of the tolerance: what is found between the points of the fit 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Residuals at the frequencies of a fit.
+    """Residuals at the frequencies of a fit."""
 
-    Parameters
-    ----------
-    freqs_hz, tau : ndarray, shape (frequency,)
-    residuals : ndarray, shape (unit, frequency, p', m')
-    optimal : ndarray, shape (frequency,), nepers
-        Cost of the optimal cover, infinite beyond the band.
-    ratio : ndarray, shape (unit, frequency)
-        Of the residuals to such a cover, or to a weight: which units lead.
-    """
-
-    freqs_hz: Array
-    tau: Array
-    residuals: Array
-    optimal: Array
-    ratio: Array
+    freqs_hz: Array  # (frequency,)
+    tau: Array  # (frequency,)
+    residuals: Array  # (unit, frequency, p', m')
+    optimal: Array  # (frequency,), nepers: cost of the optimal cover, infinite beyond the band
+    ratio: Array  # (unit, frequency): of the residuals to such a cover, or to a weight: which units lead
 
     def joint(self, units: int = _UNITS, step: int = 1) -> JointFit:
         """Return the joint fit with the leading units of every frequency."""
@@ -109,16 +99,7 @@ class Problem:
 
 
 def fit_sections(problem: Problem, max_order: int, tolerance_db: float) -> Fitted:
-    """Return magnitudes of a diagonal weight, left ones first: of the smallest orders found within the tolerance, or the best up to the largest.
-
-    Parameters
-    ----------
-    problem : Problem
-    max_order : int
-        Of an entry.
-    tolerance_db : float, dB
-        Excess cost at which lower orders are good enough.
-    """
+    """Return magnitudes of a diagonal weight, left ones first: of the lowest orders found within the tolerance, or the best up to the largest."""
     joint, order = problem.joint(), max_order if max_order <= _START_ORDER else _START_ORDER - max_order % 2
     found = _jumped(joint, _first(problem, joint, _starts(problem, joint, order), tolerance_db), tolerance_db)
     if found.excess_db > _UNSATISFIED * tolerance_db:
@@ -159,8 +140,8 @@ def _starts(problem: Problem, joint: JointFit, order: int) -> Iterator[Sections]
         orders = [order] * len(logs)
         orders[cover.left.shape[1] + reference] = 0
         for even in _EVEN if order > 1 else _EVEN[:1]:
-            places = [log_knots(problem.tau, row, (n + 1) // 2, even) for row, n in zip(logs, orders, strict=True)]
-            yield follow(problem.tau, logs, Sections.spread(places, orders, _WIDTH), joint.ends(), _FOLLOW)
+            corners = [log_knots(problem.tau, row, (n + 1) // 2, even) for row, n in zip(logs, orders, strict=True)]
+            yield follow(problem.tau, logs, Sections.spread(corners, orders, _WIDTH), joint.ends(), _FOLLOW)
 
 
 def _from_scalar(problem: Problem, joint: JointFit, order: int) -> Iterator[Sections]:
@@ -173,9 +154,9 @@ def _from_scalar(problem: Problem, joint: JointFit, order: int) -> Iterator[Sect
     cover = optimal_cover(problem.residuals[:, problem.some(_COARSE)], pull=_PULLS[1], squarings=_QUICK)
     for reference in np.argsort(-np.median(cover.right, axis=0), kind="stable")[:_GAUGES]:
         orders = [0] * p + [0 if j == reference else order for j in range(m)]
-        places = [log_knots(problem.tau, np.log(size), (n + 1) // 2, _EVEN[0]) for n in orders]
+        corners = [log_knots(problem.tau, np.log(size), (n + 1) // 2, _EVEN[0]) for n in orders]
         try:
-            yield Sections.spread(places, orders, _WIDTH).like(np.arange(p), scalar)
+            yield Sections.spread(corners, orders, _WIDTH).like(np.arange(p), scalar)
         except KrosError as error:
             _LOG.debug("Diagonal weights: the scalar magnitude is no start (%s)", error)
 

@@ -13,20 +13,10 @@ Array = npt.NDArray[Any]
 
 
 def diagonal_response(system: StateSpace, freqs_hz: npt.ArrayLike) -> Array:
-    """Return the diagonal of the response of a square system.
+    """Return the diagonal of the response of one square system, shape (frequency, size), complex.
 
     Where A is block upper triangular with blocks of at most two states, `(zeta - A) x = b` is solved from the last block up, all frequencies at
     once, and what a channel does not reach is left out; other systems are solved as they are.
-
-    Parameters
-    ----------
-    system : StateSpace
-        One system, as many outputs as inputs.
-    freqs_hz : array_like, shape (frequency,), Hz
-
-    Returns
-    -------
-    ndarray, shape (frequency, size), complex
     """
     freqs = np.asarray(freqs_hz, float)
     blocks = _blocks(system.A)

@@ -35,34 +35,22 @@ _FARTHEST = 1.5  # largest change of a parameter in a step
 _SETTLED = 0.02  # gain of a step, in temperatures, below which the temperature falls
 _TRIES = 8
 _NEGLIGIBLE = 1e-6  # weight of a term in a smoothed maximum
-_BEYOND = 7.0  # log tau that places may go beyond the frequencies
+_BEYOND = 7.0  # log tau that corners may go beyond the frequencies
 _DAMPING = (1e-6, 1e-2)  # smallest and first
-_PLACES, _DIPOLE = 60, np.log(2.0)  # where further sections are tried, and their width
+_CORNERS, _DIPOLE = 60, np.log(2.0)  # where further sections are tried, and their width
 _TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Data of a joint fit.
+    """Data of a joint fit."""
 
-    Parameters
-    ----------
-    residuals : ndarray, shape (n, p', m'), complex
-        Of units at frequencies.
-    at : ndarray of int, shape (n,)
-        The frequency each belongs to.
-    tau : ndarray, shape (frequency,)
-    optimal : ndarray, shape (frequency,), nepers
-        Cost of the optimal cover, mean log left plus mean log right; infinite where nothing has to be tight.
-    price : float
-        Of the peak of square weights.
-    """
-
-    residuals: Array
-    at: Array
-    tau: Array
+    residuals: Array  # (n, p', m'), complex: of units at frequencies
+    at: Array  # (n,): the frequency each belongs to
+    tau: Array  # (frequency,)
+    # (frequency,), nepers: cost of the optimal cover, mean log left plus mean log right; infinite where nothing has to be tight
     optimal: Array
-    price: float = _PEAK
+    price: float = _PEAK  # of the peak of square weights
 
     @property
     def n_left(self) -> int:
@@ -72,16 +60,8 @@ class JointFit:
     def descend(self, start: Sections, temperatures: Sequence[float], steps: int, enough_db: float = -np.inf) -> Fitted:
         """Return better sections of the same orders, raised to be sound at the frequencies of the fit.
 
-        Parameters
-        ----------
-        start : Sections
-            Left entries first.
-        temperatures : sequence of float, nepers
-            One after the other.
-        steps : int
-            At each temperature, at most.
-        enough_db : float, dB
-            Excess cost at which it stops.
+        From sections with the left entries first, through temperatures one after the other, each with so many steps at most, until the excess cost is
+        low enough.
         """
         state, damping = _State.of(self, start), _DAMPING[1]
         for temperature in temperatures:
@@ -95,7 +75,7 @@ class JointFit:
         return state.fitted()
 
     def ends(self) -> tuple[float, float]:
-        """Places that sections may take."""
+        """Corners that sections may take."""
         inner = np.log(self.tau[(self.tau > 0) & (self.tau < 1e12)])
         low, high = (inner.min(), inner.max()) if inner.size else (0.0, 0.0)  # DC and Nyquist alone
         return float(low - _BEYOND), float(high + _BEYOND)
@@ -107,28 +87,21 @@ class JointFit:
     def grown(self, start: Sections, temperature: float) -> Sections:
         """Return the same magnitudes with a pair of poles and zeros more in every entry that has any, where moving them apart gains most."""
         low, high = self.ends()
-        entries, places = np.flatnonzero(start.orders > 0), np.linspace(low + _BEYOND, high - _BEYOND, _PLACES)
-        probe = Sections.spread([places[[i]] for i in range(_PLACES)], [2] * _PLACES, _DIPOLE)
-        slopes = probe.slopes(self.tau)[_PLACES:]
-        apart = slopes[: 2 * _PLACES : 2], slopes[2 * _PLACES :: 2]  # of the zeros: by place and by width
+        entries, corners = np.flatnonzero(start.orders > 0), np.linspace(low + _BEYOND, high - _BEYOND, _CORNERS)
+        probe = Sections.spread([corners[[i]] for i in range(_CORNERS)], [2] * _CORNERS, _DIPOLE)
+        slopes = probe.slopes(self.tau)[_CORNERS:]
+        apart = slopes[: 2 * _CORNERS : 2], slopes[2 * _CORNERS :: 2]  # of the zeros: by corner and by width
         weights = _State.of(self, start).weights(temperature)[entries]
         gain = sum(np.abs(weights @ s.T) / np.linalg.norm(s, axis=1) for s in apart)
-        return start.with_pairs(entries, places[np.argmax(gain, axis=1)], _DIPOLE)
+        return start.with_pairs(entries, corners[np.argmax(gain, axis=1)], _DIPOLE)
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Sections that are sound at the frequencies of a fit.
-
-    Parameters
-    ----------
-    sections : Sections
-    excess_db : float, dB
-        Largest excess cost.
-    """
+    """Sections that are sound at the frequencies of a fit."""
 
     sections: Sections
-    excess_db: float
+    excess_db: float  # dB: largest excess cost
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,28 +42,19 @@ class Programs:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Targets on a grid, with the basis evaluated there.
+    """Targets on a grid, with the basis evaluated there."""
 
-    Parameters
-    ----------
-    targets : ndarray, shape (n_points,)
-        Squared magnitudes f to stay above.
-    knots : ndarray, shape (order,)
-    phi : ndarray, shape (n_points, order + 1)
-    end, inner : ndarray, shape (n_edges, order + 1)
-        Basis at DC, Nyquist and cuts, and at the grid point next to each: n and d may not fall by more than a factor between them.
-    nearest : ndarray of int, shape (n_edges,)
-    programs : Programs
-        Counted down; none is solved when none is left.
-    """
-
-    targets: Array
-    knots: Array
-    phi: Array
+    targets: Array  # (n_points,): squared magnitudes f to stay above
+    knots: Array  # (order,)
+    phi: Array  # (n_points, order + 1)
+    # (n_edges, order + 1): basis at DC, Nyquist and cuts, and at the grid point next to each: n and d may not fall by more than a
+    # factor between them
     end: Array
+    # (n_edges, order + 1): basis at DC, Nyquist and cuts, and at the grid point next to each: n and d may not fall by more than a
+    # factor between them
     inner: Array
-    nearest: Array
-    programs: Programs
+    nearest: Array  # (n_edges,)
+    programs: Programs  # counted down; none is solved when none is left
 
     @classmethod
     def build(cls, tau: Array, targets: Array, knots: Array, cuts: Array, programs: Programs) -> Grid:

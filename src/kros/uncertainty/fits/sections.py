@@ -33,71 +33,44 @@ _REAL = 1e-9  # relative imaginary part below which a root counts as real
 
 @dataclass(frozen=True, eq=False)
 class Sections:
-    """Magnitudes, one for every entry of a weight.
+    """Magnitudes, one for every entry of a weight."""
 
-    Parameters
-    ----------
-    level : ndarray, shape (entry,), nepers
-        Log magnitude at DC.
-    entry : ndarray of int, shape (section,)
-        The entry a section belongs to.
-    sign : ndarray, shape (section,)
-        1 for zeros, -1 for poles.
-    pair : ndarray of bool, shape (section,)
-        Whether it is of second order.
-    place : ndarray, shape (section,)
-        x.
-    width : ndarray, shape (section,)
-        y; of no effect in sections of first order.
-    """
-
-    level: Array
-    entry: Array
-    sign: Array
-    pair: Array
-    place: Array
-    width: Array
+    level: Array  # (entry,), nepers: log magnitude at DC
+    entry: Array  # (section,): the entry a section belongs to
+    sign: Array  # (section,): 1 for zeros, -1 for poles
+    pair: Array  # (section,): whether it is of second order
+    corner: Array  # (section,): x
+    width: Array  # (section,): y; of no effect in sections of first order
 
     @classmethod
-    def spread(cls, places: Sequence[Array], orders: Sequence[int], width: float) -> Sections:
-        """Return magnitudes of one: poles and, on top of them, zeros at every place of an entry.
-
-        Parameters
-        ----------
-        places : sequence of ndarray, shape (ceil(order / 2),)
-            By entry; at the last place of an odd order there is one of each, at all others there are two.
-        orders : sequence of int
-        width : float
-        """
+    def spread(cls, corners: Sequence[Array], orders: Sequence[int], width: float) -> Sections:
+        """Return magnitudes of one: poles and, on top of them, zeros at every corner of an entry, two of each; one at the last corner of an odd order."""
         rows = [
             (entry, sign, 2 * (i + 1) <= order, x)
-            for entry, (values, order) in enumerate(zip(places, orders, strict=True))
+            for entry, (values, order) in enumerate(zip(corners, orders, strict=True))
             for i, x in enumerate(values)
             for sign in (1.0, -1.0)
         ]
-        entry, sign, pair, place = (np.array(column) for column in zip(*rows, strict=True)) if rows else (np.zeros(0),) * 4
-        return cls(np.zeros(len(places)), entry.astype(int), sign, pair.astype(bool), place.astype(float), np.full(len(rows), width))
+        entry, sign, pair, corner = (np.array(column) for column in zip(*rows, strict=True)) if rows else (np.zeros(0),) * 4
+        return cls(np.zeros(len(corners)), entry.astype(int), sign, pair.astype(bool), corner.astype(float), np.full(len(rows), width))
 
     def like(self, entries: Array, magnitude: RationalMagnitude) -> Sections:
         """Return the same with poles, zeros and level of a magnitude in some entries.
 
-        Raises
-        ------
-        KrosError
-            When the magnitude is zero or infinite at DC or Nyquist, or its roots are not found.
+        A `KrosError` is raised when the magnitude is zero or infinite at DC or Nyquist, or its roots are not found.
         """
         others, level = ~np.isin(self.entry, entries), self.level.copy()
         sides = [roots(c, magnitude.knots)[0] for c in (magnitude.numerator, magnitude.denominator)]
         if any(len(side) < len(magnitude.knots) or 0 in side for side in sides):
             raise KrosError("Weight sections: the magnitude is zero or infinite at DC or Nyquist; try another order.")
         level[entries] = np.log(magnitude.numerator[0] / magnitude.denominator[0]) / 2
-        columns = [[getattr(self, x)[others]] for x in ("entry", "sign", "pair", "place", "width")]
+        columns = [[getattr(self, x)[others]] for x in ("entry", "sign", "pair", "corner", "width")]
         for sign, side in zip((1.0, -1.0), sides, strict=True):
-            for pair, place, width in _paired([np.sqrt(-complex(t)) for t in side]):
-                for column, value in zip(columns, (entries, sign, pair, place, width), strict=True):
+            for pair, corner, width in _paired([np.sqrt(-complex(t)) for t in side]):
+                for column, value in zip(columns, (entries, sign, pair, corner, width), strict=True):
                     column.append(np.broadcast_to(np.asarray(value), len(entries)))
-        entry, sign_, pair_, place_, width_ = (np.concatenate(column) for column in columns)
-        return Sections(level, entry, sign_, pair_, place_, width_)
+        entry, sign_, pair_, corner_, width_ = (np.concatenate(column) for column in columns)
+        return Sections(level, entry, sign_, pair_, corner_, width_)
 
     @property
     def orders(self) -> Array:
@@ -107,7 +80,7 @@ class Sections:
 
     @property
     def owner(self) -> Array:
-        """Entry of every parameter: levels, places, widths of pairs."""
+        """Entry of every parameter: levels, corners, widths of pairs."""
         return np.concatenate([np.arange(len(self.level)), self.entry, self.entry[self.pair]])
 
     def logs(self, tau: Array) -> Array:
@@ -121,18 +94,12 @@ class Sections:
         u, q = self._variables(tau)
         share, half = u / (1 + u), (self.sign / 2)[:, None]
         v, extra = share / (1 + u), np.exp(self.width)[:, None]
-        by_place = np.where(self.pair[:, None], (extra - 4) * v * (1 - 2 * share) / q + 2 * share, share)
+        by_corner = np.where(self.pair[:, None], (extra - 4) * v * (1 - 2 * share) / q + 2 * share, share)
         by_width = (extra * v / q)[self.pair]
-        return np.vstack([np.ones((len(self.level), len(tau))), -half * by_place, half[self.pair] * by_width])
+        return np.vstack([np.ones((len(self.level), len(tau))), -half * by_corner, half[self.pair] * by_width])
 
     def curvature(self, tau: Array, weights: Array) -> Array:
-        """Return the convex part of the second derivatives of a weighted sum of log magnitudes, shape (parameter, parameter).
-
-        Parameters
-        ----------
-        tau : ndarray, shape (frequency,)
-        weights : ndarray, shape (entry, frequency)
-        """
+        """Return the convex part of the second derivatives of a sum of log magnitudes with weights (entry, frequency), shape (parameter, parameter)."""
         u, q = self._variables(tau)
         s, extra = u / (1 + u), np.exp(self.width)[:, None]
         v = s / (1 + u)
@@ -150,18 +117,18 @@ class Sections:
         values, vectors = np.linalg.eigh(blocks)
         blocks = np.einsum("kai,ki,kbi->kab", vectors, values.clip(0.0), vectors)
         n, k = len(self.level), len(self.entry)
-        out, place, width = np.zeros((len(self.owner),) * 2), n + np.arange(k), n + k + np.arange(int(self.pair.sum()))
-        out[place, place] = blocks[:, 0, 0]
+        out, corner, width = np.zeros((len(self.owner),) * 2), n + np.arange(k), n + k + np.arange(int(self.pair.sum()))
+        out[corner, corner] = blocks[:, 0, 0]
         out[width, width] = blocks[self.pair, 1, 1]
-        out[place[self.pair], width] = out[width, place[self.pair]] = blocks[self.pair, 0, 1]
+        out[corner[self.pair], width] = out[width, corner[self.pair]] = blocks[self.pair, 0, 1]
         return out
 
     def moved(self, step: Array, ends: tuple[float, float]) -> Sections:
-        """Return sections with all parameters moved, places kept within ends."""
-        n, k = len(self.level), len(self.place)
+        """Return sections with all parameters moved, corners kept within ends."""
+        n, k = len(self.level), len(self.corner)
         width = self.width.copy()
         width[self.pair] = np.clip(width[self.pair] + step[n + k :], _NARROW, _WIDE)
-        return replace(self, level=self.level + step[:n], place=np.clip(self.place + step[n : n + k], *ends), width=width)
+        return replace(self, level=self.level + step[:n], corner=np.clip(self.corner + step[n : n + k], *ends), width=width)
 
     def lifted(self, entries: slice, by: float) -> Sections:
         """Return sections with the levels of some entries raised."""
@@ -171,7 +138,7 @@ class Sections:
 
     def bends(self) -> Array:
         """Return the tau at which sections bend: a peak or a notch between grid points is there."""
-        return np.unique(np.exp(self.place))
+        return np.unique(np.exp(self.corner))
 
     def systems(self, sample_period_s: float) -> list[StateSpace]:
         """Return the systems of the entries."""
@@ -179,7 +146,7 @@ class Sections:
 
     def _system(self, entry: int, sample_period_s: float) -> StateSpace:
         zeros, poles = self._roots(entry, 1.0), self._roots(entry, -1.0)
-        constant = np.where(self.pair, 1.0, 0.5) * self.place * self.sign
+        constant = np.where(self.pair, 1.0, 0.5) * self.corner * self.sign
         factor = self.level[entry] - constant[self.entry == entry].sum()
         return cascade(zeros, poles, float(np.exp(factor)), sample_period_s)
 
@@ -187,7 +154,7 @@ class Sections:
         """Return roots in w: the larger real one of a pair without cancellation, the other from their product."""
         found: list[complex] = []
         for k in np.flatnonzero((self.entry == entry) & (self.sign == sign)):
-            size = np.exp(self.place[k] / 2)
+            size = np.exp(self.corner[k] / 2)
             if not self.pair[k]:
                 found.append(complex(-size))
                 continue
@@ -201,7 +168,7 @@ class Sections:
         return found
 
     def _variables(self, tau: Array) -> tuple[Array, Array]:
-        u = np.minimum(tau, _FAR) * np.exp(-self.place)[:, None]
+        u = np.minimum(tau, _FAR) * np.exp(-self.corner)[:, None]
         return u, np.maximum(1 + (np.exp(self.width)[:, None] - 4) * u / (1 + u) ** 2, _TINY)
 
     def _sum(self, values: Array) -> Array:
@@ -210,7 +177,7 @@ class Sections:
         member[self.entry, np.arange(len(self.entry))] = 1.0
         return member @ values
 
-    def with_pairs(self, entries: Array, places: Array, width: float) -> Sections:
+    def with_pairs(self, entries: Array, corners: Array, width: float) -> Sections:
         """Return the same magnitudes, with a pair of zeros and one of poles on top of each other in some entries."""
         twice = np.repeat(np.arange(len(entries)), 2)
         return Sections(
@@ -218,7 +185,7 @@ class Sections:
             np.concatenate([self.entry, np.asarray(entries)[twice]]),
             np.concatenate([self.sign, np.tile([1.0, -1.0], len(entries))]),
             np.concatenate([self.pair, np.ones(len(twice), bool)]),
-            np.concatenate([self.place, np.asarray(places)[twice]]),
+            np.concatenate([self.corner, np.asarray(corners)[twice]]),
             np.concatenate([self.width, np.full(len(twice), width)]),
         )
 
@@ -239,10 +206,10 @@ class Sections:
         kept = np.setdiff1d(np.arange(len(self.entry)), [idle.zero, idle.pole])
         level = self.level.copy()
         level[idle.entry] += idle.middle
-        return Sections(level, self.entry[kept], self.sign[kept], self.pair[kept], self.place[kept], self.width[kept])
+        return Sections(level, self.entry[kept], self.sign[kept], self.pair[kept], self.corner[kept], self.width[kept])
 
     def halved(self, idle: Idle) -> Sections:
-        """Return the magnitudes with one pole and one zero in the place of two that cancel each other."""
+        """Return the magnitudes with one pole and one zero instead of two that cancel each other."""
         pair = self.pair.copy()
         pair[[idle.zero, idle.pole]] = False
         return replace(self, pair=pair)

@@ -38,19 +38,11 @@ _INSIDE = 1e-13  # distance from the unit circle that is no rounding
 
 @dataclass(frozen=True, eq=False)
 class RationalMagnitude:
-    """Squared magnitude `n / d` in tau.
+    """Squared magnitude `n / d` in tau."""
 
-    Parameters
-    ----------
-    numerator, denominator : ndarray, shape (order + 1,)
-        Coefficients a and b.
-    knots : ndarray, shape (order,)
-        The tau_k.
-    """
-
-    numerator: Array
-    denominator: Array
-    knots: Array
+    numerator: Array  # (order + 1,): coefficients a
+    denominator: Array  # (order + 1,): coefficients b
+    knots: Array  # (order,): the tau_k
 
     def __call__(self, tau: npt.ArrayLike) -> Array:
         """Return the squared magnitude, shape of `tau`; infinity (Nyquist) is allowed."""
@@ -85,12 +77,8 @@ def log_knots(tau: Array, log: Array, count: int, even: float) -> Array:
 def roots(coefficients: Array, knots: Array) -> tuple[list[complex], float]:
     """Return the roots in tau of `sum a_k phi_k`, and the coefficient of the highest power (its value at Nyquist where that is not zero).
 
-    Eigenvalues of the companion matrix, then Aberth's iteration in 60 digits: the roots differ by many decades.
-
-    Raises
-    ------
-    KrosError
-        When the roots do not settle, or all coefficients are zero.
+    Eigenvalues of the companion matrix, then Aberth's iteration in 60 digits: the roots differ by many decades. A `KrosError` is raised when they do not
+    settle, or all coefficients are zero.
     """
     import mpmath
 
@@ -141,24 +129,10 @@ def on_half_line(found: Sequence[complex]) -> list[float]:
 
 
 def spectral_factor(magnitude: RationalMagnitude, sample_period_s: float) -> StateSpace:
-    """Return the stable, minimum-phase system whose squared magnitude is given.
+    """Return the stable, minimum-phase system, with as many states as knots, whose squared magnitude is given.
 
-    Parameters
-    ----------
-    magnitude : RationalMagnitude
-        Positive on the whole axis.
-    sample_period_s : float, s
-
-    Returns
-    -------
-    StateSpace
-        One input, one output, as many states as knots.
-
-    Raises
-    ------
-    KrosError
-        When numerator or denominator is not positive on the whole axis, or their roots lie so near to it that no system in double precision has
-        them.
+    A `KrosError` is raised when numerator or denominator is not positive on the whole axis, or their roots lie so near to it that no system in double
+    precision has them.
     """
     zero_roots, lead_n = roots(magnitude.numerator, magnitude.knots)
     pole_roots, lead_d = roots(magnitude.denominator, magnitude.knots)
@@ -184,15 +158,7 @@ def _check_inside(found: Sequence[complex]) -> None:
 
 
 def cascade(zeros: Sequence[complex], poles: Sequence[complex], factor: float, sample_period_s: float) -> StateSpace:
-    """Return `factor * prod (w - q_i) / prod (w - p_i)` as a series of sections in z.
-
-    Parameters
-    ----------
-    zeros, poles : sequence of complex
-        In the variable w, equally many, complex ones in conjugate pairs.
-    factor : float
-    sample_period_s : float, s
-    """
+    """Return `factor * prod (w - q_i) / prod (w - p_i)`, equally many zeros and poles, complex ones in conjugate pairs, as a series of sections in z."""
     sections, total = [], factor
     for q, p in _pair(list(zeros), list(poles)):
         total *= float(np.real(np.prod([1 - x for x in q]) / np.prod([1 - x for x in p])))

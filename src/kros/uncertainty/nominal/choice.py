@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DimensionError
-from ..forms import Form, as_form, member
-from ..residuals import check_responses
+from ..forms import Form, as_form, check_responses, member
 from .search import Geometry, search
 
 Array = npt.NDArray[Any]
@@ -102,13 +101,12 @@ def choose_nominal(
     geometry = Geometry.of(form, (G.shape[2], G.shape[3]))
     plants = geometry.plants(np.concatenate([G, others]))
     units = plants.part(slice(0, len(G)))
-    if criterion is Criterion.PEAK:
-        index, bound, scores, evaluated = search(geometry, plants, units, lambda bound: bound.max(axis=-1), partial=True)
-    else:
-        floor = 10 ** (_FLOOR_DB / 20)
-        index, bound, scores, evaluated = search(
-            geometry, plants, units, lambda bound: np.exp(np.log(np.maximum(bound, floor)) @ weights), partial=False
-        )
+    floor = 10 ** (_FLOOR_DB / 20)
+
+    def mean(bound: Array) -> Array:
+        return np.asarray(np.exp(np.log(np.maximum(bound, floor)) @ weights))
+
+    index, bound, scores, evaluated = search(geometry, plants, units, mean if criterion is Criterion.AREA else lambda b: b.max(axis=-1))
     with np.errstate(divide="ignore"):
         return NominalChoice(form, index, bound, 20 * np.log10(scores), evaluated, criterion)
 

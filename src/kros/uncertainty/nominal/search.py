@@ -6,8 +6,6 @@ raises the lower bounds of all other candidates by these witnesses. A candidate 
 when none is left below, the best is the best of all: nothing is assumed about the population. A population has few extreme units, so that
 few rounds are needed; each visits as many pairs as there are units, not their square.
 
-A peak is looked for on part of the frequencies first, because a maximum over part of them is a lower bound as well. A mean needs all.
-
 Plants are tall here: wide ones are transposed, with the dual form; as `E_ia(G^T, Gp^T) = -E_ia(Gp, G)^T`, the inverse additive form then has nominal
 and perturbed plant exchanged. With `G^+ = L Q^H`, L small and triangular, `sigma(D G^+) = sigma(D L)`.
 """
@@ -28,26 +26,16 @@ Array = npt.NDArray[Any]
 Score = Callable[[Array], Array]
 
 _VECTOR = 16000  # complex numbers in a vector
-_COARSE = 16  # every so many frequencies a peak is looked for first
 _TIE = 1e-9  # relative; scores closer than rounding are one
 
 
 @dataclass(frozen=True, eq=False)
 class Plants:
-    """Responses with what residuals need of them, entries first: (p, m, unit, frequency).
+    """Responses with what residuals need of them, entries first: (p, m, unit, frequency)."""
 
-    Parameters
-    ----------
-    G : ndarray, shape (p, m, unit, frequency), p >= m
-    P : ndarray, shape (m, p, unit, frequency), or None
-        Pseudo-inverses, for the forms that need them.
-    L : ndarray, shape (m, m, unit, frequency), or None
-        Triangles with `P P^H = L L^H`.
-    """
-
-    G: Array
-    P: Array | None
-    L: Array | None
+    G: Array  # (p, m, unit, frequency), p >= m
+    P: Array | None  # (m, p, unit, frequency), or None: pseudo-inverses, for the forms that need them
+    L: Array | None  # (m, m, unit, frequency), or None: triangles with `P P^H = L L^H`
 
     def part(self, *index: Any) -> Plants:
         """Return some units and frequencies; two integer arrays are matched, as in NumPy."""
@@ -104,7 +92,7 @@ class Geometry:
         return sigma_max_first(multiply(D, _known(base.L)))
 
 
-def search(geometry: Geometry, candidates: Plants, units: Plants, score: Score, *, partial: bool) -> tuple[int, Array, Array, Array]:
+def search(geometry: Geometry, candidates: Plants, units: Plants, score: Score) -> tuple[int, Array, Array, Array]:
     """Return the candidate whose bound has the lowest score.
 
     Parameters
@@ -115,8 +103,6 @@ def search(geometry: Geometry, candidates: Plants, units: Plants, score: Score, 
     units : Plants
     score : callable
         From bounds (..., frequency) to scores (...), non-negative and never falling when a bound rises.
-    partial : bool
-        Whether the score of some of the frequencies bounds that of all from below.
 
     Returns
     -------
@@ -129,38 +115,21 @@ def search(geometry: Geometry, candidates: Plants, units: Plants, score: Score, 
     evaluated : ndarray of bool, shape (candidate,)
         Which scores are exact.
     """
-    n_freqs = units.G.shape[3]
-    coarse = np.unique(np.linspace(0, n_freqs - 1, max(2, n_freqs // _COARSE)).round().astype(int)) if partial else np.arange(n_freqs)
-    few_candidates, few_units = (candidates.part(slice(None), coarse), units.part(slice(None), coarse)) if partial else (candidates, units)
-    count = candidates.G.shape[2]
-    lower, scores = np.zeros((count, len(coarse))), np.zeros(count)
-    evaluated, waiting = np.zeros(count, bool), np.ones(count, bool)
-    best, bound, holder = np.inf, np.zeros(n_freqs), -1
-    while waiting.any():
-        rows = np.flatnonzero(waiting)
-        row = int(rows[np.argmin(scores[rows])]) if evaluated.any() else _central(candidates, rows)
-        if scores[row] > best * (1 + _TIE):
+    count, n_freqs = candidates.G.shape[2:]
+    lower, scores, evaluated = np.zeros((count, n_freqs)), np.zeros(count), np.zeros(count, bool)
+    best, row = np.inf, _central(candidates)
+    while scores[row] <= best * (1 + _TIE):
+        lower[row], witness = bound_of(geometry, candidates.one(row), units)
+        scores[row], evaluated[row] = float(score(lower[row])), True
+        best = min(best, scores[row])
+        rows = np.flatnonzero(~evaluated & (scores <= best * (1 + _TIE)))
+        if not rows.size:
             break
-        lower[row], witness = bound_of(geometry, few_candidates.one(row), few_units)
-        scores[row], waiting[row] = max(scores[row], float(score(lower[row]))), False
-        raised = few_units.part(witness, np.arange(len(coarse)))
-        if scores[row] <= best * (1 + _TIE):
-            full, who = bound_of(geometry, candidates.one(row), units) if partial else (lower[row], witness)
-            scores[row], evaluated[row] = float(score(full)), True
-            if scores[row] < best:
-                best, bound, holder = scores[row], full, row
-            if partial and waiting.any():
-                peak = int(np.argmax(full))
-                _raise_at(
-                    geometry, candidates, units.part(slice(who[peak], who[peak] + 1), slice(peak, peak + 1)), peak, waiting, scores, score
-                )
-        rows = np.flatnonzero(waiting & (scores <= best * (1 + _TIE)))
-        _raise_by(geometry, few_candidates, raised, rows, lower)
+        _raise_by(geometry, candidates, units.part(witness, np.arange(n_freqs)), rows, lower)
         scores[rows] = np.maximum(scores[rows], score(lower[rows]))
+        row = int(rows[np.argmin(scores[rows])])
     index = first_best(np.where(evaluated, scores, np.inf))
-    if index != holder:
-        bound = bound_of(geometry, candidates.one(index), units)[0]
-    return index, bound, scores, evaluated
+    return index, lower[index], scores, evaluated
 
 
 def bound_of(geometry: Geometry, nominal: Plants, units: Plants) -> tuple[Array, Array]:
@@ -196,19 +165,11 @@ def _raise_by(geometry: Geometry, candidates: Plants, witnesses: Plants, rows: A
         lower[chosen] = np.maximum(lower[chosen], geometry.sigma(candidates.part(chosen), one_each))
 
 
-def _raise_at(geometry: Geometry, candidates: Plants, witness: Plants, freq: int, waiting: Array, scores: Array, score: Score) -> None:
-    """Raise scores by one unit at one frequency."""
-    rows = np.flatnonzero(waiting)
-    sigma = geometry.sigma(candidates.part(rows, slice(freq, freq + 1)), witness)
-    scores[rows] = np.maximum(scores[rows], score(sigma))
-
-
-def _central(candidates: Plants, rows: Array) -> int:
+def _central(candidates: Plants) -> int:
     """Return the candidate closest to the mean at a few frequencies, to begin with."""
-    some = np.linspace(0, candidates.G.shape[3] - 1, 8).astype(int)
-    G = candidates.G[..., some][:, :, rows]
+    G = candidates.G[..., np.linspace(0, candidates.G.shape[3] - 1, 8).astype(int)]
     distance = np.abs(G - G.mean(axis=2, keepdims=True)).max(axis=(0, 1))
-    return int(rows[np.argmin((distance / np.maximum(distance.max(axis=0), 1e-300)).max(axis=1))])
+    return int(np.argmin((distance / np.maximum(distance.max(axis=0), 1e-300)).max(axis=1)))
 
 
 def _known(factor: Array | None) -> Array:

@@ -30,25 +30,14 @@ _AT_ONCE = 4_000_000  # complex numbers of residuals in memory
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """Distances of all units.
+    """Distances of all units."""
 
-    Parameters
-    ----------
-    nominals : ndarray, shape (nominal,)
-        Rows of the units that were the nominal in turn.
-    by_nominal : ndarray, shape (nominal, unit, frequency), dB
-        Largest singular value of the scaled residual, smoothed; NaN of a unit against itself.
-    levels : ndarray, shape (unit, frequency), dB
-        The median over the nominals.
-    left, right : ndarray, shape (frequency, p') and (frequency, m')
-        Typical size of the residual's rows and columns.
-    """
-
-    nominals: Array
+    nominals: Array  # (nominal,): rows of the units that were the nominal in turn
+    # (nominal, unit, frequency), dB: largest singular value of the scaled residual, smoothed; NaN of a unit against itself
     by_nominal: Array
-    levels: Array
-    left: Array
-    right: Array
+    levels: Array  # (unit, frequency), dB: the median over the nominals
+    left: Array  # (frequency, p'): typical size of the residual's rows
+    right: Array  # (frequency, m'): of its columns
 
 
 def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
@@ -72,17 +61,7 @@ def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
 
 
 def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances, freqs_hz: Array) -> Array:
-    """Return smoothed levels of residuals in the scales of a population, shape (..., frequency), dB.
-
-    Parameters
-    ----------
-    form : Form
-    nominal, perturbed : ndarray, shape (..., frequency, p, m), complex
-        They broadcast against each other.
-    found : Distances
-        Of the population.
-    freqs_hz : ndarray, shape (frequency,), Hz
-    """
+    """Return smoothed levels of residuals in the scales of a population, shape (..., frequency), dB; responses broadcast against each other."""
     E = residual(form, nominal, perturbed) / found.left[:, :, None] / found.right[:, None, :]
     return _smooth(20 * np.log10(np.maximum(sigma_max_first(entries_first(E)), _LEAST)), freqs_hz)
 
@@ -98,20 +77,14 @@ def largest_entries(form: Form, responses: Array, found: Distances, units: Array
     size = np.abs(residual(form, nominal, perturbed[None])) / found.left[rows][:, :, None] / found.right[rows][:, None, :]
     own = found.nominals[:, None] == units
     middle = _median(size, own)
-    places = [np.unravel_index(int(np.argmax(m)), m.shape) for m in middle]
-    return [(int(i), int(j)) for i, j in places]
+    entries = [np.unravel_index(int(np.argmax(m)), m.shape) for m in middle]
+    return [(int(i), int(j)) for i, j in entries]
 
 
 def typical(squares: Array) -> tuple[Array, Array]:
     """Return left and right scales that bring squared entries to equal row and column sums.
 
-    Parameters
-    ----------
-    squares : ndarray, shape (frequency, p', m')
-
-    Returns
-    -------
-    tuple of ndarray, shape (frequency, p') and (frequency, m')
+    From shape (frequency, p', m') to (frequency, p') and (frequency, m').
     """
     row = _positive(squares.max(axis=2, keepdims=True))
     column = _positive((squares / row).max(axis=1, keepdims=True))

@@ -21,37 +21,20 @@ _FLOOR_DB = 40.0
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Inliers and outliers.
+    """Inliers and outliers."""
 
-    Parameters
-    ----------
-    inliers : ndarray of bool, shape (unit,)
-    margin_db : ndarray, shape (unit,), dB
-        Score minus the threshold of the step at which the unit went out, or of the last step; minus infinity where nothing can be told.
-    threshold_db : float, dB
-        What the largest score of the inliers would have to exceed.
-    """
-
-    inliers: npt.NDArray[np.bool_]
+    inliers: npt.NDArray[np.bool_]  # (unit,)
+    # (unit,), dB: score minus the threshold of the step at which the unit went out, or of the last step; minus infinity where nothing
+    # can be told
     margin_db: Array
-    threshold_db: float
+    threshold_db: float  # dB: what the largest score of the inliers would have to exceed
 
 
 def excess(levels: Array, size: int = 1) -> tuple[Array, Array]:
     """Return how far every unit exceeds the `size`-th largest of the others, and where.
 
-    Parameters
-    ----------
-    levels : ndarray, shape (unit, frequency), dB
-        More than `size` units.
-    size : int
-        With 1 the others' cover; with g a group of g that are alike no longer covers its members.
-
-    Returns
-    -------
-    tuple of ndarray, shape (unit,)
-        The largest excess over frequency in dB, and the index of its frequency. Where the reference is more than 40 dB below its peak, it
-        is held there: an excess over next to nothing is noise.
+    The largest excess of levels, shape (unit, frequency), over frequency in dB, and the index of its frequency. With size 1 the reference is the others'
+    cover; with g a group of g that are alike no longer covers its members.
     """
     over = levels - covers(levels, size)
     where = over.argmax(axis=1)

@@ -15,7 +15,7 @@ out one at a time while they are beyond; where none is, groups that hide one ano
 and eight at once. With three units nothing can be flagged: two scores make no model. Two units are refused.
 
 All this compares estimates that are equally good. A unit whose estimate is known to scatter more than the others' takes no part in their cover
-and has a bound of its own, from the others estimated as badly (`chance`). What a score would have shown stands beside it (`detectable`, `score`).
+and has a bound of its own, from the others estimated as badly (`noise`). What a score would have shown stands beside it (`scoring`, `score`).
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ import numpy.typing as npt
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.loading import check_shapes, loader
-from ..forms import Form, as_form
-from ..residuals import check_responses
+from ..forms import Form, as_form, check_responses
+from ..validation import check_scale
 from .distances import balance, distances
 from .groups import separate
 from .noise import AS_GOOD, Others, spread, times_noisier
@@ -226,13 +226,7 @@ def score_outliers(
     rows = np.unique(np.linspace(0, len(freqs) - 1, _FREQUENCIES).round().astype(int))
     freqs, G = freqs[rows], G[:, rows]
     given = output_scale is not None or input_scale is not None
-    scales = tuple(np.ones(n) if s is None else np.asarray(s, float) for s, n in ((output_scale, G.shape[2]), (input_scale, G.shape[3])))
-    scales = scales if given else balance(G)
-    if any(s.shape != (n,) or not (np.isfinite(s).all() and (s > 0).all()) for s, n in zip(scales, G.shape[2:], strict=True)):
-        raise DimensionError(
-            f"Outlier scores: ranges should be {G.shape[2]} positive numbers for the outputs and {G.shape[3]} for the inputs, "
-            f"found {scales[0].tolist()} and {scales[1].tolist()}."
-        )
+    scales = (check_scale("output", output_scale, G.shape[2]), check_scale("input", input_scale, G.shape[3])) if given else balance(G)
     model = _compared(G / scales[0][:, None] * scales[1], ids, freqs, form, rate, scales)
     if deviations is None:
         return model
@@ -265,7 +259,7 @@ def _compared(G: Array, ids: tuple[str, ...], freqs: Array, form: Form, rate: fl
 
 
 def _with_deviations(model: OutlierModel, G: Array, ids: tuple[str, ...], draws: list[Array]) -> OutlierModel:
-    """Judge units that are known less well than most by themselves, G and draws in physical units, all others among themselves."""
+    """Score units that are known less well than most by themselves, G and draws in physical units, all others among themselves."""
     scales = model.output_scale, model.input_scale
     noise = np.stack([spread(d) for d in draws]) * (scales[1] / scales[0][:, None]) ** 2
     worse = np.array([times_noisier(own, noise) for own in noise])

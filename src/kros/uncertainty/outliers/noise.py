@@ -10,7 +10,7 @@ scored against the cover of the others as they are. Location and scale are measu
 of the tail model at the same rate (`tail`). With equal variances nothing is added and the bound is the usual one.
 
 The unit itself is in the cover of the others, as everywhere, but only with what is left of its distance without a level of noise that few draws exceed:
-a unit that is far off for its noise alone would lower the scores that it is judged by.
+a unit that is far off for its noise alone would lower the scores that it is compared with.
 """
 
 from __future__ import annotations
@@ -39,27 +39,14 @@ _LARGE = 0.95  # quantile of the noise that is taken off a unit's distance
 
 @dataclass(frozen=True, eq=False)
 class Others:
-    """Units that another one is compared with, and how well they are known.
-
-    Parameters
-    ----------
-    form : Form
-    responses : ndarray, shape (unit, frequency, p, m), complex
-        In scaled coordinates.
-    noise : ndarray, shape (unit, frequency, p, m)
-        Variances of the estimates.
-    freqs_hz : ndarray, shape (frequency,), Hz
-    rate : float
-    found : Distances
-        Of these units among themselves.
-    """
+    """Units that another one is compared with, and how well they are known."""
 
     form: Form
-    responses: Array
-    noise: Array
+    responses: Array  # (unit, frequency, p, m), complex, in scaled coordinates
+    noise: Array  # variances of the estimates, of the same shape
     freqs_hz: Array
     rate: float
-    found: Distances
+    found: Distances  # of these units among themselves
 
     @classmethod
     def of(cls, form: Form, responses: Array, noise: Array, freqs_hz: Array, rate: float) -> Others:
@@ -69,16 +56,8 @@ class Others:
     def bounds(self, response: Array, deviations: Array) -> tuple[float, float] | None:
         """Return the bound of a unit that is known as well as these, and of one with such estimation errors.
 
-        Parameters
-        ----------
-        response : ndarray, shape (frequency, p, m), complex
-            Of the unit.
-        deviations : ndarray, shape (draw, frequency, p, m), complex
-
-        Returns
-        -------
-        tuple of float, dB, or None
-            The second is not below the first. None where the unit is known as well as these, or where there are too few of them for any bound.
+        From its response, shape (frequency, p, m), and draws of its errors, shape (draw, frequency, p, m). The second is not below the first; None where the
+        unit is known as well as these, or where there are too few of them for any bound.
         """
         variance = spread(deviations)
         if len(self.responses) <= LEAST_SCORES or times_noisier(variance, self.noise) <= AS_GOOD:
@@ -127,15 +106,7 @@ def spread(deviations: Array) -> Array:
 def times_noisier(variance: Array, noise: Array) -> float:
     """Return how many times the variance of one estimate is that of the middle one of others.
 
-    Parameters
-    ----------
-    variance : ndarray, shape (frequency, p, m)
-    noise : ndarray, shape (unit, frequency, p, m)
-
-    Returns
-    -------
-    float
-        The median over frequencies and entries; infinity where only the one has noise, zero where it has none.
+    The median over frequencies and entries; infinity where only the one has noise, zero where it has none.
     """
     middle = np.median(noise, axis=0)
     known = variance > 0

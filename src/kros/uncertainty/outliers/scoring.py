@@ -1,4 +1,9 @@
-"""Scores of units from distances: who covers whom, what a unit exceeds that by, and what its own noise adds to its bound."""
+"""Scores of units from distances: who covers whom, what a unit exceeds that by, and what its own noise adds to its bound.
+
+Beside a score stands the smallest change of a unit that it would have shown, as a change of gain: a level in dB says little to people who build
+machines. One entry of a unit's response, changed by one percent, is a residual of some level at every frequency; a level is proportional to the change
+to first order, so what it takes to reach the bound follows in percent.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +15,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ..forms import Form
-from .detectable import change_levels, smallest_change
-from .distances import Distances, largest_entries
+from .distances import Distances, largest_entries, scaled_levels
 from .groups import excess, held
 from .noise import Others
 from .score import LARGEST_RISE_DB, OutlierScore, Status, room_db
 from .tail import leave_one_out_bounds
 
 Array = npt.NDArray[Any]
+
+_PERCENT = 1.0
+_MOST = 12  # units whose changes are tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +41,10 @@ class Nominals:
         values, beyond = np.full(shape, np.nan), np.zeros(shape, bool)
         for row, nominal in enumerate(found.nominals):
             others = np.arange(shape[1]) != nominal
-            for units, members in _juries(inliers & others, others):
+            for units, members in _comparisons(inliers & others, others):
                 score, margin = margins_of(found.by_nominal[row, members], rate)
-                place = np.searchsorted(members, units)
-                values[row, units], beyond[row, units] = score[place], margin[place] > 0
+                at = np.searchsorted(members, units)
+                values[row, units], beyond[row, units] = score[at], margin[at] > 0
         return cls(values, beyond)
 
     def summary(self, unit: int) -> dict[str, Any]:
@@ -51,7 +58,7 @@ class Nominals:
         }
 
 
-def _juries(inliers: npt.NDArray[np.bool_], wanted: npt.NDArray[np.bool_]) -> list[tuple[Array, Array]]:
+def _comparisons(inliers: npt.NDArray[np.bool_], wanted: npt.NDArray[np.bool_]) -> list[tuple[Array, Array]]:
     """Units, and the units that they are scored among: inliers together, every other unit alone with them."""
     together = np.flatnonzero(inliers)
     alone = [(np.array([k]), np.sort(np.append(together, k))) for k in np.flatnonzero(wanted & ~inliers)]
@@ -81,9 +88,9 @@ def scores_of(
     """Scores of some units; `margins` and `ids` are theirs."""
     wanted = np.isin(np.arange(len(G)), np.asarray(units))
     value, where = np.zeros(len(G)), np.zeros(len(G), int)
-    for some, members in _juries(inliers, wanted | inliers):
-        score, place = excess(found.levels[members])
-        value[some], where[some] = score[np.searchsorted(members, some)], place[np.searchsorted(members, some)]
+    for some, members in _comparisons(inliers, wanted | inliers):
+        rank, (score, peak) = np.searchsorted(members, some), excess(found.levels[members])
+        value[some], where[some] = score[rank], peak[rank]
     rows = where[list(units)]
     entries = largest_entries(form, G, found, np.asarray(units), rows)
     change = change_levels(form, G[inliers], found, freqs)
@@ -136,3 +143,23 @@ def with_noise(score: OutlierScore, G: Array, others: Others, draws: Array) -> O
         detectable_percent=score.detectable_percent * 10 ** (lift / 20),
         more_data=1.0 if enough else others.more_data(G, draws, allowed),
     )
+
+
+def change_levels(form: Form, responses: Array, found: Distances, freqs_hz: Array) -> Array:
+    """Return levels, dB, of residuals between units and themselves with one entry changed by one percent: the median over units, shape (p, m, frequency)."""
+    G = responses[np.unique(np.linspace(0, len(responses) - 1, min(_MOST, len(responses))).round().astype(int))]
+    levels = np.empty((*G.shape[2:], G.shape[1]))
+    for i, j in np.ndindex(*G.shape[2:]):
+        changed = G.copy()
+        changed[:, :, i, j] *= 1 + _PERCENT / 100
+        levels[i, j] = np.median(scaled_levels(form, G, changed, found, freqs_hz), axis=0)
+    return levels
+
+
+def smallest_change(change: Array, cover: Array, bound_db: float) -> tuple[float, int, tuple[int, int]]:
+    """Return the smallest change of gain that exceeds a cover by a bound, percent, its frequency and entry; infinity, and the first, without a bound."""
+    if not np.isfinite(bound_db):
+        return float("inf"), 0, (0, 0)
+    percent = _PERCENT * 10 ** ((cover + bound_db - change) / 20)
+    i, j, row = (int(k) for k in np.unravel_index(int(np.argmin(percent)), percent.shape))
+    return float(percent[i, j, row]), row, (i, j)

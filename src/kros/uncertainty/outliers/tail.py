@@ -42,18 +42,7 @@ def largest_group(count: int) -> int:
 
 
 def prediction_bound(scores: Array, rate: float) -> Array:
-    """Return what one further score exceeds with probability `rate`.
-
-    Parameters
-    ----------
-    scores : ndarray, shape (..., score), dB
-    rate : float
-
-    Returns
-    -------
-    ndarray, shape (...), dB
-        Infinity with fewer than three scores.
-    """
+    """Return what one further score exceeds with probability `rate`, from scores of shape (..., score), dB; infinity with fewer than three."""
     scores = np.asarray(scores, float)
     if scores.shape[-1] < LEAST_SCORES:
         return np.full(scores.shape[:-1], np.inf)

@@ -55,22 +55,12 @@ class Method(str, Enum):
 
 @dataclass(frozen=True)
 class Certificate:
-    """Largest ratio over all frequencies.
-
-    Parameters
-    ----------
-    method : Method
-    peak : float
-        Attained at `freq_hz`.
-    freq_hz : float, Hz
-    margin : float
-        By level sets no frequency exceeds ``(1 + margin) * peak``; NaN on a grid, which proves nothing of the kind.
-    """
+    """Largest ratio over all frequencies."""
 
     method: Method
-    peak: float
-    freq_hz: float
-    margin: float
+    peak: float  # attained at `freq_hz`
+    freq_hz: float  # Hz
+    margin: float  # by level sets no frequency exceeds ``(1 + margin) * peak``; NaN on a grid, which proves nothing of the kind
 
 
 def certify(ratio: Ratio, freqs_hz: Array, left: StateSpace, right: StateSpace, systems: ResidualSystems | None = None) -> Certificate:

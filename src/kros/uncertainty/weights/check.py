@@ -27,24 +27,13 @@ _SAME = 1e-9  # relative distance of frequencies that are one
 
 @dataclass(frozen=True, eq=False)
 class Checks:
-    """How a weight is checked.
+    """How a weight is checked."""
 
-    Parameters
-    ----------
-    density : int
-        How much denser than the grid of the fit.
-    also_hz : ndarray, shape (n,), Hz, optional
-        Further frequencies, where residuals peak between the points.
-    systems : ResidualSystems, optional
-        For a proof by level sets.
-    sampled : bool
-        Residuals are known at the frequencies of the fit only: there, and beyond their ends, the bound is claimed. Between them the fit is kept
-        above what `between_points` draws, and nothing is claimed.
-    """
-
-    density: int = 10
-    also_hz: Array | None = None
-    systems: ResidualSystems | None = None
+    density: int = 10  # how much denser than the grid of the fit
+    also_hz: Array | None = None  # (n,), Hz, optional: further frequencies, where residuals peak between the points
+    systems: ResidualSystems | None = None  # for a proof by level sets
+    # residuals are known at the frequencies of the fit only: there, and beyond their ends, the bound is claimed. Between them the fit
+    # is kept above what `between_points` draws, and nothing is claimed
     sampled: bool = False
 
     def grid(self, freqs_hz: Array, sample_period_s: float) -> Array:
@@ -102,15 +91,11 @@ def joined(freqs_hz: Array, others_hz: Array) -> tuple[Array, Array]:
 
 
 def between_points(E: Array, freqs_hz: Array) -> Residuals:
-    """Return residuals that are known at some frequencies at any frequency, for fits that should not make much of what they do not know.
+    """Return residuals (unit, frequency, p', m') that are known at some frequencies at any frequency.
 
-    Between two points they are those of the nearer one, with the largest 3 dB below the smaller of both: a smooth weight is above that, and one
-    that follows the points and dips between them is not. Beyond the ends they are those of the ends.
-
-    Parameters
-    ----------
-    E : ndarray, shape (unit, frequency, p', m')
-    freqs_hz : ndarray, shape (frequency,), Hz
+    For fits that should not make much of what they do not know: between two points they are those of the nearer one, with the largest 3 dB below the
+    smaller of both. A smooth weight is above that, and one that follows the points and dips between them is not. Beyond the ends they are those of
+    the ends.
     """
     size = sigma_max(E).max(axis=0)
 

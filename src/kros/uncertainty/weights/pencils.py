@@ -139,21 +139,10 @@ def ratio_systems(systems: ResidualSystems, left: StateSpace, right: StateSpace)
 
 
 def peaks_hz(systems: ResidualSystems, grid_hz: Array, sample_period_s: float) -> Array:
-    """Return frequencies in and around every mode of the residuals that a grid passes over: of the plants, and where the inverted plant vanishes.
+    """Return frequencies in and around every mode of the residuals that a grid from DC to Nyquist passes over, not beyond the grid.
 
-    A mode `s = a + j b` is a peak or a notch of the half-width |a|.
-
-    Parameters
-    ----------
-    systems : ResidualSystems
-    grid_hz : ndarray, shape (n,), Hz
-        From DC to Nyquist; modes wider than its steps are left out.
-    sample_period_s : float, s
-
-    Returns
-    -------
-    ndarray, shape (frequency,), Hz
-        Increasing, not beyond the grid; empty where it shows every mode.
+    Modes of the plants, and where the inverted plant vanishes. A mode `s = a + j b` is a peak or a notch of the half-width |a|; those wider than the
+    steps of the grid are left out.
     """
     form = as_form(systems.form)
     wide = systems.nominal.n_outputs < systems.nominal.n_inputs
@@ -164,9 +153,9 @@ def peaks_hz(systems: ResidualSystems, grid_hz: Array, sample_period_s: float) -
     plants = [to_continuous(s).poles() for s in (systems.nominal, *(systems.units[k] for k in range(systems.units.batch_shape[0])))]
     modes = np.concatenate([part.poles() for f in forms for part in _of_units(residual, f)] + plants).astype(complex)
     light = modes[(modes.imag > 0) & (np.abs(modes.real) <= _LIGHT * np.abs(modes))]
-    place = np.arctan(light.imag) / (np.pi * sample_period_s)
+    at_hz = np.arctan(light.imag) / (np.pi * sample_period_s)
     width = np.abs(light.real) / (1 + light.imag**2) / (np.pi * sample_period_s)
-    light = light[(width < np.interp(place, grid_hz, np.gradient(grid_hz))) & (place <= grid_hz[-1])]
+    light = light[(width < np.interp(at_hz, grid_hz, np.gradient(grid_hz))) & (at_hz <= grid_hz[-1])]
     light = light[np.argsort(np.abs(light.real) / np.abs(light), kind="stable")]
     kept: list[tuple[float, float]] = []
     for half, middle in zip(np.abs(light.real), light.imag, strict=True):

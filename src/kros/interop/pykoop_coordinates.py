@@ -20,8 +20,9 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError, IdentificationError
 from ..lifting import Lifting
+from ..lifting.formula import base_and_delay
 from .adopted import AdoptedModel
-from .pykoop_formulas import LiftedColumns, base_and_delay, exact, text, walk
+from .pykoop_formulas import LiftedColumns, exact, text, walk
 
 Array = npt.NDArray[np.float64]
 

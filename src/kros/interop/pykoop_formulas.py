@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import ConfigError
-from ..lifting.formula import delayed_name
+from ..lifting.formula import base_and_delay, delayed_name
 
 
 @dataclass(frozen=True)
@@ -122,16 +122,6 @@ def _earlier(column: Any, delay: int) -> Any:
         name, already = base_and_delay(symbol.name)
         moved[symbol] = sp.Symbol(delayed_name(name, already + delay), real=True)
     return column.xreplace(moved)
-
-
-def base_and_delay(name: str) -> tuple[str, int]:
-    """Return the quantity behind a name, and how many samples before it is meant.
-
-    >>> base_and_delay("angle[-2]"), base_and_delay("angle")
-    (('angle', 2), ('angle', 0))
-    """
-    base, _, index = name.partition("[")
-    return base, -int(index[:-1]) if index else 0
 
 
 def _affine(function: Any, columns: LiftedColumns, place: str) -> LiftedColumns:

@@ -62,7 +62,7 @@ class Formula:
         import sympy as sp
 
         sizes = dict(self.sizes)
-        known = {symbol: sizes.get(symbol.name.partition("[")[0], 1.0) for symbol in self.written.free_symbols}
+        known = {symbol: sizes.get(base_and_delay(symbol.name)[0], 1.0) for symbol in self.written.free_symbols}
         tree = self.written.xreplace({symbol: sp.Float(size, 17) * symbol for symbol, size in known.items() if size != 1})
         return tree if self.size == 1 else tree * sp.Float(1 / self.size, 17)
 
@@ -108,6 +108,16 @@ def delayed_name(name: str, delay: int) -> str:
     'position[-2]'
     """
     return f"{name}[-{delay}]" if delay else name
+
+
+def base_and_delay(name: str) -> tuple[str, int]:
+    """Return the quantity behind a name, and how many samples before it is meant.
+
+    >>> base_and_delay("angle[-2]"), base_and_delay("angle")
+    (('angle', 2), ('angle', 0))
+    """
+    base, _, index = name.partition("[")
+    return base, -int(index[:-1]) if index else 0
 
 
 def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
+from .formula import base_and_delay
 
 Array = npt.NDArray[np.float64]
 Interval = tuple[Array, Array]
@@ -58,7 +59,7 @@ def _range(name: str, value: Any) -> tuple[float, float]:
 def pieces_of(expression: Any, box: Box) -> Interval:
     """Return bounds of a tree over every piece of a box, each of shape (pieces,); rounding is not covered."""
     names = sorted(symbol.name for symbol in expression.free_symbols)
-    sides = {name: _range(name, box.get(name, box.get(name.partition("[")[0], _REALS))) for name in names}
+    sides = {name: _range(name, box.get(name, box.get(base_and_delay(name)[0], _REALS))) for name in names}
     return _walk(expression, _pieces(sides))
 
 

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DimensionError
 from .continuity import slope_bounds_of
 from .evaluation import Columns
-from .formula import Formula, require_text
+from .formula import Formula, base_and_delay, require_text
 from .intervals import Box, bounds_of
 from .separation import Separation
 from .window import Window
@@ -85,7 +85,7 @@ class Lifting:
                     f"Lifting: {formula.text!r} depends on no state ({', '.join(self.states)}); a constant cannot be lifted, remove it."
                 )
         for formula in self.input_formulas:
-            if not {name.partition("[")[0] for name in formula.used} & set(self.inputs):
+            if not {base_and_delay(name)[0] for name in formula.used} & set(self.inputs):
                 raise ConfigError(
                     f"Lifting: the input function {formula.text!r} depends on no input ({', '.join(self.inputs) or 'none are named'}); "
                     "a function of states alone belongs to the lifted functions."

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError
-from .formula import delayed_name
+from .formula import base_and_delay, delayed_name
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
@@ -43,9 +43,9 @@ class Window:
         """Collect the delays from the names that formulas use."""
         depths: dict[str, int] = {}
         for name in used:
-            if name.endswith("]"):
-                base, _, index = name.partition("[")
-                depths[base] = max(depths.get(base, 0), -int(index[:-1]))
+            base, delay = base_and_delay(name)
+            if delay:
+                depths[base] = max(depths.get(base, 0), delay)
         return cls(states, inputs, tuple((q, depths[q]) for q in states + inputs if q in depths))
 
     @property
@@ -56,7 +56,12 @@ class Window:
     @cached_property
     def earlier(self) -> tuple[str, ...]:
         """Names of the earlier values, in the order of the window."""
-        return tuple(delayed_name(q, d) for q, depth in self.depths for d in range(1, depth + 1))
+        return tuple(delayed_name(q, d) for q, d in self.quantities if d)
+
+    @cached_property
+    def quantities(self) -> tuple[tuple[str, int], ...]:
+        """The quantity behind every entry, and how many samples before it is meant."""
+        return (*((state, 0) for state in self.states), *((q, d) for q, depth in self.depths for d in range(1, depth + 1)))
 
     @property
     def names(self) -> tuple[str, ...]:

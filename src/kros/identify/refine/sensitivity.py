@@ -96,12 +96,12 @@ def normal_equations(
 def _moving_past(lifting: Lifting) -> list[Past]:
     """Earlier values of states that a formula reads: entry of the window, state and delay."""
     read = {name for formula in (*lifting.formulas, *lifting.input_formulas) for name in formula.used}
-    found = []
-    for entry, name in enumerate(lifting.window.names):
-        state, _, delay = name.rstrip("]").partition("[")
-        if delay and name in read and state in lifting.states:
-            found.append((entry, lifting.states.index(state), -int(delay)))
-    return found
+    window, states = lifting.window, lifting.states
+    return [
+        (entry, states.index(quantity), delay)
+        for entry, (quantity, delay) in enumerate(window.quantities)
+        if delay and window.names[entry] in read and quantity in states
+    ]
 
 
 def _state_matrix(

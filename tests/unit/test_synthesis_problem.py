@@ -1,0 +1,75 @@
+"""The observer problem of an uncertain model: everything is taken over, and what does not belong together is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kros.core.errors import SynthesisError
+from kros.data import Channel, Role
+from kros.identify import ModelSet
+from kros.lifting import Lifting
+from kros.synthesis import Injection, ObserverProblem
+from kros.uncertainty import quantify_systems
+
+DT = 0.01
+
+
+@pytest.fixture(scope="module")
+def models() -> ModelSet:
+    rng = np.random.default_rng(2)
+    A = np.array([[0.9, 0.1, 0.0], [0.0, 0.7, 0.1], [0.0, 0.0, 0.5]]) + 0.003 * rng.normal(size=(4, 3, 3))
+    return ModelSet(
+        name="koopman",
+        condition="default",
+        lifting=Lifting(("position", "velocity"), ("sin(0.5*position)",)),
+        channels=(Channel("position", Role.STATE, measured=True), Channel("velocity", Role.STATE), Channel("target", Role.INPUT)),
+        sample_period_s=DT,
+        unit_ids=tuple(f"unit.{i}" for i in range(4)),
+        A=A,
+        B=np.array([[0.1], [1.0], [0.3]]) + 0.003 * rng.normal(size=(4, 3, 1)),
+        parameters={},
+        residual_covariance=np.broadcast_to(np.eye(3), A.shape),
+        output_scale=np.array([1.0, 2.0, 0.5]),
+        input_scale=np.array([3.0]),
+    )
+
+
+@pytest.fixture(scope="module")
+def uncertain(models):
+    return quantify_systems(models, form="inverse_input_multiplicative", freqs_hz=models.frequencies(60), max_order=2)
+
+
+def test_nothing_is_left_out(models, uncertain):
+    case = ObserverProblem.from_uncertain(models, uncertain, [1e-3], injection=Injection.INPUT, correction_penalty=1e-2)
+    assert uncertain.remainder is not None
+    assert case.remainder_left is uncertain.remainder.left
+    assert case.remainder_right is uncertain.remainder.right
+    assert (case.W_L, case.W_R, case.form) == (uncertain.weight.left, uncertain.weight.right, uncertain.form)
+    assert np.array_equal(case.nominal.A, models.A[uncertain.nominal])
+    assert np.array_equal(case.C, [[1.0, 0.0, 0.0]])
+    assert (case.n_original, case.injection, case.correction_penalty) == (2, Injection.INPUT, 1e-2)
+    assert np.array_equal(case.output_scale, models.output_scale)
+
+
+def test_units_of_measure_change_nothing(models, uncertain):
+    recorded = ObserverProblem.from_uncertain(models, uncertain, [1e-3])
+    divided = ObserverProblem.from_uncertain(models.normalised(), uncertain, [1e-3])
+    for ours, theirs in zip(recorded.scaled, divided.scaled, strict=True):
+        assert np.allclose(ours, theirs, rtol=1e-12)
+
+
+def test_models_of_another_population_are_refused(models, uncertain):
+    with pytest.raises(SynthesisError, match="not the nominal that the uncertain set surrounds"):
+        ObserverProblem.from_uncertain(replace(models, A=0.9 * models.A), uncertain, [1e-3])
+
+
+def test_a_nominal_that_is_no_unit_is_refused(models, uncertain):
+    with pytest.raises(SynthesisError, match="'pooled' is none of the models' units"):
+        ObserverProblem.from_uncertain(models, replace(uncertain, nominal_id="pooled"), [1e-3])
+
+
+def test_entrywise_weights_are_refused(models):
+    entrywise = quantify_systems(models, form="additive", freqs_hz=models.frequencies(60), structure="entrywise", max_order=2)
+    with pytest.raises(SynthesisError, match="made for a diagonal perturbation"):
+        ObserverProblem.from_uncertain(models, entrywise, [1e-3])

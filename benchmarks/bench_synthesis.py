@@ -14,6 +14,7 @@ from scipy.linalg import expm
 
 from kros.core import KrosError, StateSpace, block_diagonal, gain
 from kros.synthesis import Injection, ObserverProblem, mixed, worst_case_h2
+from kros.synthesis.problem.plants import mixed_plant
 
 DT = 1e-3
 
@@ -92,7 +93,7 @@ def main(count: int) -> None:
             riccati.append(two.solve_s)
             gaps.append(two.gap_percent or np.nan)
             print(
-                f"{seed:3d} {injection.value:5s} states {case.mixed_plant().sizes[0]:2d} | mixed {times[-1]:6.2f} s {one.solver} {one.status.value} "
+                f"{seed:3d} {injection.value:5s} states {mixed_plant(case).sizes[0]:2d} | mixed {times[-1]:6.2f} s {one.solver} {one.status.value} "
                 f"worst case {one.worst_case_h2:9.4f} | worst_case_h2 {1e3 * two.solve_s:6.2f} ms (with fits {total:5.2f} s) {two.worst_case_h2:9.4f} "
                 f"bound {two.lower_bound:9.4f} gap {two.gap_percent:6.2f} %",
                 flush=True,

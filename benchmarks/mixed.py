@@ -33,6 +33,7 @@ from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.engine.store import Store
+from kros.synthesis.problem.plants import mixed_plant
 from kros.synthesis.worst_case.certificate import certify
 
 
@@ -92,7 +93,7 @@ def solve(task: DesignTask) -> tuple[str, float, bool]:
     """Synthesise one observer; return what to print, the processor seconds, and whether it failed."""
     if task.problem is None:
         return f"no usable set: {task.refusal}", 0.0, True
-    n_states = task.problem.mixed_plant().sizes[0]
+    n_states = mixed_plant(task.problem).sizes[0]
     wall, start = time.perf_counter(), time.process_time()
     try:
         result = design_mixed(task)

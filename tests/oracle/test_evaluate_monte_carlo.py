@@ -9,7 +9,8 @@ from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
 from kros.evaluate import Candidate, Contractions, sample_errors
 from kros.evaluate.monte_carlo import draw_members
 from kros.synthesis import Injection, ObserverProblem, worst_case_h2
-from kros.synthesis.problem.perturbation import PLACES
+from kros.synthesis.problem.plants import generalized_plant
+from kros.synthesis.problem.uncertainty_location import LOCATIONS
 from kros.synthesis.worst_case.causal import perturbed
 from kros.synthesis.worst_case.certificate import certify
 from kros.synthesis.worst_case.unit_check import unit_error
@@ -25,7 +26,7 @@ def low_pass(pole, size):
 
 def problem(form, remainder=True):
     n, m = B.shape
-    rows, columns = PLACES[Form(form)].sizes(n, m)
+    rows, columns = LOCATIONS[Form(form)].sizes(n, m)
     parts = {
         "nominal": StateSpace(A, B, np.eye(n), np.zeros((n, m)), DT),
         "C": np.eye(n)[:1],
@@ -69,7 +70,7 @@ def test_errors_of_members_are_those_of_their_state_space_models_and_below_the_c
     drawn, rests = draw_members(case, members, seed=4)
     for row, largest, candidate in zip(found.norms, found.largest, candidates(), strict=True):
         own = replace(case, injection=candidate.injection)
-        closed = own.generalized_plant().close(own.to_scaled(candidate.controller))
+        closed = generalized_plant(own).close(own.to_scaled(candidate.controller))
         expected = [
             h2_norm(perturbed(own, closed, drawn.system(i, DT), rests.system(i, DT) if remainder else None)) for i in range(members)
         ]

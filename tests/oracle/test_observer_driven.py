@@ -21,7 +21,7 @@ from kros.observer import (
     with_internal,
 )
 from kros.observer.predictor import embedded
-from kros.synthesis.residual_shaped.shaping import Bank
+from kros.synthesis.residual_shaped.shaping_filter import Bank
 
 DT, SIZES, UNITS = 0.01, (1.0, 0.5), list("aabbcc")
 

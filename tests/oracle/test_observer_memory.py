@@ -15,7 +15,7 @@ from kros.observer import (
 )
 from kros.observer.predictor import embedded, tune_predictor
 from kros.synthesis import Injection, kalman
-from kros.synthesis.residual_shaped.shaping import Bank
+from kros.synthesis.residual_shaped.shaping_filter import Bank
 
 DT = 0.01
 LIFTING = Lifting(("p", "c"), ("sin(5*p + phase)",), ("phase",))

@@ -10,7 +10,7 @@ from kros.observer.predictor import tune_predictor
 from kros.observer.predictor.tuning import _slowing
 from kros.observer.tuning.blocks import blocks_of, joined
 from kros.synthesis import Injection, kalman
-from kros.synthesis.residual_shaped.shaping import Bank
+from kros.synthesis.residual_shaped.shaping_filter import Bank
 
 DT = 0.01
 

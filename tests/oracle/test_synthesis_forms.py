@@ -6,7 +6,8 @@ from scipy.linalg import expm
 
 from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import Injection, ObserverProblem, check_units, worst_case_h2, worst_case_hinf
-from kros.synthesis.problem.perturbation import PLACES
+from kros.synthesis.problem.plants import generalized_plant
+from kros.synthesis.problem.uncertainty_location import LOCATIONS
 from kros.synthesis.worst_case.causal import causal_h2, perturbed
 from kros.synthesis.worst_case.certificate import certify, density
 from kros.synthesis.worst_case.robust_gain import robust_gain
@@ -42,7 +43,7 @@ def problem(form, seed=0, structure="full", injection=Injection.STATE, remainder
     A = rng.standard_normal((N, N))
     A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
     nominal = StateSpace(A, rng.standard_normal((N, M)), np.eye(N), np.zeros((N, M)), DT)
-    rows, columns = PLACES[Form(form)].sizes(N, M)
+    rows, columns = LOCATIONS[Form(form)].sizes(N, M)
     parts = {
         "nominal": nominal,
         "C": np.eye(N)[:1],
@@ -61,9 +62,9 @@ def problem(form, seed=0, structure="full", injection=Injection.STATE, remainder
     if remainder:
         parts |= {"remainder_left": scaled_by(weight(rng, N, N, "full"), 0.2), "remainder_right": random_system(rng, M, M, 1)}
     case = ObserverProblem(**{**parts, **changes})
-    if case.loop is None:
+    if case.N is None:
         return case
-    return ObserverProblem(**{**parts, "W_L": scaled_by(parts["W_L"], 0.6 / hinf_norm(case.loop)), **changes})
+    return ObserverProblem(**{**parts, "W_L": scaled_by(parts["W_L"], 0.6 / hinf_norm(case.N)), **changes})
 
 
 def observer(rng, case):
@@ -115,7 +116,7 @@ def test_interconnection_is_the_perturbed_plant(form, injection):
         K = observer(rng, case)
         delta = random_system(rng, case.W_L.n_inputs, case.W_R.n_outputs, 2)
         rest = random_system(rng, N, M, 2)
-        closed = case.generalized_plant().close(case.to_scaled(K))
+        closed = generalized_plant(case).close(case.to_scaled(K))
         found = perturbed(case, closed, delta, rest)
         assert found.is_stable()
         expected = brute_force(case, K, delta, rest, FREQS)
@@ -126,13 +127,13 @@ def test_interconnection_is_the_perturbed_plant(form, injection):
 def test_plant_is_minimal(form):
     """Controllable and observable; the copies of the plant that a naive interconnection has (two, and the observer) are gone."""
     case = problem(form, 1)
-    system = case.generalized_plant().open_loop()
+    system = generalized_plant(case).open_loop()
     n = system.n_states
     for pair in ((system.A, system.B), (system.A.T, system.C.T)):
         for pole in np.linalg.eigvals(system.A):
             assert np.linalg.matrix_rank(np.hstack([pair[0] - pole * np.eye(n), pair[1]]), tol=1e-9) == n
     weights = [case.W_L, case.W_R, case.W_u, case.W_p, case.remainder_left, case.remainder_right]
-    copies = 1 if PLACES[form].sees_input else 2
+    copies = 1 if LOCATIONS[form].sees_input else 2
     assert n == copies * N + sum(w.n_states for w in weights)
 
 
@@ -178,9 +179,9 @@ def test_bound_against_the_worst_perturbation_found(form, structure, limit):
     bound = np.sqrt(density(case, loop, freqs) - np.sum(np.abs(noise_columns(case, response)) ** 2, axis=(-2, -1)))
     for k in range(len(freqs)):
         at = freqs[[k]]
-        loop_ = np.zeros((case.W_R.n_outputs, case.W_L.n_inputs)) if case.loop is None else case.loop.frequency_response(at)[0]
-        T = response[k][:, case.port] @ case.W_L.frequency_response(at)[0]
-        found = worst_found(rng, T, loop_, case.chain.frequency_response(at)[0])
+        loop_ = np.zeros((case.W_R.n_outputs, case.W_L.n_inputs)) if case.N is None else case.N.frequency_response(at)[0]
+        T = response[k][:, case.uncertainty_input] @ case.W_L.frequency_response(at)[0]
+        found = worst_found(rng, T, loop_, case.M.frequency_response(at)[0])
         assert found <= bound[k] * (1 + 1e-9)
         assert bound[k] <= found * limit
 
@@ -191,7 +192,7 @@ def test_causal_perturbations_are_members_below_the_bound(form):
     rng = np.random.default_rng(2)
     K = observer(rng, case)
     value, causal = certify(case, K)[0], causal_h2(case, K)
-    closed = case.generalized_plant().close(case.to_scaled(K))
+    closed = generalized_plant(case).close(case.to_scaled(K))
     assert 0.3 * value < causal <= value
     for _ in range(5):
         delta, rest = random_system(rng, case.W_L.n_inputs, case.W_R.n_outputs, 2), random_system(rng, N, M, 2)
@@ -211,9 +212,9 @@ def test_gain_is_that_of_the_worst_perturbation(form):
     found = []
     for k in range(len(freqs)):
         at = freqs[[k]]
-        loop_ = np.zeros((case.W_R.n_outputs, case.W_L.n_inputs)) if case.loop is None else case.loop.frequency_response(at)[0]
-        T = response[k][:, case.port] @ case.W_L.frequency_response(at)[0]
-        found.append(worst_found(rng, T, loop_, case.chain.frequency_response(at)[0], 2, noise_columns(case, response)[k], starts=10))
+        loop_ = np.zeros((case.W_R.n_outputs, case.W_L.n_inputs)) if case.N is None else case.N.frequency_response(at)[0]
+        T = response[k][:, case.uncertainty_input] @ case.W_L.frequency_response(at)[0]
+        found.append(worst_found(rng, T, loop_, case.M.frequency_response(at)[0], 2, noise_columns(case, response)[k], starts=10))
     assert max(found) <= proof.value
     assert found[0] >= 0.99 * proof.attained
 
@@ -223,7 +224,7 @@ def test_gain_with_a_remainder_bounds_random_members():
     rng = np.random.default_rng(4)
     K = observer(rng, case)
     proof = robust_gain(case, K)
-    closed = case.generalized_plant().close(case.to_scaled(K))
+    closed = generalized_plant(case).close(case.to_scaled(K))
     for _ in range(10):
         delta, rest = random_system(rng, case.W_L.n_inputs, case.W_R.n_outputs, 2), random_system(rng, N, M, 2)
         assert hinf_norm(perturbed(case, closed, delta, rest)) <= proof.value

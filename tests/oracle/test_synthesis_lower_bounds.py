@@ -313,18 +313,18 @@ def test_a_perturbation_that_is_held_keeps_what_is_proven(form):
     spectrum = channels.average().mixed_with(0.0, contractions, 1.0)
     proven, seen = proofs.disturbance(spectrum, theta, half)
     theta_hz = theta / (2 * np.pi)
-    if case.loop is None:
+    if case.N is None:
         delta = contractions[channels.nearest(theta)]
     else:
-        N = case.loop.frequency_response(theta_hz)
+        N = case.N.frequency_response(theta_hz)
         X = channels.ball_of(N, np.broadcast_to(np.eye(a, dtype=complex), (60, a, a)))
         X = X.center + X.left @ contractions[channels.nearest(theta)] @ X.right
         delta = np.linalg.solve(np.eye(b) + X @ N, X)
     assert np.linalg.norm(delta, 2, axis=(-2, -1)).max() <= 1 + 1e-9
 
     def size(there):
-        M = case.chain.frequency_response(there / (2 * np.pi))
-        N = np.zeros((60, a, b)) if case.loop is None else case.loop.frequency_response(there / (2 * np.pi))
+        M = case.M.frequency_response(there / (2 * np.pi))
+        N = np.zeros((60, a, b)) if case.N is None else case.N.frequency_response(there / (2 * np.pi))
         return np.linalg.norm(delta @ np.linalg.solve(np.eye(a) - N @ delta, M), axis=-1)
 
     assert seen == pytest.approx(size(theta), rel=1e-9)
@@ -350,7 +350,7 @@ def test_filters_are_lowered_by_the_least_ratio_and_no_further():
     shaping = Shaping(high, channels.behind, two)
 
     def ball(f):
-        return channels.ball_of(case.loop.frequency_response(f), case.chain.frequency_response(f))
+        return channels.ball_of(case.N.frequency_response(f), case.M.frequency_response(f))
 
     def remainder(f):
         L, Q = left.frequency_response(f), case.remainder_right.frequency_response(f)

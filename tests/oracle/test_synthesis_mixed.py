@@ -17,7 +17,8 @@ from kros.synthesis.mixed_norms.inequalities import MixedInequalities
 from kros.synthesis.mixed_norms.solvers import Program, solve
 from kros.synthesis.mixed_norms.youla import hinf_lower_bound, youla_bound
 from kros.synthesis.problem.paper_plant import paper_plant, reduced_plant
-from kros.synthesis.reduction.reduction import truncate
+from kros.synthesis.problem.plants import mixed_plant
+from kros.synthesis.reduction.truncation import truncate
 from kros.synthesis.worst_case.certificate import certify
 
 DT = 1e-3
@@ -197,7 +198,7 @@ def test_feedthrough_is_absorbed():
 def test_drive_like_observers_are_solved_and_certified(seed, order, injection):
     case = drive_problem(seed, injection, order)
     found = mixed(case)
-    plant = case.mixed_plant()
+    plant = mixed_plant(case)
     assert plant.sizes[0] == 4 + 2 * order
     closed = plant.close(case.to_scaled(found.controller))
     assert closed.is_stable()
@@ -245,7 +246,7 @@ def test_mixed_plant_is_the_published_one_with_noise_and_penalty():
     nominal = StateSpace(A, B, np.eye(4), np.zeros((4, 2)), DT)
     published = reduced_plant(nominal, C, gain(W_p, DT), gain(np.eye(2), DT), case.W_L)
     freqs = np.geomspace(0.01, 500, 30)
-    ours, theirs = case.mixed_plant().open_loop().frequency_response(freqs), published.open_loop().frequency_response(freqs)
+    ours, theirs = mixed_plant(case).open_loop().frequency_response(freqs), published.open_loop().frequency_response(freqs)
     rows, columns = np.r_[0:3, 5:7, 7], np.r_[0:2, 3:5, 5:7]  # without penalty outputs and noise inputs
     assert ours[:, rows][:, :, columns] == pytest.approx(theirs, abs=1e-8 * np.abs(theirs).max())
 
@@ -254,7 +255,7 @@ def test_mixed_plant_with_dynamic_weights_on_both_sides():
     base = drive_problem(2, Injection.INPUT, 1)
     lagged = block_diagonal([StateSpace([[0.5]], [[1.0]], [[0.2]], [[0.3]], DT)] * 2)
     case = ObserverProblem(base.nominal, base.C, base.W_L, lagged, base.input_scale, base.output_scale, base.noise, 3, W_u=lagged)
-    plant = case.mixed_plant()
+    plant = mixed_plant(case)
     A, B, _, W_p = case.scaled
     freqs = np.geomspace(0.01, 500, 20)
     found = plant.open_loop().frequency_response(freqs)
@@ -268,7 +269,7 @@ def test_mixed_plant_with_dynamic_weights_on_both_sides():
 
 
 def test_truncation_error_is_within_its_bound():
-    plant = drive_problem(4, Injection.INPUT, 5).mixed_plant()
+    plant = mixed_plant(drive_problem(4, Injection.INPUT, 5))
     small, tail = truncate(plant, 8)
     full = plant.open_loop()
     difference = StateSpace(

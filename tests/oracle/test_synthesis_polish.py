@@ -8,6 +8,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 from kros.core import ConfigError, StateSpace, SynthesisError, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, h2, polish
+from kros.synthesis.problem.plants import shaped_plant
 from kros.synthesis.reduction.affine_loop import AffineLoop
 from kros.synthesis.reduction.bounded_cost import BoundedCost
 from kros.synthesis.reduction.certified_cost import CertifiedCost
@@ -131,7 +132,7 @@ def test_static_observer_gain_against_exhaustive_search():
             return np.inf
 
     best = minimize_scalar(value, bounds=(0.0, 8.0), method="bounded").fun
-    start = h2(problem.shaped_plant(gain([[1.0]], 0.01), gain(np.zeros((2, 0)), 0.01)), Injection.INPUT)
+    start = h2(shaped_plant(problem, gain([[1.0]], 0.01), gain(np.zeros((2, 0)), 0.01)), Injection.INPUT)
     start = replace(start, controller=gain([[0.2]], 0.01))
     found = polish(problem, start)
     assert value(0.2) > 1.01 * best

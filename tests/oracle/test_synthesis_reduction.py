@@ -10,7 +10,7 @@ from kros.core import ConfigError, StateSpace, SynthesisError, block_diagonal, g
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, h2, reduce_controller, worst_case_h2
 from kros.synthesis.reduction.balancing import Balancing, gramian_root
 from kros.synthesis.reduction.certified_cost import CertifiedCost
-from kros.synthesis.reduction.purpose import ForPlant
+from kros.synthesis.reduction.objective import ForPlant
 from kros.synthesis.worst_case.certificate import certify
 
 DT = 1e-3

@@ -10,6 +10,7 @@ from kros.design.published import as_published, design_published, entrywise_weig
 from kros.design.task import DesignResult
 from kros.synthesis import Injection, ObserverProblem
 from kros.synthesis.problem.paper_plant import reduced_plant
+from kros.synthesis.problem.plants import mixed_plant
 from kros.uncertainty import residual
 
 DT, UNITS = 0.01, ("a", "b", "c")
@@ -58,7 +59,7 @@ def test_the_plant_is_the_published_one_with_noise_and_penalty(task):
     assert problem.injection is Injection.INPUT
     published = reduced_plant(problem.nominal, problem.C / 1e-3, gain(np.eye(2), DT), gain(np.eye(2), DT), weight)
     freqs = np.geomspace(0.01, 49, 20)
-    ours, theirs = (plant.open_loop().frequency_response(freqs) for plant in (problem.mixed_plant(), published))
+    ours, theirs = (plant.open_loop().frequency_response(freqs) for plant in (mixed_plant(problem), published))
     rows, columns = np.r_[0:2, 4:6, 6], np.r_[0:2, 3:5, 5:7]  # without penalty outputs and noise inputs
     assert ours[:, rows][:, :, columns] == pytest.approx(theirs, abs=1e-8 * np.abs(theirs).max())
 

@@ -32,6 +32,7 @@ import numpy.typing as npt
 from ..core.lti import StateSpace
 from ..core.norms import h2_norm
 from ..synthesis import Injection, ObserverProblem
+from ..synthesis.problem.plants import generalized_plant
 from ..synthesis.worst_case.causal import perturbed
 from .contractions import Contractions
 
@@ -103,7 +104,7 @@ def sample_errors(
     responses = [loop.frequency_response(freqs) for loop in loops]
     noise = np.array([h2_norm(StateSpace(loop.A, loop.B[:, m + n :], loop.C, loop.D[:, m + n :], loop.dt)) ** 2 for loop in loops])
     W_L = problem.W_L.frequency_response(freqs)
-    T = [r[..., problem.port] @ W_L for r in responses]
+    T = [r[..., problem.uncertainty_input] @ W_L for r in responses]
     if problem.remainder_left is not None:
         W_rL = problem.remainder_left.frequency_response(freqs)
         T = [np.concatenate([t, r[..., m : m + n] @ W_rL], axis=-1) for t, r in zip(T, responses, strict=True)]
@@ -132,9 +133,9 @@ def draw_members(problem: ObserverProblem, members: int, seed: int = 0) -> tuple
 def _effects(problem: ObserverProblem, drawn: Contractions, rests: Contractions, freqs: Array) -> Array:
     """X M over members and frequencies, below it the remainder's ``Delta_r M_r``, shape (member, f, b, m)."""
     theta = 2 * np.pi * problem.nominal.dt * freqs
-    delta, M = drawn.response(theta), problem.chain.frequency_response(freqs)
-    if problem.loop is not None:
-        N = problem.loop.frequency_response(freqs)
+    delta, M = drawn.response(theta), problem.M.frequency_response(freqs)
+    if problem.N is not None:
+        N = problem.N.frequency_response(freqs)
         M = np.linalg.solve(np.eye(N.shape[-2]) - N @ delta, np.broadcast_to(M, (len(delta), *M.shape)))
     effect = delta @ M
     if problem.remainder_right is None:
@@ -164,14 +165,14 @@ def _units_power(problem: ObserverProblem, responses: Sequence[Array], units: St
 
 def _exact(problem: ObserverProblem, candidate: Candidate, drawn: Contractions, rests: Contractions, member: int) -> float:
     problem, dt = replace(problem, injection=candidate.injection), problem.nominal.dt
-    closed = problem.generalized_plant().close(problem.to_scaled(candidate.controller))
+    closed = generalized_plant(problem).close(problem.to_scaled(candidate.controller))
     rest = rests.system(member, dt) if problem.remainder_left is not None else None
     return float(h2_norm(perturbed(problem, closed, drawn.system(member, dt), rest)))
 
 
 def _grid(problem: ObserverProblem, loops: Sequence[StateSpace], units: StateSpace | None) -> tuple[Array, Array]:
     """Angles from 0 to pi, dense around all poles, and the weights of the trapezoidal rule over pi."""
-    systems = [*loops, problem.W_L, problem.chain, problem.loop, problem.remainder_left, problem.remainder_right]
+    systems = [*loops, problem.W_L, problem.M, problem.N, problem.remainder_left, problem.remainder_right]
     poles = [s.poles().ravel() for s in systems if s is not None]
     if units is not None:
         poles.append(np.linalg.eigvals(units.A).ravel())

@@ -21,7 +21,7 @@ from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
 from ..lifting import Lifting
 from ..observer.predictor import Past
-from ..synthesis.residual_shaped.shaping import Bank
+from ..synthesis.residual_shaped.shaping_filter import Bank
 from .signals import low_passed, without_level
 
 Array = npt.NDArray[np.float64]

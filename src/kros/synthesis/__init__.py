@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from .mixed_norms.youla import YoulaBound, youla_bound
     from .problem.observer_problem import ObserverProblem
     from .reduction.polishing import polish
-    from .reduction.reduction import reduce_controller
-    from .residual_shaped.shaped import residual_h2
-    from .residual_shaped.shaping import Bank, shaping_filter
+    from .reduction.truncation import reduce_controller
+    from .residual_shaped.residual_h2 import residual_h2
+    from .residual_shaped.shaping_filter import Bank, shaping_filter
     from .result import Injection, Status, Synthesis
     from .riccati.constant_gain import kalman, luenberger
     from .riccati.h2_optimal import h2
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from .structured.dk import dk_iteration
     from .worst_case.robust_gain import RobustGain, robust_gain
     from .worst_case.unit_check import UnitCheck, check_units
-    from .worst_case.worst_case import worst_case_h2
+    from .worst_case.worst_case_h2 import worst_case_h2
     from .worst_case.worst_case_hinf import worst_case_hinf
 
 _HOME = {
-    "Bank": "residual_shaped.shaping",
+    "Bank": "residual_shaped.shaping_filter",
     "Block": "structured.blocks",
     "GeneralizedPlant": "generalized_plant",
     "Injection": "result",
@@ -55,11 +55,11 @@ _HOME = {
     "mu_lower": "structured.bounds",
     "mu_upper": "structured.bounds",
     "polish": "reduction.polishing",
-    "reduce_controller": "reduction.reduction",
-    "residual_h2": "residual_shaped.shaped",
+    "reduce_controller": "reduction.truncation",
+    "residual_h2": "residual_shaped.residual_h2",
     "robust_gain": "worst_case.robust_gain",
-    "shaping_filter": "residual_shaped.shaping",
-    "worst_case_h2": "worst_case.worst_case",
+    "shaping_filter": "residual_shaped.shaping_filter",
+    "worst_case_h2": "worst_case.worst_case_h2",
     "worst_case_hinf": "worst_case.worst_case_hinf",
     "youla_bound": "mixed_norms.youla",
 }

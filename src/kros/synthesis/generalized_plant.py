@@ -178,3 +178,11 @@ class GeneralizedPlant:
         A[self.A.shape[0] :, self.A.shape[0] :] += K.A
         C = np.hstack([self.C1, np.zeros((self.C1.shape[0], K.n_states))]) + self.D12 @ u_x
         return StateSpace(A, np.vstack([self.B1 + self.B2 @ u_w, K.B @ y_w]), C, self.D11 + self.D12 @ u_w, self.dt)
+
+
+def partitioned(system: StateSpace, w: dict[str, int], z: dict[str, int]) -> GeneralizedPlant:
+    """Cut a system from (w, u) to (z, y) into the nine matrices; channel 1 is all but the perturbation's part."""
+    n_w, n_z = sum(w.values()), sum(z.values())
+    B, C, D = system.B, system.C, system.D
+    matrices = (system.A, B[:, :n_w], B[:, n_w:], C[:n_z], C[n_z:], D[:n_z, :n_w], D[:n_z, n_w:], D[n_z:, :n_w], D[n_z:, n_w:])
+    return GeneralizedPlant(*matrices, system.dt, n_w1=w.get("w1"), n_z1=z.get("z1"), w_parts=w, z_parts=z)

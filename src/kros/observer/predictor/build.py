@@ -13,7 +13,7 @@ from ...core.linalg import least_squares
 from ...core.lti import gain
 from ...data import EpisodeBatch
 from ...lifting import Lifting
-from ...synthesis.residual_shaped.shaping import Bank
+from ...synthesis.residual_shaped.shaping_filter import Bank
 from ...synthesis.result import Injection
 from ..observer import Observer
 from ..tuning.blocks import Array, Model

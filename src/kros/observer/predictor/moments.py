@@ -32,7 +32,7 @@ from ...core.linalg import least_squares
 from ...core.norms import gramian
 from ...data import EpisodeBatch
 from ...lifting import Lifting
-from ...synthesis.residual_shaped.shaping import Bank
+from ...synthesis.residual_shaped.shaping_filter import Bank
 
 Array = npt.NDArray[np.float64]
 DELAYS = 40

@@ -24,7 +24,7 @@ from ...core.errors import DataError
 from ...core.linalg import least_squares
 from ...data import EpisodeBatch
 from ...lifting import Lifting
-from ...synthesis.residual_shaped.shaped import promised_errors
+from ...synthesis.residual_shaped.residual_h2 import promised_errors
 from .one_step import mean_error_dynamics, one_step_residual, residual_spectra
 
 Array = npt.NDArray[np.float64]

@@ -11,7 +11,7 @@ from scipy.linalg import LinAlgError
 
 from ...core.errors import KrosError, SynthesisError
 from ..generalized_plant import GeneralizedPlant
-from ..reduction.reduction import truncate
+from ..reduction.truncation import truncate
 from ..riccati.h2_optimal import absorb_feedthrough
 from ..riccati.hinf_optimal import hinf
 from .balance import balance

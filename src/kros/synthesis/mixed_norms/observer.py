@@ -23,6 +23,7 @@ from ...core.lti import StateSpace, gain
 from ...core.norms import gramian, hinf_norm
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
+from ..problem.plants import mixed_plant
 from ..result import Status, Synthesis
 from ..worst_case.certificate import certify
 from .attainable import require_reachable
@@ -58,7 +59,7 @@ def for_observer(
     rows = [(floor, states, ladder) for floor in (noise_floor, 10 * noise_floor) for states in _around(max_states)]
     for floor, states, rungs in [*rows, (noise_floor, max_states, solvers)]:
         noisy = replace(problem, noise=np.maximum(problem.noise, floor * (np.abs(problem.C) @ problem.output_scale)))
-        plant = noisy.mixed_plant(noise_floor=0.0, penalty_floor=penalty_floor)
+        plant = mixed_plant(noisy, noise_floor=0.0, penalty_floor=penalty_floor)
         require_reachable(plant, gamma)  # K does not enter T22, so that this is all there is to say about the constraint
         for tried in canonical_scalings(plant) if scalings is None else [tuple(scalings)]:
             told: list[str] = []

@@ -6,8 +6,8 @@ With uncertainty of any of the six forms, ``E = W_L Delta W_R`` on scaled signal
 .. math:: e = T_e W_L\,\Delta (I - N \Delta)^{-1} M w_1 + S R\,W_u w_1 \; - \; S\,(zI - A)^{-1} J K\, n
 
 with :math:`S = (I + (zI - A)^{-1} J K C)^{-1}` and ``J = B`` (input injection) or ``J = I`` (state injection). ``T_e`` is ``S`` or ``S G``, and
-M and N, which do not contain K, depend on the form as told in `perturbation`. K is outside the loop of :math:`\Delta`, so no choice of K can
-lose robustness, and none can gain it: the set is well posed when ``||N|| < 1``. The diagram is in `observer_plants`.
+M and N, which do not contain K, depend on the form, see `uncertainty_location`. K is outside the loop of :math:`\Delta`, so no choice of K can
+lose robustness, and none can gain it: the set is well posed when ``||N|| < 1``. The diagram is in `plants`.
 
 Everything numerical happens in scaled coordinates: states over `output_scale`, inputs over `input_scale`, measurements over their noise.
 
@@ -28,15 +28,13 @@ import numpy.typing as npt
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
-from ...identify import ModelSet
-from ...uncertainty import Structure, UncertainModel
 from ...uncertainty.forms import Form, as_form
 from ...uncertainty.weights.cover import Structure
 from ..assumptions import unreachable_modes
-from ..generalized_plant import GeneralizedPlant
+from ..generalized_plant import GeneralizedPlant, partitioned
 from ..result import Injection
-from . import observer_plants
-from .perturbation import PLACES, Place
+from .interconnect import interconnect
+from .uncertainty_location import LOCATIONS, UncertaintyLocation
 
 if TYPE_CHECKING:
     from ...identify.model_set import ModelSet
@@ -109,55 +107,6 @@ class ObserverProblem:
     process_noise: Array | None = None
     form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE
 
-    @classmethod
-    def from_uncertain(
-        cls,
-        models: ModelSet,
-        uncertain: UncertainModel,
-        noise: npt.ArrayLike,
-        *,
-        injection: Injection | str = Injection.STATE,
-        correction_penalty: float = 1e-3,
-    ) -> ObserverProblem:
-        """Return the problem of an uncertain set around the nominal unit of some models: its weights, its form and its remainder.
-
-        Parameters
-        ----------
-        models : ModelSet
-            In the same channels as the set is of, or divided by their ranges.
-        uncertain : UncertainModel
-        noise : array_like, shape (q,)
-            As above, in the units of `models`.
-        injection, correction_penalty
-            As above.
-
-        Raises
-        ------
-        SynthesisError
-            When the weights are no bound for a full perturbation.
-        """
-        if uncertain.weight.structure is Structure.ENTRYWISE:
-            raise SynthesisError(
-                "the weights are entrywise, made for a diagonal perturbation, and synthesis is for a full one; "
-                "set uncertainty.structure to 'auto', 'diagonal' or 'scalar'"
-            )
-        remainder = uncertain.remainder
-        return cls(
-            nominal=models.systems([uncertain.nominal_id])[0],
-            C=np.eye(models.lifting.n_lifted)[list(models.measured)],
-            W_L=uncertain.weight.left,
-            W_R=uncertain.weight.right,
-            input_scale=models.input_scale,
-            output_scale=models.output_scale,
-            noise=np.asarray(noise, dtype=float),
-            n_original=models.lifting.n_states,
-            correction_penalty=correction_penalty,
-            remainder_left=None if remainder is None else remainder.left,
-            remainder_right=None if remainder is None else remainder.right,
-            injection=Injection(injection),
-            form=uncertain.form,
-        )
-
     def __post_init__(self) -> None:
         object.__setattr__(self, "form", as_form(self.form))
         for name in ("nominal", "W_L", "W_R", "W_u", "remainder_left", "remainder_right"):
@@ -195,7 +144,7 @@ class ObserverProblem:
             raise DimensionError("Observer problem: injection should be Injection.INPUT or Injection.STATE, found NONE.")
         if (self.remainder_left is None) != (self.remainder_right is None):
             raise DimensionError("Observer problem: remainder_left and remainder_right come together, found only one of them.")
-        rows, columns = self.place.sizes(n, m)
+        rows, columns = self.location.sizes(n, m)
         sizes: dict[str, tuple[int | None, int | None]] = {"W_L": (rows, None), "W_R": (None, columns), "W_u": (m, m), "W_p": (None, n)}
         for name, size in (sizes | {"remainder_left": (n, None), "remainder_right": (None, m)}).items():
             self._check_weight(name, *size)
@@ -207,7 +156,7 @@ class ObserverProblem:
         uncertain: UncertainModel,
         noise: npt.ArrayLike,
         *,
-        injection: Injection = Injection.STATE,
+        injection: Injection | str = Injection.STATE,
         correction_penalty: float = 1e-3,
     ) -> ObserverProblem:
         """Return the problem of the nominal unit and the set around it, remainder included.
@@ -219,7 +168,7 @@ class ObserverProblem:
         uncertain : UncertainModel
         noise : array_like, shape (q,)
             Standard deviation of every measurement's noise, in the units of `models`.
-        injection : Injection
+        injection : Injection or str
         correction_penalty : float
 
         Raises
@@ -236,7 +185,9 @@ class ObserverProblem:
             )
         unit, remainder = uncertain.nominal_id, uncertain.remainder
         if unit not in models.unit_ids:
-            raise SynthesisError(f"Observer problem: the nominal {unit!r} is none of the models' units; quantify with one of them as nominal.")
+            raise SynthesisError(
+                f"Observer problem: the nominal {unit!r} is none of the models' units; quantify with one of them as nominal."
+            )
         problem = cls(
             nominal=models.systems([unit])[0],
             C=np.eye(models.lifting.n_lifted)[list(models.measured)],
@@ -249,11 +200,11 @@ class ObserverProblem:
             correction_penalty=correction_penalty,
             remainder_left=remainder.left if remainder is not None else None,
             remainder_right=remainder.right if remainder is not None else None,
-            injection=injection,
+            injection=Injection(injection),
             form=uncertain.form,
         )
-        expected = uncertain.scaled_nominal().frequency_response(uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // 8)])
-        found = problem.scaled_model.frequency_response(uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // 8)])
+        freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // 8)]
+        expected, found = (system.frequency_response(freqs) for system in (uncertain.scaled_nominal(), problem.scaled_model))
         if found.shape != expected.shape or np.abs(found - expected).max() > 1e-6 * np.abs(expected).max():
             raise SynthesisError(
                 f"Observer problem: the model of {unit!r} is not the nominal that the uncertain set surrounds; quantify these very models."
@@ -276,9 +227,9 @@ class ObserverProblem:
             )
 
     @property
-    def place(self) -> Place:
+    def location(self) -> UncertaintyLocation:
         """Where the perturbation acts and what it sees."""
-        return PLACES[as_form(self.form)]
+        return LOCATIONS[as_form(self.form)]
 
     @property
     def input_weight(self) -> StateSpace:
@@ -312,14 +263,20 @@ class ObserverProblem:
         return StateSpace(A, B, np.eye(len(A)), np.zeros_like(B), self.nominal.dt)
 
     @cached_property
-    def chain(self) -> StateSpace:
-        """M, from the disturbance w1 to what Delta sees."""
-        return self.place.chain(self.W_R, self.scaled_model, self.input_weight)
+    def M(self) -> StateSpace:  # noqa: N802
+        """From the disturbance w1 to what Delta sees."""
+        return self.location.M(self.W_R, self.scaled_model, self.input_weight)
 
     @cached_property
-    def loop(self) -> StateSpace | None:
-        """N, from what Delta does to what it sees; None for the forms without a loop."""
-        return self.place.loop(self.W_R, self.scaled_model, self.W_L)
+    def N(self) -> StateSpace | None:  # noqa: N802
+        """From what Delta does to what it sees; None for the forms without a loop."""
+        return self.location.N(self.W_R, self.scaled_model, self.W_L)
+
+    @property
+    def injection_matrix(self) -> Array:
+        """J in scaled coordinates: the correction enters through the inputs or on the state itself."""
+        A, B, _, _ = self.scaled
+        return B if self.injection is Injection.INPUT else np.eye(len(A))
 
     @property
     def correction_size(self) -> int:
@@ -327,10 +284,10 @@ class ObserverProblem:
         return self.nominal.n_inputs if self.injection is Injection.INPUT else self.nominal.n_states
 
     @property
-    def port(self) -> slice:
+    def uncertainty_input(self) -> slice:
         """Columns of `error_system` at which ``W_L w2`` acts."""
         m, n = self.nominal.n_inputs, self.nominal.n_states
-        return slice(0, m) if self.place.at_input else slice(m, m + n)
+        return slice(0, m) if self.location.at_input else slice(m, m + n)
 
     def require_sound(self) -> float:
         """Check that the set is well posed and the observer possible; return ``||N||``, zero for the forms without a loop.
@@ -358,11 +315,11 @@ class ObserverProblem:
                     f"Observer synthesis: {name} has spectral radius {float(system.spectral_radius()):.9g}; it must be below 1, "
                     "use a stable model (identification guarantees it) and stable weights."
                 )
-        size = 0.0 if self.loop is None else hinf_norm(self.loop)
+        size = 0.0 if self.N is None else hinf_norm(self.N)
         if size >= 1:
             raise SynthesisError(
-                f"Observer synthesis: ||{self.place.loop_name}|| = {size:.6g} should be below 1 for {as_form(self.form).value.replace('_', ' ')} "
-                "uncertainty, otherwise the set contains ill-posed plants; choose another form or nominal, or leave outlying units out."
+                f"Observer synthesis: ||{self.location.N_name}|| = {size:.6g} should be below 1 for {as_form(self.form).value.replace('_', ' ')} "
+                "uncertainty, otherwise the set contains ill-posed plants; choose another form or nominal, or leave outliers out."
             )
         return size
 
@@ -372,24 +329,20 @@ class ObserverProblem:
         return self.process_noise / self.output_scale
 
     def error_plant(self) -> GeneralizedPlant:
-        """Unweighted error system in scaled coordinates: w = (d, r, n, v), z = W_p e, u = y^c, y = C e + n; v is process noise."""
-        return observer_plants.error_plant(self)
+        """Unweighted error system, scaled: w = (d, r, n, v), z = W_p e, y = C e + n; d acts at the input, r at the state, v is process noise."""
+        A, B, C, _ = self.scaled
+        n, m, q, eye = len(A), B.shape[1], len(C), np.eye
+        whole = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), self.nominal.dt)
+        w = {"d": m, "r": n, "n": q, "v": n}
+        error = {"error": eye(n), "r": eye(n)}
+        wires = {"error": {"d": B, "v": np.diag(self.scaled_process_noise), "u": -self.injection_matrix}, "W_p": error}
+        outputs = {"z": {"W_p": eye(self.performance.n_outputs)}, "y": {name: C for name in error} | {"n": eye(q)}}
+        system = interconnect({"error": whole, "W_p": self.performance}, wires, w | {"u": self.correction_size}, outputs)
+        return partitioned(system, w, {"z": self.performance.n_outputs})
 
     def error_system(self, controller: StateSpace) -> StateSpace:
         """Closed error system from (d, r, n, v), scaled, to W_p e, for a controller in physical units."""
         return self.error_plant().close(self.to_scaled(controller))
-
-    def generalized_plant(self) -> GeneralizedPlant:
-        """Whole problem in scaled coordinates, minimal, with named parts ``w1 w2 [w3] n [v] | u`` and ``z1 z2 [z3] | y``."""
-        return observer_plants.generalized_plant(self)
-
-    def shaped_plant(self, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
-        """Regularised plant for white noise through the shaping filters d (at the input) and r (at the state), w = (nu_d, nu_r, n, v)."""
-        return observer_plants.shaped_plant(self, d, r)
-
-    def mixed_plant(self, noise_floor: float = 1e-3, penalty_floor: float = 3e-2) -> GeneralizedPlant:
-        """Reduced, regularised, scaled form of (37)-(39): w1 = (inputs, n), w2 = output of Delta, z1 = (W_p e, penalty), z2 = input of Delta."""
-        return observer_plants.mixed_plant(self, noise_floor, penalty_floor)
 
     def _scales(self) -> tuple[Array, Array]:
         correction = self.input_scale if self.injection is Injection.INPUT else self.output_scale

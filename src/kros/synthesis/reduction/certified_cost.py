@@ -83,7 +83,7 @@ class CertifiedCost:
     loop: AffineLoop
     weight: Array
     freqs_hz: Array
-    port: slice
+    uncertainty_input: slice
     state: slice
     W_L: Array
     center: Array
@@ -99,7 +99,7 @@ class CertifiedCost:
         plant = problem.error_plant()
         closed, dt = plant.close(controller), plant.dt
         remainder = None
-        systems = [closed, problem.W_L, problem.chain, problem.loop, problem.remainder_left, problem.remainder_right]
+        systems = [closed, problem.W_L, problem.M, problem.N, problem.remainder_left, problem.remainder_right]
         poles = np.concatenate([s.poles() for s in systems if s is not None]).astype(complex)
         angle, weight = nodes(np.log(poles[(poles.imag >= 0) & (np.abs(poles) > 1e-3)]))
         freqs = angle / (2 * np.pi * dt)
@@ -112,8 +112,8 @@ class CertifiedCost:
         q = np.linalg.svd(ball.right, compute_uv=False)
         state = slice(m, m + n)
         loop, one, guard = AffineLoop(plant, controller.n_states), np.ones(len(freqs)), Guard.of(closed, angle)
-        cost = cls(loop, weight, freqs, problem.port, state, W_L, ball.center, ball.left, q, one, remainder, guard)
-        T = closed.frequency_response(freqs)[..., problem.port] @ W_L
+        cost = cls(loop, weight, freqs, problem.uncertainty_input, state, W_L, ball.center, ball.left, q, one, remainder, guard)
+        T = closed.frequency_response(freqs)[..., problem.uncertainty_input] @ W_L
         simple, _ = cost._simple(T)
         ratio = ball.bound(T) / np.maximum(simple, _TINY)
         return replace(cost, ratio=ratio)
@@ -124,16 +124,16 @@ class CertifiedCost:
         if not self.guard.allows(closed):
             return float("inf"), np.zeros_like(theta)
         left, T, right = self.loop.responses(theta, self.freqs_hz)
-        simple, towards = self._simple(T[..., self.port] @ self.W_L)
+        simple, towards = self._simple(T[..., self.uncertainty_input] @ self.W_L)
         amplitude, Gamma = self.ratio * simple, 2 * T
-        Gamma[..., self.port], Gamma[..., self.state] = 0.0, 0.0
+        Gamma[..., self.uncertainty_input], Gamma[..., self.state] = 0.0, 0.0
         remainder = None
         if self.remainder is not None:
             W_r, q = self.remainder
             size, remainder = _spread(T[..., self.state] @ W_r, q)
             amplitude = amplitude + size
             Gamma[..., self.state] += 2 * amplitude[:, None, None] * (remainder @ _hermitian(W_r))
-        Gamma[..., self.port] += 2 * (amplitude * self.ratio)[:, None, None] * (towards @ _hermitian(self.W_L))
+        Gamma[..., self.uncertainty_input] += 2 * (amplitude * self.ratio)[:, None, None] * (towards @ _hermitian(self.W_L))
         noise = T[..., self.state.stop :]
         value = float(self.weight @ (amplitude**2 + np.sum(np.abs(noise) ** 2, axis=(-2, -1))))
         weighted = self.weight[:, None, None] * Gamma
@@ -158,8 +158,8 @@ class CertifiedCost:
         """Responses of the error to what Theta drives, and of what Theta sees to the set's average disturbance and the noise."""
         left, _, right = self.loop.responses(theta, self.freqs_hz)
         energy = np.linalg.norm(self.q, axis=-1) / np.sqrt(self.left.shape[-1])
-        at_port = right[:, :, self.port] @ self.W_L
-        driven = [at_port @ self.center, at_port @ self.left * energy[:, None, None], right[:, :, self.state.stop :]]
+        at_input = right[:, :, self.uncertainty_input] @ self.W_L
+        driven = [at_input @ self.center, at_input @ self.left * energy[:, None, None], right[:, :, self.state.stop :]]
         if self.remainder is not None:
             W_r, q = self.remainder
             driven.append(right[:, :, self.state] @ W_r * (np.linalg.norm(q, axis=-1) / np.sqrt(W_r.shape[-1]))[:, None, None])

@@ -26,7 +26,7 @@ from .affine_loop import AffineLoop
 from .bounded_cost import BoundedCost
 from .certified_cost import CertifiedCost
 from .descent import bfgs
-from .purpose import ForObserver, purpose
+from .objective import ForObserver, purpose
 
 Array = npt.NDArray[Any]
 Cost = Callable[[Array], tuple[float, Array]]

@@ -26,6 +26,7 @@ from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.norms import h2_norm
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
+from ..problem.plants import generalized_plant
 from .disturbance import design_grid
 
 Array = npt.NDArray[Any]
@@ -45,7 +46,7 @@ def causal_h2(problem: ObserverProblem, controller: StateSpace) -> float:
     dt = problem.nominal.dt
     theta = np.geomspace(2 * np.pi * dt * design_grid(problem)[0], np.pi, _POINTS)
     parts = _Parts.of(problem, controller, theta / (2 * np.pi * dt), np.gradient(theta))
-    corners = np.geomspace(theta[0] * 10, 1.0, _LAGS) if problem.loop is not None else np.zeros(0)
+    corners = np.geomspace(theta[0] * 10, 1.0, _LAGS) if problem.N is not None else np.zeros(0)
     filters = [gain([[1.0]], dt)] + [_all_pass(np.exp(-corner), dt) for corner in corners]
     values, found, rests = [], [], []
     for start in parts.starts():
@@ -55,7 +56,7 @@ def causal_h2(problem: ObserverProblem, controller: StateSpace) -> float:
         rests.append(rest)
     order = np.argsort(-np.concatenate(values))[:_CHECKED]
     R, rest = np.concatenate(found), np.concatenate(rests)
-    closed = problem.generalized_plant().close(problem.to_scaled(controller))
+    closed = generalized_plant(problem).close(problem.to_scaled(controller))
     return max(h2_norm(perturbed(problem, closed, _times(filters[k % len(filters)], R[k]), gain(rest[k], dt))) for k in order)
 
 
@@ -72,7 +73,7 @@ def perturbed(problem: ObserverProblem, closed: StateSpace, delta: StateSpace, r
     rest : StateSpace, optional
         Perturbation of the remainder, from z3 to w3, where the problem has one.
     """
-    plant = problem.generalized_plant()
+    plant = generalized_plant(problem)
     acts = [plant.part("w", name) for name in ("w2", "w3") if name in plant.w_parts]
     sees = [plant.part("z", name) for name in ("z2", "z3") if name in plant.z_parts]
     u, y = np.concatenate(acts), np.concatenate(sees)
@@ -113,9 +114,9 @@ class _Parts:
         if problem.remainder_left is not None and problem.remainder_right is not None:
             T_r = response[..., m : m + n] @ problem.remainder_left.frequency_response(freqs_hz)
             M_r = (problem.remainder_right @ problem.input_weight).frequency_response(freqs_hz)
-        N = None if problem.loop is None else problem.loop.frequency_response(freqs_hz)
-        T = response[..., problem.port] @ problem.W_L.frequency_response(freqs_hz)
-        return cls(T, problem.chain.frequency_response(freqs_hz), N, T_r, M_r, freqs_hz)
+        N = None if problem.N is None else problem.N.frequency_response(freqs_hz)
+        T = response[..., problem.uncertainty_input] @ problem.W_L.frequency_response(freqs_hz)
+        return cls(T, problem.M.frequency_response(freqs_hz), N, T_r, M_r, freqs_hz)
 
     def starts(self) -> list[Array]:
         """The identity, its negative, and what aligns the largest directions of T and M over all frequencies."""

@@ -30,7 +30,7 @@ def density(problem: ObserverProblem, loop: StateSpace, freqs_hz: Array) -> Arra
     """Certified worst-case power density of ``W_p e``, shape (f,), for the closed error system `loop`."""
     m, n = problem.nominal.n_inputs, problem.nominal.n_states
     response = loop.frequency_response(freqs_hz)
-    T = response[..., problem.port] @ problem.W_L.frequency_response(freqs_hz)
+    T = response[..., problem.uncertainty_input] @ problem.W_L.frequency_response(freqs_hz)
     uncertain = uncertain_ball(problem, freqs_hz).bound(T)
     if problem.remainder_left is not None and problem.remainder_right is not None:
         left = response[..., m : m + n] @ problem.remainder_left.frequency_response(freqs_hz)
@@ -68,7 +68,7 @@ def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5
 
 def _log_poles(problem: ObserverProblem, loop: StateSpace) -> Array:
     """Logarithms of all poles, in the upper half plane."""
-    systems = [loop, problem.W_L, problem.chain, problem.loop, problem.remainder_left, problem.remainder_right]
+    systems = [loop, problem.W_L, problem.M, problem.N, problem.remainder_left, problem.remainder_right]
     poles = np.concatenate([s.poles() for s in systems if s is not None]).astype(complex)
     poles = poles[(poles.imag >= 0) & (np.abs(poles) > 1e-3)]
     return np.log(poles)

@@ -78,8 +78,8 @@ class Shaping:
         """Return the shaped disturbances at the input, m outputs, and at the state, n outputs."""
         m, n, dt = problem.nominal.n_inputs, problem.nominal.n_states, problem.nominal.dt
         shaped = self.filters if self.behind is None else self.behind @ self.filters
-        at_input = shaped if problem.place.at_input else gain(np.zeros((m, 0)), dt)
-        at_state = [s for s in (None if problem.place.at_input else shaped, self.remainder) if s is not None]
+        at_input = shaped if problem.location.at_input else gain(np.zeros((m, 0)), dt)
+        at_state = [s for s in (None if problem.location.at_input else shaped, self.remainder) if s is not None]
         return at_input, _sum(at_state) if at_state else gain(np.zeros((n, 0)), dt)
 
 
@@ -99,10 +99,10 @@ def _sum(systems: list[StateSpace]) -> StateSpace:
 
 def uncertain_ball(problem: ObserverProblem, freqs_hz: Array) -> Ball:
     """Return the ball of ``Delta (I - N Delta)^-1 M``."""
-    M = problem.chain.frequency_response(freqs_hz)
-    if problem.loop is None:
+    M = problem.M.frequency_response(freqs_hz)
+    if problem.N is None:
         return Ball.without_loop(M, problem.W_L.n_inputs)
-    return Ball.of(problem.loop.frequency_response(freqs_hz), M)
+    return Ball.of(problem.N.frequency_response(freqs_hz), M)
 
 
 def is_diagonal(system: StateSpace) -> bool:
@@ -122,9 +122,9 @@ def is_diagonal(system: StateSpace) -> bool:
 
 def symmetric(problem: ObserverProblem) -> bool:
     """Tell whether the set keeps every change of signs, so that the diagonal of any element's spectrum is an average over the set."""
-    if problem.loop is None:
+    if problem.N is None:
         return True
-    place = problem.place
+    place = problem.location
     return place.sees_input and place.at_input and all(is_diagonal(s) for s in (problem.W_L, problem.W_R, problem.input_weight))
 
 
@@ -174,7 +174,7 @@ class Channels:
 
     def worst(self, controller: StateSpace) -> tuple[Array, Array]:
         """Spectrum of the element of the set that is (locally) worst for a given observer, and its contraction."""
-        T = self.problem.error_system(controller).frequency_response(self.freqs_hz)[..., self.problem.port] @ self.left
+        T = self.problem.error_system(controller).frequency_response(self.freqs_hz)[..., self.problem.uncertainty_input] @ self.left
         theta = self.ball.worst(T)
         return self.shaped(self.ball.spectrum(theta)), theta
 

@@ -49,8 +49,8 @@ class Everywhere:
         self.channels, self.dt = channels, problem.nominal.dt
         inside = 2 * np.pi * self.dt * channels.freqs_hz
         self.edges = np.unique(np.concatenate([[0.0], inside[inside < np.pi * (1 - 1e-9)], [np.pi]]))
-        self.chain = Enclosure(problem.chain)
-        self.loop = None if problem.loop is None else Enclosure(problem.loop)
+        self.M = Enclosure(problem.M)
+        self.N = None if problem.N is None else Enclosure(problem.N)
         self.remainder: tuple[Enclosure, Enclosure] | None = None
         if problem.remainder_left is not None and problem.remainder_right is not None:
             self.remainder = Enclosure(problem.remainder_left), Enclosure(problem.remainder_right @ problem.input_weight)
@@ -80,11 +80,11 @@ class Everywhere:
 
     def disturbance(self, spectrum: Spectrum, theta: Array, half: Array) -> tuple[Array, Array]:
         """Magnitude of every component of w2: what is proven on the arcs and what is seen in the middle, (k, b)."""
-        M, reach_M = self.chain(theta, half)
+        M, reach_M = self.M(theta, half)
         size_M, distance = np.linalg.norm(M, axis=(-2, -1)), np.linalg.norm(reach_M, axis=-1)
         N = None
-        if self.loop is not None:
-            N, reach_N = self.loop(theta, half)
+        if self.N is not None:
+            N, reach_N = self.N(theta, half)
             far, nu = np.linalg.norm(reach_N, axis=-1), np.linalg.norm(N, 2, axis=(-2, -1))
             room = 1 - nu - far
             with np.errstate(invalid="ignore"):
@@ -100,10 +100,10 @@ class Everywhere:
 
         ``I - N^H N`` grows by at most ``eta = epsilon_N (2 nu + epsilon_N)`` on the arc, so its inverse keeps ``1 / (1 + eta / (1 - nu^2))``.
         """
-        M, reach_M = self.chain(theta, half)
+        M, reach_M = self.M(theta, half)
         N, far, nu = None, np.zeros(len(theta)), np.zeros(len(theta))
-        if self.loop is not None:
-            N, reach_N = self.loop(theta, half)
+        if self.N is not None:
+            N, reach_N = self.N(theta, half)
             far, nu = np.linalg.norm(reach_N, axis=-1), np.linalg.norm(N, 2, axis=(-2, -1))
         ball, slack = self.channels.ball_of(N, M), 1 - nu**2
         root, q = np.sqrt(below(ball.symmetric_part())), np.linalg.norm(ball.right, 2, axis=(-2, -1))

@@ -35,6 +35,7 @@ from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import crossings, gramian, to_continuous
 from ..problem.observer_problem import ObserverProblem
+from ..problem.plants import generalized_plant
 from .disturbance import design_grid, uncertain_ball
 
 Array = npt.NDArray[Any]
@@ -75,7 +76,7 @@ class _Constraint:
     def of(cls, problem: ObserverProblem, loop: StateSpace, freqs_hz: Array) -> _Constraint:
         m, n = problem.nominal.n_inputs, problem.nominal.n_states
         response = loop.frequency_response(freqs_hz)
-        T = response[..., problem.port] @ problem.W_L.frequency_response(freqs_hz)
+        T = response[..., problem.uncertainty_input] @ problem.W_L.frequency_response(freqs_hz)
         ball = uncertain_ball(problem, freqs_hz)
         noise = response[..., m + n :]
         noise = noise[..., np.concatenate([np.full(len(problem.C), True), problem.scaled_process_noise > 0])]
@@ -179,7 +180,7 @@ def robust_gain(problem: ObserverProblem, controller: StateSpace) -> RobustGain:
 def _first_grid(problem: ObserverProblem, loop: StateSpace) -> Array:
     """DC, Nyquist, a logarithmic grid, and the frequencies of all poles."""
     dt = problem.nominal.dt
-    systems = [loop, problem.W_L, problem.chain, problem.loop, problem.remainder_left, problem.remainder_right]
+    systems = [loop, problem.W_L, problem.M, problem.N, problem.remainder_left, problem.remainder_right]
     poles = np.concatenate([s.poles() for s in systems if s is not None]).astype(complex)
     angles = np.abs(np.angle(poles[np.abs(poles) > 1e-3])) / (2 * np.pi * dt)
     return np.unique(np.concatenate([[0.0], design_grid(problem)[::4], angles, [0.5 / dt]]))
@@ -189,7 +190,7 @@ def _walk(
     problem: ObserverProblem, loop: StateSpace, controller: StateSpace, found: float, freq_hz: float, margin: float
 ) -> RobustGain | None:
     """Prove the level from DC to Nyquist; raise it where a frequency in between turns out to be worse. None when it takes too many steps."""
-    plant = problem.generalized_plant()
+    plant = generalized_plant(problem)
     closed = to_continuous(_evened(plant.close(problem.to_scaled(controller))))
     dt = problem.nominal.dt
     rows = np.concatenate([np.full(size, {"z2": 0, "z3": 1}.get(name, -1)) for name, size in plant.z_parts.items()])

@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from ...core.lti import StateSpace
 from ..problem.observer_problem import ObserverProblem
+from ..problem.plants import shaped_plant
 from ..result import Injection
 from ..riccati.constant_gain import predictor
 from ..riccati.filter_bound import predictor_bound
@@ -81,7 +82,7 @@ def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:
     """Return the filter that is H2-optimal for the shaped disturbances, in physical units."""
     d, r = shaping.ports(problem)
     if problem.injection is Injection.INPUT or problem.performance.n_states:
-        return problem.to_physical(h2(problem.shaped_plant(d, r), problem.injection).controller)
+        return problem.to_physical(h2(shaped_plant(problem, d, r), problem.injection).controller)
     return problem.to_physical(_kalman(problem, d, r))
 
 

@@ -26,7 +26,6 @@ from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import h2_norm, hinf_norm
 from ..problem.interconnect import interconnect
-from ..problem.observer_plants import injection_matrix
 from ..problem.observer_problem import ObserverProblem
 from .certificate import certify, density
 from .disturbance import design_grid
@@ -146,7 +145,7 @@ def unit_error(problem: ObserverProblem, controller: StateSpace, A_p: Array, B_p
     }
     wires = {
         "unit": {"W_u": B_p},
-        "error": {"unit": A_p - A, "W_u": B_p - B, "K": -injection_matrix(problem)},
+        "error": {"unit": A_p - A, "W_u": B_p - B, "K": -problem.injection_matrix},
         "K": {"error": C},
         "W_u": {"w1": np.eye(problem.input_weight.n_inputs)},
         "W_p": {"error": eye},

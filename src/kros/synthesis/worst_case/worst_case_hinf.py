@@ -28,8 +28,8 @@ from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.norms import hinf_norm
 from ..generalized_plant import GeneralizedPlant
-from ..problem.observer_plants import shape_inputs
 from ..problem.observer_problem import ObserverProblem
+from ..problem.plants import shape_inputs, shaped_plant
 from ..result import Status, Synthesis, enclosed
 from ..riccati.hinf_optimal import hinf
 from .ball import below
@@ -96,7 +96,7 @@ def worst_case_hinf(
         shaping = channels.shaping(spectrum, fit, "above", options)
         start = time.perf_counter()
         try:
-            found = hinf(problem.shaped_plant(*shaping.ports(problem)), tolerance=tolerance, injection=problem.injection)
+            found = hinf(shaped_plant(problem, *shaping.ports(problem)), tolerance=tolerance, injection=problem.injection)
             controller = problem.to_physical(found.controller)
             value = robust_gain(problem, controller)
         except SynthesisError as error:
@@ -153,7 +153,7 @@ def dominating(channels: Channels, loop: StateSpace) -> Spectrum:
     problem, ball = channels.problem, channels.ball
     m, n = problem.nominal.n_inputs, problem.nominal.n_states
     response = loop.frequency_response(channels.freqs_hz)
-    T = response[..., problem.port] @ channels.left
+    T = response[..., problem.uncertainty_input] @ channels.left
     Q = [ball.right]
     sizes = [_norm(T @ ball.left) * _norm(ball.right)]
     if problem.remainder_left is not None and problem.remainder_right is not None:
@@ -166,7 +166,7 @@ def dominating(channels: Channels, loop: StateSpace) -> Spectrum:
     for t, matrix in zip(share, Q, strict=True):
         inner = inner - (t / np.maximum(_norm(matrix), 1e-300) ** 2)[:, None, None] * (_turn(matrix) @ matrix)
     psi = (_norm(Q[0]) ** 2 / share[0])[:, None, None] * (ball.left @ _turn(ball.left))
-    if problem.loop is not None:
+    if problem.N is not None:
         psi = psi + ball.center @ np.linalg.pinv(inner, rcond=1e-9, hermitian=True) @ _turn(ball.center)
     phi = channels.shaped(np.real(np.einsum("fii->fi", psi)))
     if len(Q) == 1:

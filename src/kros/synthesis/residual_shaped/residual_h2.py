@@ -28,7 +28,7 @@ from ...core.norms import gramian, h2_norm
 from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.constant_gain import kalman
 from ..riccati.filter_bound import predictor_bound
-from .shaping import Bank, circle_weights, shaping_filter
+from .shaping_filter import Bank, circle_weights, shaping_filter
 
 Array = npt.NDArray[np.float64]
 Spectra = npt.NDArray[Any]

@@ -24,8 +24,8 @@ from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..result import Synthesis
 from .balancing import Balancing, gramian_root
+from .objective import Purpose, purpose
 from .polishing import polish
-from .purpose import Purpose, purpose
 
 _NEGLIGIBLE = 1e-10
 

@@ -1,6 +1,6 @@
 r"""Generalized plants of the observer problem, in scaled coordinates.
 
-For every form, with the perturbed plant in its place (`perturbation`) and the observer (18)-(21) beside it::
+For every form, with the perturbed plant in it (`uncertainty_location`) and the observer (18)-(21) beside it::
 
     w1 -> W_u -+-> s                       s, or x = G (s + [W_L w2]) + [W_L w2] -> W_R -> z2 ... Delta ... w2
                |                                   (what an inverse form sees contains W_L w2)
@@ -23,45 +23,36 @@ s : scaled input;  xi : what the observer's loop can see of the error;  e : erro
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace, block_diagonal, gain
-from ..generalized_plant import GeneralizedPlant
-from ..result import Injection
+from ..generalized_plant import GeneralizedPlant, partitioned
 from .interconnect import interconnect
-
-if TYPE_CHECKING:
-    from .observer_problem import ObserverProblem
+from .observer_problem import ObserverProblem
 
 Array = npt.NDArray[Any]
-
-
-def injection_matrix(problem: ObserverProblem) -> Array:
-    """J: the correction enters through the inputs or on the state itself."""
-    A, B, _, _ = problem.scaled
-    return B if problem.injection is Injection.INPUT else np.eye(len(A))
 
 
 def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     """Whole problem: w = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); the brackets stand for a remainder and process noise, where there are any."""
     A, B, C, _ = problem.scaled
-    place, J, eye = problem.place, injection_matrix(problem), np.eye
+    location, J, eye = problem.location, problem.injection_matrix, np.eye
     n, m, q = len(A), B.shape[1], len(C)
     whole = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), problem.nominal.dt)
     blocks = {"error": whole, "W_p": problem.performance, "W_u": problem.input_weight, "W_L": problem.W_L, "W_R": problem.W_R}
     inputs = {"w1": m, "w2": problem.W_L.n_inputs}
-    error = {"error": eye(n)} | ({} if place.at_input else {"W_L": eye(n)})
-    drive = {"u": -J} | ({"W_L": B} if place.at_input else {})
-    own = {"W_L": eye(problem.W_L.n_outputs)} if place.inverse else {}
-    seen = {"W_u": eye(m)} if place.sees_input else {"plant": eye(n)}
+    error = {"error": eye(n)} | ({} if location.at_input else {"W_L": eye(n)})
+    drive = {"u": -J} | ({"W_L": B} if location.at_input else {})
+    own = {"W_L": eye(problem.W_L.n_outputs)} if location.inverse else {}
+    seen = {"W_u": eye(m)} if location.sees_input else {"plant": eye(n)}
     wires: dict[str, dict[str, Array]] = {"W_u": {"w1": eye(m)}, "W_L": {"w2": eye(inputs["w2"])}}
-    if not place.sees_input:
+    if not location.sees_input:
         blocks["plant"] = whole
-        wires["plant"] = {"W_u": B} | ({"W_L": B} if place.inverse and place.at_input else {})
-    wires["W_R"] = seen | (own if place.at_input is place.sees_input else {})
+        wires["plant"] = {"W_u": B} | ({"W_L": B} if location.inverse and location.at_input else {})
+    wires["W_R"] = seen | (own if location.at_input is location.sees_input else {})
     outputs = {"z1": {"W_p": eye(problem.performance.n_outputs)}, "z2": {"W_R": eye(problem.W_R.n_outputs)}}
     if problem.remainder_left is not None and problem.remainder_right is not None:
         blocks |= {"W_rL": problem.remainder_left, "W_rR": problem.remainder_right}
@@ -80,36 +71,14 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     return partitioned(system, inputs, parts_z)
 
 
-def partitioned(system: StateSpace, w: dict[str, int], z: dict[str, int]) -> GeneralizedPlant:
-    """Cut a system from (w, u) to (z, y) into the nine matrices; channel 1 is all but the perturbation's part."""
-    n_w, n_z = sum(w.values()), sum(z.values())
-    B, C, D = system.B, system.C, system.D
-    matrices = (system.A, B[:, :n_w], B[:, n_w:], C[:n_z], C[n_z:], D[:n_z, :n_w], D[:n_z, n_w:], D[n_z:, :n_w], D[n_z:, n_w:])
-    return GeneralizedPlant(*matrices, system.dt, n_w1=w.get("w1"), n_z1=z.get("z1"), w_parts=w, z_parts=z)
-
-
-def error_plant(problem: ObserverProblem) -> GeneralizedPlant:
-    """Unweighted error system: w = (d, r, n, v), z = W_p e, y = C e + n; d acts at the input, r at the state, v is process noise."""
-    A, B, C, _ = problem.scaled
-    n, m, q, eye = len(A), B.shape[1], len(C), np.eye
-    J = injection_matrix(problem)
-    whole = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), problem.nominal.dt)
-    w = {"d": m, "r": n, "n": q, "v": n}
-    error = {"error": eye(n), "r": eye(n)}
-    wires = {"error": {"d": B, "v": np.diag(problem.scaled_process_noise), "u": -J}, "W_p": error}
-    outputs = {"z": {"W_p": eye(problem.performance.n_outputs)}, "y": {name: C for name in error} | {"n": eye(q)}}
-    system = interconnect({"error": whole, "W_p": problem.performance}, wires, w | {"u": J.shape[1]}, outputs)
-    return partitioned(system, w, {"z": problem.performance.n_outputs})
-
-
 def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
     """White noise through shaping filters at the input and at the state, penalty on the correction: w = (nu_d, nu_r, n, v)."""
     q, n = len(problem.C), problem.nominal.n_states
     filters = block_diagonal([d, r, gain(np.eye(q + n), problem.nominal.dt)])
-    return penalise(shape_inputs(error_plant(problem), filters), problem.correction_penalty)
+    return penalise(shape_inputs(problem.error_plant(), filters), problem.correction_penalty)
 
 
-def mixed_plant(problem: ObserverProblem, noise_floor: float, penalty_floor: float) -> GeneralizedPlant:
+def mixed_plant(problem: ObserverProblem, noise_floor: float = 1e-3, penalty_floor: float = 3e-2) -> GeneralizedPlant:
     """Reduced, regularised form of (37)-(39) for every form: w = (w1, n, w2), z = (W_p e, penalty, z2).
 
     The remainder has no place in this problem and is left to the certificate. With the noise of a good encoder the covariances span twelve

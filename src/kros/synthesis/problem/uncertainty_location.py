@@ -38,7 +38,7 @@ from ...uncertainty.forms import Form
 
 
 @dataclass(frozen=True)
-class Place:
+class UncertaintyLocation:
     """Where a perturbation acts, and what it sees.
 
     Parameters
@@ -56,8 +56,8 @@ class Place:
     inverse: bool
 
     @property
-    def loop_name(self) -> str:
-        """The loop N in words."""
+    def N_name(self) -> str:  # noqa: N802
+        """What N is made of."""
         if not self.inverse:
             return "0"
         return "W_R W_L" if self.at_input is self.sees_input else "W_R G W_L"
@@ -66,22 +66,22 @@ class Place:
         """Rows of W_L and columns of W_R, for n states and m inputs."""
         return (m if self.at_input else n), (m if self.sees_input else n)
 
-    def chain(self, W_R: StateSpace, G: StateSpace, W_u: StateSpace) -> StateSpace:
+    def M(self, W_R: StateSpace, G: StateSpace, W_u: StateSpace) -> StateSpace:  # noqa: N802
         """From the disturbance to what Delta sees: M."""
         return W_R @ W_u if self.sees_input else W_R @ (G @ W_u)
 
-    def loop(self, W_R: StateSpace, G: StateSpace, W_L: StateSpace) -> StateSpace | None:
+    def N(self, W_R: StateSpace, G: StateSpace, W_L: StateSpace) -> StateSpace | None:  # noqa: N802
         """From what Delta does to what it sees: N; None where there is no loop."""
         if not self.inverse:
             return None
         return W_R @ W_L if self.at_input is self.sees_input else W_R @ (G @ W_L)
 
 
-PLACES = {
-    Form.ADDITIVE: Place(at_input=False, sees_input=True, inverse=False),
-    Form.INPUT_MULTIPLICATIVE: Place(at_input=True, sees_input=True, inverse=False),
-    Form.OUTPUT_MULTIPLICATIVE: Place(at_input=False, sees_input=False, inverse=False),
-    Form.INVERSE_ADDITIVE: Place(at_input=True, sees_input=False, inverse=True),
-    Form.INVERSE_INPUT_MULTIPLICATIVE: Place(at_input=True, sees_input=True, inverse=True),
-    Form.INVERSE_OUTPUT_MULTIPLICATIVE: Place(at_input=False, sees_input=False, inverse=True),
+LOCATIONS = {
+    Form.ADDITIVE: UncertaintyLocation(at_input=False, sees_input=True, inverse=False),
+    Form.INPUT_MULTIPLICATIVE: UncertaintyLocation(at_input=True, sees_input=True, inverse=False),
+    Form.OUTPUT_MULTIPLICATIVE: UncertaintyLocation(at_input=False, sees_input=False, inverse=False),
+    Form.INVERSE_ADDITIVE: UncertaintyLocation(at_input=True, sees_input=False, inverse=True),
+    Form.INVERSE_INPUT_MULTIPLICATIVE: UncertaintyLocation(at_input=True, sees_input=True, inverse=True),
+    Form.INVERSE_OUTPUT_MULTIPLICATIVE: UncertaintyLocation(at_input=False, sees_input=False, inverse=True),
 }

@@ -16,8 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
-from scipy.signal import lfilter
 
 Array = npt.NDArray[np.float64]
 Model = tuple[Array, Array, Array]
@@ -63,6 +61,8 @@ class Block:
 
     def _through(self, signals: Array, rest: Array) -> tuple[Array, Array]:
         """Signals through the scalar filter, and their rest."""
+        from scipy.signal import lfilter
+
         F = self.F
         poles = np.array([1.0, -F[0, 0]] if len(F) == 1 else [1.0, -np.trace(F), np.linalg.det(F)])
         at_rest = rest / poles.sum()
@@ -94,6 +94,8 @@ def _modes(F: Array) -> Array:
 
 def joined(blocks: Sequence[Block]) -> Model:
     """Return one model of all blocks."""
+    from scipy.linalg import block_diag
+
     return (
         np.asarray(block_diag(*(b.F for b in blocks))),
         np.vstack([b.G for b in blocks]),

@@ -120,7 +120,7 @@ class RunningObserver:
         Parameters
         ----------
         y : array_like, shape (q,)
-            NaN, or infinite, where a measurement is missing or too late: it corrects nothing at this step.
+            NaN, or infinite, where a measurement is missing or too old: it corrects nothing at this step.
         u : array_like, shape (m,)
             Not finite where it is not known: the last good value stands for it, zero before the first. What is implausible: see `screen`.
 
@@ -147,7 +147,7 @@ class RunningObserver:
         return self._screen.take(y[None, None], u[None, None], held)
 
     def _take(self, y: Array, u: Array) -> tuple[Array, Array]:
-        """Judge a sample, and start anew where that is due; the first sample is the one that the observer started at."""
+        """Judge a sample, and start again where that is due; the first sample is the one that the observer started at."""
         samples = self._judge(y, u, self._held)
         self._status, self._held = SampleStatus(int(samples.status[0, 0])), samples.held
         first, self._fresh = self._fresh, False

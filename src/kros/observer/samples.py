@@ -51,7 +51,7 @@ class Held:
     since : ndarray of int, shape (batch, m)
         Samples since then.
     stale : ndarray of bool, shape (batch,)
-        Whether the observer starts anew at the next sample with a measurement and all inputs.
+        Whether the observer starts again at the next sample with a measurement and all inputs.
     """
 
     inputs: Array
@@ -77,7 +77,7 @@ class Screened:
     status : ndarray of uint8, shape (n_samples, batch)
         Bits of `SampleStatus`.
     starts : ndarray of bool, shape (n_samples, batch)
-        Samples at which an observer starts anew.
+        Samples at which an observer starts again.
     held : Held
         After the last sample.
     """

@@ -14,7 +14,7 @@ none either: however large a command is, the machine gets the limit. So nothing 
 lifted, and what is left of a fault is what the model misses while it lasts.
 
 Observers start at a measurement. Where none has arrived yet, or no value of some input, the estimate is that from rest, and the observer starts
-anew at the first sample at which there are both. It does so, too, after an input was held for more than a few samples: what a held reference
+again at the first sample at which there are both. It does so, too, after an input was held for more than a few samples: what a held reference
 does to an observer that watches tracking errors grows with every sample, and a start costs no more than a start. Parameters stay.
 """
 

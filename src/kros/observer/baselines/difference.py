@@ -100,7 +100,7 @@ class FilteredDifference:
 
 
 def rates(channels: Iterable[Channel], measured: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """Return which states are rates of measured ones, told by their units, such as rad and rad/s.
+    """Return which states are rates of measured ones, found by their units, such as rad and rad/s.
 
     Parameters
     ----------

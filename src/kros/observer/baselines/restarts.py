@@ -1,4 +1,4 @@
-"""Restarts of estimators that know nothing of them: run once more from each sample at which an observer starts anew (`screen`)."""
+"""Restarts of estimators that know nothing of them: run once more from each sample at which an observer starts again (`screen`)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = npt.NDArray[np.float64]
 
 
 def restarted(run: Callable[[Array, Array, Mapping[str, Any]], Array], samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
-    """Run a batch, and every member once more from each sample at which it starts anew to the next; shape (n_samples, batch, n).
+    """Run a batch, and every member once more from each sample at which it starts again to the next; shape (n_samples, batch, n).
 
     Parameters
     ----------

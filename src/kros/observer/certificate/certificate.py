@@ -1,4 +1,4 @@
-r"""Certificate of an observer as it runs: retracted and lifted anew at every step.
+r"""Certificate of an observer as it runs: retracted and re-lifted at every step.
 
 For every true trajectory and every sequence of measurement noise, whatever machine they come from,
 
@@ -9,8 +9,9 @@ its *frozen response* e', the linear response to the same omega and n with every
 
 .. math:: \|e - e'\|_2 \le \kappa \, \|q'\|_2,    q' = M e' the largest movement of the lifted functions that e' can cause.
 
-Since e' is computed for the residual as it was, this bound uses its whole course, and not its energy alone. The ladder: a Riccati equation with multipliers;
-a semidefinite program over the corners; one whose Lyapunov function knows the next slopes. What is returned was proven in exact arithmetic.
+Since e' is computed for the residual as it was, this bound uses its whole course, and not its energy alone. Methods, in this order: a Riccati equation
+with multipliers; a semidefinite program over the corners; one whose Lyapunov function knows the next slopes. What is returned was proven in exact
+arithmetic.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class ReliftCertificate:
     lower_bound : float or None
         Gain that a frozen slope attains: no certificate of any kind is below it.
     roots : ndarray, shape (n_words, n_xi, n_xi)
-        Upper triangular factors of the Lyapunov matrices, ``P = R'R``; one without memory.
+        Upper triangular factors of the Lyapunov matrices, ``P = R'R``; one where slopes to come are not looked at.
     corners : ndarray, shape (n_corners, n_p)
         Places of the slopes in their intervals, -1 or 1.
     multipliers : ndarray, shape (n_p,)
@@ -69,7 +70,7 @@ class ReliftCertificate:
     clipped : bool
         What was asked; see `relift_certificate`.
     method : str
-        Rung of the ladder.
+        By which method.
     solve_s : float
     """
 
@@ -113,15 +114,15 @@ class ReliftCertificate:
         x, u = factors(observer, sizes)
         n, lifting = observer.lifting.n_states, observer.lifting
         by_name = dict(zip((*lifting.states, *observer.inputs), np.concatenate([x[:n], u[: len(observer.inputs)]]), strict=True))
-        errors = [by_name[name.partition("[")[0]] for name in lifting.window.names if name.partition("[")[0] in lifting.states]
+        errors = [by_name[name] for name, _ in lifting.window.quantities if name in lifting.states]
         y = x[list(observer.measured)]
         scales = ReliftScales(self.scales.error * x[:n], self.scales.residual * x[:n], self.scales.noise * y)
         box = {name: tuple(np.multiply(value, by_name.get(name, 1.0)).tolist()) for name, value in self.box.items()}
-        told = tuple(text.replace(_ranges(self.box), _ranges(box)) for text in self.assumptions) if box else self.assumptions
+        assumptions = tuple(text.replace(_ranges(self.box), _ranges(box)) for text in self.assumptions) if box else self.assumptions
         roots = self.roots.copy()
         if roots.size:
             roots[:, :, : len(errors)] /= errors
-        return replace(self, scales=scales, box=box, assumptions=told, roots=roots)
+        return replace(self, scales=scales, box=box, assumptions=assumptions, roots=roots)
 
     def save(self, folder: Path) -> None:
         """Write ``relift.json`` and ``arrays.npz``."""
@@ -154,7 +155,7 @@ def relift_certificate(
     *,
     clipped: bool = False,
     dropped: Dropped | str = Dropped.NEVER,
-    memory: int = 1,
+    lookahead: int = 1,
     mismatch: bool = True,
     tight: bool = False,
     time_limit_s: float = 20.0,
@@ -175,12 +176,12 @@ def relift_certificate(
         The lifted functions see the estimate clipped to the box; then only the true state has to stay inside.
     dropped : Dropped or str
         What the observer does without a measurement, where any may be missing, in any pattern.
-    memory : int
+    lookahead : int
         How many coming slopes the Lyapunov function may know, where one matrix does not do.
     mismatch : bool
         Whether to certify the distance from the frozen response as well.
     tight : bool
-        Climb on for a lower gain where the first proof is more than ten percent above what frozen slopes attain.
+        Go on for a lower gain where the first proof is more than ten percent above what frozen slopes attain.
     time_limit_s : float
         For each semidefinite program.
 
@@ -228,12 +229,12 @@ def relift_certificate(
     modes = [system, *without_measurement(observer, system, dropped)]
     few = system.corner_count <= MOST_CORNERS
     places = np.array(list(product((-1.0, 1.0), repeat=system.L.shape[1]))) if few else np.zeros((0, system.L.shape[1]))
-    found, reason, status = prove(modes, memory, time_limit_s, tight=tight)
+    found, reason, status = prove(modes, lookahead, time_limit_s, tight=tight)
     common = replace(empty, corners=places, channels=system.channels, status=status, reason=reason)
     if found is None:
         return replace(common, solve_s=time.perf_counter() - start)
     proposal, spare = found
-    kappa = mismatch_gain(modes, memory, time_limit_s) if mismatch else None
+    kappa = mismatch_gain(modes, lookahead, time_limit_s) if mismatch else None
     return replace(
         common,
         certified=True,
@@ -257,19 +258,19 @@ _WITHOUT = {
 
 def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None, dropped: Dropped, *, clipped: bool) -> tuple[str, ...]:
     """Return what has to hold, in words."""
-    told = ["the machine and the observer have the same inputs", "machine and observer lift with the same parameters"]
+    found = ["the machine and the observer have the same inputs", "machine and observer lift with the same parameters"]
     if parameters:
-        told.append(f"parameters within {_ranges(parameters)}")
+        found.append(f"parameters within {_ranges(parameters)}")
     elif observer.lifting.parameters:
-        told.append(f"any value of {', '.join(observer.lifting.parameters)}")
+        found.append(f"any value of {', '.join(observer.lifting.parameters)}")
     if box and clipped:
-        told.append(f"the true state stays within {_ranges(box)}, and lifted functions see the estimate clipped to it")
+        found.append(f"the true state stays within {_ranges(box)}, and lifted functions see the estimate clipped to it")
     elif box:
-        told.append(f"true and estimated state stay within {_ranges(box)}")
-    told.append("every measurement arrives" if dropped is Dropped.NEVER else f"any measurement may be missing; {_WITHOUT[dropped]}")
+        found.append(f"true and estimated state stay within {_ranges(box)}")
+    found.append("every measurement arrives" if dropped is Dropped.NEVER else f"any measurement may be missing; {_WITHOUT[dropped]}")
     if observer.seen is not None:
-        told.append("no measurement and no input is refused as implausible")
-    return tuple(told)
+        found.append("no measurement and no input is refused as implausible")
+    return tuple(found)
 
 
 def _ranges(box: Box) -> str:

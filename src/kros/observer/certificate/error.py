@@ -31,7 +31,7 @@ import numpy.typing as npt
 from ...core.errors import DimensionError, KrosError
 from ...core.lti import StateSpace
 from ...lifting.continuity import break_of, slope_bounds_of
-from ...synthesis.result import Injection
+from ...lifting.formula import delayed_name
 from ..data import ObserverData
 from .status import Dropped
 
@@ -163,10 +163,6 @@ class ErrorSystem:
         width = self.L.shape[1]
         return replace(self, B=np.zeros((len(self.A), width)), D=np.eye(width))
 
-    def output(self, rows: Any) -> ErrorSystem:
-        """Return the system with some of the scaled errors as its output."""
-        return replace(self, C=np.atleast_2d(self.C[rows]))
-
 
 def error_system(
     observer: ObserverData,
@@ -206,7 +202,8 @@ def error_system(
             f"Re-lift scales of observer {observer.name}: needs {n} errors, {n} residuals and {q} noises, found {scales.error.shape}, "
             f"{scales.residual.shape}, {scales.noise.shape}."
         )
-    names = [name for i, name in enumerate(lifting.window.names) if i < n or name.partition("[")[0] in lifting.states]
+    lags = [(name, delay) for name, delay in lifting.window.quantities if name in lifting.states]
+    names = [delayed_name(name, d) for name, d in lags]
     lower, upper = slope_box(observer, names, box, parameters, clipped=clipped)
     columns = np.hstack([observer.A[:n, n:], observer.B[:n, len(observer.inputs) :]])
     functions = lifting.functions + lifting.input_functions
@@ -214,13 +211,12 @@ def error_system(
 
     h, order = len(names), K.n_states
     selector = np.eye(n, h)[list(observer.measured)]
-    into = (observer.B if observer.injection is Injection.INPUT else np.eye(observer.A.shape[0]))[:n]
+    into = observer.into[:n]
     A = np.zeros((h + order, h + order))
     A[:n, :n] = observer.A[:n, :n]
     A[:n, :h] += columns @ middle - into @ K.D @ selector
-    for row in range(n, h):
-        base, depth = names[row][:-1].split("[-")
-        A[row, names.index(base if depth == "1" else f"{base}[-{int(depth) - 1}]")] = 1.0
+    for row, (name, d) in enumerate(lags[n:], n):
+        A[row, lags.index((name, d - 1))] = 1.0
     A[:n, h:], A[h:, :h], A[h:, h:] = -into @ K.C, K.B @ selector, K.A
     B = np.zeros((h + order, n + q))
     B[:n, :n], B[:n, n:], B[h:, n:] = np.diag(scales.residual), -into @ K.D * scales.noise, K.B * scales.noise
@@ -230,8 +226,8 @@ def error_system(
         L[:n, channel], M[channel, j] = columns[:, i], half[i, j]
     C = np.zeros((n, h + order))
     C[:, :n] = np.diag(1 / scales.error)
-    told = tuple(f"{functions[i]} by {names[j]}" for i, j in moving)
-    return ErrorSystem(A, L, B, M, np.zeros((len(moving), n + q)), C, observer.sample_period_s, told)
+    channels = tuple(f"{functions[i]} by {names[j]}" for i, j in moving)
+    return ErrorSystem(A, L, B, M, np.zeros((len(moving), n + q)), C, observer.sample_period_s, channels)
 
 
 def require_covered(observer: ObserverData) -> None:
@@ -269,7 +265,7 @@ def without_measurement(observer: ObserverData, system: ErrorSystem, dropped: Dr
     """Return the dynamics of a step whose measurement is missing, one system for each thing that the observer may do then."""
     K, n, q = observer.controller, observer.lifting.n_states, len(observer.measured)
     h = len(system.A) - K.n_states
-    into = (observer.B if observer.injection is Injection.INPUT else np.eye(observer.A.shape[0]))[:n]
+    into = observer.into[:n]
     A, B = system.A.copy(), system.B.copy()
     A[:n, list(observer.measured)] += into @ K.D
     A[h:, :h] = 0.0

@@ -1,6 +1,6 @@
 r"""Proof of a gain, independent of whatever solver proposed it.
 
-With Lyapunov matrices ``P_v = R_v' R_v``, one for every word v of the last corners (one in all without memory), the gain gamma is proven when
+With Lyapunov matrices ``P_v = R_v' R_v``, one for every word v of the last corners (one in all without lookahead), the gain gamma is proven when
 
     F = [[P_v, 0], [0, gamma^2 I]] - [A_c, B_c]' P_v' [A_c, B_c] - [C, D]' [C, D] > 0
 

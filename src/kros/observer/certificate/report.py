@@ -125,7 +125,7 @@ def held_residual(observer: ObserverData, states: Array, inputs: Array, paramete
 def first_error(observer: ObserverData, error: Array, width: int) -> Array:
     """Return the first error with the earlier ones that the lifting reads behind it, which equal it; shape (batch, width)."""
     states = observer.lifting.states
-    earlier = [states.index(name.partition("[")[0]) for name in observer.lifting.window.earlier if name.partition("[")[0] in states]
+    earlier = [states.index(name) for name, delay in observer.lifting.window.quantities if delay and name in states]
     return np.concatenate([error, error[:, earlier]], axis=1)[:, :width]
 
 

@@ -1,4 +1,4 @@
-r"""One Lyapunov matrix from a Riccati equation: the cheap rung, and for a single slope the whole answer.
+r"""One Lyapunov matrix from a Riccati equation: the cheap method, and for a single slope the whole answer.
 
 A common quadratic Lyapunov function over all slopes in the box follows where multipliers ``T = diag(t) > 0`` exist with
 

@@ -1,6 +1,6 @@
-r"""Lyapunov matrices by a semidefinite program over the corners, with memory where one matrix does not do.
+r"""Lyapunov matrices by a semidefinite program over the corners, that look at slopes to come where one matrix does not do.
 
-Without memory one P serves all corners (quadratic stability). With memory m there is a matrix for every word of the next m corners,
+Without lookahead one P serves all corners (quadratic stability). With a lookahead of m there is a matrix for every word of the next m corners,
 
     V_k = sum over words v of  lambda_v(d_k, ..., d_{k+m-1}) xi' P_v xi,
 
@@ -15,7 +15,10 @@ reachability Gramian is the identity. The first program finds the least gamma, a
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +27,6 @@ from ...core.norms import gramian
 from .error import ErrorSystem
 from .proof import margin, steps
 from .riccati import Proposal
-from .solver import cvxpy, solve
 
 Array = npt.NDArray[np.float64]
 _ABOVE = (1.003, 1.02, 1.1, 1.5)
@@ -33,7 +35,7 @@ _HOW = ("one Lyapunov matrix for all corners", "a Lyapunov matrix for every corn
 
 
 def sdp_proposal(
-    system: ErrorSystem, corners: Sequence[tuple[Array, Array]], memory: int = 0, time_limit_s: float = 20.0
+    system: ErrorSystem, corners: Sequence[tuple[Array, Array]], lookahead: int = 0, time_limit_s: float = 20.0
 ) -> tuple[Proposal | None, str]:
     """Return the best proposal that holds in floating point, and what the solver said.
 
@@ -42,13 +44,13 @@ def sdp_proposal(
     system : ErrorSystem
     corners : sequence of (A, B)
         Corners of every mode.
-    memory : int
+    lookahead : int
         Number of coming corners that the Lyapunov function knows.
     time_limit_s : float
         For each program.
     """
-    cp = cvxpy()
-    n, n_words = len(system.A), len(corners) ** memory
+    cp: Any = import_module("cvxpy")  # takes a second; its own annotations do not describe what it exports
+    n, n_words = len(system.A), len(corners) ** lookahead
     T, size = _coordinates(system, corners)
     scaled = [(np.linalg.solve(T, (A - np.eye(n)) @ T), np.linalg.solve(T, B) / size) for A, B in corners]
     C = system.C @ T
@@ -63,12 +65,12 @@ def sdp_proposal(
         cross = -(after + N.T @ after) @ B
         F = cp.bmat([[state, cross], [cross.T, level * np.eye(B.shape[1]) - B.T @ after @ B]])
         constraints.append((F + F.T) / 2 - slack * np.eye(F.shape[0]) >> 0)
-    least, word = solve(cp.Problem(cp.Minimize(level), [*constraints, slack == 0]), level, time_limit_s)
+    least, word = _solve(cp.Problem(cp.Minimize(level), [*constraints, slack == 0]), level, time_limit_s)
     if least is None or least <= 0:
         return None, word
     bound = float(np.sqrt(least * unit)) * size
     for factor in _ABOVE:
-        strictest, word = solve(cp.Problem(cp.Maximize(slack), [*constraints, level == least * factor**2]), slack, time_limit_s)
+        strictest, word = _solve(cp.Problem(cp.Maximize(slack), [*constraints, level == least * factor**2]), slack, time_limit_s)
         if strictest is None or strictest <= 0:
             continue
         try:
@@ -76,7 +78,7 @@ def sdp_proposal(
         except np.linalg.LinAlgError:  # not positive definite after all
             continue
         if margin(roots, corners, system.C, bound * factor) > 0:
-            return Proposal(bound * factor, roots, _HOW[min(memory, 2)]), word
+            return Proposal(bound * factor, roots, _HOW[min(lookahead, 2)]), word
     return None, word
 
 
@@ -92,3 +94,18 @@ def _coordinates(system: ErrorSystem, corners: Sequence[tuple[Array, Array]]) ->
     values, vectors = np.linalg.eigh(W / np.outer(diagonal, diagonal))
     T = diagonal[:, None] * vectors * np.sqrt(np.maximum(values, 1e-8 * values.max()))
     return T, float(max(np.linalg.norm(np.linalg.solve(T, corner[1]), 2) for corner in corners)) or 1.0
+
+
+def _solve(problem: Any, value: Any, time_limit_s: float) -> tuple[float | None, str]:
+    """Return the value of one variable, None where there is no solution, and the solver's word; what it claims is proven elsewhere."""
+    error = import_module("cvxpy").error.SolverError
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Solution may be inaccurate")
+            problem.solve(solver="CLARABEL", time_limit=time_limit_s)
+    except (error, ValueError, ArithmeticError) as failure:
+        return None, f"Clarabel: {failure}"
+    word = f"Clarabel: {problem.status}"
+    if value.value is None or not np.isfinite(value.value) or problem.status not in ("optimal", "optimal_inaccurate"):
+        return None, word
+    return float(value.value), word

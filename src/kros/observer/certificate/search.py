@@ -1,4 +1,4 @@
-"""The ladder of the certificate: from one Lyapunov matrix by a Riccati equation to several by a semidefinite program; a counterexample ends it."""
+"""Search for a proof: from one Lyapunov matrix by a Riccati equation to several by a semidefinite program; a counterexample ends it."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def frozen_gain(system: ErrorSystem) -> float:
     return max(hinf_norm(system.frozen(place)) for place in places)
 
 
-def prove(modes: list[ErrorSystem], memory: int, time_limit_s: float, *, tight: bool = False) -> tuple[Proof | None, str, ReliftStatus]:
-    """Climb the ladder; return the first proof with its margin (where `tight`, the best of all rungs), or why there is none."""
+def prove(modes: list[ErrorSystem], lookahead: int, time_limit_s: float, *, tight: bool = False) -> tuple[Proof | None, str, ReliftStatus]:
+    """Return the first proof with its margin (where `tight`, the best of all methods), or why there is none."""
     system = modes[0]
     if system.corner_count > MOST_CORNERS:
         return _prove_by_multipliers(modes)
@@ -43,7 +43,7 @@ def prove(modes: list[ErrorSystem], memory: int, time_limit_s: float, *, tight: 
     said = f"the program would have {len(system.A)} states, more than {_BIG_SDP}; reduce the correction filter's order"
     # Against one slope the Riccati equation loses nothing: another program for one matrix would find the same gain.
     lowest = 1 if best is not None and len(corners) == 2 else 0
-    for depth in range(lowest, memory + 1 if len(system.A) <= _BIG_SDP else 0):
+    for depth in range(lowest, lookahead + 1 if len(system.A) <= _BIG_SDP else 0):
         if len(corners) ** (depth + 1) > MOST_CORNERS:
             break
         proposal, said = sdp_proposal(system, corners, depth, time_limit_s)
@@ -96,11 +96,11 @@ def growing_sequence(corners: Corners) -> str:
     return ""
 
 
-def mismatch_gain(modes: list[ErrorSystem], memory: int, time_limit_s: float) -> float | None:
+def mismatch_gain(modes: list[ErrorSystem], lookahead: int, time_limit_s: float) -> float | None:
     """Return kappa; with dropped samples the frozen response has no single meaning, and there is none."""
     if not modes[0].L.shape[1]:
         return 0.0
     if len(modes) > 1:
         return None
-    found, _, _ = prove([modes[0].mismatch()], memory, time_limit_s)
+    found, _, _ = prove([modes[0].mismatch()], lookahead, time_limit_s)
     return None if found is None else found[0].gain

@@ -16,7 +16,7 @@ class ReliftStatus(str, Enum):
     UNBOUNDED
         A lifted function may be arbitrarily steep. Name a box of states (and inputs) in which the observer works.
     NOT_FOUND
-        Neither a proof nor a counterexample was found. Allow more memory or time, or take a smaller box.
+        Neither a proof nor a counterexample was found. Allow a longer lookahead or more time, or take a smaller box.
     NOT_COVERED
         The observer runs with a delay or limits, which the equations of the error do not know. Certify it without, and do not take the certificate
         for one of the observer with them.

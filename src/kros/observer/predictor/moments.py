@@ -37,7 +37,7 @@ from ...synthesis.residual_shaped.shaping_filter import Bank
 Array = npt.NDArray[np.float64]
 DELAYS = 40
 THIN, SKIP = 4, 300
-SHORT = 25  # memories forget within this part of an episode unless told otherwise
+SHORT = 25  # internal states forget within this part of an episode by default
 _RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 1e-5, 0.5, 0.1, 1e-13
 
 

@@ -27,7 +27,7 @@ from scipy.linalg import block_diag
 from ...core.errors import DataError
 from ...data import EpisodeBatch
 from ..tuning.blocks import Array, Block, Model, blocks_of, joined
-from ..tuning.gauss_newton import MEMORIES, Damping, mean_log, scaled, search, whitening
+from ..tuning.gauss_newton import SETTLED, Damping, mean_log, scaled, search, whitening
 from .moments import Past, hidden_of
 
 _DAMPING = Damping(1e-7, 1e-3, 1e4, 4.0)
@@ -79,7 +79,7 @@ def tune_predictor(
     """
     problem = _Tuning(past, batch, importance, deviation)
     own = float(np.abs(np.linalg.eigvals(model[0])).max())
-    problem.slowest = max(own, 1 - MEMORIES / len(batch.states) if slowest is None else slowest)
+    problem.slowest = max(own, 1 - SETTLED / len(batch.states) if slowest is None else slowest)
     if not problem.slowest < 1:
         raise DataError("Tuning a predictor: the model is not stable; start from one that is.")
     found, criterion = search(problem.at(blocks_of(*model)), problem.steps, _DAMPING, iterations, least_gain, patience=2)

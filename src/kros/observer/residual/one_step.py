@@ -6,7 +6,7 @@ Let the nominal's one-step model be :math:`x^+ = f(x, u) = A_s x + a\,\sigma(x) 
 
 does not depend on the observer, and holds everything that the model does not know: the unit's own parameters, loads, the lifting's error.
 The deployed error obeys, exactly, ``e+ = (A_s + a delta_k) e - y^c + omega_k`` with ``delta_k`` between the slopes of the lifted functions.
-**Only the rows of the original states drive it**: the lifted functions are computed anew from the states at every step, so their rows of
+**Only the rows of the original states drive it**: the lifted functions are computed again from the states at every step, so their rows of
 the model, and what these rows miss, never enter. The linear time-invariant stand-in for the error dynamics takes the mean of ``delta_k`` over
 the recordings. Where functions oscillate as the machine moves, as ``sin(100 position + phase)`` does, that mean is nearly zero.
 """

@@ -29,7 +29,7 @@ from ..data import ObserverData
 from ..residual.one_step import mean_error_dynamics
 from ..simulate import run_observer
 from .blocks import blocks_of
-from .gauss_newton import MEMORIES, Damping, mean_log, scaled, search, whitening
+from .gauss_newton import SETTLED, Damping, mean_log, scaled, search, whitening
 
 Array = npt.NDArray[np.float64]
 O = TypeVar("O", bound=ObserverData)  # noqa: E741
@@ -77,7 +77,7 @@ def tune_observer(observer: O, batch: EpisodeBatch, iterations: int = 25) -> tup
     start = problem.at(observer)
     if not np.isfinite(start.criterion):
         raise DataError(f"Tuning observer {observer.name}: it diverges on the recordings; start from one that does not.")
-    problem.slowest = max(problem.radius(observer), 1 - MEMORIES / len(batch.states))
+    problem.slowest = max(problem.radius(observer), 1 - SETTLED / len(batch.states))
     found, criterion = search(start, problem.steps, _DAMPING, iterations, _LEAST_GAIN)
     return replace(observer, A=found.observer.A, B=found.observer.B, controller=found.observer.controller), criterion
 

@@ -9,8 +9,7 @@ import pytest
 
 from kros.core import DataError, IdentificationError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
-from kros.identify import Factor, combine, free_run, lifted_factor, reduce_episode
-from kros.identify.episode_factors import episode_factors
+from kros.identify import Factor, combine, episode_factors, free_run, lifted_factor, reduce_episode
 from kros.identify.refine import RefinedModels, RefineOptions, refine_population
 from kros.identify.refine.episodes import episode_normals
 from kros.identify.refine.segments import Segments, read_segments

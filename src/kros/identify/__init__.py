@@ -10,8 +10,7 @@ from typing import Any
 from .bootstrap import ModelSamples, bootstrap_edmd, bootstrap_refined, episode_weights, one_step_deviations
 from .calibration import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
 from .edmd import KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
-from .episode_factors import episode_factors
-from .factors import Factor, combine, lifted_factor, reduce_episode
+from .factors import Factor, combine, episode_factors, lifted_factor, reduce_episode
 from .free_run import free_run
 from .identified import EpisodeFactors, IdentifiedModels
 from .identify import identify

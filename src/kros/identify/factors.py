@@ -14,13 +14,15 @@ R    : upper triangular factor, (n_columns, n_columns)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from ..core.errors import DataError
 from ..core.linalg import qr_triangle
+from ..data.population import EpisodeKey, Population
 from ..lifting import Lifting
 
 Array = npt.NDArray[np.float64]
@@ -100,6 +102,46 @@ def combine(factors: Factor) -> Factor:
     ends = factors.input_range
     span = None if ends is None else np.stack([ends[..., 0, :].min(axis=-2), ends[..., 1, :].max(axis=-2)], axis=-2)
     return Factor(qr_triangle(stacked), factors.peak.max(axis=-2), factors.n_samples.sum(axis=-1), span)
+
+
+def episode_factors(
+    population: Population,
+    keys: Mapping[str, Sequence[EpisodeKey]],
+    lifting: Lifting,
+    parameters: Mapping[str, npt.ArrayLike] | None = None,
+) -> Factor:
+    """Return factors of [Psi | Theta_plus] of every episode by itself, for leaving episodes out and for drawing them again.
+
+    Parameters
+    ----------
+    population : Population
+    keys : mapping of str to sequence of EpisodeKey
+        Episodes of every unit.
+    lifting : Lifting
+    parameters : mapping of str to array_like, shape (unit,), optional
+        The lifting's parameters, in the order of `keys`.
+
+    Returns
+    -------
+    Factor
+        Batch (unit, episode) in the order of `keys`; zero where a unit has fewer episodes than others.
+
+    Raises
+    ------
+    DataError
+        When there are no episodes at all.
+    """
+    most = max((len(episodes) for episodes in keys.values()), default=0)
+    if most == 0:
+        raise DataError(
+            f"Factors by episode: {len(keys)} units without an episode among them; pass keys as population.keys(unit) gives them."
+        )
+    rows = [[reduce_episode(*population.read_parts(key), lifting) for key in episodes] for episodes in keys.values()]
+    first = next(f for row in rows for f in row)
+    none = Factor(np.zeros_like(first.R), np.zeros_like(first.peak), np.zeros_like(first.n_samples))
+    own = {name: np.asarray((parameters or {})[name], dtype=float)[:, None] for name in lifting.parameters}
+    stacked = Factor.stack([Factor.stack([replace(f, input_range=None) for f in row] + [none] * (most - len(row))) for row in rows])
+    return lifted_factor(stacked, lifting, own, lifting)
 
 
 def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array], model: Lifting) -> Factor:

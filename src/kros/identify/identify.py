@@ -32,8 +32,8 @@ from .model_set import ModelSet
 from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .ranges import Ranges
 from .refine import RefinedModels, RefineOptions, refine_population
+from .refine.spread import peak_residual_db
 from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
-from .spread import peak_residual_db
 
 log = logging.getLogger(__name__)
 _DOUBLINGS = 12

@@ -11,10 +11,10 @@ import numpy.typing as npt
 from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
 from ..free_run import free_run
-from ..spread import peak_residual_db
 from .model import TradeOff
 from .pooled import matrices_of
 from .problem import Problem
+from .spread import peak_residual_db
 
 Array = npt.NDArray[np.float64]
 _AT_ONCE = 4_000_000  # numbers of recordings in memory

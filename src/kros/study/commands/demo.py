@@ -14,7 +14,6 @@ from ..config import Stage, validate_config
 from ..engine.run_folder import open_run
 from ..engine.store import Store, code_key, hash_of
 from ..pipeline import RunResult, require_usable, run_in
-from ..presets import HARMONIC_DRIVE
 
 FORMATS = ("parquet", "raw")
 _STAGE, _RECORDINGS = "simulate", "simulated"

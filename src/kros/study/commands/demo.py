@@ -10,6 +10,7 @@ from ...core.artifacts import write_json
 from ...core.errors import ConfigError
 from ...core.work import Progress
 from ...data import write_parquet, write_raw
+from ...identify.presets import HARMONIC_DRIVE
 from ..config import Stage, validate_config
 from ..engine.run_folder import open_run
 from ..engine.store import Store, code_key, hash_of

@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,13 +29,10 @@ from kros.motor_drive import (
     AngleLoad,
     calibrate_load,
     calibrate_torque,
-    disturbance_observer,
     load_accuracy,
-    load_direction,
     load_from_current,
     load_observer,
     low_passed,
-    ripple_power,
     without_level,
 )
 from kros.observer import (
@@ -48,6 +47,9 @@ from kros.observer import (
 from kros.plants import HarmonicDrivePopulation
 from kros.plants.harmonic_drive.control import COUNT_RAD
 from kros.synthesis import kalman
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+from load_baselines import disturbance_observer, load_direction, ripple_power
 
 Array = npt.NDArray[np.float64]
 LIMIT, RATIO, BAND_HZ, SLOW_HZ, REAL_HZ = 0.97, 100, (45.0, 55.0), 5.0, 20.0

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from batches import batch_of
+from load_baselines import disturbance_observer, load_direction, ripple_power
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.lifting import Lifting
@@ -12,14 +13,11 @@ from kros.motor_drive import (
     AngleLoad,
     calibrate_load,
     calibrate_torque,
-    disturbance_observer,
     known_load,
     load_accuracy,
-    load_direction,
     load_from_current,
     load_observer,
     low_passed,
-    ripple_power,
     without_level,
 )
 from kros.observer import Observer, one_step_residual, relift_certificate, run_observer

@@ -1,9 +1,4 @@
-r"""How well a load is estimated: slow errors against the same estimator's floor without load, and what is left of the gearbox's ripple.
-
-Slow errors are of estimate and truth low-passed without delay. The ripple is taken in the moving band of the gear: with r the ratio,
-``estimate exp(-j r theta)`` low-passed is the amplitude that turns with the gear, at any speed; it counts where its frequency ``r |speed|`` is
-above a least one, where it cannot be taken for load.
-"""
+"""How well a load is estimated: slow errors against the same estimator's floor without load; of estimate and truth low-passed without delay."""
 
 from __future__ import annotations
 
@@ -76,39 +71,3 @@ def load_accuracy(
         return float(np.sqrt(np.mean(values**2)))
 
     return LoadAccuracy(rms(error[:, ~loaded]), rms(error[:, loaded]), rms(slow[:, loaded]))
-
-
-def ripple_power(
-    signal: npt.ArrayLike,
-    position: npt.ArrayLike,
-    speed: npt.ArrayLike,
-    ratio: float,
-    sample_period_s: float,
-    least_hz: float = 15.0,
-    width_hz: float = 5.0,
-) -> Array:
-    """Return the power of what turns with the gear, shape (batch,), the signal's unit squared.
-
-    Parameters
-    ----------
-    signal : array_like, shape (n_samples, batch)
-    position, speed : array_like, shape (n_samples, batch), rad and rad/s
-    ratio : float
-        Ripples a turn.
-    sample_period_s : float
-    least_hz : float
-        Frequency above which the ripple counts.
-    width_hz : float
-        Half the width of the moving band.
-
-    Raises
-    ------
-    DataError
-        When an episode never turns so fast.
-    """
-    x, theta = np.asarray(signal, dtype=float), np.asarray(position, dtype=float)
-    real, imaginary = (low_passed(part, width_hz, sample_period_s) for part in (x * np.cos(ratio * theta), -x * np.sin(ratio * theta)))
-    fast = ratio * np.abs(np.asarray(speed, dtype=float)) / (2 * np.pi) > least_hz
-    if not fast.any(axis=0).all():
-        raise DataError(f"Ripple of the gear: an episode never turns so fast that the ripple is above {least_hz:g} Hz; leave it out.")
-    return np.asarray(2 * np.sum(real**2 + imaginary**2, axis=0, where=fast) / fast.sum(axis=0))

@@ -18,12 +18,13 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError, DimensionError
-from ..core.lti import gain
-from ..observer.observer import Observer
-from ..synthesis.result import Injection
-from ..synthesis.riccati.constant_gain import kalman
-from .calibrate import LOAD
+from kros.core.errors import DataError, DimensionError
+from kros.core.lti import gain
+from kros.motor_drive import low_passed
+from kros.motor_drive.calibrate import LOAD
+from kros.observer import Observer
+from kros.synthesis.result import Injection
+from kros.synthesis.riccati.constant_gain import kalman
 
 Array = npt.NDArray[np.float64]
 
@@ -109,3 +110,39 @@ def disturbance_observer(
     widened = replace(lifting, states=(*lifting.states, LOAD))
     own = {**observer.parameters, **(parameters or {})}
     return Observer(name, widened, A, B, observer.measured, observer.inputs, gains, Injection.STATE, observer.sample_period_s, own)
+
+
+def ripple_power(
+    signal: npt.ArrayLike,
+    position: npt.ArrayLike,
+    speed: npt.ArrayLike,
+    ratio: float,
+    sample_period_s: float,
+    least_hz: float = 15.0,
+    width_hz: float = 5.0,
+) -> Array:
+    """Return the power of what turns with the gear, shape (batch,), the signal's unit squared.
+
+    Parameters
+    ----------
+    signal : array_like, shape (n_samples, batch)
+    position, speed : array_like, shape (n_samples, batch), rad and rad/s
+    ratio : float
+        Ripples a turn.
+    sample_period_s : float
+    least_hz : float
+        Frequency above which the ripple counts.
+    width_hz : float
+        Half the width of the moving band.
+
+    Raises
+    ------
+    DataError
+        When an episode never turns so fast.
+    """
+    x, theta = np.asarray(signal, dtype=float), np.asarray(position, dtype=float)
+    real, imaginary = (low_passed(part, width_hz, sample_period_s) for part in (x * np.cos(ratio * theta), -x * np.sin(ratio * theta)))
+    fast = ratio * np.abs(np.asarray(speed, dtype=float)) / (2 * np.pi) > least_hz
+    if not fast.any(axis=0).all():
+        raise DataError(f"Ripple of the gear: an episode never turns so fast that the ripple is above {least_hz:g} Hz; leave it out.")
+    return np.asarray(2 * np.sum(real**2 + imaginary**2, axis=0, where=fast) / fast.sum(axis=0))

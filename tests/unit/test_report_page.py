@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from html.parser import HTMLParser
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,10 @@ from kros.report.figures.uncertainty.forms_entrywise import entry_bounds
 from kros.report.figures.uncertainty.weights import in_gauge
 from kros.report.files import to_svg
 from kros.report.names import observer_label
+from kros.report.plotting import PLOTS
 from kros.report.run_folder import NotShownError, RunFolder
 from kros.report.theme import Tone
+from kros.study.pipeline import RunResult
 from kros.synthesis.result import Injection, Status, Synthesis
 from kros.uncertainty import (
     Cover,
@@ -637,3 +640,23 @@ def test_condition_without_models_is_not_shown(finished: tuple[Path, dict[str, A
     assert run.condition_models("koopman_edmd", "load").condition == "load"
     with pytest.raises(NotShownError, match="hot"):
         run.condition_models("koopman_edmd", "hot")
+
+
+def test_every_class_that_can_be_plotted_has_its_figure() -> None:
+    for name, place in PLOTS.items():
+        module, _, function = place.partition(":")
+        assert callable(getattr(import_module(f"kros.report.figures.{module}"), function)), name
+    observer = Observer(
+        "linear/h2", Lifting(STATES), np.eye(3), np.ones((3, 2)), (0,), ("u", "v"), gain(0.1 * np.ones((3, 1)), DT), Injection.STATE, DT
+    )
+    assert [line.get_label() for line in plot(observer).axes[0].lines] == [f"position → {name}" for name in STATES]
+
+
+def test_a_run_is_plotted_by_any_figure_of_its_report(finished: tuple[Path, dict[str, Any]]) -> None:
+    run = RunResult(finished[0], finished[1], ())
+    assert len(plot(run).axes) == len(STATES)
+    assert len(plot(run, name="phase").axes) == 3
+    with pytest.raises(ConfigError, match="declares no load"):
+        plot(run, name="load_torque")
+    with pytest.raises(ConfigError, match="no figure 'beauty'"):
+        plot(run, name="beauty")

@@ -14,6 +14,10 @@ if TYPE_CHECKING:
 
 PLOTS = {
     "Population": "recordings.signals:population_figure",
+    "IdentifiedModels": "models.bode:identified_figure",
+    "UncertainModels": "uncertainty.uncertain_model:sets_figure",
+    "Design": "observers.estimate:design_figure",
+    "RunResult": "run:run_figure",
     "PhaseCalibration": "recordings.phase:phase_figure",
     "ModelSet": "models.bode:bode_figure",
     "UncertainModel": "uncertainty.uncertain_model:uncertain_figure",
@@ -33,12 +37,14 @@ def plot(result: Any, **options: Any) -> Figure:
 
     Parameters
     ----------
-    result : Population, PhaseCalibration, ModelSet, UncertainModel, VariationAndNoise, Tightness, OutlierModel, Synthesis, Observer or ErrorSummary
-        A population is shown by the first episode of its first unit, models by their Bode magnitudes, an uncertain model by its forms and weights, a
-        synthesis or an observer by the correction filter, errors by their spectra.
+    result : one of the classes in `PLOTS`
+        A population is shown by the first episode of its first unit, models by their Bode magnitudes, uncertain models by forms, weights and every unit
+        over the weights, a design, a synthesis or an observer by the correction filter and its certificate, errors by their spectra, and a run by the
+        errors of all observers.
     **options
-        Of models ``nominal``, a unit that is drawn on top. Of an uncertain model ``models``, the `ModelSet` that it was made of, which shows every unit
-        over the weights, and then ``entries=True`` for the paper's figure entry by entry.
+        ``kind`` of identified and uncertain models, such as ``"linear"``; ``entries=True`` for the paper's figure of an uncertain model, entry by entry.
+        ``models`` of a design, the identified models behind it: its estimates on a held-out episode. ``name`` of a run: any figure of its report.
+        ``nominal`` of a `ModelSet`, a unit that is drawn on top; ``models`` of an `UncertainModel`, the `ModelSet` that it was made of.
 
     Returns
     -------

@@ -6,6 +6,7 @@ Needs: models.
 from __future__ import annotations
 
 from ....identify import ModelSet
+from ....identify.identified import IdentifiedModels
 from ...canvas import Figure, decibel, frequency_axis, grid, legend, limit_decibels, lines_of_units
 from ...names import best_models, is_koopman, model_label, model_look, shorten
 from ...run_folder import RunFolder
@@ -24,6 +25,11 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
         "value. The spread of the lines is what the uncertainty model has to cover."
     )
     return bode_figure(models, nominal), text
+
+
+def identified_figure(found: IdentifiedModels, kind: str | None = None, condition: str | None = None) -> Figure:
+    """Draw the models of one kind, the first by default, in the condition that feeds synthesis or another."""
+    return bode_figure(found.models(kind, condition))
 
 
 def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from ....core.errors import ConfigError
 from ....identify import ModelSet
 from ....uncertainty import UncertainModel
+from ....uncertainty.quantify import UncertainModels
 from ...canvas import Axes, Figure, decibel, end_labels, frequency_axis, grid, thin_log
 from ...names import form_label
+from ...theme import HUES
 from ..residuals import beside, entries_figure, entry_names, ratio_panel
 from .forms import FORM_TONES, draw_forms, window
-from .weights import TONES, in_gauge
+from .weights import in_gauge
 
 
 def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entries: bool = False) -> Figure:
@@ -38,11 +40,19 @@ def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entr
     return figure
 
 
+def sets_figure(found: UncertainModels, kind: str | None = None, entries: bool = False) -> Figure:
+    """Draw the uncertain set of one kind of model, the first by default, with every unit over its weights, or entry by entry."""
+    name = kind or next(iter(found.sets))
+    if name not in found.sets:
+        raise ConfigError(f"Plot of uncertain models: there is no set of kind {name!r}; choose one of {', '.join(found.sets)}.")
+    return uncertain_figure(found.sets[name], found.models.models(name), entries)
+
+
 def _weights(axes: Axes, model: UncertainModel) -> None:
     fitted, ends = model.weight.magnitudes(model.freqs_hz), []
     cover = in_gauge(model.cover, fitted)
     for side, lines, covers, style in (("left", fitted.left, cover.left, "-"), ("right", fitted.right, cover.right, "--")):
-        for i, tone in zip(range(lines.shape[1]), TONES, strict=False):
+        for i, tone in zip(range(lines.shape[1]), HUES, strict=False):
             freqs, line = thin_log(model.freqs_hz, lines[:, i])
             axes.plot(freqs, decibel(thin_log(model.freqs_hz, covers[:, i])[1]), color=tone.light, lw=3, alpha=0.3)
             axes.plot(freqs, decibel(line), style, color=tone.light)

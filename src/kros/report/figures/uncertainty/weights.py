@@ -14,10 +14,9 @@ from ....uncertainty.unit_residuals import UnitResiduals
 from ...canvas import Array, Axes, Figure, decibel, frequency_axis, grid, label_below, note, thin_log
 from ...names import best_models, model_label, number
 from ...run_folder import NotShownError, RunFolder
-from ...theme import Tone
+from ...theme import HUES, Tone
 from ..residuals import ratio_panel, short
 
-TONES = (Tone.BLUE, Tone.ORANGE, Tone.GREEN, Tone.PURPLE, Tone.GOLD, Tone.SKY, Tone.GREY, Tone.INK)
 _INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
 
 
@@ -90,7 +89,7 @@ def _draw_entries(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, 
     labels = names if names and len(names) == magnitudes.shape[1] else [str(i + 1) for i in range(magnitudes.shape[1])]
     ends = []
     frequency_axis(axes, freqs_hz, "", 4)
-    for i, tone in zip(range(magnitudes.shape[1]), TONES, strict=False):
+    for i, tone in zip(range(magnitudes.shape[1]), HUES, strict=False):
         freqs, line = thin_log(freqs_hz, magnitudes[:, i])
         _, below = thin_log(freqs_hz, cover[:, i])
         axes.plot(freqs, decibel(below), color=tone.light, lw=3.2, alpha=0.3, solid_capstyle="butt")

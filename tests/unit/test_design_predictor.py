@@ -8,7 +8,7 @@ import pytest
 
 from kros.data.population import EpisodeKey
 from kros.design.certificates import certify_running
-from kros.design.methods import design
+from kros.design.methods_table import design
 from kros.design.predictor import on_the_circle
 from kros.design.residual_shaped import TUNED, tuned
 from kros.design.settings import PredictorSettings, SynthesisSettings

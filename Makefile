@@ -32,11 +32,12 @@ demo: $(INSTALLED)  ## simulate a population of drives and run the whole study o
 test: $(INSTALLED_DEV)  ## run all tests and measure their coverage
 	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --benchmark-skip --cov --cov-report=term
 
-check: $(INSTALLED_DEV)  ## lint, formatting, types and import layers
+check: $(INSTALLED_DEV)  ## lint, formatting, types, import layers and circles
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -q -p no:cacheprovider tests/contract/test_meta_circles.py
 
 bench: $(INSTALLED_DEV)  ## run the benchmarks
 	$(ONE_THREAD) $(BIN)/python -m pytest benchmarks --benchmark-only

@@ -24,7 +24,7 @@ import numpy as np
 from kros.core import KrosError, gain
 from kros.core.artifacts import read_json
 from kros.core.work import Work
-from kros.design.robust import design_mixed
+from kros.design.methods.robust import design_mixed
 from kros.design.synthesize import tasks_of
 from kros.design.task import DesignTask
 from kros.study import run_study, validate_config

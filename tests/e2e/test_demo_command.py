@@ -4,7 +4,9 @@ import json
 
 
 def test_the_demo_command_runs_everything_tunes_and_says_where_the_report_is(kros, tmp_path, monkeypatch):
-    monkeypatch.setattr("kros.design.task._CORNERS_HZ", (1.0,))  # eight candidates in place of sixteen: the search is the same
+    monkeypatch.setattr(
+        "kros.design.methods.disturbance_model._CORNERS_HZ", (1.0,)
+    )  # eight candidates in place of sixteen: the search is the same
     out = tmp_path / "demo"
     result = kros("demo", "--out", out, "--units", 3, "--episodes", 2, "--seconds", 6, "--workers", 1)
     assert result.exit_code == 0, result.output

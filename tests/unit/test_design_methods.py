@@ -2,7 +2,7 @@
 
 import logging
 
-from kros.design.methods_table import METHODS, preferred, slowest_first, suitable
+from kros.design.methods.table import METHODS, preferred, slowest_first, suitable
 
 
 def test_ranks_decide():
@@ -10,7 +10,7 @@ def test_ranks_decide():
 
 
 def test_what_does_not_suit_refined_models_is_left_out_with_the_reason(caplog):
-    caplog.set_level(logging.INFO, logger="kros.design.methods_table")
+    caplog.set_level(logging.INFO, logger="kros.design.methods.table")
     wanted = ("mixed", "worst_case_h2", "open_loop", "filtered_difference")
     assert [m.name for m in suitable(wanted, "koopman_edmd", refined=False)] == ["open_loop", "mixed", "worst_case_h2"]
     assert not caplog.records

@@ -8,12 +8,12 @@ import pytest
 
 from kros.data.population import EpisodeKey
 from kros.design.certificates import certify_running
-from kros.design.methods_table import design
-from kros.design.predictor import on_the_circle
-from kros.design.residual_shaped import TUNED, tuned
+from kros.design.methods.predictor import on_the_circle
+from kros.design.methods.residual_shaped import TUNED, tuned
+from kros.design.methods.table import design
+from kros.design.methods.tuned import held_out, tuned_where_better
 from kros.design.settings import PredictorSettings, SynthesisSettings
 from kros.design.task import DesignResult, DesignTask
-from kros.design.tuned import held_out, tuned_where_better
 from kros.design.uncertain_set import certificate
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
@@ -181,7 +181,7 @@ def test_the_verdict_claims_no_set_for_it():
 
 
 def test_an_observer_that_loses_the_machine_is_not_made(made, monkeypatch):
-    monkeypatch.setattr("kros.design.predictor.DIVERGED", 0.0)
+    monkeypatch.setattr("kros.design.methods.predictor.DIVERGED", 0.0)
     product = design(made[0])
     assert product.synthesis is None
     assert "it diverges" in product.facts["reason"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kros.core.lti import StateSpace, gain
-from kros.design.published import as_published, design_published, entrywise_weight
+from kros.design.methods.published import as_published, design_published, entrywise_weight
 from kros.design.task import DesignResult
 from kros.synthesis import Injection, ObserverProblem
 from kros.synthesis.problem.paper_plant import reduced_plant

@@ -31,7 +31,7 @@ from ..observer import (
 )
 from ..observer.baselines.restarts import restarted
 from ..observer.screen import Screen
-from .gains import EQUAL, RESIDUAL
+from .methods.gains import EQUAL, RESIDUAL
 from .validation import TrainingSet, rank
 
 Array = npt.NDArray[np.float64]

@@ -26,7 +26,7 @@ from ..observer import Observer, ReliftCertificate, in_sizes
 from ..synthesis import ObserverProblem, Synthesis
 from ..uncertainty.quantify import UncertainModels
 from .certificates import DIVERGED, Running, certify_running
-from .methods_table import BY_NAME, design, preferred, slowest_first, suitable
+from .methods.table import BY_NAME, design, preferred, slowest_first, suitable
 from .settings import ObserverSettings, PredictorSettings, SynthesisSettings
 from .task import DesignResult, DesignTask
 from .uncertain_set import certificate, usable_problem

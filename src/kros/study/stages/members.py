@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ...core.artifacts import load_artifact
 from ...core.lti import StateSpace
-from ...design.disturbance_model import DisturbanceModel
+from ...design.methods.disturbance_model import DisturbanceModel
 from ...design.synthesize import measurement_noise
 from ...design.uncertain_set import usable_problem
 from ...evaluate import Candidate, sample_errors

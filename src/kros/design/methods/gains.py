@@ -8,11 +8,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..core.errors import SynthesisError
-from ..core.lti import gain
-from ..observer import kalman_candidates, luenberger_candidates, noise_covariances
-from ..synthesis import Synthesis, kalman
-from .task import DesignResult, DesignTask, first_of, without_correction
+from ...core.errors import SynthesisError
+from ...core.lti import gain
+from ...observer import kalman_candidates, luenberger_candidates, noise_covariances
+from ...synthesis import Synthesis, kalman
+from ..task import DesignResult, DesignTask, first_of, without_correction
 
 T = TypeVar("T")
 EQUAL, RESIDUAL = "equal share of every range", "one-step residuals"

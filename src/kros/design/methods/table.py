@@ -6,13 +6,13 @@ import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from ..core.errors import SynthesisError
+from ...core.errors import SynthesisError
+from ..task import DesignResult, DesignTask
 from .gains import design_kalman_tuned, design_kalman_white, design_luenberger, design_open_loop
 from .predictor import design_predictor
 from .published import design_published
 from .residual_shaped import design_residual_h2
 from .robust import design_mixed, design_worst_case_h2, design_worst_case_hinf
-from .task import DesignResult, DesignTask
 
 log = logging.getLogger(__name__)
 

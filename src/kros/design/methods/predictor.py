@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import KrosError, SynthesisError
-from ..lifting import Lifting
-from ..observer import Observer, driven_coordinates, identify_predictor
-from ..synthesis import Status, Synthesis
-from .certificates import DIVERGED
-from .task import DesignResult, DesignTask
+from ...core.errors import KrosError, SynthesisError
+from ...lifting import Lifting
+from ...observer import Observer, driven_coordinates, identify_predictor
+from ...synthesis import Status, Synthesis
+from ..certificates import DIVERGED
+from ..task import DesignResult, DesignTask
+from ..validation import ValidationSet, hidden_mean
 from .tuned import tuned_where_better
-from .validation import ValidationSet, hidden_mean
 
 UNCOVERED = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
 _CIRCLE = {"sin": "cos", "cos": "sin"}

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core.lti import StateSpace, gain
-from ..synthesis import Injection, ObserverProblem, mixed
-from ..uncertainty import EntrywiseWeight, Structure, quantify_systems
-from .task import DesignResult, DesignTask
+from ...core.lti import StateSpace, gain
+from ...synthesis import Injection, ObserverProblem, mixed
+from ...uncertainty import EntrywiseWeight, Structure, quantify_systems
+from ..task import DesignResult, DesignTask
 
 
 def design_published(task: DesignTask) -> DesignResult:

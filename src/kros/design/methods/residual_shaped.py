@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import SynthesisError
-from ..observer import Observer, ResidualModel, residual_models, tune_observer
-from ..synthesis import Synthesis, residual_h2
-from .task import DesignResult, DesignTask, first_of
+from ...core.errors import SynthesisError
+from ...observer import Observer, ResidualModel, residual_models, tune_observer
+from ...synthesis import Synthesis, residual_h2
+from ..task import DesignResult, DesignTask, first_of
+from ..validation import ValidationSet
 from .tuned import tuned_where_better
-from .validation import ValidationSet
 
 Array = npt.NDArray[np.float64]
 MAX_ORDER = 12

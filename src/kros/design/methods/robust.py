@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import SynthesisError
-from ..synthesis import Injection, ObserverProblem, Synthesis, mixed, reduce_controller, worst_case_h2, worst_case_hinf
-from ..synthesis.worst_case.causal import causal_h2
-from ..uncertainty import fit_magnitude
+from ...core.errors import SynthesisError
+from ...synthesis import Injection, ObserverProblem, Synthesis, mixed, reduce_controller, worst_case_h2, worst_case_hinf
+from ...synthesis.worst_case.causal import causal_h2
+from ...uncertainty import fit_magnitude
+from ..task import DesignResult, DesignTask, first_of
 from .disturbance_model import TUNED, DisturbanceModel, candidates
-from .task import DesignResult, DesignTask, first_of
 
 Array = npt.NDArray[np.float64]
 

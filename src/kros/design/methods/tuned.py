@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import DataError, KrosError
-from ..data.population import EpisodeKey
-from ..observer import Observer, relift_certificate
-from .certificates import DIVERGED, dropout_error_percent, scales_of
-from .task import DesignTask
-from .validation import ValidationSet, hidden_mean
+from ...core.errors import DataError, KrosError
+from ...data.population import EpisodeKey
+from ...observer import Observer, relift_certificate
+from ..certificates import DIVERGED, dropout_error_percent, scales_of
+from ..task import DesignTask
+from ..validation import ValidationSet, hidden_mean
 
 log = logging.getLogger(__name__)
 

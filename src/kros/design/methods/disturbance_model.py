@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.lti import StateSpace, block_diagonal
-from ..synthesis import ObserverProblem
+from ...core.lti import StateSpace, block_diagonal
+from ...synthesis import ObserverProblem
 
 IDENTITY, TUNED = "identity", "tuned"
 _CORNERS_HZ = (0.03, 1.0, 30.0)

@@ -1,0 +1,1 @@
+"""The methods of observer design, one file each, and the table of them all."""

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -43,10 +43,16 @@ class ReliftCertificate:
 
     Parameters
     ----------
-    certified : bool
+    scales : ReliftScales
+    assumptions : tuple of str
+        What has to hold, in words.
+    box, parameters : mapping of str to (lower, upper)
+    clipped : bool
+        What was asked; see `relift_certificate`.
     status : ReliftStatus
     reason : str
         A sentence; empty where the gain is proven.
+    certified : bool
     gain : float or None
         gamma, in the units of `scales`.
     mismatch_gain : float or None
@@ -63,35 +69,29 @@ class ReliftCertificate:
         Slopes that move.
     margin : float or None
         One minus the largest squared singular value over all corners in the coordinates where P is the identity.
-    scales : ReliftScales
-    assumptions : tuple of str
-        What has to hold, in words.
-    box, parameters : mapping of str to (lower, upper)
-    clipped : bool
-        What was asked; see `relift_certificate`.
     method : str
         By which method.
     solve_s : float
     """
 
-    certified: bool
-    status: ReliftStatus
-    reason: str
-    gain: float | None
-    mismatch_gain: float | None
-    lower_bound: float | None
-    roots: Array
-    corners: Array
-    multipliers: Array
-    channels: tuple[str, ...]
-    margin: float | None
     scales: ReliftScales
     assumptions: tuple[str, ...]
     box: Box
     parameters: Box
     clipped: bool
-    method: str
-    solve_s: float
+    status: ReliftStatus = ReliftStatus.UNBOUNDED
+    reason: str = ""
+    certified: bool = False
+    gain: float | None = None
+    mismatch_gain: float | None = None
+    lower_bound: float | None = None
+    roots: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    corners: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    multipliers: Array = field(default_factory=lambda: np.zeros(0))
+    channels: tuple[str, ...] = ()
+    margin: float | None = None
+    method: str = ""
+    solve_s: float = 0.0
 
     def system(self, observer: ObserverData) -> ErrorSystem:
         """Return the error dynamics that the certificate is about."""
@@ -141,6 +141,11 @@ class ReliftCertificate:
         scales = ReliftScales(**{name: arrays[f"scales/{name}"] for name in ReliftScales.__dataclass_fields__})
         values |= {name: arrays[name] for name in _ARRAYS}
         return cls(scales=scales, **values)
+
+    def __repr__(self) -> str:
+        """Say what is proven, in a line."""
+        said = f"gain {self.gain:.4g} (at least {self.lower_bound:.4g})" if self.certified else f"{self.status.value}: {self.reason}"
+        return f"<ReliftCertificate {said}>"
 
 
 _ARRAYS = ("roots", "corners", "multipliers")
@@ -200,50 +205,32 @@ def relift_certificate(
     >>> round(relift_certificate(plant).gain, 1)
     3.3
     """
-    start, nothing, dropped = time.perf_counter(), np.zeros((0, 0)), Dropped(dropped)
-    empty = ReliftCertificate(
-        certified=False,
-        status=ReliftStatus.UNBOUNDED,
-        reason="",
-        gain=None,
-        mismatch_gain=None,
-        lower_bound=None,
-        roots=np.zeros((0, 0, 0)),
-        corners=nothing,
-        multipliers=np.zeros(0),
-        channels=(),
-        margin=None,
-        scales=scales or ReliftScales.ones(observer),
-        assumptions=_assumptions(observer, box, parameters, dropped, clipped=clipped),
-        box=dict(box or {}),
-        parameters=dict(parameters or {}),
-        clipped=clipped,
-        method="",
-        solve_s=0.0,
-    )
+    start, dropped = time.perf_counter(), Dropped(dropped)
+    assumptions = _assumptions(observer, box, parameters, dropped, clipped=clipped)
+    asked = ReliftCertificate(scales or ReliftScales.ones(observer), assumptions, dict(box or {}), dict(parameters or {}), clipped)
     try:
-        system = empty.system(observer)
+        system = asked.system(observer)
     except (UnboundedSlopeError, UncoveredRuntimeError) as error:
         status = ReliftStatus.UNBOUNDED if isinstance(error, UnboundedSlopeError) else ReliftStatus.NOT_COVERED
-        return replace(empty, status=status, reason=f"No certificate: {error}.", solve_s=time.perf_counter() - start)
+        return replace(asked, status=status, reason=f"No certificate: {error}.", solve_s=time.perf_counter() - start)
     modes = [system, *without_measurement(observer, system, dropped)]
-    few = system.corner_count <= MOST_CORNERS
-    places = np.array(list(product((-1.0, 1.0), repeat=system.L.shape[1]))) if few else np.zeros((0, system.L.shape[1]))
+    few, width = system.corner_count <= MOST_CORNERS, system.L.shape[1]
+    corners = np.array(list(product((-1.0, 1.0), repeat=width))) if few else np.zeros((0, width))
     found, reason, status = prove(modes, lookahead, time_limit_s, tight=tight)
-    common = replace(empty, corners=places, channels=system.channels, status=status, reason=reason)
+    tried = replace(asked, corners=corners, channels=system.channels, status=status, reason=reason)
     if found is None:
-        return replace(common, solve_s=time.perf_counter() - start)
-    proposal, spare = found
+        return replace(tried, solve_s=time.perf_counter() - start)
+    proposal, margin = found
     kappa = mismatch_gain(modes, lookahead, time_limit_s) if mismatch else None
     return replace(
-        common,
+        tried,
         certified=True,
         gain=proposal.gain,
         mismatch_gain=kappa,
         lower_bound=frozen_gain(system),
         roots=proposal.roots,
         multipliers=np.zeros(0) if few or proposal.multipliers is None else proposal.multipliers,
-        margin=spare,
+        margin=margin,
         method=proposal.how,
         solve_s=time.perf_counter() - start,
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
-from kros.evaluate import Candidate, Contractions, sample_errors
+from kros.evaluate import Contractions, sample_errors
 from kros.evaluate.monte_carlo import draw_members
 from kros.synthesis import Injection, ObserverProblem, worst_case_h2
 from kros.synthesis.problem.plants import generalized_plant
@@ -44,7 +44,7 @@ def problem(form, remainder=True):
 
 
 def candidates():
-    return [Candidate(gain([[0.4], [0.2], [0.1]], DT), Injection.STATE), Candidate(gain([[0.1], [0.3]], DT), Injection.INPUT)]
+    return [(gain([[0.4], [0.2], [0.1]], DT), Injection.STATE), (gain([[0.1], [0.3]], DT), Injection.INPUT)]
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(1, 1), (2, 2), (4, 2), (1, 3)])
@@ -68,15 +68,15 @@ def test_errors_of_members_are_those_of_their_state_space_models_and_below_the_c
     case, members = problem(form, remainder), 9
     found = sample_errors(case, candidates(), members, seed=4)
     drawn, rests = draw_members(case, members, seed=4)
-    for row, largest, candidate in zip(found.norms, found.largest, candidates(), strict=True):
-        own = replace(case, injection=candidate.injection)
-        closed = generalized_plant(own).close(own.to_scaled(candidate.controller))
+    for row, largest, (K, injection) in zip(found.norms, found.largest, candidates(), strict=True):
+        own = replace(case, injection=injection)
+        closed = generalized_plant(own).close(own.to_scaled(K))
         expected = [
             h2_norm(perturbed(own, closed, drawn.system(i, DT), rests.system(i, DT) if remainder else None)) for i in range(members)
         ]
         np.testing.assert_allclose(row, expected, rtol=2e-3)
         assert largest == pytest.approx(max(expected), rel=1e-9)
-        assert largest <= certify(own, candidate.controller)[0] * (1 + 1e-9)  # rounding: some bounds are attained
+        assert largest <= certify(own, K)[0] * (1 + 1e-9)  # rounding: some bounds are attained
 
 
 def test_the_worst_machine_of_a_scalar_set_is_found():
@@ -85,7 +85,7 @@ def test_the_worst_machine_of_a_scalar_set_is_found():
     nominal = StateSpace([[a]], [[1.0]], [[1.0]], [[0.0]], dt)
     case = ObserverProblem(nominal, np.eye(1), gain([[w]], dt), gain([[1.0]], dt), np.ones(1), np.ones(1), np.array([0.1]))
     L = 0.3
-    found = sample_errors(case, [Candidate(gain([[L]], dt), Injection.STATE)], 60)
+    found = sample_errors(case, [(gain([[L]], dt), Injection.STATE)], 60)
     pole = a - L
     analytic = np.sqrt(((w / (1 - w)) ** 2 + (0.1 * L) ** 2) / (1 - pole**2))
     assert found.largest[0] == pytest.approx(analytic, rel=1e-9)
@@ -100,16 +100,16 @@ def test_machines_of_the_population_have_the_error_of_their_models():
     A_p, B_p = A + 0.02 * rng.normal(size=(3, *A.shape)), B * (1 + 0.1 * rng.normal(size=(3, *B.shape)))
     units = StateSpace(A_p, B_p, np.broadcast_to(np.eye(3), A_p.shape), np.zeros(B_p.shape), DT)
     found = sample_errors(case, candidates(), 2, units)
-    for row, noise, candidate in zip(found.units, found.noise, candidates(), strict=True):
-        own = replace(case, injection=candidate.injection)
-        expected = [np.hypot(h2_norm(unit_error(own, candidate.controller, A_p[k], B_p[k])), noise) for k in range(3)]
+    for row, noise, (K, injection) in zip(found.units, found.noise, candidates(), strict=True):
+        own = replace(case, injection=injection)
+        expected = [np.hypot(h2_norm(unit_error(own, K, A_p[k], B_p[k])), noise) for k in range(3)]
         np.testing.assert_allclose(row, expected, rtol=2e-3)
 
 
 def test_many_members_stay_below_the_certificate_of_a_robust_observer():
     case = problem(Form.INVERSE_INPUT_MULTIPLICATIVE)
     made = worst_case_h2(case, max_order=2, tolerance_db=3.0, refinements=0)
-    found = sample_errors(case, [Candidate(made.controller, made.injection)], 300)
+    found = sample_errors(case, [(made.controller, made.injection)], 300)
     assert found.largest[0] <= made.worst_case_h2
     assert found.largest[0] == pytest.approx(found.norms.max(), rel=2e-3)
     assert found.norms.min() >= found.noise[0]

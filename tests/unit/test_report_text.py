@@ -10,7 +10,7 @@ import pytest
 from kros.report.canvas import decibel, log_ticks, power_of_ten, spread, thin, thin_log
 from kros.report.error_tables import error_table
 from kros.report.figures.rows import best_last
-from kros.report.names import best_models, deployed_pair, main_observers, model_label, number, observer_label, observer_look, paper_pair
+from kros.report.names import best_models, deployed_pair, model_label, number, observer_label, observer_look, paper_pair
 from kros.report.theme import Tone
 from kros.report.verdict import verdict
 
@@ -159,13 +159,6 @@ def test_names_are_words() -> None:
     assert observer_label("filtered_difference") == "filtered difference"
 
 
-def test_main_observers_are_few_and_the_deployed_comes_last() -> None:
-    names = [f"{m}/{k}" for m in ("koopman", "linear") for k in ("open_loop", "kalman_white", "kalman_tuned", "mixed", "worst_case_h2")]
-    assert main_observers(names, "koopman/mixed") == ["linear/mixed", "koopman/open_loop", "koopman/kalman_tuned", "koopman/mixed"]
-    assert main_observers(names, None)[-1] == "koopman/mixed"
-    assert main_observers(["linear_edmd/open_loop"], None) == ["linear_edmd/open_loop"]
-
-
 def test_pairs_are_a_linear_and_a_koopman_observer() -> None:
     names = [
         f"{m}/{k}"
@@ -173,6 +166,8 @@ def test_pairs_are_a_linear_and_a_koopman_observer() -> None:
         for k in ("open_loop", "kalman_tuned", "mixed", "residual_h2")
     ]
     assert deployed_pair(names, "koopman/residual_h2") == ["linear/residual_h2", "koopman/residual_h2"]
+    assert deployed_pair(names, None) == ["linear/mixed", "koopman/mixed"]
+    assert deployed_pair(["linear_edmd/open_loop"], None) == ["linear_edmd/open_loop"]
     assert deployed_pair(["koopman/open_loop", "koopman/kalman_tuned", "koopman/mixed"], None) == ["koopman/kalman_tuned", "koopman/mixed"]
     assert paper_pair(names) == ["linear_edmd/mixed", "koopman_edmd/mixed"]
     assert paper_pair(["linear_edmd/mixed", "koopman/mixed"]) == ["linear_edmd/mixed"]

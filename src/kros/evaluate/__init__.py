@@ -4,12 +4,11 @@ from .contractions import Contractions
 from .disturb import SEVERITIES, Disturbance, Kind, Measured, hold_missing, standard_disturbances
 from .errors import ErrorSummary, error_percent, error_rms, error_spectrum, summarise
 from .intervals import draw_interval, interval_rows, mean_intervals, unit_interval
-from .monte_carlo import Candidate, MonteCarlo, sample_errors
+from .monte_carlo import MonteCarlo, sample_errors
 from .robustness import DisturbedEpisodes, robustness_rows, severity_of_growth
 
 __all__ = [
     "SEVERITIES",
-    "Candidate",
     "Contractions",
     "Disturbance",
     "DisturbedEpisodes",

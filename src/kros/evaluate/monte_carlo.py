@@ -1,4 +1,4 @@
-r"""Random members of the certified set against its certificate: what observers do on machines that might be, beside the bound for the worst.
+r"""Random members of the certified set against its certificate: errors of observers on them beside the bound for the worst.
 
 Members of the set are drawn as stable, causal contractions of the form
 
@@ -40,6 +40,7 @@ Array = npt.NDArray[Any]
 _POINTS, _LOWEST = 160, 1e-6
 _AROUND = np.concatenate([-np.geomspace(20, 0.15, 8), [0.0], np.geomspace(0.15, 20, 8)])  # of a pole's angle, in units of its damping
 _ALIKE = 0.1  # relative distance of poles that share their points
+Candidate = tuple[StateSpace, Injection]
 _TOGETHER = 40  # members whose spectra are in memory
 
 
@@ -64,14 +65,6 @@ class MonteCarlo:
     noise: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """An observer's filter, in physical units, and where its correction enters."""
-
-    controller: StateSpace
-    injection: Injection
-
-
 def sample_errors(
     problem: ObserverProblem, candidates: Sequence[Candidate], members: int, units: StateSpace | None = None, seed: int = 0
 ) -> MonteCarlo:
@@ -81,7 +74,8 @@ def sample_errors(
     ----------
     problem : ObserverProblem
         The set, its noise and its input weight.
-    candidates : sequence of Candidate
+    candidates : sequence of (StateSpace, Injection)
+        Filters of observers, in physical units, and where their corrections enter.
     members : int
     units : StateSpace, optional
         Models in physical units, the unit axis first.
@@ -98,7 +92,7 @@ def sample_errors(
     """
     problem.require_sound()
     drawn, rests = draw_members(problem, members, seed)
-    loops = [replace(problem, injection=c.injection).error_system(c.controller) for c in candidates]
+    loops = [replace(problem, injection=injection).error_system(K) for K, injection in candidates]
     theta, weights = _grid(problem, loops, units)
     freqs, m, n = theta / (2 * np.pi * problem.nominal.dt), problem.nominal.n_inputs, problem.nominal.n_states
     responses = [loop.frequency_response(freqs) for loop in loops]
@@ -164,8 +158,9 @@ def _units_power(problem: ObserverProblem, responses: Sequence[Array], units: St
 
 
 def _exact(problem: ObserverProblem, candidate: Candidate, drawn: Contractions, rests: Contractions, member: int) -> float:
-    problem, dt = replace(problem, injection=candidate.injection), problem.nominal.dt
-    closed = generalized_plant(problem).close(problem.to_scaled(candidate.controller))
+    K, injection = candidate
+    problem, dt = replace(problem, injection=injection), problem.nominal.dt
+    closed = generalized_plant(problem).close(problem.to_scaled(K))
     rest = rests.system(member, dt) if problem.remainder_left is not None else None
     return float(h2_norm(perturbed(problem, closed, drawn.system(member, dt), rest)))
 
@@ -182,8 +177,4 @@ def _grid(problem: ObserverProblem, loops: Sequence[StateSpace], units: StateSpa
     near = (log.imag[:, None] - log.real[:, None] * _AROUND).ravel()
     theta = np.concatenate([[0.0], np.geomspace(_LOWEST, np.pi, _POINTS), near])
     theta = np.unique(np.round(theta[(theta >= 0) & (theta <= np.pi)], 9))
-    steps = np.diff(theta) / np.pi
-    weights = np.zeros(len(theta))
-    weights[:-1] += steps / 2
-    weights[1:] += steps / 2
-    return theta, weights
+    return theta, np.convolve(np.diff(theta) / np.pi, [0.5, 0.5])

@@ -108,27 +108,21 @@ def best_models(names: Iterable[str]) -> list[str]:
     return [n for n in chosen if n is not None] or known[:2]
 
 
-def main_observers(names: Sequence[str], deployed: str | None) -> list[str]:
-    """Return the few observers that figures compare: the deployed one, its linear twin, the tuned Kalman filter, the open loop.
+def deployed_pair(names: Sequence[str], deployed: str | None) -> list[str]:
+    """Return the deployed observer and its linear twin, or without a robust twin what there is beside its tuned Kalman filter.
 
-    The first robust one stands for the deployed one where that is unknown.
+    The first robust observer stands for the deployed one where that is unknown.
     """
-    known = list(names)
-    robust = [n for n in known if split_observer(n)[1] not in BASELINES]
-    first = deployed if deployed in known else (robust or known or [""])[0]
+    robust = [n for n in names if split_observer(n)[1] not in BASELINES]
+    first = deployed if deployed is not None and deployed in names else (robust or list(names) or [""])[0]
     model, method = split_observer(first)
     other = model.replace("koopman", "linear") if is_koopman(model) else model.replace("linear", "koopman")
-    twin = next((n for n in (f"{other}/{m}" for m in (method, "worst_case_h2", "mixed", "kalman_tuned")) if n in known), "")
-    wanted = [twin, f"{model}/open_loop", f"{model}/kalman_tuned", first]
-    return [n for n in dict.fromkeys(wanted) if n in known]
-
-
-def deployed_pair(names: Sequence[str], deployed: str | None) -> list[str]:
-    """Return the deployed observer and its linear twin; without a twin its tuned Kalman filter."""
-    known = main_observers(names, deployed)
-    main = [n for n in known if split_observer(n)[1] != "open_loop"] or known
-    robust = [n for n in main if split_observer(n)[1] not in BASELINES]
-    return robust if len(robust) > 1 else main
+    twin = next((n for n in (f"{other}/{m}" for m in (method, "worst_case_h2", "mixed", "kalman_tuned")) if n in names), "")
+    pair = [n for n in dict.fromkeys((twin, first)) if n in robust]
+    if len(pair) > 1:
+        return pair
+    wanted = [n for n in dict.fromkeys((twin, f"{model}/kalman_tuned", first)) if n in names]
+    return [n for n in wanted if split_observer(n)[1] != "open_loop"] or wanted
 
 
 def paper_pair(names: Iterable[str]) -> list[str]:

@@ -14,7 +14,7 @@ from ...core.lti import StateSpace
 from ...design.methods.disturbance_model import DisturbanceModel
 from ...design.synthesize import measurement_noise
 from ...design.uncertain_set import usable_problem
-from ...evaluate import Candidate, sample_errors
+from ...evaluate import sample_errors
 from ...synthesis import ObserverProblem, Synthesis
 from ..engine.context import Context
 
@@ -48,7 +48,7 @@ def run_on_members(
     problem: ObserverProblem, syntheses: Mapping[str, Synthesis], bounds: Mapping[str, float], members: int, units: StateSpace
 ) -> Members:
     """Return for every observer a row for the metrics, and its norms over ``members`` and ``units``."""
-    found = sample_errors(problem, [Candidate(s.controller, s.injection) for s in syntheses.values()], members, units)
+    found = sample_errors(problem, [(s.controller, s.injection) for s in syntheses.values()], members, units)
     rows = {}
     for i, name in enumerate(syntheses):
         row: dict[str, Any] = {"observer": name, "members": members, "bound": bounds[name], "largest": float(found.largest[i])}

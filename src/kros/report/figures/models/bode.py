@@ -1,7 +1,4 @@
-"""Magnitude of every unit's model from every input to every state.
-
-Needs: models.
-"""
+"""Magnitude of every unit's model from every input to every state."""
 
 from __future__ import annotations
 

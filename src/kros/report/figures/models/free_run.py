@@ -1,7 +1,4 @@
-"""Free-running predictions of the linear and the Koopman model against the truth, with a zoom (the paper's Figure 5).
-
-Needs: the evaluation's kept episodes with models.
-"""
+"""Free-running predictions of the linear and the Koopman model against the truth, with a zoom (the paper's Figure 5)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Spectra of the free-run errors of the linear and the Koopman model, linear and logarithmic (the paper's Figure 6).
-
-Needs: the evaluation's model spectra.
-"""
+"""Spectra of the free-run errors of the linear and the Koopman model, linear and logarithmic (the paper's Figure 6)."""
 
 from __future__ import annotations
 

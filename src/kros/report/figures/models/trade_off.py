@@ -1,7 +1,4 @@
-"""What the prior of the refined models costs and brings: accuracy on held-out training episodes against uncertainty.
-
-Needs: refined models.
-"""
+"""What the prior of the refined models costs and brings: accuracy on held-out training episodes against uncertainty."""
 
 from __future__ import annotations
 

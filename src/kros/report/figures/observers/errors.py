@@ -1,7 +1,4 @@
-"""Errors of all observers at a glance: a mark for each role of a unit, a row an observer.
-
-Needs: the evaluation.
-"""
+"""Errors of all observers at a glance: a mark for each role of a unit, a row an observer."""
 
 from __future__ import annotations
 

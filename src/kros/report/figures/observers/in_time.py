@@ -1,7 +1,4 @@
-"""Estimates of the deployed observer and its linear twin, or of the paper's pair, for the nominal and the worst off-nominal unit (the paper's Figure 11).
-
-Needs: the evaluation's kept episodes with observers.
-"""
+"""Estimates of the deployed observer and its linear twin, or of the paper's pair, for the nominal and the worst off-nominal unit (the paper's Figure 11)."""
 
 from __future__ import annotations
 

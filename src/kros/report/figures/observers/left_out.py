@@ -1,7 +1,4 @@
-"""Errors on units that were left out against errors on the same units when they take part: a row an observer, a dot a unit.
-
-Needs: the evaluation, and units that were left out.
-"""
+"""Errors on units that were left out against errors on the same units when they take part: a row an observer, a dot a unit."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Estimates of the load's torque beside the load that was declared, in time, and their errors over frequency.
-
-Needs: a study with ``[load] moment``.
-"""
+"""Estimates of the load's torque beside the load that was declared, in time, and their errors over frequency."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Estimation errors of the nominal unit in a condition that no model has seen, of the deployed pair or the paper's (the paper's Figure 13).
-
-Needs: the evaluation's kept episodes in a second condition.
-"""
+"""Estimation errors of the nominal unit in a condition that no model has seen, of the deployed pair or the paper's (the paper's Figure 13)."""
 
 from __future__ import annotations
 

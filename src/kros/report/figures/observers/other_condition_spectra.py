@@ -1,7 +1,4 @@
-"""Spectra of the estimation errors of the nominal unit in a condition that no model has seen (the paper's Figure 14).
-
-Needs: the evaluation's kept episodes in a second condition.
-"""
+"""Spectra of the estimation errors of the nominal unit in a condition that no model has seen (the paper's Figure 14)."""
 
 from __future__ import annotations
 

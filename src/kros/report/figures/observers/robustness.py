@@ -1,7 +1,4 @@
-"""Error against severity: what observers do when measurements are worse than in the recordings.
-
-Needs: disturbed runs.
-"""
+"""Error against severity: what observers do when measurements are worse than in the recordings."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Spectra of the estimation errors of the paper's pair of observers and of the deployed pair (the paper's Figure 12).
-
-Needs: the evaluation's kept episodes with observers, and its observer spectra.
-"""
+"""Spectra of the estimation errors of the paper's pair of observers and of the deployed pair (the paper's Figure 12)."""
 
 from __future__ import annotations
 

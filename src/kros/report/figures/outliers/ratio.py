@@ -1,7 +1,4 @@
-"""The most conspicuous unit against the cover of all the others, all directions at once (the paper's Figure 15 as a bound).
-
-Needs: outlier scores, residuals beside the cover of the others.
-"""
+"""The most conspicuous unit against the cover of all the others, all directions at once (the paper's Figure 15 as a bound)."""
 
 from __future__ import annotations
 

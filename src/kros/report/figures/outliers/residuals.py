@@ -1,7 +1,4 @@
-"""Residual of the most conspicuous unit against those of all the others, entry by entry (the paper's Figure 15).
-
-Needs: outlier scores, models and residuals in the condition of the highest score.
-"""
+"""Residual of the most conspicuous unit against those of all the others, entry by entry (the paper's Figure 15)."""
 
 from __future__ import annotations
 

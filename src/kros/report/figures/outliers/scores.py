@@ -1,7 +1,4 @@
-"""Outlier scores of all units against the threshold, with their range over all nominals, a row a condition.
-
-Needs: outlier scores.
-"""
+"""Outlier scores of all units against the threshold, with their range over all nominals, a row a condition."""
 
 from __future__ import annotations
 

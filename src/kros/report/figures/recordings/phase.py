@@ -1,7 +1,4 @@
-"""Phase calibration of every unit: phase, lag, concentration (Appendix B).
-
-Needs: the phase calibration.
-"""
+"""Phase calibration of every unit: phase, lag, concentration (Appendix B)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Recorded signals of one held-out episode in every condition, with the velocity error at constant speed.
-
-Needs: the evaluation's kept episodes, or the recordings.
-"""
+"""Recorded signals of one held-out episode in every condition, with the velocity error at constant speed."""
 
 from __future__ import annotations
 

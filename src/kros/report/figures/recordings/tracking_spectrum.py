@@ -1,7 +1,4 @@
-"""Power spectrum of the tracking error at constant speed, against multiples of the disturbance's frequency (the paper's Figure 4).
-
-Needs: the phase calibration, the evaluation's kept episodes, or the recordings.
-"""
+"""Power spectrum of the tracking error at constant speed, against multiples of the disturbance's frequency (the paper's Figure 4)."""
 
 from __future__ import annotations
 

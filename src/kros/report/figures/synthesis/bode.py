@@ -1,7 +1,4 @@
-"""Magnitudes of the nominal plant, the weights and the correction filters, linear beside Koopman (the paper's Figure 10).
-
-Needs: models, uncertain models, syntheses.
-"""
+"""Magnitudes of the nominal plant, the weights and the correction filters, linear beside Koopman (the paper's Figure 10)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Certified worst case of every observer against the lower bound.
-
-Needs: observers with their facts.
-"""
+"""Certified worst case of every observer against the lower bound."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Random members of the certified set beside the certificate: a row an observer.
-
-Needs: Monte Carlo over the set.
-"""
+"""Random members of the certified set beside the certificate: a row an observer."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Bounds of the residuals of all six uncertainty forms, linear beside Koopman (the paper's Figure 7).
-
-Needs: uncertain models; models, for the paper's variants.
-"""
+"""Bounds of the residuals of all six uncertainty forms, linear beside Koopman (the paper's Figure 7)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Bounds of the residuals' entries for all six forms (the paper's Figure 7, entry by entry).
-
-Needs: uncertain models, models.
-"""
+"""Bounds of the residuals' entries for all six forms (the paper's Figure 7, entry by entry)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""How much of the uncertainty is the units and how much the finite recording, over frequency.
-
-Needs: variation and noise.
-"""
+"""How much of the uncertainty is the units and how much the finite recording, over frequency."""
 
 from __future__ import annotations
 

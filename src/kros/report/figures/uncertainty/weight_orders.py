@@ -1,7 +1,4 @@
-"""What a further state of a weight buys: overbound over order, with what no system of that order can beat.
-
-Needs: overbounds over orders, uncertain models.
-"""
+"""What a further state of a weight buys: overbound over order, with what no system of that order can beat."""
 
 from __future__ import annotations
 

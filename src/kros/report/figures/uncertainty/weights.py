@@ -1,7 +1,4 @@
-"""Fitted weights over the optimal cover, left and right, their product against 0 dB, every unit over them (the paper's Figure 8).
-
-Needs: uncertain models; residuals of the units, for the last column.
-"""
+"""Fitted weights over the optimal cover, left and right, their product against 0 dB, every unit over them (the paper's Figure 8)."""
 
 from __future__ import annotations
 

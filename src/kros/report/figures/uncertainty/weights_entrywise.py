@@ -1,7 +1,4 @@
-"""Residuals of all units entry by entry, with their bound and its fit (the paper's Figure 8 as it is there).
-
-Needs: residuals of the units, models.
-"""
+"""Residuals of all units entry by entry, with their bound and its fit (the paper's Figure 8 as it is there)."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ the response from the state.
 
 Symbols
 -------
-T : from what Delta does to the weighted error;  M, N : as in `synthesis.problem.perturbation`;  Gp, G : a machine's model and the nominal one
+T : from what Delta does to the weighted error;  M, N : as in `synthesis.problem.uncertainty_location`;  Gp, G : a machine's model and the nominal one
 """
 
 from __future__ import annotations

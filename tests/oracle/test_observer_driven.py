@@ -21,7 +21,7 @@ from kros.observer import (
     with_internal,
 )
 from kros.observer.predictor import embedded
-from kros.synthesis.residual_shaped.shaping_filter import Bank
+from kros.synthesis.residual_shaped.shaping_filter import Basis
 
 DT, SIZES, UNITS = 0.01, (1.0, 0.5), list("aabbcc")
 
@@ -48,7 +48,7 @@ def remembering(functions=("sin(5*p + phase)", "cos(5*p + phase)")):
     lifting = Lifting(("p", "c"), functions, ("phase",) if functions else ())
     values = phase if functions else None
     batch = batch_of(x, u, DT, values, units=UNITS)
-    past = Past.of(lifting, (0,), batch, Bank(15))
+    past = Past.of(lifting, (0,), batch, Basis(15))
     return embedded("o", past, past.model(4), ("target",), batch), x, u, values
 
 

@@ -7,7 +7,7 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from kros.core import StateSpace
 from kros.lifting import Lifting
 from kros.observer import mean_error_dynamics, one_step_residual, residual_spectra
-from kros.synthesis import Bank, Injection, Status, kalman, residual_h2, shaping_filter
+from kros.synthesis import Basis, Injection, Status, kalman, residual_h2, shaping_filter
 
 DT = 1e-2
 A = np.array([[1.0, 0.01], [-0.05, 0.95]])
@@ -77,7 +77,7 @@ def response(K):
 def test_known_shaping_filter_gives_its_optimum():
     truth = autoregression()
     reference, best = optimum(truth)
-    found = residual_h2(A, C, spectrum(truth)[None], NOISE, SCALE, DT, [Bank(2)], tolerance_percent=0)
+    found = residual_h2(A, C, spectrum(truth)[None], NOISE, SCALE, DT, [Basis(2)], tolerance_percent=0)
     assert (found.status, found.injection, found.method) == (Status.OPTIMAL, Injection.STATE, "residual_h2")
     assert found.h2_norm == pytest.approx(best, rel=1e-5)
     assert achieved(found.controller, truth) == pytest.approx(best, rel=1e-5)
@@ -100,8 +100,8 @@ def test_a_filter_outside_the_class_is_approached():
     zero = StateSpace(np.diag([0.97, 0.9]), ROOT, np.array([[0.3, 0.0], [0.4, -0.7]]), ROOT, DT)
     _, best = optimum(zero)
     loss = [
-        achieved(residual_h2(A, C, spectrum(zero)[None], NOISE, SCALE, DT, [bank], tolerance_percent=0).controller, zero) / best - 1
-        for bank in (Bank(1), Bank(4), Bank(8), Bank(2, (0.9, 0.97)))
+        achieved(residual_h2(A, C, spectrum(zero)[None], NOISE, SCALE, DT, [basis], tolerance_percent=0).controller, zero) / best - 1
+        for basis in (Basis(1), Basis(4), Basis(8), Basis(2, (0.9, 0.97)))
     ]
     assert loss[0] > loss[1] > loss[2] > -1e-9
     assert loss[2] < 0.01
@@ -163,11 +163,11 @@ def test_worst_unit_against_a_search_over_mixtures():
 
     def observer(weights, **options):
         return residual_h2(
-            A, C, np.tensordot(weights, spectra, 1)[None], NOISE, SCALE, DT, [Bank(8)], tolerance_percent=0, **options
+            A, C, np.tensordot(weights, spectra, 1)[None], NOISE, SCALE, DT, [Basis(8)], tolerance_percent=0, **options
         ).controller
 
-    found = hidden(residual_h2(A, C, spectra, NOISE, SCALE, DT, [Bank(8)], tolerance_percent=0, worst_unit=True).controller)
-    mean = hidden(residual_h2(A, C, spectra, NOISE, SCALE, DT, [Bank(8)], tolerance_percent=0).controller)
+    found = hidden(residual_h2(A, C, spectra, NOISE, SCALE, DT, [Basis(8)], tolerance_percent=0, worst_unit=True).controller)
+    mean = hidden(residual_h2(A, C, spectra, NOISE, SCALE, DT, [Basis(8)], tolerance_percent=0).controller)
     best = min(hidden(observer([t, 1 - t])).max() for t in np.linspace(0, 1, 21))
     assert found.max() <= mean.max()
     assert found.max() <= 1.03 * best
@@ -175,7 +175,7 @@ def test_worst_unit_against_a_search_over_mixtures():
 
 def test_shaping_filter_reproduces_covariances():
     truth = autoregression()
-    found = shaping_filter(spectrum(truth), Bank(3), DT)
+    found = shaping_filter(spectrum(truth), Basis(3), DT)
     assert found.is_stable()
 
     def covariances(system):
@@ -188,13 +188,13 @@ def test_shaping_filter_reproduces_covariances():
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("bank", [Bank(1), Bank(8), Bank(0, (0.5, 0.99)), Bank(3, (0.9, -0.5, 0.999))])
-def test_shaping_filters_are_stable_for_any_spectrum(bank):
+@pytest.mark.parametrize("basis", [Basis(1), Basis(8), Basis(0, (0.5, 0.99)), Basis(3, (0.9, -0.5, 0.999))])
+def test_shaping_filters_are_stable_for_any_spectrum(basis):
     rng = np.random.default_rng(3)
     for _ in range(5):
         root = rng.standard_normal((65, 3, 3)) * np.exp(3 * rng.standard_normal((65, 1, 1))) + 0j
         root[1:-1] += 1j * rng.standard_normal((63, 3, 3))
-        assert shaping_filter(root @ root.conj().swapaxes(-1, -2), bank, DT).is_stable()
+        assert shaping_filter(root @ root.conj().swapaxes(-1, -2), basis, DT).is_stable()
 
 
 def test_spectra_integrate_to_covariances_of_each_unit():

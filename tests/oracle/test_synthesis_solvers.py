@@ -10,7 +10,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from kros.core import SynthesisError, hinf_norm
 from kros.synthesis import GeneralizedPlant, h2, hinf, mixed
 from kros.synthesis.mixed_norms.barrier import Block, Ending, minimise
-from kros.synthesis.mixed_norms.solvers import Program, climb, installed, solve
+from kros.synthesis.mixed_norms.solvers import Program, installed, solve, solve_with_fallback
 
 
 def largest_eigenvalue(matrix):
@@ -69,14 +69,14 @@ def test_infeasible_is_told_from_stalled_and_from_time():
     assert minimise(program.c, [Block(b.constant, 0 * b.basis) for b in program.blocks], program.start).x is None
 
 
-def test_nothing_is_accepted_that_fails_its_check_and_all_rungs_are_told():
+def test_nothing_is_accepted_that_fails_its_check_and_all_solvers_are_noted():
     program = largest_eigenvalue(random_symmetric(0))
-    result = climb(program, lambda answer: f"{answer.solver}: rejected", rungs=["BARRIER", "CLARABEL"])
+    result = solve_with_fallback(program, lambda answer: f"{answer.solver}: rejected", solvers=["BARRIER", "CLARABEL"])
     assert result.accepted is None
-    assert result.told == ["BARRIER: rejected", "CLARABEL: rejected"]
-    accepted = climb(program, lambda answer: answer.value if answer.solver == "CLARABEL" else "not this one")
+    assert result.notes == ["BARRIER: rejected", "CLARABEL: rejected"]
+    accepted = solve_with_fallback(program, lambda answer: answer.value if answer.solver == "CLARABEL" else "not this one")
     assert accepted.answer.solver == "CLARABEL"
-    assert climb(program, lambda answer: 1.0, time_limit_s=1e-12).told[0].startswith("BARRIER: not tried")
+    assert solve_with_fallback(program, lambda answer: 1.0, time_limit_s=1e-12).notes[0].startswith("BARRIER: not tried")
 
 
 def plant(**changes):

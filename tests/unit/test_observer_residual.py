@@ -6,7 +6,7 @@ import pytest
 from kros.core import DataError, DimensionError, SynthesisError
 from kros.lifting import Lifting
 from kros.observer import one_step_residual, residual_spectra
-from kros.synthesis import Bank, residual_h2, shaping_filter
+from kros.synthesis import Basis, residual_h2, shaping_filter
 
 A, C, NOISE, SCALE, DT = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[1.0, 0.0]]), [1e-3], [1.0, 1.0], 1e-2
 
@@ -68,13 +68,13 @@ def test_shapes_are_named():
     with pytest.raises(DimensionError, match=r"spectra \(unit, f, n, n\)"):
         residual_h2(A, C, np.ones((65, 2, 2), complex), NOISE, SCALE, DT)
     with pytest.raises(DimensionError, match=r"\(f, n, n\)"):
-        shaping_filter(np.ones((65, 2, 3), complex), Bank(), DT)
+        shaping_filter(np.ones((65, 2, 3), complex), Basis(), DT)
 
 
 @pytest.mark.parametrize("options", [{"delays": -1}, {"poles": (1.0,)}, {"poles": (0.5, 0.5)}, {"poles": (0.0,)}])
 def test_banks_that_make_no_sense(options):
     with pytest.raises(DimensionError, match="different poles inside the unit circle"):
-        Bank(**options)
+        Basis(**options)
 
 
 def test_unobservable_plants_are_refused():

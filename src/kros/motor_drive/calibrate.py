@@ -21,7 +21,7 @@ from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
 from ..lifting import Lifting
 from ..observer.predictor import Past
-from ..synthesis.residual_shaped.shaping_filter import Bank
+from ..synthesis.residual_shaped.shaping_filter import Basis
 from .signals import low_passed, without_level
 
 Array = npt.NDArray[np.float64]
@@ -110,5 +110,5 @@ def calibrate_load(
     with_load = replace(lifting, states=(*lifting.states, LOAD))
     keys = tuple(EpisodeKey(_LOADED if found else _UNLOADED, "", str(i)) for i, found in zip(used, loaded, strict=True))
     seen_batch = replace(batch.take(used.tolist()), keys=keys, states=widened)
-    past = Past.of(with_load, tuple(measured), seen_batch, Bank(_DELAYS, (float(np.exp(-dt / level_s)),)))
+    past = Past.of(with_load, tuple(measured), seen_batch, Basis(_DELAYS, (float(np.exp(-dt / level_s)),)))
     return LoadCalibration(past, seen_batch, level_s, tuple(used.tolist()), tuple(np.flatnonzero(at_limit).tolist()))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .reduction.polishing import polish
     from .reduction.truncation import reduce_controller
     from .residual_shaped.residual_h2 import residual_h2
-    from .residual_shaped.shaping_filter import Bank, shaping_filter
+    from .residual_shaped.shaping_filter import Basis, shaping_filter
     from .result import Injection, Status, Synthesis
     from .riccati.constant_gain import kalman, luenberger
     from .riccati.h2_optimal import h2
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from .worst_case.worst_case_hinf import worst_case_hinf
 
 _HOME = {
-    "Bank": "residual_shaped.shaping_filter",
+    "Basis": "residual_shaped.shaping_filter",
     "Block": "structured.blocks",
     "GeneralizedPlant": "generalized_plant",
     "Injection": "result",
@@ -65,7 +65,7 @@ _HOME = {
 }
 
 __all__ = [
-    "Bank",
+    "Basis",
     "Block",
     "GeneralizedPlant",
     "Injection",

@@ -13,7 +13,7 @@ from ...core.linalg import least_squares
 from ...core.lti import gain
 from ...data import EpisodeBatch
 from ...lifting import Lifting
-from ...synthesis.residual_shaped.shaping_filter import Bank
+from ...synthesis.residual_shaped.shaping_filter import Basis
 from ...synthesis.result import Injection
 from ..observer import Observer
 from ..tuning.blocks import Array, Model
@@ -70,7 +70,7 @@ def identify_predictor(
     """
     units = batch.units
     slowest = 1 - (SHORT / int(batch.lengths.min()) if longest_s is None else batch.sample_period_s / longest_s)
-    past = Past.of(lifting, measured, batch, Bank(DELAYS, (slowest,)))
+    past = Past.of(lifting, measured, batch, Basis(DELAYS, (slowest,)))
     model = past.model(len(hidden_of(lifting, measured)) + internal, importance=importance, deviation=deviation)
     few = batch.take([i for i in range(len(units)) if units[:i].count(units[i]) < episodes])
     few = few.head(min(samples, int(few.lengths.min())))

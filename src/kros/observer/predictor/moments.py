@@ -5,7 +5,7 @@ controller, the load. Here the hidden states are regressed on the past of what t
 
 .. math:: z = [\,y - M u;\; u_f;\; \sigma(y)\,],
 
-(u_f the inputs that no measurement follows) through a bank of delays of all and slow lags of the first
+(u_f the inputs that no measurement follows) through a basis of delays of all and slow lags of the first
 (as for `shaping_filter`), ``s+ = S s + E z``, ``x_h = W s``. Only few directions of s matter: with P the second moment of s *as recorded* and
 Q the observability Gramian of (W, S), the leading eigenvectors of ``Q^(1/2) P Q^(1/2)`` span the states that are kept. In the
 coordinates where Q is the identity S is a contraction, and so is any orthogonal projection of it: the reduced model is *always stable*.
@@ -32,7 +32,7 @@ from ...core.linalg import least_squares
 from ...core.norms import gramian
 from ...data import EpisodeBatch
 from ...lifting import Lifting
-from ...synthesis.residual_shaped.shaping_filter import Bank
+from ...synthesis.residual_shaped.shaping_filter import Basis
 
 Array = npt.NDArray[np.float64]
 DELAYS = 40
@@ -43,13 +43,13 @@ _RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 1e-5, 0.5, 0.1, 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Past:
-    """What the units' recordings say about their hidden states: moments of the bank's states, common to any order.
+    """What the units' recordings say about their hidden states: moments of the basis's states, common to any order.
 
     Parameters
     ----------
     lifting : Lifting
     measured : tuple of int
-    bank : Bank
+    basis : Basis
     static : ndarray, shape (q, m)
         M, what the inputs alone say of the measurement.
     free : tuple of int
@@ -65,7 +65,7 @@ class Past:
 
     lifting: Lifting
     measured: tuple[int, ...]
-    bank: Bank
+    basis: Basis
     static: Array
     free: tuple[int, ...]
     units: tuple[str, ...]
@@ -79,7 +79,7 @@ class Past:
         lifting: Lifting,
         measured: Sequence[int],
         batch: EpisodeBatch,
-        bank: Bank | None = None,
+        basis: Basis | None = None,
     ) -> Past:
         """Collect moments of recordings.
 
@@ -89,7 +89,7 @@ class Past:
             Its functions read measured states alone; no delays, no functions of inputs.
         measured : sequence of int
         batch : EpisodeBatch
-        bank : Bank, optional
+        basis : Basis, optional
             By default 40 delays, and a lag of the tracking errors that forgets in a twenty-fifth of the shortest episode: controllers
             integrate.
 
@@ -111,14 +111,14 @@ class Past:
                 f"Predictor: needs a state that is not measured and episodes of more than {2 * SKIP} samples, "
                 f"found {len(hidden)} and {lengths.min()}."
             )
-        bank = bank or Bank(DELAYS, (1 - SHORT / int(lengths.min()),))
+        basis = basis or Basis(DELAYS, (1 - SHORT / int(lengths.min()),))
         y = states[..., list(measured)]
         static = _static(inputs, y)
         share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
         free = tuple(int(j) for j in np.flatnonzero(share.max(axis=0) < _FOLLOWS))
         z = _channels(lifting, tuple(measured), static, free, batch)
         names = tuple(dict.fromkeys(batch.units))
-        size = bank.delays * z.shape[-1] + len(bank.poles) * len(measured)
+        size = basis.delays * z.shape[-1] + len(basis.poles) * len(measured)
         gram, cross, power = (
             np.zeros((len(names), size, size)),
             np.zeros((len(names), size, len(hidden))),
@@ -127,13 +127,13 @@ class Past:
         counts = np.zeros(len(names))
         for i, unit in enumerate(batch.units):
             rows, k = np.arange(SKIP, lengths[i], THIN), names.index(unit)
-            s, truth = _bank_states(bank, z[:, i], rows, len(measured)), states[rows, i][:, hidden]
+            s, truth = _basis_states(basis, z[:, i], rows, len(measured)), states[rows, i][:, hidden]
             gram[k] += s.T @ s
             cross[k] += s.T @ truth
             power[k] += np.sum(truth**2, axis=0)
             counts[k] += len(rows)
         each = counts[:, None]
-        return cls(lifting, tuple(measured), bank, static, free, names, gram / each[:, None], cross / each[:, None], power / each)
+        return cls(lifting, tuple(measured), basis, static, free, names, gram / each[:, None], cross / each[:, None], power / each)
 
     def model(
         self, order: int, without: Sequence[str] = (), importance: npt.ArrayLike = 1.0, deviation: float = 0.0
@@ -149,7 +149,7 @@ class Past:
 
         Notes
         -----
-        `importance`, shape (h,) or a number, weights the hidden states' mean square errors, each relative to what the whole bank leaves of it.
+        `importance`, shape (h,) or a number, weights the hidden states' mean square errors, each relative to what the whole basis leaves of it.
         With `deviation` every lifted function's effect is known but for an independent factor 1 +- deviation, which differs from machine to machine.
         """
         rows = [i for i, unit in enumerate(self.units) if unit not in without]
@@ -158,9 +158,9 @@ class Past:
         P, cross, power = self.gram[rows].mean(axis=0), self.cross[rows].mean(axis=0), self.power[rows].mean(axis=0)
         if not cross.shape[1] <= order:
             raise DimensionError(f"Predictor: {cross.shape[1]} hidden states need an order of at least as many, found {order}.")
-        q, delays = len(self.measured), self.bank.delays
-        channels = (len(P) - len(self.bank.poles) * q) // delays
-        S, E = self.bank.system(channels)
+        q, delays = len(self.measured), self.basis.delays
+        channels = (len(P) - len(self.basis.poles) * q) // delays
+        S, E = self.basis.system(channels)
         present = [i for i in range(len(S)) if i < delays * channels or i % channels < q]
         size = self._channel_sizes(P, channels)
         P, cross = P / np.outer(size, size), cross / size[:, None]
@@ -169,7 +169,7 @@ class Past:
         for channel in range(channels - functions, channels):
             own = np.arange(channel, delays * channels, channels)
             P[np.ix_(own, own)] *= 1 + deviation**2
-        W = _ridge(P, cross, self.bank, channels)
+        W = _ridge(P, cross, self.basis, channels)
         left = np.sqrt(np.maximum(power - 2 * np.sum(W * cross.T, axis=1) + np.sum((W @ P) * W, axis=1), _NEGLIGIBLE * power))
         values, vectors = np.linalg.eigh(gramian(S.T, (W * (np.sqrt(importance) / left)[:, None]).T, 1.0))
         kept = values > _NEGLIGIBLE * values[-1]
@@ -185,11 +185,11 @@ class Past:
         return _channels(self.lifting, self.measured, self.static, self.free, batch)
 
     def _channel_sizes(self, P: Array, channels: int) -> Array:
-        """Size of the channel that every state of the bank is of: what is negligible must not depend on units of measure."""
-        delays, q = self.bank.delays, len(self.measured)
+        """Size of the channel that every state of the basis is of: what is negligible must not depend on units of measure."""
+        delays, q = self.basis.delays, len(self.measured)
         power = np.diag(P)[: delays * channels].reshape(delays, channels).mean(axis=0)
         size = np.sqrt(np.where(power > 0, power, 1.0))
-        return np.concatenate([np.tile(size, delays), np.tile(size[:q], len(self.bank.poles))])
+        return np.concatenate([np.tile(size, delays), np.tile(size[:q], len(self.basis.poles))])
 
 
 def hidden_of(lifting: Lifting, measured: Sequence[int]) -> list[int]:
@@ -218,18 +218,18 @@ def _channels(lifting: Lifting, measured: tuple[int, ...], static: Array, free: 
     return np.concatenate([y - u @ static.T, u[..., list(free)], lifting.lift(x, batch.parameters)[..., lifting.n_states :]], axis=-1)
 
 
-def _bank_states(bank: Bank, z: Array, rows: npt.NDArray[np.intp], slow: int) -> Array:
+def _basis_states(basis: Basis, z: Array, rows: npt.NDArray[np.intp], slow: int) -> Array:
     """States s of one episode at some samples: delays of all channels, then lags of the first few, shape (rows, N)."""
     from scipy.signal import lfilter
 
-    delayed = [z[np.maximum(rows - j, 0)] for j in range(1, bank.delays + 1)]
-    lags = [lfilter([0.0, np.sqrt(1 - p**2)], [1.0, -p], z[:, :slow], axis=0)[rows] for p in bank.poles]
+    delayed = [z[np.maximum(rows - j, 0)] for j in range(1, basis.delays + 1)]
+    lags = [lfilter([0.0, np.sqrt(1 - p**2)], [1.0, -p], z[:, :slow], axis=0)[rows] for p in basis.poles]
     return np.concatenate([*delayed, *lags], axis=1)
 
 
-def _ridge(P: Array, cross: Array, bank: Bank, channels: int) -> Array:
+def _ridge(P: Array, cross: Array, basis: Basis, channels: int) -> Array:
     """Weights W of the hidden states, shape (h, N); the penalty is on differences of neighbouring samples, as the samples are nearly alike."""
-    n = bank.delays * channels
+    n = basis.delays * channels
     change = np.eye(len(P)) - np.diag((np.arange(len(P) - channels) < n - channels).astype(float), -channels)
     P, cross = change @ P @ change.T, change @ cross
     size = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))

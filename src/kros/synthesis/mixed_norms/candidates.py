@@ -17,7 +17,7 @@ from ..riccati.hinf_optimal import hinf
 from .balance import balance
 from .channels import Verified, scaled, verify
 from .inequalities import MixedInequalities
-from .solvers import Answer, Program, climb
+from .solvers import Answer, Program, solve_with_fallback
 
 
 def by_inequalities(
@@ -62,8 +62,8 @@ def by_inequalities(
                 origin = f"{answer.solver} ({answer.word}), {label}, their value {size * np.sqrt(max(answer.value, 0.0)):.6g}"
                 return verify(plant, K, gamma, origin, answer.solver.lower(), answer.optimal)
 
-            result = climb(program, check, time_limit_s=left, rungs=solvers)
-            reasons += [f"{label}, {told}" for told in result.told]
+            result = solve_with_fallback(program, check, time_limit_s=left, solvers=solvers)
+            reasons += [f"{label}, {note}" for note in result.notes]
             if result.accepted is not None:
                 found.append(result.accepted)
     return found

@@ -54,22 +54,22 @@ def for_observer(
         return _without_correction(problem, nothing, start)
     best: Synthesis | None = None
     reasons: list[str] = []
-    ladder = ("BARRIER",) if solvers is None else solvers
+    quick = ("BARRIER",) if solvers is None else solvers
     # What the quick solver cannot do on any of the problems is asked of all the others on the first.
-    rows = [(floor, states, ladder) for floor in (noise_floor, 10 * noise_floor) for states in _around(max_states)]
-    for floor, states, rungs in [*rows, (noise_floor, max_states, solvers)]:
+    rows = [(floor, states, quick) for floor in (noise_floor, 10 * noise_floor) for states in _around(max_states)]
+    for floor, states, tried_solvers in [*rows, (noise_floor, max_states, solvers)]:
         noisy = replace(problem, noise=np.maximum(problem.noise, floor * (np.abs(problem.C) @ problem.output_scale)))
         plant = mixed_plant(noisy, noise_floor=0.0, penalty_floor=penalty_floor)
         require_reachable(plant, gamma)  # K does not enter T22, so that this is all there is to say about the constraint
         for tried in canonical_scalings(plant) if scalings is None else [tuple(scalings)]:
-            told: list[str] = []
+            failed: list[str] = []
             notes: list[str] = []
-            found = by_inequalities(plant, gamma, tried, states, end, told, notes, rungs)
+            found = by_inequalities(plant, gamma, tried, states, end, failed, notes, tried_solvers)
             if found:
                 made = _certified(problem, noisy, min(found, key=lambda v: v.h2), notes, start)
                 best = made if best is None or _worst(made) < _worst(best) else best
                 break
-            reasons.append(f"with measurement noise of {floor:g} of the range and {states} states: {'; '.join(dict.fromkeys(told))}")
+            reasons.append(f"with measurement noise of {floor:g} of the range and {states} states: {'; '.join(dict.fromkeys(failed))}")
         if best is not None and (_worst(best) <= idle * (1 + _NOTHING) or floor > noise_floor):
             return best
     if best is not None:

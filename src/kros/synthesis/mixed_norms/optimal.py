@@ -83,7 +83,7 @@ def mixed(
     penalty_floor : float
         For observer problems: least weight of the scaled correction in the inequalities.
     solvers : sequence of str, optional
-        Rungs of the ladder, see `kros.synthesis.mixed_norms.solvers.installed`.
+        Solver and its fallbacks, see `kros.synthesis.mixed_norms.solvers.installed`.
 
     Returns
     -------
@@ -157,9 +157,9 @@ def mixed(
         else:
             found = by_inequalities(plant, gamma, _LAST_SCALINGS if scalings is None else tried, max_states, end, reasons, notes, solvers)
     if not found:
-        told = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
+        why = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
         raise SynthesisError(
-            f"Mixed synthesis: no controller survived; {told}. Raise gamma = {gamma:g}, max_states, noise or the time limit."
+            f"Mixed synthesis: no controller survived; {why}. Raise gamma = {gamma:g}, max_states, noise or the time limit."
         )
     if polished:
         found += _improved(plant, found, gamma, end)
@@ -195,9 +195,9 @@ def _singular(
         found += on_the_plant(plant, by_hinf(regular, gamma, end, reasons), gamma)
     if not found:
         require_attainable(regular, gamma, 2 * gamma, max(end - time.perf_counter(), 1.0))
-        told = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
+        why = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
         raise SynthesisError(
-            f"Mixed synthesis of a singular plant: no controller survived; {told}. Add penalty and noise to channel 1, or raise gamma."
+            f"Mixed synthesis of a singular plant: no controller survived; {why}. Add penalty and noise to channel 1, or raise gamma."
         )
     if degenerate:
         notes.append(

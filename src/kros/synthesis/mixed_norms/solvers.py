@@ -1,7 +1,7 @@
-"""A ladder of solvers for matrix inequalities: each rung within a time limit, nothing accepted that does not survive a check.
+"""Solvers of matrix inequalities and their fallbacks: each within a time limit, nothing accepted that does not survive a check.
 
-The first rung is the package's own barrier method, then Clarabel, both free of licences; SDPA, SCS and MOSEK follow where they are installed.
-A rung that finds the inequalities infeasible is asked again by the next ones, since conic solvers say so of ill-conditioned problems too.
+The first is the package's own barrier method, then Clarabel, both free of licences; SDPA, SCS and MOSEK follow where they are installed.
+A solver that finds the inequalities infeasible is asked again by the next ones, since conic solvers say so of ill-conditioned problems too.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ class Answer:
 
 
 @dataclass(frozen=True, eq=False)
-class Climb(Generic[T]):
-    """The first accepted answer, what was made of it, and what the rungs before it said."""
+class Attempts(Generic[T]):
+    """The first accepted answer, what was made of it, and what the solvers before it said."""
 
     answer: Answer | None
     accepted: T | None
-    told: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def installed() -> list[str]:
@@ -60,14 +60,14 @@ def installed() -> list[str]:
     return [name for name, module in _MODULES.items() if find_spec(module) is not None]
 
 
-def climb(
+def solve_with_fallback(
     program: Program,
     check: Callable[[Answer], T | str],
     *,
     time_limit_s: float = 20.0,
-    rungs: Sequence[str] | None = None,
+    solvers: Sequence[str] | None = None,
     rtol: float = 1e-4,
-) -> Climb[T]:
+) -> Attempts[T]:
     """Try solvers in order until an answer passes the check.
 
     Parameters
@@ -76,25 +76,25 @@ def climb(
     check : callable
         Turns an answer into what is wanted, or into the reason why it is rejected.
     time_limit_s : float
-        For all rungs together.
-    rungs : sequence of str, optional
+        For all solvers together.
+    solvers : sequence of str, optional
         Names of solvers; default those that are installed.
     rtol : float
         Accuracy asked of every solver, relative to the value.
     """
     end = time.perf_counter() + time_limit_s
-    told: list[str] = []
-    for name in installed() if rungs is None else rungs:
+    notes: list[str] = []
+    for name in installed() if solvers is None else solvers:
         left = end - time.perf_counter()
         if left <= 0:
-            told.append(f"{name}: not tried, the time limit of {time_limit_s:g} s was used up")
+            notes.append(f"{name}: not tried, the time limit of {time_limit_s:g} s was used up")
             continue
         answer = solve(program, name, left, rtol)
         verdict: T | str = f"{name}: {answer.word}" if answer.x is None else check(answer)
         if not isinstance(verdict, str):
-            return Climb(answer, verdict, told)
-        told.append(verdict)
-    return Climb(None, None, told)
+            return Attempts(answer, verdict, notes)
+        notes.append(verdict)
+    return Attempts(None, None, notes)
 
 
 def solve(program: Program, solver: str, time_limit_s: float, rtol: float = 1e-4) -> Answer:

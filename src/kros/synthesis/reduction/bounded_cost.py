@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import KrosError
+from ...core.linalg import adjoint
 from ...core.lti import StateSpace
 from ...core.norms import hinf_norm
 from .affine_loop import AffineLoop
@@ -59,11 +60,11 @@ class BoundedCost:
             return float("inf"), np.zeros_like(theta)
         left, T, right = self.loop.responses(theta, self.freqs_hz)
         left, T, right = left[:, rows], T[:, rows, columns], right[:, :, columns]
-        inverse = np.linalg.inv(np.eye(T.shape[-1]) - _hermitian(T) @ T / self.bound**2)
+        inverse = np.linalg.inv(np.eye(T.shape[-1]) - adjoint(T) @ T / self.bound**2)
         excess = np.real(np.einsum("fii->f", inverse)) - T.shape[-1]
         towards = 2 / self.bound**2 * T @ inverse @ inverse
         weight = self.barrier / len(self.freqs_hz)
-        slope = np.real(np.sum(_hermitian(left) @ towards @ _hermitian(right), axis=0))
+        slope = np.real(np.sum(adjoint(left) @ towards @ adjoint(right), axis=0))
         return value + weight * float(excess.sum()), gradient + weight * slope
 
     def _within(self, theta: Array, rows: slice, columns: slice) -> bool:
@@ -73,7 +74,3 @@ class BoundedCost:
         except KrosError:
             return False
         return norm * (1 + 2e-6) < self.bound
-
-
-def _hermitian(matrix: Array) -> Array:
-    return np.conj(np.swapaxes(matrix, -1, -2))

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.linalg import qr_triangle
+from ...core.linalg import adjoint, qr_triangle
 from ...core.lti import StateSpace
 from ..problem.observer_problem import ObserverProblem
 from ..worst_case.disturbance import uncertain_ball
@@ -67,7 +67,7 @@ class CertifiedCost:
     weight : ndarray, shape (f,)
         Of the nodes; they sum to one.
     freqs_hz : ndarray, shape (f,)
-    port, state : slice
+    uncertainty_input, state : slice
         Inputs of the loop at which the perturbation and the remainder act.
     W_L, center, left : ndarray
         Responses of the left weight and of the ball (`kros.synthesis.worst_case.ball`).
@@ -132,12 +132,12 @@ class CertifiedCost:
             W_r, q = self.remainder
             size, remainder = _spread(T[..., self.state] @ W_r, q)
             amplitude = amplitude + size
-            Gamma[..., self.state] += 2 * amplitude[:, None, None] * (remainder @ _hermitian(W_r))
-        Gamma[..., self.uncertainty_input] += 2 * (amplitude * self.ratio)[:, None, None] * (towards @ _hermitian(self.W_L))
+            Gamma[..., self.state] += 2 * amplitude[:, None, None] * (remainder @ adjoint(W_r))
+        Gamma[..., self.uncertainty_input] += 2 * (amplitude * self.ratio)[:, None, None] * (towards @ adjoint(self.W_L))
         noise = T[..., self.state.stop :]
         value = float(self.weight @ (amplitude**2 + np.sum(np.abs(noise) ** 2, axis=(-2, -1))))
         weighted = self.weight[:, None, None] * Gamma
-        return value, np.real(np.sum(_hermitian(left) @ weighted @ _hermitian(right), axis=0))
+        return value, np.real(np.sum(adjoint(left) @ weighted @ adjoint(right), axis=0))
 
     def roots(self, theta: Array) -> tuple[Array, Array]:
         """Factors R and S of the Gramians of the filter's states in the loop, driven by the set's average and seen in the error.
@@ -146,7 +146,7 @@ class CertifiedCost:
         """
         _, _, n_u, _, n_y = self.loop.plant.sizes
         left, driven = self._signals(theta)
-        return self._root(driven[:, n_y:]), self._root(_hermitian(left[:, :, n_u:]))
+        return self._root(driven[:, n_y:]), self._root(adjoint(left[:, :, n_u:]))
 
     def typical(self, theta: Array) -> Array:
         """Size of every entry of Theta that changes the cost by about as much as any other; see `AffineLoop.typical`."""
@@ -174,7 +174,7 @@ class CertifiedCost:
         through = T @ self.center
         size = np.linalg.norm(through, axis=(-2, -1))
         ball, towards = _spread(T @ self.left, self.q)
-        derivative = through @ _hermitian(self.center) / np.maximum(size, _TINY)[:, None, None] + towards @ _hermitian(self.left)
+        derivative = through @ adjoint(self.center) / np.maximum(size, _TINY)[:, None, None] + towards @ adjoint(self.left)
         return size + ball, derivative
 
 
@@ -186,8 +186,8 @@ def nodes(poles: Array) -> tuple[Array, Array]:
     angle, width = np.abs(poles.imag), np.maximum(np.abs(poles.real), 1e-9)
     low = float(np.clip(0.05 * np.hypot(angle, width).min(initial=1.0), 1e-9, 1e-2))
     sharp = angle > width
-    ladder = np.array([-16, -4, -1, -0.25, 0.25, 1, 4, 16])
-    around = (angle[sharp, None] + width[sharp, None] * ladder).ravel()
+    widths = np.array([-16, -4, -1, -0.25, 0.25, 1, 4, 16])
+    around = (angle[sharp, None] + width[sharp, None] * widths).ravel()
     decades = np.log10(np.pi / low)
     edges = np.unique(np.concatenate([np.geomspace(low, np.pi, 2 + int(10 * decades)), around[(around > low) & (around < np.pi)]]))
     edges = np.concatenate([[0.0], edges[np.concatenate([[True], np.diff(np.log(edges)) > 1e-6])]])
@@ -204,7 +204,3 @@ def _spread(P: Array, q: Array) -> tuple[Array, Array]:
     s, q = s[..., :k], q[..., :k]
     size = np.sqrt(np.sum((s * q) ** 2, axis=-1))
     return size, (U[..., :k] * (s * q**2 / np.maximum(size, _TINY)[:, None])[:, None, :]) @ Vh[..., :k, :]
-
-
-def _hermitian(matrix: Array) -> Array:
-    return np.conj(np.swapaxes(matrix, -1, -2))

@@ -20,7 +20,7 @@ from .balancing import Balancing, gramian_root
 from .certified_cost import CertifiedCost
 
 
-class Purpose(Protocol):
+class Objective(Protocol):
     """What a controller is for."""
 
     def inside(self, controller: StateSpace) -> StateSpace:
@@ -39,7 +39,7 @@ class Purpose(Protocol):
         """Return the synthesis with another controller (outside): all that depends on it recomputed, or left out."""
 
 
-def purpose(problem: ObserverProblem | GeneralizedPlant) -> Purpose:
+def objective_of(problem: ObserverProblem | GeneralizedPlant) -> Objective:
     """Return what a controller for this problem is for."""
     return ForObserver(problem) if isinstance(problem, ObserverProblem) else ForPlant(problem)
 
@@ -76,7 +76,7 @@ class ForObserver:
         value, error = certify(problem, controller)
         before = certify(problem, synthesis.controller)[0]
         loop, white = problem.error_system(controller), problem.nominal.n_inputs + problem.nominal.n_states
-        lower, gap, told = enclosed(value, synthesis.lower_bound) if synthesis.bounded_in_h2 else (None, None, ())
+        lower, gap, notes = enclosed(value, synthesis.lower_bound) if synthesis.bounded_in_h2 else (None, None, ())
         change = 100 * (value / before - 1)
         stale: dict[str, Any] = dict.fromkeys(("hinf_norm", "worst_case_hinf", "causal_h2"))
         return replace(
@@ -91,7 +91,7 @@ class ForObserver:
             quadrature_error=error,
             spectral_radius=float(loop.spectral_radius()),
             solve_s=synthesis.solve_s + seconds,
-            notes=(*synthesis.notes, f"{what}: certified worst-case H2 {value:.6g} against {before:.6g} before ({change:+.2f} %)", *told),
+            notes=(*synthesis.notes, f"{what}: certified worst-case H2 {value:.6g} against {before:.6g} before ({change:+.2f} %)", *notes),
         )
 
 
@@ -126,7 +126,7 @@ class ForPlant:
         split = plant.n_w1 is not None or plant.n_z1 is not None
         closed = plant.close(controller)
         value, before = h2_norm(one.close(controller)), h2_norm(one.close(synthesis.controller))
-        lower, gap, told = enclosed(value, synthesis.lower_bound) if synthesis.method in ("h2", "mixed") else (None, None, ())
+        lower, gap, notes = enclosed(value, synthesis.lower_bound) if synthesis.method in ("h2", "mixed") else (None, None, ())
         stale: dict[str, Any] = dict.fromkeys(("worst_case_h2", "worst_case_hinf", "causal_h2"))
         return replace(
             synthesis,
@@ -142,6 +142,6 @@ class ForPlant:
             notes=(
                 *synthesis.notes,
                 f"{what}: H2 norm {value:.6g} against {before:.6g} before ({100 * (value / before - 1):+.2f} %)",
-                *told,
+                *notes,
             ),
         )

@@ -26,7 +26,7 @@ from .affine_loop import AffineLoop
 from .bounded_cost import BoundedCost
 from .certified_cost import CertifiedCost
 from .descent import bfgs
-from .objective import ForObserver, purpose
+from .objective import ForObserver, objective_of
 
 Array = npt.NDArray[Any]
 Cost = Callable[[Array], tuple[float, Array]]
@@ -92,7 +92,7 @@ def polish(
         K = _polished_observer(problem, synthesis.controller, rounds, iterations)
     else:
         K = _polished_plant(problem, synthesis.controller, bound, rounds, iterations)
-    return purpose(problem).restated(synthesis, K, "polished", time.perf_counter() - start)
+    return objective_of(problem).restated(synthesis, K, "polished", time.perf_counter() - start)
 
 
 def descend(cost: Cost, size: Array, theta: Array, iterations: int) -> Array:
@@ -107,8 +107,8 @@ def descend(cost: Cost, size: Array, theta: Array, iterations: int) -> Array:
 
 
 def _polished_observer(problem: ObserverProblem, controller: StateSpace, rounds: int, iterations: int) -> StateSpace:
-    aim = ForObserver(problem)
-    K, (value, _) = aim.inside(controller), certify(problem, controller)
+    objective = ForObserver(problem)
+    K, (value, _) = objective.inside(controller), certify(problem, controller)
     for _ in range(rounds):
         cost = CertifiedCost.around(problem, K)
         theta = cost.loop.theta(K)
@@ -116,7 +116,7 @@ def _polished_observer(problem: ObserverProblem, controller: StateSpace, rounds:
         found, trial = float("inf"), K
         for halving in range(_HALVINGS):
             trial = cost.loop.controller(theta + 0.5**halving * step)
-            found = aim.value(trial)
+            found = objective.value(trial)
             if found < value:
                 break
         if not found < value:
@@ -124,7 +124,7 @@ def _polished_observer(problem: ObserverProblem, controller: StateSpace, rounds:
         gain, K, value = 1 - found / value, trial, found
         if gain < _WORTH:
             break
-    return aim.outside(K)
+    return objective.outside(K)
 
 
 def _polished_plant(plant: GeneralizedPlant, controller: StateSpace, bound: float | None, rounds: int, iterations: int) -> StateSpace:

@@ -24,7 +24,7 @@ from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..result import Synthesis
 from .balancing import Balancing, gramian_root
-from .objective import Purpose, purpose
+from .objective import Objective, objective_of
 from .polishing import polish
 
 _NEGLIGIBLE = 1e-10
@@ -67,23 +67,23 @@ def reduce_controller(
     if largest_loss_percent < 0 or (order is not None and order < 0):
         raise ConfigError(f"Order reduction: order = {order} and largest_loss_percent = {largest_loss_percent} should not be negative.")
     start = time.perf_counter()
-    aim = purpose(problem)
-    full = aim.inside(synthesis.controller)
-    allowed = aim.value(full) * (1 + largest_loss_percent / 100)
+    objective = objective_of(problem)
+    full = objective.inside(synthesis.controller)
+    allowed = objective.value(full) * (1 + largest_loss_percent / 100)
     if not np.isfinite(allowed):
         raise SynthesisError("Order reduction: the controller to be reduced does not stabilise; start from one that does.")
     if not full.n_states:
         return synthesis
-    balancing = aim.balanced(full)
+    balancing = objective.balanced(full)
     for k in range(full.n_states) if order is None else [min(order, full.n_states)]:
-        for value, how, K in _candidates(balancing, full, k, aim):
+        for value, how, K in _candidates(balancing, full, k, objective):
             if not polished and order is None and value > allowed:
                 continue
             what = f"order {full.n_states} reduced to {K.n_states} by {how}"
-            candidate = aim.restated(synthesis, aim.outside(K), what, time.perf_counter() - start)
+            candidate = objective.restated(synthesis, objective.outside(K), what, time.perf_counter() - start)
             if polished:
                 candidate = polish(problem, candidate)
-                value = aim.value(aim.inside(candidate.controller))
+                value = objective.value(objective.inside(candidate.controller))
             if order is not None or value <= allowed:
                 return candidate
     if order is not None:
@@ -91,7 +91,7 @@ def reduce_controller(
     return synthesis
 
 
-def _candidates(balancing: Balancing, full: StateSpace, k: int, aim: Purpose) -> list[tuple[float, str, StateSpace]]:
+def _candidates(balancing: Balancing, full: StateSpace, k: int, objective: Objective) -> list[tuple[float, str, StateSpace]]:
     """Reduced controllers of one order that stabilise, the better one first."""
     order = min(k, len(balancing.values))
     found = []
@@ -100,7 +100,7 @@ def _candidates(balancing: Balancing, full: StateSpace, k: int, aim: Purpose) ->
             K = reduced(full, order)
         except np.linalg.LinAlgError:
             continue
-        value = aim.value(K)
+        value = objective.value(K)
         if np.isfinite(value):
             found.append((value, how, K))
     return sorted(found, key=lambda row: row[0])

@@ -28,11 +28,11 @@ from ...core.norms import gramian, h2_norm
 from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.constant_gain import kalman
 from ..riccati.filter_bound import predictor_bound
-from .shaping_filter import Bank, circle_weights, shaping_filter
+from .shaping_filter import Basis, circle_weights, shaping_filter
 
 Array = npt.NDArray[np.float64]
 Spectra = npt.NDArray[Any]
-BANKS = (Bank(8), Bank(4, (0.8, 0.95, 0.98)), Bank(8, (0.95, 0.98)), Bank(8, (0.9, 0.97, 0.99, 0.997)))
+BASES = (Basis(8), Basis(4, (0.8, 0.95, 0.98)), Basis(8, (0.95, 0.98)), Basis(8, (0.9, 0.97, 0.99, 0.997)))
 _ROUNDS = 30
 _CLOSE = 1.02
 _NEGLIGIBLE = 1e-12
@@ -45,7 +45,7 @@ def residual_h2(
     noise: npt.ArrayLike,
     scale: npt.ArrayLike,
     dt: float,
-    banks: Sequence[Bank] = BANKS,
+    bases: Sequence[Basis] = BASES,
     tolerance_percent: float = 1.0,
     worst_unit: bool = False,
     n_lifted: int | None = None,
@@ -66,11 +66,11 @@ def residual_h2(
     scale : array_like, shape (n,)
         Range of every state; norms are of errors in these units.
     dt : float, s
-    banks : sequence of Bank
+    bases : sequence of Basis
         Memories of the shaping filter that are tried: the one with the least error under the spectra as they were measured is kept. A lag
         with a pole near one is a disturbance state, for loads.
     tolerance_percent : float
-        What the reduction of the order from ``n * bank.size`` may cost in the RMS error of any state that is not measured; 0 keeps every
+        What the reduction of the order from ``n * basis.size`` may cost in the RMS error of any state that is not measured; 0 keeps every
         state of the filter.
     worst_unit : bool
         Minimise the largest error of a unit in place of the mean.
@@ -107,7 +107,7 @@ def residual_h2(
     start = time.perf_counter()
     scaled = A / scale[:, None] * scale, C * scale, noise, spectra / np.outer(scale, scale)
     problem = (
-        min((_Problem(*scaled, bank, dt) for bank in banks), key=_Problem.promise) if len(banks) > 1 else _Problem(*scaled, banks[0], dt)
+        min((_Problem(*scaled, basis, dt) for basis in bases), key=_Problem.promise) if len(bases) > 1 else _Problem(*scaled, bases[0], dt)
     )
     weights, note = problem.worst_unit() if worst_unit else (np.full(len(spectra), 1 / len(spectra)), f"mean of {len(spectra)} units")
     full = problem.filter(weights)
@@ -119,9 +119,9 @@ def residual_h2(
         )
     K = problem.reduced(full, K, tolerance_percent, max_order)
     norm, radius = problem.norm(full, K), float(problem.error_system(K).spectral_radius())
-    note += f", {problem.bank.delays} delays, lags {problem.bank.poles}"
+    note += f", {problem.basis.delays} delays, lags {problem.basis.poles}"
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
-    lower, gap, told = enclosed(norm, problem.lower_bound(full))
+    lower, gap, notes = enclosed(norm, problem.lower_bound(full))
     rows = np.zeros(((n_lifted or n) - n, q))
     controller = StateSpace(
         K.A,
@@ -141,16 +141,16 @@ def residual_h2(
         spectral_radius=radius,
         solve_s=time.perf_counter() - start,
         solver="riccati",
-        notes=(note, *told),
+        notes=(note, *notes),
     )
 
 
-def promised_errors(A: Array, C: Array, spectra: Spectra, noise: Array, scale: Array, dt: float, bank: Bank = BANKS[1]) -> Array:
+def promised_errors(A: Array, C: Array, spectra: Spectra, noise: Array, scale: Array, dt: float, basis: Basis = BASES[1]) -> Array:
     """Return the root mean square error of every state, as a share of its largest value, that a residual-shaped observer would have on the spectra as measured.
 
     Parameters as in `residual_h2`; the mean over units is taken, the order is not reduced. Infinite where there is no observer.
     """
-    problem = _Problem(A / scale[:, None] * scale, C * scale, noise, spectra / np.outer(scale, scale), bank, dt)
+    problem = _Problem(A / scale[:, None] * scale, C * scale, noise, spectra / np.outer(scale, scale), basis, dt)
     try:
         K = problem.correction(problem.filter(np.full(len(spectra), 1 / len(spectra))))
     except SynthesisError:
@@ -166,12 +166,12 @@ class _Problem:
     C: Array
     noise: Array
     spectra: Spectra
-    bank: Bank
+    basis: Basis
     dt: float
 
     def filter(self, weights: Array) -> StateSpace:
         """Shaping filter of a mixture of the units' spectra."""
-        return shaping_filter(np.tensordot(weights, self.spectra, 1), self.bank, self.dt)
+        return shaping_filter(np.tensordot(weights, self.spectra, 1), self.basis, self.dt)
 
     def shaped(self, shaping: StateSpace) -> tuple[Array, Array, Array]:
         """Plant behind its shaping filter: dynamics, input of the white noise, measurement."""

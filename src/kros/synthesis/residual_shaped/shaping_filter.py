@@ -1,6 +1,6 @@
 r"""Shaping filters: stable models of low order whose output has a given spectrum.
 
-The signal omega passes a bank of delays and first-order lags, ``z+ = A_z z + B_z omega``, with covariance
+The signal omega passes a basis of delays and first-order lags, ``z+ = A_z z + B_z omega``, with covariance
 
 .. math:: G = \frac{1}{2\pi} \int Z S Z^H \, d\theta, \qquad Z = (e^{j\theta} I - A_z)^{-1} B_z
 
@@ -34,7 +34,7 @@ _PREDICTABLE = 1e-10
 
 
 @dataclass(frozen=True)
-class Bank:
+class Basis:
     """Delays and first-order lags of every channel.
 
     Parameters
@@ -55,7 +55,7 @@ class Bank:
 
     @cached_property
     def scalar(self) -> tuple[Array, Array]:
-        """Dynamics and input of the bank of one channel."""
+        """Dynamics and input of the basis of one channel."""
         shift = np.eye(self.delays, k=-1)
         poles = np.array(self.poles)
         first = np.eye(self.delays, 1)[:, 0]
@@ -84,7 +84,7 @@ def circle_weights(f: int) -> Array:
     return weight
 
 
-def shaping_filter(spectrum: Array, bank: Bank, dt: float) -> StateSpace:
+def shaping_filter(spectrum: Array, basis: Basis, dt: float) -> StateSpace:
     """Fit a shaping filter to a spectrum.
 
     Parameters
@@ -92,7 +92,7 @@ def shaping_filter(spectrum: Array, bank: Bank, dt: float) -> StateSpace:
     spectrum : ndarray, shape (f, n, n), complex
         Cross spectral density at equal steps from zero to Nyquist, both included; its mean over the circle is the covariance. Channels
         should be scaled to similar size.
-    bank : Bank
+    basis : Basis
     dt : float, s
 
     Returns
@@ -116,8 +116,8 @@ def shaping_filter(spectrum: Array, bank: Bank, dt: float) -> StateSpace:
     if not (np.isfinite(R).all() and largest > 0):
         raise SynthesisError("Shaping filter: the residual is zero or not finite, there is nothing to shape; correct nothing (open loop).")
     R = R + _FLOOR * largest * np.eye(n)
-    response = bank.response(np.exp(1j * np.linspace(0, np.pi, f)))
-    k = bank.size
+    response = basis.response(np.exp(1j * np.linspace(0, np.pi, f)))
+    k = basis.size
     blocks = np.einsum("f,fa,fb,fij->aibj", weight, response, response.conj(), spectrum, optimize=True).real
     floor = np.einsum("f,fa,fb->ab", weight, response, response.conj()).real
     G = blocks.reshape(k * n, k * n) + _FLOOR * largest * np.kron(floor, np.eye(n)).reshape(k * n, k * n)
@@ -132,5 +132,5 @@ def shaping_filter(spectrum: Array, bank: Bank, dt: float) -> StateSpace:
             "record longer or richer episodes."
         )
     root = vectors * np.sqrt(np.maximum(values, 0))
-    A, B = bank.system(n)
+    A, B = basis.system(n)
     return StateSpace(A + B @ Theta, B @ root, Theta, root, dt)

@@ -151,16 +151,16 @@ def luenberger(A: npt.ArrayLike, C: npt.ArrayLike, poles: npt.ArrayLike, dt: flo
     )
 
 
-def predictor(A: Array, C: Array, Q: Array, R: Array, S: Array, purpose: str) -> tuple[Array, Array]:
+def predictor(A: Array, C: Array, Q: Array, R: Array, S: Array, method: str) -> tuple[Array, Array]:
     """Gain and covariance of the one-step predictor for noise covariances Q, R and cross covariance S (n, q)."""
-    P = solve_riccati(A.T, C.T, Q, R, S, 1.0, purpose)
+    P = solve_riccati(A.T, C.T, Q, R, S, 1.0, method)
     return -discrete_gain(A.T, C.T, R, S, P).T, P
 
 
-def require_detectable(A: Array, C: Array, purpose: str) -> None:
+def require_detectable(A: Array, C: Array, method: str) -> None:
     """Raise a `SynthesisError` naming the first mode on or outside the unit circle that C does not see."""
     modes = unreachable_modes(A.T, C.T, 1.0)
     if modes:
         raise SynthesisError(
-            f"{purpose}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible in y; measure another state."
+            f"{method}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible in y; measure another state."
         )

@@ -19,7 +19,7 @@ from ...core.errors import SynthesisError
 Array = npt.NDArray[Any]
 
 
-def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, purpose: str) -> Array:
+def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, method: str) -> Array:
     """Return the stabilising solution X of the algebraic Riccati equation.
 
     Parameters
@@ -28,7 +28,7 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, p
         Dynamics (n, n), input (n, m), state cost (n, n), input cost (m, m), cross cost (n, m).
     dt : float, s
         0 for the continuous equation.
-    purpose : str
+    method : str
         For the message when it fails.
 
     Raises
@@ -48,13 +48,13 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, p
         X = (solve_discrete_are if dt > 0 else solve_continuous_are)(A, B, Q, R, s=S)
     except (LinAlgError, ValueError) as error:
         raise SynthesisError(
-            f"{purpose}: the Riccati equation of {A.shape[0]} states has no stabilising solution that can be computed ({error}); "
+            f"{method}: the Riccati equation of {A.shape[0]} states has no stabilising solution that can be computed ({error}); "
             "check stabilisability, detectability and scaling."
         ) from error
     X = (X + X.T) / 2
     if dt > 0 and _residual(A, B, Q, R, S, X) > 1e-5:
         raise SynthesisError(
-            f"{purpose}: the Riccati solution has residual {_residual(A, B, Q, R, S, X):.2g}; scale states, inputs and outputs to similar size."
+            f"{method}: the Riccati solution has residual {_residual(A, B, Q, R, S, X):.2g}; scale states, inputs and outputs to similar size."
         )
     return X
 

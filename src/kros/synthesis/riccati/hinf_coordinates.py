@@ -175,10 +175,10 @@ def balancing(p: GeneralizedPlant) -> tuple[Array, Array] | None:
     """Change of the states, and its inverse, that balances the H2 Riccati solutions; None where these cannot be computed."""
     if not p.sizes[0]:
         return None
-    purpose = "H-infinity synthesis, balancing"
+    method = "H-infinity synthesis, balancing"
     try:
-        X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, p.D12.T @ p.D12, p.C1.T @ p.D12, p.dt, purpose)
-        Y = solve_riccati(p.A.T, p.C2.T, p.B1 @ p.B1.T, p.D21 @ p.D21.T, p.B1 @ p.D21.T, p.dt, purpose)
+        X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, p.D12.T @ p.D12, p.C1.T @ p.D12, p.dt, method)
+        Y = solve_riccati(p.A.T, p.C2.T, p.B1 @ p.B1.T, p.D21 @ p.D21.T, p.B1 @ p.D21.T, p.dt, method)
         square = [_root(X, p.A, p.C1), _root(Y, p.A, p.B1)]
         U, s, Vh = np.linalg.svd(square[0].T @ square[1])
     except (SynthesisError, LinAlgError):

@@ -175,13 +175,13 @@ class _Search:
         best = self.bisect(1e-3)
         if best.norm <= gamma:
             return best
-        told = f"the best that was reached is {best.norm:.6g}, and no controller is below {best.lower:.6g}"
+        reached = f"the best that was reached is {best.norm:.6g}, and no controller is below {best.lower:.6g}"
         if best.lower >= gamma:
             _, why = self.level(gamma)
             reason = f" ({why.value})" if why is not None else ""
-            raise SynthesisError(f"H-infinity synthesis: the level gamma = {gamma:.6g} is out of reach{reason}; {told}. Raise gamma.")
+            raise SynthesisError(f"H-infinity synthesis: the level gamma = {gamma:.6g} is out of reach{reason}; {reached}. Raise gamma.")
         raise SynthesisError(
-            f"H-infinity synthesis: the level gamma = {gamma:.6g} was not reached, which does not prove that it cannot be; {told}. Raise gamma, or scale "
+            f"H-infinity synthesis: the level gamma = {gamma:.6g} was not reached, which does not prove that it cannot be; {reached}. Raise gamma, or scale "
             "states, inputs and outputs to similar size."
         )
 

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.linalg import adjoint
 from .blocks import Structure
 
 Array = npt.NDArray[Any]
@@ -81,8 +82,8 @@ def scalings(M: Array, structure: Structure, diagonal: bool = False) -> Scalings
 def _attained(M: Array, x: Array, E_L: Array, E_R: Array) -> Array:
     """Largest squared singular value after scaling, shape (f,)."""
     X_L, X_R = np.tensordot(x, E_L, 1), np.tensordot(x, E_R, 1)
-    right = _hermitian(np.linalg.inv(np.linalg.cholesky(X_R)))
-    scaled = _hermitian(np.linalg.cholesky(X_L)) @ M @ right
+    right = adjoint(np.linalg.inv(np.linalg.cholesky(X_R)))
+    scaled = adjoint(np.linalg.cholesky(X_L)) @ M @ right
     return np.asarray(np.linalg.norm(scaled, 2, axis=(-2, -1)) ** 2)
 
 
@@ -102,7 +103,7 @@ def _osborne(M: Array, structure: Structure) -> tuple[Array, Array]:
 
 def _centre(M: Array, x: Array, level: Array, E_L: Array, E_R: Array) -> Array:
     """Analytic centre by damped Newton steps: minimise ``-logdet(lambda X_R - M^H X_L M) - logdet X - logdet(I - X)``."""
-    pushed = _hermitian(M)[:, None] @ E_L @ M[:, None]
+    pushed = adjoint(M)[:, None] @ E_L @ M[:, None]
     dS = level[:, None, None, None] * E_R - pushed
     k = x.shape[1]
     for _ in range(_NEWTON):
@@ -120,7 +121,3 @@ def _centre(M: Array, x: Array, level: Array, E_L: Array, E_R: Array) -> Array:
         if decrement.max(initial=0.0) < 0.05:
             break
     return x
-
-
-def _hermitian(matrix: Array) -> Array:
-    return np.conj(np.swapaxes(matrix, -1, -2))

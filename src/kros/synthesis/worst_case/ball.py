@@ -42,6 +42,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.linalg import adjoint
 from .dual_bound import dual_bound
 
 Array = npt.NDArray[Any]
@@ -71,8 +72,8 @@ class Ball:
         U, s, Vh = np.linalg.svd(N)
         k = s.shape[-1]
         radius = 1 / np.sqrt(1 - s**2)
-        X_c = (_hermitian(Vh)[..., :k] * (s * radius**2)[..., None, :]) @ _hermitian(U)[..., :k, :]
-        return cls(X_c @ M, _with_gains(_hermitian(Vh), radius), _with_gains(U, radius) @ M)
+        X_c = (adjoint(Vh)[..., :k] * (s * radius**2)[..., None, :]) @ adjoint(U)[..., :k, :]
+        return cls(X_c @ M, _with_gains(adjoint(Vh), radius), _with_gains(U, radius) @ M)
 
     @classmethod
     def without_loop(cls, M: Array, b: int) -> Ball:
@@ -89,12 +90,12 @@ class Ball:
     def average(self) -> Array:
         """Average spectrum, shape (f, b, b)."""
         energy = np.sum(np.abs(self.right) ** 2, axis=(-2, -1)) / max(self.right.shape[-2], self.left.shape[-1])
-        return self.center @ _hermitian(self.center) + energy[..., None, None] * (self.left @ _hermitian(self.left))
+        return self.center @ adjoint(self.center) + energy[..., None, None] * (self.left @ adjoint(self.left))
 
     def symmetric_part(self) -> Array:
         """``q^2 R_l R_l^H`` with ``q = ||R_r M||``: what the ball holds on both sides of its centre, shape (f, b, b)."""
         q = np.linalg.norm(self.right, 2, axis=(-2, -1))
-        return q[:, None, None] ** 2 * (self.left @ _hermitian(self.left))
+        return q[:, None, None] ** 2 * (self.left @ adjoint(self.left))
 
     def spectrum(self, theta: Array) -> Array:
         """Diagonal of the spectrum of the element of a contraction (f, b, a), shape (f, b)."""
@@ -111,9 +112,9 @@ class Ball:
         U_q, _, _ = np.linalg.svd(self.right)
         k = min(P.shape[-1], self.right.shape[-2])
         starts = (
-            _polar(_hermitian(self.left) @ self.center @ _hermitian(self.right)),  # aligned with the centre
-            _polar(_hermitian(P) @ (T @ self.center) @ _hermitian(self.right)),  # aligned with the centre, as T sees it
-            _hermitian(Vh_p)[..., :k] @ _hermitian(U_q)[..., :k, :],  # worst without the centre
+            _polar(adjoint(self.left) @ self.center @ adjoint(self.right)),  # aligned with the centre
+            _polar(adjoint(P) @ (T @ self.center) @ adjoint(self.right)),  # aligned with the centre, as T sees it
+            adjoint(Vh_p)[..., :k] @ adjoint(U_q)[..., :k, :],  # worst without the centre
         )
         best, best_value = starts[0], np.full(T.shape[:-2], -1.0)
         for theta in starts:
@@ -123,7 +124,7 @@ class Ball:
                     value = np.linalg.norm(error, axis=(-2, -1))
                     better = value > best_value * (1 + 1e-6)
                     best, best_value = np.where(better[..., None, None], theta, best), np.where(better, value, best_value)
-                theta = _polar(_hermitian(P) @ error @ _hermitian(self.right))
+                theta = _polar(adjoint(P) @ error @ adjoint(self.right))
         return best
 
 
@@ -134,14 +135,10 @@ def spread(P: Array, Q: Array) -> Array:
     return np.sqrt(np.sum((s[..., :k] * t[..., :k]) ** 2, axis=-1))
 
 
-def _hermitian(matrix: Array) -> Array:
-    return np.conj(np.swapaxes(matrix, -1, -2))
-
-
 def _with_gains(U: Array, gains: Array) -> Array:
     """Return ``U diag(gains, 1, ...) U^H``."""
     gains = np.concatenate([gains, np.ones((*gains.shape[:-1], U.shape[-1] - gains.shape[-1]))], axis=-1)
-    return (U * gains[..., None, :]) @ _hermitian(U)
+    return (U * gains[..., None, :]) @ adjoint(U)
 
 
 def below(spectrum: Array) -> Array:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.linalg import adjoint
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.norms import h2_norm
 from ..generalized_plant import GeneralizedPlant
@@ -50,7 +51,7 @@ def causal_h2(problem: ObserverProblem, controller: StateSpace) -> float:
     filters = [gain([[1.0]], dt)] + [_all_pass(np.exp(-corner), dt) for corner in corners]
     values, found, rests = [], [], []
     for start in parts.starts():
-        value, R, rest = parts.climb(filters, start)
+        value, R, rest = parts.ascend(filters, start)
         values.append(value)
         found.append(R)
         rests.append(rest)
@@ -61,7 +62,7 @@ def causal_h2(problem: ObserverProblem, controller: StateSpace) -> float:
 
 
 def perturbed(problem: ObserverProblem, closed: StateSpace, delta: StateSpace, rest: StateSpace | None = None) -> StateSpace:
-    """Return the observer's loop from (w1, n, v) to z1, scaled, with a causal perturbation in its place.
+    """Return the observer's loop from (w1, n, v) to z1, scaled, with a causal perturbation.
 
     Parameters
     ----------
@@ -120,14 +121,14 @@ class _Parts:
 
     def starts(self) -> list[Array]:
         """The identity, its negative, and what aligns the largest directions of T and M over all frequencies."""
-        _, left = np.linalg.eigh(np.real(_hermitian(self.T) @ self.T).sum(axis=0))
-        _, right = np.linalg.eigh(np.real(self.M @ _hermitian(self.M)).sum(axis=0))
+        _, left = np.linalg.eigh(np.real(adjoint(self.T) @ self.T).sum(axis=0))
+        _, right = np.linalg.eigh(np.real(self.M @ adjoint(self.M)).sum(axis=0))
         k = min(len(left), len(right))
         eye = np.eye(len(left), len(right))
         aligned = left[:, ::-1][:, :k] @ right[:, ::-1][:, :k].T
         return [eye, aligned] if self.N is None else [eye, -eye, aligned]
 
-    def climb(self, filters: list[StateSpace], start: Array) -> tuple[Array, Array, Array]:
+    def ascend(self, filters: list[StateSpace], start: Array) -> tuple[Array, Array, Array]:
         """Return the best value, R and R_r for every filter."""
         lag = np.concatenate([a.frequency_response(self.freqs_hz)[..., 0] for a in filters], axis=-1).T[..., None, None]
         R = np.broadcast_to(start, (len(filters), *start.shape))
@@ -148,8 +149,8 @@ class _Parts:
             better = value > best
             best = np.where(better, value, best)
             best_R, best_rest = np.where(better[:, None, None], R, best_R), np.where(better[:, None, None], rest, best_rest)
-            R = _polar(np.real(np.conj(lag) * (_hermitian(left) @ error @ _hermitian(right))).sum(axis=1))
-            rest = _polar(np.real(_hermitian(self.T_r) @ error @ _hermitian(self.M_r)).sum(axis=1))
+            R = _polar(np.real(np.conj(lag) * (adjoint(left) @ error @ adjoint(right))).sum(axis=1))
+            rest = _polar(np.real(adjoint(self.T_r) @ error @ adjoint(self.M_r)).sum(axis=1))
         return best, best_R, best_rest
 
 
@@ -163,10 +164,6 @@ def _times(a: StateSpace, R: Array) -> StateSpace:
     """``a(z) R`` for one filter a and a matrix."""
     R = R * (1 - 1e-12)
     return block_diagonal([a] * len(R)) @ gain(R, a.dt)
-
-
-def _hermitian(matrix: Array) -> Array:
-    return np.conj(np.swapaxes(matrix, -1, -2))
 
 
 def _polar(matrix: Array) -> Array:

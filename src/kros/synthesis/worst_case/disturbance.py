@@ -74,7 +74,7 @@ class Shaping:
     behind: StateSpace | None
     remainder: StateSpace | None
 
-    def ports(self, problem: ObserverProblem) -> tuple[StateSpace, StateSpace]:
+    def at_input_and_state(self, problem: ObserverProblem) -> tuple[StateSpace, StateSpace]:
         """Return the shaped disturbances at the input, m outputs, and at the state, n outputs."""
         m, n, dt = problem.nominal.n_inputs, problem.nominal.n_states, problem.nominal.dt
         shaped = self.filters if self.behind is None else self.behind @ self.filters
@@ -124,8 +124,8 @@ def symmetric(problem: ObserverProblem) -> bool:
     """Tell whether the set keeps every change of signs, so that the diagonal of any element's spectrum is an average over the set."""
     if problem.N is None:
         return True
-    place = problem.location
-    return place.sees_input and place.at_input and all(is_diagonal(s) for s in (problem.W_L, problem.W_R, problem.input_weight))
+    location = problem.location
+    return location.sees_input and location.at_input and all(is_diagonal(s) for s in (problem.W_L, problem.W_R, problem.input_weight))
 
 
 def design_grid(problem: ObserverProblem) -> Array:
@@ -179,7 +179,7 @@ class Channels:
         return self.shaped(self.ball.spectrum(theta)), theta
 
     def ball_of(self, N: Array | None, M: Array) -> Ball:
-        """Return the ball for a loop and a chain at other frequencies."""
+        """Return the ball for N and M at other frequencies."""
         return Ball.without_loop(M, self.problem.W_L.n_inputs) if N is None else Ball.of(N, M)
 
     def nearest(self, theta: Array) -> Array:

@@ -103,12 +103,12 @@ def circle_mean(density: Callable[[Array], Array], centers: Array, rtol: float =
 
 
 def _edges(centers: Array) -> Array:
-    """Panel edges: three a decade, and a ladder of widths around each pole's angle."""
+    """Panel edges: three a decade, and a row of widths around each pole's angle."""
     angle, width = np.abs(centers.imag), np.abs(centers.real)
     size = np.hypot(angle, width)
     low = min(max(1e-2 * size.min(initial=np.pi), 1e-12), 1e-3)
-    ladder = np.concatenate([-(4.0 ** np.arange(8)), [0.0], 4.0 ** np.arange(8)])
-    around = (angle[:, None] + width[:, None] * ladder).ravel()
+    widths = np.concatenate([-(4.0 ** np.arange(8)), [0.0], 4.0 ** np.arange(8)])
+    around = (angle[:, None] + width[:, None] * widths).ravel()
     around = around[(around > low) & (around < np.pi)]
     edges = np.unique(np.concatenate([np.geomspace(low, np.pi, 2 + int(3 * np.log10(np.pi / low))), around]))
     kept = np.concatenate([[True], np.diff(np.log(edges)) > 1e-9])

@@ -32,6 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import SynthesisError
+from ...core.linalg import adjoint
 from ...core.lti import StateSpace
 from ...core.norms import crossings, gramian, to_continuous
 from ..problem.observer_problem import ObserverProblem
@@ -95,13 +96,13 @@ class _Constraint:
         extra = np.zeros((f, w, w), complex)
         m = self.Q[0].shape[-1]
         for k, (P, Q) in enumerate(zip(self.P, self.Q, strict=True)):
-            slack = slack - P @ _hermitian(P) / tau[:, k, None, None]
-            extra[:, :m, :m] += tau[:, k, None, None] * (_hermitian(Q) @ Q)
+            slack = slack - P @ adjoint(P) / tau[:, k, None, None]
+            extra[:, :m, :m] += tau[:, k, None, None] * (adjoint(Q) @ Q)
         values, vectors = np.linalg.eigh(slack)
         feasible = values[:, 0] > 1e-12
         inverse = 1 / np.sqrt(np.where(feasible[:, None], values, 1.0))
-        half = inverse[..., None] * (_hermitian(vectors) @ self.A)
-        return np.where(feasible, np.linalg.eigvalsh(_hermitian(half) @ half + extra)[:, -1], np.inf)
+        half = inverse[..., None] * (adjoint(vectors) @ self.A)
+        return np.where(feasible, np.linalg.eigvalsh(adjoint(half) @ half + extra)[:, -1], np.inf)
 
     def vanishes(self) -> bool:
         """Tell whether nothing reaches the error; a rational response that is zero at a whole grid is zero everywhere."""
@@ -271,7 +272,3 @@ def _holds_until(system: StateSpace, nu: float) -> float:
     gains = np.linalg.norm(system.frequency_response(between / (2 * np.pi)), 2, axis=(-2, -1))
     above = np.flatnonzero(gains > 1)
     return float(points[above[0]]) if len(above) else np.inf
-
-
-def _hermitian(matrix: Array) -> Array:
-    return np.conj(np.swapaxes(matrix, -1, -2))

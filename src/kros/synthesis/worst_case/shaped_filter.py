@@ -80,7 +80,7 @@ class _Model:
 
 def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:
     """Return the filter that is H2-optimal for the shaped disturbances, in physical units."""
-    d, r = shaping.ports(problem)
+    d, r = shaping.at_input_and_state(problem)
     if problem.injection is Injection.INPUT or problem.performance.n_states:
         return problem.to_physical(h2(shaped_plant(problem, d, r), problem.injection).controller)
     return problem.to_physical(_kalman(problem, d, r))
@@ -88,7 +88,7 @@ def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:
 
 def lower_bound(problem: ObserverProblem, shaping: Shaping) -> float | None:
     """Return a worst-case H2 norm that no observer of either injection beats, for filters that lie below the spectrum; None where none is proven."""
-    model = _Model.of(problem, *shaping.ports(problem))
+    model = _Model.of(problem, *shaping.at_input_and_state(problem))
     squared = predictor_bound(model.A, model.B, model.C, model.D, model.Z)
     white = float(np.sum(model.Z_w**2)) * (1 - 1e-12)
     return float(np.sqrt((squared or 0.0) + white)) if squared or white else None

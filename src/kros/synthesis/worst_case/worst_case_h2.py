@@ -6,7 +6,7 @@ start from the average spectrum of the set, find the spectrum that is worst for 
 iterate is certified independently and the best is kept, no correction and filters of lower orders among them (`search`). The last averaged spectrum
 gives the lower bound.
 
-The filters themselves are told in `shaped_filter`; that a lower bound holds, in `everywhere` and `riccati.filter_bound`.
+The filters themselves are in `shaped_filter`; that a lower bound holds, in `everywhere` and `riccati.filter_bound`.
 """
 
 from __future__ import annotations

@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import SynthesisError
+from ...core.linalg import adjoint
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.norms import hinf_norm
 from ..generalized_plant import GeneralizedPlant
@@ -96,7 +97,7 @@ def worst_case_hinf(
         shaping = channels.shaping(spectrum, fit, "above", options)
         start = time.perf_counter()
         try:
-            found = hinf(shaped_plant(problem, *shaping.ports(problem)), tolerance=tolerance, injection=problem.injection)
+            found = hinf(shaped_plant(problem, *shaping.at_input_and_state(problem)), tolerance=tolerance, injection=problem.injection)
             controller = problem.to_physical(found.controller)
             value = robust_gain(problem, controller)
         except SynthesisError as error:
@@ -164,10 +165,10 @@ def dominating(channels: Channels, loop: StateSpace) -> Spectrum:
     share = [np.clip(size / np.maximum(sum(sizes) + centre, 1e-300), 1e-3, 1.0) for size in sizes]
     inner = np.broadcast_to(np.eye(m, dtype=complex), (len(T), m, m))
     for t, matrix in zip(share, Q, strict=True):
-        inner = inner - (t / np.maximum(_norm(matrix), 1e-300) ** 2)[:, None, None] * (_turn(matrix) @ matrix)
-    psi = (_norm(Q[0]) ** 2 / share[0])[:, None, None] * (ball.left @ _turn(ball.left))
+        inner = inner - (t / np.maximum(_norm(matrix), 1e-300) ** 2)[:, None, None] * (adjoint(matrix) @ matrix)
+    psi = (_norm(Q[0]) ** 2 / share[0])[:, None, None] * (ball.left @ adjoint(ball.left))
     if problem.N is not None:
-        psi = psi + ball.center @ np.linalg.pinv(inner, rcond=1e-9, hermitian=True) @ _turn(ball.center)
+        psi = psi + ball.center @ np.linalg.pinv(inner, rcond=1e-9, hermitian=True) @ adjoint(ball.center)
     phi = channels.shaped(np.real(np.einsum("fii->fi", psi)))
     if len(Q) == 1:
         return Spectrum(phi, None)
@@ -187,7 +188,7 @@ def lower_bound(problem: ObserverProblem, shaping: Shaping, tolerance: float) ->
     Estimates of ``W_p x`` one step ahead, free of any structure, are what is searched: the disturbance is delayed by one sample, which changes no
     norm, so that the output to be estimated is that of the next sample.
     """
-    d, r = shaping.ports(problem)
+    d, r = shaping.at_input_and_state(problem)
     q, n, dt = len(problem.C), problem.nominal.n_states, problem.nominal.dt
     error = problem.error_plant()
     shaped = shape_inputs(error, block_diagonal([d, r, gain(np.eye(q + n), dt)]))
@@ -220,7 +221,3 @@ def lower_bound(problem: ObserverProblem, shaping: Shaping, tolerance: float) ->
 
 def _norm(matrix: Array) -> Array:
     return np.asarray(np.linalg.norm(matrix, 2, axis=(-2, -1)))
-
-
-def _turn(matrix: Array) -> Array:
-    return np.conj(np.swapaxes(matrix, -1, -2))

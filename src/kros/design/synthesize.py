@@ -22,13 +22,14 @@ from ..core.loading import loader
 from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
+from ..identify.kinds import kind_of
 from ..observer import Observer, ReliftCertificate, in_sizes
 from ..synthesis import ObserverProblem, Synthesis
 from ..uncertainty.quantify import UncertainModels
 from .certificates import DIVERGED, Running, certify_running
 from .methods.table import BY_NAME, design, preferred, slowest_first, suitable
 from .settings import ObserverSettings, PredictorSettings, SynthesisSettings
-from .task import DesignResult, DesignTask
+from .task import DesignResult, DesignTask, split_name
 from .uncertain_set import certificate, usable_problem
 from .validation import TrainingSet
 
@@ -159,7 +160,7 @@ def synthesize(
         found = synthesize_all(uncertain, asked, among, of, robust=robust, work=work)
         return found.designs[found.deployed]
     name = named(uncertain, method)
-    kind, _, short = name.rpartition("/")
+    kind, short = split_name(name)
     with_set = {short, _SURROUNDED} if _SURROUNDED in asked.methods else {short}
     tasks = tasks_of(uncertain, kind, with_set, asked, of)
     results = designed(tasks, work or Work())
@@ -205,9 +206,8 @@ def synthesize_all(
 
 def named(uncertain: UncertainModels, method: str) -> str:
     """Return the full name of an observer: that of a method for the first kind of model that it is for."""
-    kinds, edmd = uncertain.models.kinds, uncertain.models.edmd_kinds
-    every = [f"{kind}/{m.name}" for kind in kinds for m in suitable(BY_NAME, kind, refined=kind not in edmd)]
-    found = [name for name in every if method in (name, name.rpartition("/")[2])]
+    every = [f"{kind}/{m.name}" for kind in uncertain.models.kinds for m in suitable(BY_NAME, kind, kind_of(kind).refined)]
+    found = [name for name in every if method in (name, split_name(name)[1])]
     if not found:
         raise ConfigError(f"Synthesize: there is no method {method!r}; known are {', '.join(every)}.")
     return found[0]
@@ -225,7 +225,7 @@ def tasks_of(
     shared: dict[str, Any] = {"models": models, "unit": uncertain.nominal, "problem": problem, "refusal": refusal, "noise": noise}
     shared |= {"training": TrainingSet.of(identified, recorded).normalised(recorded), "covered": own.unit_ids}
     shared |= {"max_order": uncertain.max_order, "settings": settings, "predictor": predictor}
-    methods = suitable(wanted, kind, refined=kind not in identified.edmd_kinds)
+    methods = suitable(wanted, kind, kind_of(kind).refined)
     return [DesignTask(f"{kind}/{method.name}", method.name, **shared) for method in methods]
 
 

@@ -141,3 +141,9 @@ def without_correction(task: DesignTask) -> Synthesis:
 def first_of(ranks: Sequence[tuple[bool, float]]) -> int:
     """Return which rank is the least, the first of equal ones."""
     return min(range(len(ranks)), key=lambda i: ranks[i])
+
+
+def split_name(observer: str) -> tuple[str, str]:
+    """Return kind of model and method of an observer's name; what has no model has an empty kind."""
+    kind, _, method = observer.rpartition("/")
+    return kind, method

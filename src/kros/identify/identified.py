@@ -20,6 +20,7 @@ from ..data.survey import RecordingFacts
 from ..lifting import Lifting
 from .calibration import PhaseCalibration
 from .factors import Factor
+from .kinds import KINDS, kinds_for
 from .model_set import ModelSet
 from .refine.model import RefinedModels
 
@@ -124,7 +125,7 @@ class IdentifiedModels:
     @property
     def edmd_kinds(self) -> tuple[str, ...]:
         """The paper's kinds of models, identified in every condition; the first one scores outliers."""
-        return edmd_kinds(self.lifting)
+        return tuple(kind.name for kind in kinds_for(self.lifting, refined=False))
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -196,7 +197,7 @@ class IdentifiedModels:
         sets = Stored(tuple(content["sets"]), lambda place: ModelSet.load(folder / "models" / place))
         factors = Stored(tuple(content["conditions"]), lambda c: EpisodeFactors.load(folder / "factors" / quote(c, safe="")))
         refined = Stored(tuple(content["refined"]), lambda kind: RefinedModels.load(folder / "refinement" / kind))
-        lifting = next(found.lifting for name in ("koopman_edmd", "linear_edmd") if (found := sets.get(name)) is not None)
+        lifting = next(sets[kind.name].lifting for kind in KINDS if kind.name in sets)
         calibration = PhaseCalibration.load(folder / "calibration") if lifting.parameters else None
         return cls(population, facts, lifting, calibration, tuple(content["kinds"]), sets, factors, refined)
 
@@ -212,8 +213,3 @@ def recordings_path(folder: Path) -> Path:
     """Return where the recordings of a run folder, or of a saved result, are."""
     content: dict[str, Any] = load_artifact(folder / "population", "facts")[0]
     return folder / str(content["recordings"])  # an absolute path stays as it is
-
-
-def edmd_kinds(lifting: Lifting) -> tuple[str, ...]:
-    """Return the paper's kinds of models."""
-    return ("koopman_edmd", "linear_edmd") if lifting.functions + lifting.input_functions else ("linear_edmd",)

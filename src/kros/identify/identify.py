@@ -27,7 +27,8 @@ from .calibration import PhaseCalibration
 from .edmd import KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
 from .excitation import require_excitation, require_independent
 from .factors import Factor, combine, lifted_factor, reduce_episode
-from .identified import EpisodeFactors, IdentifiedModels, edmd_kinds
+from .identified import EpisodeFactors, IdentifiedModels
+from .kinds import kinds_for
 from .model_set import ModelSet
 from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .ranges import Ranges
@@ -101,8 +102,8 @@ def identify(
         factors[condition], models, found_out = identify_condition(base, condition, asked, work)
         sets |= {base.place(m.name, condition): m for m in models}
         refined |= found_out
-    kinds = tuple(kind.removesuffix("_edmd") for kind in base.edmd_kinds) if asked.refine else ()
-    return replace(base, kinds=kinds + base.edmd_kinds, sets=sets, factors=factors, refined=refined)
+    refined_kinds = tuple(kind.name for kind in kinds_for(found, refined=True)) if asked.refine else ()
+    return replace(base, kinds=refined_kinds + base.edmd_kinds, sets=sets, factors=factors, refined=refined)
 
 
 def identify_condition(
@@ -142,7 +143,7 @@ def identify_models(
 ) -> list[ModelSet]:
     """Identify every kind of model of one condition with one common regularisation."""
     population, on = base.population, condition == base.facts.identify_on
-    liftings = {kind: base.lifting if kind.startswith("koopman") else Lifting(base.lifting.states) for kind in edmd_kinds(base.lifting)}
+    liftings = {kind.name: kind.lifting(base.lifting) for kind in kinds_for(base.lifting, refined=False)}
     factors = {kind: lifted_factor(factor, base.lifting, parameters, lifting) for kind, lifting in liftings.items()}
     pooled = np.array([u in base.facts.pooled for u in units])
     rows = pooled if pooled.any() else slice(None)
@@ -234,7 +235,11 @@ def refine_models(
         for start, lifted in zip(starts, factors, strict=True)
     ]
     refined = work.run("identify (refine)", tasks)
-    models = [with_matrices(*three) for three in zip(starts, (found.units for found in refined), factors, strict=True)]
+    kinds = kinds_for(base.lifting, refined=True)
+    models = [
+        with_matrices(start, kind.name, found.units, lifted)
+        for kind, start, found, lifted in zip(kinds, starts, refined, factors, strict=True)
+    ]
     return models, {m.name: found for m, found in zip(models, refined, strict=True)}
 
 
@@ -243,11 +248,11 @@ def refine_options(settings: IdentifySettings) -> RefineOptions:
     return RefineOptions(margin=max(settings.margin, RefineOptions().margin), largest_residual=settings.largest_residual)
 
 
-def with_matrices(start: ModelSet, matrices: KoopmanMatrices, lifted: Factor) -> ModelSet:
-    """Return a refined model set with the names, scales and phases of the one it started from."""
+def with_matrices(start: ModelSet, name: str, matrices: KoopmanMatrices, lifted: Factor) -> ModelSet:
+    """Return a refined model set with the scales and phases of the one it started from."""
     return replace(
         start,
-        name=start.name.removesuffix("_edmd"),
+        name=name,
         A=matrices.A,
         B=matrices.B,
         residual_covariance=residual_covariance(lifted.R, start.lifting.n_lifted, matrices, lifted.n_samples),

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from ...core.errors import SynthesisError
-from ..task import DesignResult, DesignTask
+from ..task import DesignResult, DesignTask, split_name
 from .gains import design_kalman_tuned, design_kalman_white, design_luenberger, design_open_loop
 from .predictor import design_predictor
 from .published import design_published
@@ -88,5 +88,5 @@ def slowest_first(names: list[str]) -> list[int]:
 
 def preferred(observers: list[str]) -> str | None:
     """Return the first observer ``<kind of model>/<method>`` of the lowest rank; None where no method is of the table."""
-    ranks = {name: BY_NAME[name.rpartition("/")[2]].rank for name in observers if name.rpartition("/")[2] in BY_NAME}
+    ranks = {name: BY_NAME[method].rank for name in observers if (method := split_name(name)[1]) in BY_NAME}
     return min(ranks, key=lambda name: ranks[name], default=None)

@@ -42,7 +42,8 @@ def _results(found: Iterator[T]) -> Iterator[T]:
         yield from found
     except BrokenProcessPool as error:
         raise KrosError(
-            "A worker process was ended from outside, perhaps because memory ran out; run again, with fewer --workers."
+            'A worker process ended: memory ran out, or a script that asks for workers has no `if __name__ == "__main__":` around what it does. '
+            "Run again with fewer workers, or add that line."
         ) from error
 
 

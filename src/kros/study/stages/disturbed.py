@@ -15,6 +15,7 @@ from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
 from ...design.estimators import Baseline
 from ...design.synthesize import measurement_noise
+from ...design.task import split_name
 from ...evaluate import (
     Disturbance,
     DisturbedEpisodes,
@@ -99,8 +100,8 @@ def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, di
         return None
     everything = config.robustness == "all"
     record = load_artifact(context.store.path("observers"), "observers")[0]
-    kind = str(record["deployed"]).rpartition("/")[0]
-    names = tuple(name for name in record["names"] if everything or name.rpartition("/")[0] == kind)
+    kind = split_name(str(record["deployed"]))[0]
+    names = tuple(name for name in record["names"] if everything or split_name(name)[0] == kind)
     models = context.identified.models()
     firsts = {(k.unit, k.condition): k for k in reversed(keys) if roles[k.unit] != "outlier"}
     chosen = [k for k in keys if firsts.get((k.unit, k.condition)) == k and (everything or k.condition == context.facts.identify_on)]
@@ -137,7 +138,7 @@ def run_disturbed(
     config, folder = context.config.evaluate, context.store.draft("disturbed")
     chosen = {name: observer for name, observer in observers.items() if name in trial.names}
     groups = alike(chosen.values())
-    kinds = list(dict.fromkeys(name.rpartition("/")[0] for name in chosen)) if config.monte_carlo else []
+    kinds = list(dict.fromkeys(split_name(name)[0] for name in chosen)) if config.monte_carlo else []
     work: list[Callable[[], Any]] = [partial(trial.errors_of_observers, group) for group in groups]
     work += [member_work(context, kind, config.monte_carlo) for kind in kinds]
     done = context.work.run("disturb", work)

@@ -13,6 +13,7 @@ from ...core.artifacts import load_artifact
 from ...core.lti import StateSpace
 from ...design.methods.disturbance_model import DisturbanceModel
 from ...design.synthesize import measurement_noise
+from ...design.task import split_name
 from ...design.uncertain_set import usable_problem
 from ...evaluate import sample_errors
 from ...synthesis import ObserverProblem, Synthesis
@@ -29,7 +30,7 @@ def member_work(context: Context, kind: str, members: int) -> Callable[[], Membe
     bounds = {
         name: float(own["worst_case_h2"])
         for name, own in facts.items()
-        if name.rpartition("/")[0] == kind and own.get("worst_case_h2") is not None
+        if split_name(name)[0] == kind and own.get("worst_case_h2") is not None
     }
     if not bounds:
         return dict

@@ -1,0 +1,43 @@
+"""The kinds of models, in the order in which they are shown: with or without lifted functions, refined or by EDMD alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..core.errors import ConfigError
+from ..lifting import Lifting
+
+
+@dataclass(frozen=True)
+class ModelKind:
+    """One kind of model; `lifted` tells whether it has the lifted functions, `refined` whether it was refined on free-run error."""
+
+    name: str
+    lifted: bool
+    refined: bool
+
+    def lifting(self, lifting: Lifting) -> Lifting:
+        """Return the lifting of this kind."""
+        return lifting if self.lifted else Lifting(lifting.states)
+
+
+KINDS = (
+    ModelKind("koopman", lifted=True, refined=True),
+    ModelKind("linear", lifted=False, refined=True),
+    ModelKind("koopman_edmd", lifted=True, refined=False),
+    ModelKind("linear_edmd", lifted=False, refined=False),
+)
+
+
+def kind_of(name: str) -> ModelKind:
+    """Return a kind by its name."""
+    for kind in KINDS:
+        if kind.name == name:
+            return kind
+    raise ConfigError(f"Kind of model {name!r}: is unknown; known are {', '.join(kind.name for kind in KINDS)}.")
+
+
+def kinds_for(lifting: Lifting, *, refined: bool) -> tuple[ModelKind, ...]:
+    """Return the refined kinds of models, or those by EDMD, that a lifting gives: without functions the linear one alone."""
+    has_functions = bool(lifting.functions + lifting.input_functions)
+    return tuple(kind for kind in KINDS if kind.refined == refined and (has_functions or not kind.lifted))

@@ -101,13 +101,6 @@ def test_file_names_differ_and_are_portable(one: tuple[str, str], other: tuple[s
         assert set(name) <= set(string.ascii_letters + string.digits + "%@._-~")
 
 
-def test_same_bytes_for_any_number_of_workers(tmp_path: Path) -> None:
-    for workers in (1, 3):
-        write_parquet(population(), tmp_path / str(workers), workers=workers)
-    for path in (tmp_path / "1").iterdir():
-        assert path.read_bytes() == (tmp_path / "3" / path.name).read_bytes()
-
-
 def test_groups_written_by_other_processes(tmp_path: Path) -> None:
     write_parquet(population(), tmp_path / "expected")
     folder = tmp_path / "out"
@@ -119,12 +112,6 @@ def test_groups_written_by_other_processes(tmp_path: Path) -> None:
     assert_same(read_parquet(folder), population())
     for path in folder.iterdir():
         assert path.read_bytes() == (tmp_path / "expected" / path.name).read_bytes()
-
-
-def test_progress_counts_groups(tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    write_parquet(population(), tmp_path / "out", lambda done, total: seen.append((done, total)))
-    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def broken() -> Population:

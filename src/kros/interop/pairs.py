@@ -13,9 +13,7 @@ from .rows import Columns, episode_edges, finite, split_columns
 Array = npt.NDArray[np.float64]
 
 
-def one_step_pairs(
-    X: Any, *, n_inputs: int = 0, episode_feature: bool = False, time: str | int | None = None
-) -> tuple[Any, Array, npt.NDArray[np.int64]]:
+def one_step_pairs(X: Any, *, n_inputs: int = 0, episode_feature: bool = False) -> tuple[Any, Array, npt.NDArray[np.int64]]:
     """Return rows, their next states and their episode, which any splitter of scikit-learn may divide and shuffle.
 
     Splitting the rows of a recording cuts episodes, and joins what is left across the cut; pairs have no such seam.
@@ -26,7 +24,6 @@ def one_step_pairs(
         As in `KoopmanRegressor.fit`.
     n_inputs : int
     episode_feature : bool
-    time : str or int, optional
 
     Returns
     -------
@@ -41,7 +38,7 @@ def one_step_pairs(
     DataError
         As `KoopmanRegressor.fit`.
     """
-    columns = split_columns(X, episode_feature=episode_feature, time=time)
+    columns = split_columns(X, episode_feature=episode_feature, time=None)
     values = _numbers(columns)
     n_states = values.shape[1] - n_inputs
     if n_inputs < 0 or n_states < 1:

@@ -23,7 +23,7 @@ _AGREE = 1e-9  # largest difference from pykoop's prediction, relative to the la
 _ROWS = 200
 
 
-def from_pykoop(pipeline: Any, *, states: Sequence[str] | None = None, inputs: Sequence[str] | None = None, seed: int = 0) -> AdoptedModel:
+def from_pykoop(pipeline: Any, *, states: Sequence[str] | None = None, inputs: Sequence[str] | None = None) -> AdoptedModel:
     """Adopt a fitted `pykoop.KoopmanPipeline`.
 
     Polynomials, radial basis functions, random Fourier features, delays, products with inputs, constants and affine scalers have formulas,
@@ -35,8 +35,6 @@ def from_pykoop(pipeline: Any, *, states: Sequence[str] | None = None, inputs: S
         Fitted.
     states, inputs : sequence of str, optional
         Names for the formulas. Default: those of the frame that the pipeline was fitted to, else ``x0, x1, ...`` and ``u0, u1, ...``.
-    seed : int
-        Of the rows at which the predictions are compared.
 
     Returns
     -------
@@ -64,7 +62,7 @@ def from_pykoop(pipeline: Any, *, states: Sequence[str] | None = None, inputs: S
         raise IdentificationError("from_pykoop: the pipeline is not fitted; call pipeline.fit(X, n_inputs=..., episode_feature=...) first.")
     names, input_names = _names(pipeline, states, inputs)
     model, reading = translate(pipeline, names, input_names)
-    return _verified(model, pipeline, reading, seed)
+    return _verified(model, pipeline, reading)
 
 
 def _names(pipeline: Any, states: Sequence[str] | None, inputs: Sequence[str] | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -82,12 +80,12 @@ def _names(pipeline: Any, states: Sequence[str] | None, inputs: Sequence[str] | 
     return x, u
 
 
-def _verified(model: AdoptedModel, pipeline: Any, reading: Reading, seed: int) -> AdoptedModel:
+def _verified(model: AdoptedModel, pipeline: Any, reading: Reading) -> AdoptedModel:
     """Return the model with its disagreement in lifted and in original states, or refuse it."""
     import pykoop
 
     n, first = model.lifting.n_states, int(pipeline.episode_feature_)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     x = model.state_offset + reading.state_size(n) * rng.normal(size=(_ROWS, n))
     u = model.input_offset + reading.input_size * rng.normal(size=(_ROWS, len(model.inputs)))
     rows = np.concatenate([np.zeros((_ROWS, first)), x, u], axis=1)

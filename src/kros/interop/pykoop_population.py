@@ -17,9 +17,7 @@ from .pykoop import from_pykoop
 Array = npt.NDArray[np.float64]
 
 
-def models_from_pykoop(
-    pipelines: Mapping[str, Any], population: Population, *, condition: str | None = None, name: str = "pykoop"
-) -> ModelSet:
+def models_from_pykoop(pipelines: Mapping[str, Any], population: Population, *, condition: str | None = None) -> ModelSet:
     """Adopt one fitted pipeline for each unit of a population, for uncertainty and synthesis.
 
     Parameters
@@ -30,7 +28,6 @@ def models_from_pykoop(
         Gives names, ranges and one-step residuals.
     condition : str, optional
         Default: the first.
-    name : str
 
     Returns
     -------
@@ -64,7 +61,7 @@ def models_from_pykoop(
     n = lifting.n_lifted
     peak = np.max([f[0] for f in facts], axis=0)
     return ModelSet(
-        name=name,
+        name="pykoop",
         condition=condition,
         lifting=lifting,
         channels=population.channels,

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError
-from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Unit
+from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population
 from .arrays import as_numbers, declare_channels, from_arrays
 
 log = logging.getLogger(__name__)
@@ -25,8 +25,6 @@ def from_pykoop(
     channels: Sequence[Channel] | None = None,
     episode_feature: bool = True,
     condition: str = DEFAULT_CONDITION,
-    units: Iterable[Unit] = (),
-    metadata: Mapping[str, Any] | None = None,
 ) -> Population:
     """Make a population from pykoop's `X`.
 
@@ -44,8 +42,6 @@ def from_pykoop(
     episode_feature : bool
         False where `X` has no episode column, so each array is one episode.
     condition : str
-    units : iterable of Unit
-    metadata : mapping, optional
 
     Returns
     -------
@@ -77,7 +73,7 @@ def from_pykoop(
     states, inputs = ([f"{letter}{i}" for i in range(count)] for letter, count in (("x", n_columns - n_inputs), ("u", n_inputs)))
     named = channels if channels is not None else declare_channels(None, states, inputs, states, "from_pykoop")
     episodes = {EpisodeKey(u, condition, name): part for u, x in arrays.items() for name, part in _split(u, x, episode_feature)}
-    return from_arrays(episodes, named, sample_period_s, units=units, metadata=metadata)
+    return from_arrays(episodes, named, sample_period_s)
 
 
 def to_pykoop(population: Population, unit: str | None = None, condition: str | None = None) -> npt.NDArray[np.float64]:

@@ -13,23 +13,17 @@ from typing import TypeVar
 from ...core.errors import DataError
 from ...core.locks import locked
 
-Progress = Callable[[int, int], None]
 T = TypeVar("T")
 
 
-def in_threads(work: Sequence[Callable[[], T]], workers: int | None, progress: Progress | None) -> list[T]:
-    """Do pieces of work in threads, by default one per processor; `progress` is told how many of how many are done."""
-    done: list[T] = []
-    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+def in_threads(work: Sequence[Callable[[], T]]) -> list[T]:
+    """Do pieces of work in threads, one per processor; what has not begun when one fails is left."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
         tasks = [pool.submit(piece) for piece in work]
         try:
-            for task in tasks:
-                done.append(task.result())
-                if progress is not None:
-                    progress(len(done), len(tasks))
+            return [task.result() for task in tasks]
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-    return done
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from ..checks import check_structure, usable_episodes
 from ..copies import Print, refuse_copies
 from ..population import EpisodeKey, Population
 from ..readers.parquet import INDEX, KEYS
-from .folders import Progress, in_threads, whole_folder
+from .folders import in_threads, whole_folder
 
 logger = logging.getLogger(__name__)
 
@@ -142,15 +142,7 @@ def write_index(population: Population, records: Iterable[GroupRecord], folder: 
     save_artifact(Path(folder), INDEX, content)
 
 
-def write_parquet(
-    population: Population,
-    out: Path | str,
-    progress: Progress | None = None,
-    *,
-    on_nan: str = "error",
-    overwrite: bool = False,
-    workers: int | None = None,
-) -> None:
+def write_parquet(population: Population, out: Path | str, *, on_nan: str = "error", overwrite: bool = False) -> None:
     """Write a population as a folder of Parquet files; it appears whole or not at all.
 
     Parameters
@@ -158,13 +150,9 @@ def write_parquet(
     population : Population
     out : Path
         Folder to make.
-    progress : callable, optional
-        Called with the groups done and their number.
     on_nan : {"error", "drop_episode"}
     overwrite : bool
         Replace what is at `out`.
-    workers : int, optional
-        Threads; default one per processor.
 
     Raises
     ------
@@ -173,7 +161,7 @@ def write_parquet(
     """
     groups = [(unit, condition) for unit, condition, _ in population.groups()]
     with whole_folder(Path(out), overwrite) as folder:
-        records = in_threads([partial(write_group, population, *group, folder, on_nan) for group in groups], workers, progress)
+        records = in_threads([partial(write_group, population, *group, folder, on_nan) for group in groups])
         write_index(population, records, folder)
 
 

@@ -15,16 +15,14 @@ from ...core.errors import DataError
 from ..arrow import from_numpy
 from ..population import OUTLIERS, EpisodeKey, Population
 from ..readers.motor_drive_raw import CHANNELS, MOTOR_DEG_TO_RAD, PERCENT, TARGET_LAG
-from .folders import Progress, in_threads, whole_folder
+from .folders import in_threads, whole_folder
 
 HEADER = b"time_s,position_deg,velocity_deg_per_s,torque_percent,target_position_deg,target_velocity_deg_per_s\n"
 DECIMALS = (6, 6, 5, 4, 6, 5)  # time, position, velocity, torque, target position, target velocity
 FIRST_STAMP = datetime(2023, 1, 1)
 
 
-def write_raw(
-    population: Population, out: Path | str, progress: Progress | None = None, *, overwrite: bool = False, workers: int | None = None
-) -> None:
+def write_raw(population: Population, out: Path | str) -> None:
     """Write the paper's raw layout, ``<out>/batch_b/{population,outliers}/<stamp>_<serial>_<load|noload>/<stamp>_<episode>.csv``.
 
     Parameters
@@ -36,11 +34,6 @@ def write_raw(
         gives one sample less (and 1000 less at rest).
     out : Path
         Folder to make, whole or not at all.
-    progress : callable, optional
-        Called with the folders done and their number.
-    overwrite : bool
-    workers : int, optional
-        Threads; default one per processor.
 
     Raises
     ------
@@ -55,8 +48,8 @@ def write_raw(
     for _, _, keys in groups:
         for key in keys:
             _check_names(key)
-    with whole_folder(Path(out), overwrite) as folder:
-        in_threads([partial(_write_folder, population, keys, folder, i) for i, (_, _, keys) in enumerate(groups)], workers, progress)
+    with whole_folder(Path(out)) as folder:
+        in_threads([partial(_write_folder, population, keys, folder, i) for i, (_, _, keys) in enumerate(groups)])
 
 
 def _check_names(key: EpisodeKey) -> None:

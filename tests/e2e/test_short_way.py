@@ -1,0 +1,90 @@
+"""The README's first example is run as it stands there, and gives the observers of the study of the same recordings, byte for byte."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kros
+from kros.design import Design
+from kros.plants import PLANTS
+from kros.study import load_config, run_study
+from kros.uncertainty import UncertainModels
+
+ROOT = Path(__file__).parents[2]
+ROLES = {"position": "measured = true", "target_position": 'role = "input"', "target_velocity": 'role = "input"'}
+LIFTING = "sin(100*position + phase)"
+
+
+def write_csv(folder: Path) -> None:
+    """Write a few drives as anybody's CSV files, and the mapping that says what is in them."""
+    population = PLANTS["harmonic-drive"](n_units=3, n_episodes=3, seconds=3.0, seed=2, conditions=("noload",)).simulate().population
+    names = [c.name for c in population.channels]
+    for key in population.episodes:
+        path = folder / "recordings" / key.unit / f"{key.episode}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        values = population.read(key)
+        time = np.arange(len(values)) * population.sample_period_s
+        np.savetxt(path, np.column_stack([time, values]), delimiter=",", header=",".join(["time", *names]), comments="", fmt="%.17g")
+    channels = [f'[[channel]]\nname = "{n}"\ncolumn = "{n}"\n{ROLES.get(n, "")}\n' for n in names]
+    head = "files = '(?P<unit>[^/]+)/(?P<episode>[^/]+)\\.csv'\ntime = \"time\"\n"
+    (folder / "mapping.toml").write_text(head + "".join(channels))
+    tables = head.replace("files", "[data.csv]\nfiles") + "".join(channels).replace("[[channel]]", "[[data.csv.channel]]")
+    (folder / "study.toml").write_text(f'[data]\nsource = "recordings"\nreader = "csv"\n{tables}\n[lifting]\nfunctions = ["{LIFTING}"]\n')
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Run the README's first lines in a folder with recordings."""
+    folder = tmp_path_factory.mktemp("short")
+    write_csv(folder)
+    code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert code is not None
+    names: dict[str, Any] = {"y0": np.array([0.1]), "y": np.array([0.1]), "u": np.array([0.1, 0.0])}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        exec(compile(code.group(1), "README.md", "exec"), names)
+    return folder, names
+
+
+@pytest.mark.slow
+def test_the_short_way_is_the_study(example: tuple[Path, dict[str, Any]]) -> None:
+    folder, names = example
+    study = run_study(load_config(folder / "study.toml"), folder / "toml", until="synthesize").folder
+    names["design"].observer.save(folder / "deployed.json")
+    deployed = (folder / "deployed.json").read_bytes()
+    assert deployed == (study / "observers" / "deployed.json").read_bytes()
+    named = kros.synthesize(names["uncertain"], method="worst_case_h2")
+    named.observer.save(folder / "named.json")
+    assert (folder / "named.json").read_bytes() == (study / "observers" / f"{named.name}.json").read_bytes()
+    assert named.lower_bound == pytest.approx(named.synthesis.lower_bound)
+    assert names["study"].folder == Path("runs/x")
+    assert (folder / "runs" / "x" / "report.html").is_file()
+    assert deployed == (folder / "runs" / "x" / "observers" / "deployed.json").read_bytes()
+
+
+@pytest.mark.slow
+def test_what_runs_has_names(example: tuple[Path, dict[str, Any]]) -> None:
+    names = example[1]
+    assert names["x_hat"]["velocity"] == names["running"].states[1]
+    for name in ("models", "uncertain", "design", "study"):
+        assert "\n" not in repr(names[name])
+        assert len(repr(names[name])) < 250
+
+
+@pytest.mark.slow
+def test_everything_is_saved_and_loaded(example: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    _, names = example
+    names["design"].save(tmp_path / "design")
+    design = Design.load(tmp_path / "design")
+    assert design.name == names["design"].name
+    assert design.certificate.gain == names["design"].certificate.gain
+    names["uncertain"].save(tmp_path / "uncertain")
+    uncertain = UncertainModels.load(tmp_path / "uncertain")
+    assert repr(uncertain) == repr(names["uncertain"])
+    same = kros.synthesize(uncertain, method="kalman_tuned").synthesis.controller.D
+    np.testing.assert_array_equal(same, kros.synthesize(names["uncertain"], method="kalman_tuned").synthesis.controller.D)

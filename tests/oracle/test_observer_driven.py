@@ -11,7 +11,7 @@ from kros.core.errors import DimensionError
 from kros.lifting import Lifting
 from kros.observer import (
     Observer,
-    Past,
+    PastMoments,
     ReliftScales,
     driven_coordinates,
     one_step_residual,
@@ -48,7 +48,7 @@ def remembering(functions=("sin(5*p + phase)", "cos(5*p + phase)")):
     lifting = Lifting(("p", "c"), functions, ("phase",) if functions else ())
     values = phase if functions else None
     batch = batch_of(x, u, DT, values, units=UNITS)
-    past = Past.of(lifting, (0,), batch, Basis(15))
+    past = PastMoments.of(lifting, (0,), batch, Basis(15))
     return embedded("o", past, past.model(4), ("target",), batch), x, u, values
 
 

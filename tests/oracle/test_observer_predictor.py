@@ -8,7 +8,7 @@ from kros.core.errors import DataError, DimensionError
 from kros.lifting import Lifting
 from kros.observer import (
     Observer,
-    Past,
+    PastMoments,
     identify_predictor,
     relift_certificate,
     run_observer,
@@ -50,7 +50,7 @@ def size(values):
 @pytest.fixture(scope="module")
 def made():
     x, u, phase = controlled()
-    past = Past.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
+    past = PastMoments.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
     return past, x, u, phase
 
 
@@ -77,8 +77,8 @@ def test_reduced_models_are_stable(made, order):
 
 def test_leaving_a_unit_out_is_as_if_it_had_not_been_recorded(made):
     past, x, u, phase = made
-    others = Past.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS).take(range(4)), Basis(20))
-    same = Past(
+    others = PastMoments.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS).take(range(4)), Basis(20))
+    same = PastMoments(
         past.lifting, past.measured, past.basis, past.static, past.free, others.units, past.gram[:2], past.cross[:2], past.power[:2]
     )
     F, G, H = past.model(4, without=["c"])
@@ -93,7 +93,7 @@ def test_a_linear_system_gets_the_kalman_predictor():
     for k in range(3999):
         x[k + 1] = x[k] @ F.T + u[k] @ G.T + rng.normal(size=(6, 2)) * np.sqrt(np.diag(Q))
     plain = Lifting(("x", "v"))
-    past = Past.of(plain, (0,), batch_of(x, u, DT), Basis(30))
+    past = PastMoments.of(plain, (0,), batch_of(x, u, DT), Basis(30))
     found = embedded("o", past, past.model(4), ("u",), batch_of(x, u, DT))
     best = kalman(F, np.eye(1, 2), Q, np.array([[1e-15]]), DT)
     ideal = Observer("k", plain, F, G, (0,), ("u",), best.controller, Injection.STATE, DT)
@@ -104,9 +104,9 @@ def test_a_linear_system_gets_the_kalman_predictor():
 def test_what_cannot_be_done_is_refused(made):
     past, x, u, phase = made
     with pytest.raises(DimensionError, match="alone"):
-        Past.of(Lifting(("p", "c"), ("sin(c)",)), (0,), batch_of(x, u, DT))
+        PastMoments.of(Lifting(("p", "c"), ("sin(c)",)), (0,), batch_of(x, u, DT))
     with pytest.raises(DataError, match="not measured"):
-        Past.of(LIFTING, (0, 1), batch_of(x, u, DT, phase))
+        PastMoments.of(LIFTING, (0, 1), batch_of(x, u, DT, phase))
     with pytest.raises(DataError, match="no unit is left"):
         past.model(3, without=["a", "b", "c"])
     with pytest.raises(DimensionError, match="at least as many"):
@@ -125,7 +125,7 @@ def test_it_starts_at_rest(made):
 
 def test_tuning_finds_the_controller_of_which_the_hidden_state_is_the_command():
     x, u, phase = controlled(home=3.0)
-    past = Past.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
+    past = PastMoments.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
     (F, _, _), criterion = tune_predictor(past.model(2), past, batch_of(x, u, DT, phase, units=UNITS), iterations=40, least_gain=1e-6)
     assert list(criterion) == sorted(criterion, reverse=True)
     np.testing.assert_allclose(np.sort(np.linalg.eigvals(F).real), [0.5, 0.99], atol=2e-3)
@@ -134,11 +134,11 @@ def test_tuning_finds_the_controller_of_which_the_hidden_state_is_the_command():
 def test_deviation_is_what_recordings_of_machines_that_deviate_would_say():
     x, u, phase = controlled()
     make = [
-        Past.of(Lifting(("p", "c"), (f"{a}*sin(5*p + phase)",), ("phase",)), (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
+        PastMoments.of(Lifting(("p", "c"), (f"{a}*sin(5*p + phase)",), ("phase",)), (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
         for a in (0.6, 1.4)
     ]
-    plain = Past.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
-    both = Past(
+    plain = PastMoments.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
+    both = PastMoments(
         LIFTING,
         (0,),
         plain.basis,
@@ -162,7 +162,7 @@ def test_the_whole_way_gives_an_observer_that_is_certified():
 
 def test_a_model_that_is_not_stable_is_refused():
     x, u, phase = controlled(n_samples=700)
-    past = Past.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
+    past = PastMoments.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
     F, G, H = past.model(2)
     with pytest.raises(DataError, match="not stable"):
         tune_predictor((1.5 * F / np.abs(np.linalg.eigvals(F)).max(), G, H), past, batch_of(x, u, DT, phase, units=UNITS))

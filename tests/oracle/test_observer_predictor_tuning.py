@@ -5,7 +5,7 @@ import pytest
 from batches import batch_of
 
 from kros.lifting import Lifting
-from kros.observer import Observer, Past, identify_predictor, run_observer
+from kros.observer import Observer, PastMoments, identify_predictor, run_observer
 from kros.observer.predictor import tune_predictor
 from kros.observer.predictor.tuning import _slowing
 from kros.observer.tuning.blocks import blocks_of, joined
@@ -72,7 +72,7 @@ def test_tuning_reaches_the_kalman_predictor_from_a_poor_model():
     for k in range(3999):
         x[k + 1] = x[k] @ F.T + u[k] @ G.T + rng.normal(size=(6, 2)) * np.sqrt(np.diag(Q))
     plain = Lifting(("x", "v"))
-    past = Past.of(plain, (0,), batch_of(x, u, DT), Basis(2))
+    past = PastMoments.of(plain, (0,), batch_of(x, u, DT), Basis(2))
     _, criterion = tune_predictor(past.model(2), past, batch_of(x, u, DT), least_gain=1e-5)
     best = kalman(F, np.eye(1, 2), Q, np.array([[1e-15]]), DT)
     ideal = Observer("k", plain, F, G, (0,), ("u",), best.controller, Injection.STATE, DT)

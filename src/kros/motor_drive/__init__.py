@@ -1,6 +1,6 @@
 """Load torque: from the current's error where the current is recorded, and by observers with a disturbance state where it is not.
 
-`signals` knows what a mounted load does and how much of it can be seen; `from_current` is the paper's way; `calibrate` and `load_observer` give
+`signals` computes what a mounted load does and how much of it can be seen; `from_current` is the paper's way; `calibrate` and `load_observer` give
 the observer that learns from one known load how loads show; `level` brings back what no measurement holds; `accuracy` judges all of them.
 """
 

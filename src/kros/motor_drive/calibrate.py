@@ -20,7 +20,7 @@ from ..core.errors import DataError, DimensionError
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
 from ..lifting import Lifting
-from ..observer.predictor import Past
+from ..observer.predictor import PastMoments
 from ..synthesis.residual_shaped.shaping_filter import Basis
 from .signals import low_passed, without_level
 
@@ -35,7 +35,7 @@ class LoadCalibration:
 
     Parameters
     ----------
-    past : Past
+    past : PastMoments
         Of the recorded states and the load, its "units" the two kinds of recordings.
     batch : EpisodeBatch
         Recorded states, the load's share taken off the current, and the load, both as far as they can be seen; its "units" are the kinds.
@@ -45,7 +45,7 @@ class LoadCalibration:
         Episodes that count, and those in which the current came to its limit.
     """
 
-    past: Past
+    past: PastMoments
     batch: EpisodeBatch
     level_s: float
     used: tuple[int, ...]
@@ -110,5 +110,5 @@ def calibrate_load(
     with_load = replace(lifting, states=(*lifting.states, LOAD))
     keys = tuple(EpisodeKey(_LOADED if found else _UNLOADED, "", str(i)) for i, found in zip(used, loaded, strict=True))
     seen_batch = replace(batch.take(used.tolist()), keys=keys, states=widened)
-    past = Past.of(with_load, tuple(measured), seen_batch, Basis(_DELAYS, (float(np.exp(-dt / level_s)),)))
+    past = PastMoments.of(with_load, tuple(measured), seen_batch, Basis(_DELAYS, (float(np.exp(-dt / level_s)),)))
     return LoadCalibration(past, seen_batch, level_s, tuple(used.tolist()), tuple(np.flatnonzero(at_limit).tolist()))

@@ -9,8 +9,8 @@ same filter makes ``psi = H phi`` of ``phi = [sin(theta), cos(theta)]``, so that
 Only what is missing is filled in: fast and unexpected loads pass as they are seen, and without load c stays near zero.
 
 A controller at its limit holds its integrator back, and from then on differs from the one that an observer knows. Where the total current comes out beyond
-the limit, the excess is taken off the load, and forgotten as slowly as levels are. If that would move the load by more than `believed` from
-what c says of the angle, it is no load: changes are counted anew from there, and what excess remains is taken off what the unloaded machine needs.
+the limit, the excess is taken off the load, and forgotten as slowly as levels are. If that would move the load by more than `trusted` from
+what c says of the angle, it is no load: changes are counted again from there, and what excess remains is taken off what the unloaded machine needs.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class AngleLoad:
         Of the load observer (`LoadCalibration`).
     sample_period_s : float
     settling_s : float, s
-        Time at full swing (sin^2 of one half) after which half of c is believed.
+        Time at full swing (sin^2 of one half) after which half of c is used.
     limit : float
         Of the current; infinite where there is none.
-    believed : float
+    trusted : float
         Most that a load at the current's limit differs from what the angle says, as a share of the limit.
     """
 
@@ -54,7 +54,7 @@ class AngleLoad:
     sample_period_s: float
     settling_s: float = 0.1
     limit: float = np.inf
-    believed: float = 0.5
+    trusted: float = 0.5
 
     def run(self, seen: npt.ArrayLike, current: npt.ArrayLike, position: npt.ArrayLike) -> LoadAndCurrent:
         """Return loads and currents with their levels.
@@ -110,7 +110,7 @@ class RunningAngleLoad:
         beyond = bounded != total
         if beyond.any():
             shifted = load - (total - bounded)
-            trusted = beyond & (np.abs(shifted - of_angle) <= self.settings.believed * self.settings.limit)
+            trusted = beyond & (np.abs(shifted - of_angle) <= self.settings.trusted * self.settings.limit)
             anew = beyond & ~trusted
             self._excess[trusted] += (total - bounded)[trusted]
             load[trusted] = shifted[trusted]

@@ -9,7 +9,7 @@ from .certificate.error import ReliftScales
 from .certificate.report import ReliftRow, relift_report
 from .certificate.status import Dropped, ReliftStatus
 from .observer import Observer
-from .predictor import Past, driven_coordinates, identify_predictor, with_internal
+from .predictor import PastMoments, driven_coordinates, identify_predictor, with_internal
 from .residual.models import ResidualModel, one_step_rows, residual_models
 from .residual.one_step import mean_error_dynamics, one_step_residual, residual_spectra
 from .running import Estimate, RunningObserver
@@ -31,7 +31,7 @@ __all__ = [
     "Learned",
     "Moments",
     "Observer",
-    "Past",
+    "PastMoments",
     "ReliftCertificate",
     "ReliftRow",
     "ReliftScales",

@@ -1,4 +1,4 @@
-"""The observer as data: nominal lifted model, correction, and what it knows of the machine (18)-(21).
+"""The observer as data: nominal lifted model, correction, delay and limits (18)-(21).
 
       u ──►┌──────────────────────────┐
            │ x_hat+ = A theta(x_hat)  │──► x_hat ──► C ──► y_hat
@@ -127,7 +127,7 @@ class ObserverData:
     def filter_gain(self) -> Array:
         """Gain from the innovation to the filtered estimate, ``x_hat(k|k) = x_hat(k) + L_f (y - C x_hat(k))``; shape (n, q).
 
-        As declared in `runtime`; else what the correction says of it. The direct correction of the next estimate is that of this one, carried
+        As declared in `runtime`; else as it follows from the correction. The direct correction of the next estimate is that of this one, carried
         through the model: ``A_s L_f = (into D^c)_s`` by least squares. For a Kalman predictor of a linear model this is its filter, exactly;
         states of the correction and slopes of lifted functions are left out.
         """

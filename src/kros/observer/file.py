@@ -1,4 +1,4 @@
-"""The file of an observer: JSON that a person can read and write, and that is believed in nothing.
+"""The file of an observer: JSON that a person can read and write, checked in every part when it is read.
 
 A file that kros wrote carries a checksum of its content. One without, from an earlier version or edited by hand, is read all the same, with a
 warning: everything below is checked either way.

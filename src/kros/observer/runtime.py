@@ -1,4 +1,4 @@
-"""What an observer knows of the machine it runs on: the delay of measurements, limits, and the largest sizes seen in training."""
+"""Delay of measurements, limits, and the largest sizes seen in training: data of the machine that an observer runs on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an observer believes of what arrives: missing, wrong and implausible samples, the same for batches and for one machine.
+"""Plausibility of samples: missing, wrong and implausible ones, judged alike for batches and for one machine.
 
 A sample is judged by itself, before the observer sees it:
 
@@ -30,13 +30,13 @@ from .runtime import Seen
 from .samples import LONGEST, Bits, Flags, Held, SampleStatus, Screened, require_samples
 
 Array = npt.NDArray[np.float64]
-BEYOND = 1.5  # times the range: what is further away is not believed
+BEYOND = 1.5  # times the range: what is further away is implausible
 _ANY = np.finfo(float).max
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Limits of some channels, and between which values a sample is believed; all of shape (channels,)."""
+    """Limits of some channels, and between which values a sample is plausible; all of shape (channels,)."""
 
     lower: Array
     upper: Array
@@ -52,7 +52,7 @@ class Bounds:
 
     @classmethod
     def of_inputs(cls, count: int, lower: Array | None = None, upper: Array | None = None, seen: Array | None = None) -> Bounds:
-        """Return those of inputs, which are believed beyond a declared limit: the machine gets the limit."""
+        """Return those of inputs, which are plausible beyond a declared limit: the machine gets the limit."""
         low, high, size = _declared(count, lower, upper, seen)
         far = np.minimum(BEYOND * size, _ANY)
         return cls(low, high, np.where(np.isfinite(low), -_ANY, -far), np.where(np.isfinite(high), _ANY, far))
@@ -62,10 +62,10 @@ class Bounds:
         return bool(np.all((values >= np.maximum(self.lower, self.least)) & (values <= np.minimum(self.upper, self.most))))
 
     def judge(self, values: Array) -> tuple[Array, Flags, Flags]:
-        """Return samples within their limits, which of them are believed, and which are beyond a limit or their range."""
-        believed = (values >= self.least) & (values <= self.most)
+        """Return samples within their limits, which of them are plausible, and which are beyond a limit or their range."""
+        plausible = (values >= self.least) & (values <= self.most)
         kept = np.clip(values, self.lower, self.upper)
-        return kept, believed, np.isfinite(values) & (~believed | (kept != values))
+        return kept, plausible, np.isfinite(values) & (~plausible | (kept != values))
 
 
 def _declared(count: int, lower: Array | None, upper: Array | None, seen: Array | None) -> tuple[Array, Array, Array]:
@@ -113,7 +113,7 @@ class Screen:
         before = Held.nothing(*u.shape[1:]) if held is None else held
         if self.measured.pass_all(y) and self.inputs.pass_all(u):
             return _as_they_are(y, u, before)
-        kept, believed, beyond = self.measured.judge(y)
+        kept, plausible, beyond = self.measured.judge(y)
         limited, good, far = self.inputs.judge(u)
         status = _bit(~np.isfinite(y), SampleStatus.MISSING) | _bit(~np.isfinite(u), SampleStatus.INVALID_INPUT)
         status |= _bit(beyond, SampleStatus.LIMIT) | _bit(far, SampleStatus.LIMIT)
@@ -121,9 +121,9 @@ class Screen:
         latest = np.maximum.accumulate(np.where(good, count, 0), axis=0)
         since = np.where(latest > 0, count - latest, count + before.since)
         inputs = np.take_along_axis(np.concatenate([before.inputs[None], limited]), latest, axis=0)
-        lost, complete = np.asarray((since > LONGEST).any(axis=-1)), np.asarray(good.all(axis=-1) & believed.any(axis=-1))
+        lost, complete = np.asarray((since > LONGEST).any(axis=-1)), np.asarray(good.all(axis=-1) & plausible.any(axis=-1))
         starts, stale = _starts(lost, complete, before.stale)
-        return Screened(np.where(believed, kept, np.nan), inputs, status, starts, Held(inputs[-1], since[-1], stale))
+        return Screened(np.where(plausible, kept, np.nan), inputs, status, starts, Held(inputs[-1], since[-1], stale))
 
 
 def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:

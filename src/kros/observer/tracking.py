@@ -31,7 +31,7 @@ from .step import Steps
 
 Array = npt.NDArray[np.float64]
 _STEP = 1e-5
-_MOST = 1.0  # error of the parameter that is believed at once: transients at the start show more
+_MOST = 1.0  # largest error of the parameter that is corrected at once: transients at the start show more
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,1 +1,1 @@
-"""What people would use instead: Kalman and Luenberger gains, extended Kalman filter, filtered difference, a learned estimator."""
+"""Estimators to compare with: Kalman and Luenberger gains, extended Kalman filter, filtered difference, a learned estimator."""

@@ -1,4 +1,4 @@
-"""What people would use instead: steady-state Kalman gains with guessed or tuned white noise, and placed poles."""
+"""Gains to compare with: steady-state Kalman gains with guessed or tuned white noise, and placed poles."""
 
 from __future__ import annotations
 

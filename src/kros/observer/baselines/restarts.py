@@ -1,4 +1,4 @@
-"""Restarts of estimators that know nothing of them: run once more from each sample at which an observer starts again (`screen`)."""
+"""Restarts of estimators that have none: run once more from each sample at which an observer starts again (`screen`)."""
 
 from __future__ import annotations
 

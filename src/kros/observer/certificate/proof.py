@@ -119,7 +119,7 @@ def _gram(matrix: _Exact) -> _Exact:
 def _positive(F: Integers) -> bool:
     """Tell whether a symmetric matrix of integers is positive definite.
 
-    Powers of two bring its diagonal to about 2^96, entries are rounded down, and what rounding can do to an eigenvalue is given away.
+    Powers of two bring its diagonal to about 2^96, entries are rounded down, and the largest effect of rounding on an eigenvalue is subtracted.
     """
     n = len(F)
     if any(F[i, i] <= 0 for i in range(n)):

@@ -17,7 +17,7 @@ from ...synthesis.residual_shaped.shaping_filter import Basis
 from ...synthesis.result import Injection
 from ..observer import Observer
 from ..tuning.blocks import Array, Model
-from .moments import DELAYS, SHORT, SKIP, THIN, Past, hidden_of
+from .moments import DELAYS, SHORT, SKIP, THIN, PastMoments, hidden_of
 from .tuning import tune_predictor
 
 DEVIATION = 0.4
@@ -55,7 +55,7 @@ def identify_predictor(
         Share by which the lifted functions' effect may differ from machine to machine.
     longest_s : float, s, optional
         Time constant of the slowest internal state; by default a twenty-fifth of the shortest episode. Controllers integrate, and a slow predictor does
-        so too: of a command it knows more, until the command meets a limit that it does not know.
+        so too, which is more accurate until the command meets a limit that is not in the model.
     samples, episodes : int
         The first so many samples of the first so many episodes of every unit are tuned on.
     iterations : int
@@ -70,7 +70,7 @@ def identify_predictor(
     """
     units = batch.units
     slowest = 1 - (SHORT / int(batch.lengths.min()) if longest_s is None else batch.sample_period_s / longest_s)
-    past = Past.of(lifting, measured, batch, Basis(DELAYS, (slowest,)))
+    past = PastMoments.of(lifting, measured, batch, Basis(DELAYS, (slowest,)))
     model = past.model(len(hidden_of(lifting, measured)) + internal, importance=importance, deviation=deviation)
     few = batch.take([i for i in range(len(units)) if units[:i].count(units[i]) < episodes])
     few = few.head(min(samples, int(few.lengths.min())))
@@ -79,8 +79,8 @@ def identify_predictor(
     return embedded(name, past, model, inputs, few)
 
 
-def embedded(name: str, past: Past, model: Model, inputs: Sequence[str], batch: EpisodeBatch) -> Observer:
-    """Write a model F, G, H of `Past.model` into an observer; the rows of the measured states are fitted to the recordings.
+def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], batch: EpisodeBatch) -> Observer:
+    """Write a model F, G, H of `PastMoments.model` into an observer; the rows of the measured states are fitted to the recordings.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-r"""The internal states of a predictor along recordings: what stands for states that nobody recorded, and coordinates in which it does so well.
+r"""The internal states of a predictor along recordings: a stand-in for states that are not recorded, and coordinates in which it is stable.
 
 The error of an observer with internal states (`identify_predictor`) obeys the same equations as any other's, for *any* sequence that is taken as the
 machine's own. One suggests itself: start it where the observer starts, and let what was recorded drive it through the observer's own rows,
@@ -6,7 +6,7 @@ machine's own. One suggests itself: start it where the observer starts, and let 
 .. math:: m_{k+1} = A_m \theta(x_k, m_k) + B_m u_k .
 
 The one-step residual of these rows is then zero by definition, whatever the machine, and that of the recorded states' rows is what the model misses
-that knows the past. Nothing of it depends on the observer's gains beyond its rows.
+that knows the past. It depends on the observer's rows, not on its gains.
 
 The coordinates of internal states are free: ``m' = m - K x_h`` (x_h the hidden states) changes no estimate, and decides whether recordings drive them
 stably. Let F be the rows of [x_h; m] and P their observability Gramian, ``P = F' P F + H' H``, H the hidden states over their sizes. With

@@ -42,7 +42,7 @@ _RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 1e-5, 0.5, 0.1, 1e-13
 
 
 @dataclass(frozen=True, eq=False)
-class Past:
+class PastMoments:
     """What the units' recordings say about their hidden states: moments of the basis's states, common to any order.
 
     Parameters
@@ -51,7 +51,7 @@ class Past:
     measured : tuple of int
     basis : Basis
     static : ndarray, shape (q, m)
-        M, what the inputs alone say of the measurement.
+        M, the part of the measurement that the inputs explain.
     free : tuple of int
         Inputs that no measurement follows.
     units : tuple of str
@@ -80,7 +80,7 @@ class Past:
         measured: Sequence[int],
         batch: EpisodeBatch,
         basis: Basis | None = None,
-    ) -> Past:
+    ) -> PastMoments:
         """Collect moments of recordings.
 
         Parameters

@@ -1,13 +1,13 @@
 r"""Tuning of linear models for hidden states: all coefficients, dynamics included, by Gauss-Newton steps.
 
-The estimates are ``x_h = H (q I - F)^-1 G z`` with z as recorded (`Past.channels`): no observer has to be run for a step. The criterion is
+The estimates are ``x_h = H (q I - F)^-1 G z`` with z as recorded (`PastMoments.channels`): no observer has to be run for a step. The criterion is
 
 .. math:: \sum_i s_i \log \bigl( \operatorname{mean}_u \overline{e_{iu}^2} \bigr)^{1/2},
 
-with :math:`\overline{e_{iu}^2}` the mean square error of hidden state i on unit u. Every episode counts twice, with the lifted functions larger and smaller
-by a share: machines on which they act more or less than on the mean machine look like that, and an observer that relied on what recordings say of
-them would fail where others adapt. Steps are taken in coordinates in which the states are white along the recordings, all coefficients free: of the many
-models with the same estimates, the nearest one. In those of companion forms or of single modes the search ends early.
+with :math:`\overline{e_{iu}^2}` the mean square error of hidden state i on unit u. Every episode counts twice, with the lifted functions larger
+and smaller by a share: machines on which they act more or less than on the mean machine look like that, and an observer that relied on the mean
+machine's would fail there. Steps are taken in coordinates in which the states are white along the recordings, all coefficients free: of the many models
+with the same estimates, the nearest one. In those of companion forms or of single modes the search ends early.
 
 References
 ----------
@@ -28,7 +28,7 @@ from ...core.errors import DataError
 from ...data import EpisodeBatch
 from ..tuning.blocks import Array, Block, Model, blocks_of, joined
 from ..tuning.gauss_newton import SETTLED, Damping, mean_log, scaled, search, whitening
-from .moments import Past, hidden_of
+from .moments import PastMoments, hidden_of
 
 _DAMPING = Damping(1e-7, 1e-3, 1e4, 4.0)
 _THIN, _SIDE_BY_SIDE = 8, 4  # episodes: keeps derivatives in some ten megabytes
@@ -38,7 +38,7 @@ _BOUND, _AT_BOUND = 1e4, 1 - 1e-6  # a pole at its bound stays there instead of 
 
 def tune_predictor(
     model: Model,
-    past: Past,
+    past: PastMoments,
     batch: EpisodeBatch,
     importance: npt.ArrayLike = 1.0,
     deviation: float = 0.0,
@@ -46,13 +46,13 @@ def tune_predictor(
     iterations: int = 25,
     least_gain: float = 1e-4,
 ) -> tuple[Model, tuple[float, ...]]:
-    """Improve a model of `Past.model` on recordings of one length.
+    """Improve a model of `PastMoments.model` on recordings of one length.
 
     Parameters
     ----------
     model : F (order, order), G (order, channels), H (h, order)
         A stable one.
-    past : Past
+    past : PastMoments
         Says what the channels are.
     batch : EpisodeBatch
     importance : array_like, shape (h,)
@@ -98,7 +98,7 @@ class _Point:
 class _Tuning:
     """Recordings to tune on, samples on the last axis."""
 
-    def __init__(self, past: Past, batch: EpisodeBatch, importance: npt.ArrayLike, deviation: float) -> None:
+    def __init__(self, past: PastMoments, batch: EpisodeBatch, importance: npt.ArrayLike, deviation: float) -> None:
         hidden = hidden_of(past.lifting, past.measured)
         seen, truth = past.channels(batch), batch.states[..., hidden]
         z, truth = (np.ascontiguousarray(np.moveaxis(a, 0, 2).swapaxes(0, 1)) for a in (seen, truth))

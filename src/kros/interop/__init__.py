@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     from .adopted import AdoptedModel
     from .control import UncertaintyForControl, from_control, models_to_control, to_control, uncertainty_to_control
     from .models import quantify_models
-    from .pairs import one_step_pairs
     from .pykoop import from_pykoop
     from .pykoop_population import models_from_pykoop
+    from .rows import one_step_pairs
     from .sklearn_estimator import KoopmanRegressor
 
 _HOME = {
@@ -22,7 +22,7 @@ _HOME = {
     "KoopmanRegressor": "sklearn_estimator",
     "from_pykoop": "pykoop",
     "models_from_pykoop": "pykoop_population",
-    "one_step_pairs": "pairs",
+    "one_step_pairs": "rows",
 }
 
 __all__ = [

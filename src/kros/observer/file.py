@@ -112,10 +112,7 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
     measured = _indices(content["measured"], lifting.n_states, where)
     injection, q = Injection(content["injection"]), len(measured)
     period = content["sample_period_s"]
-    if not _is_number(period) or not 0 < period < math.inf:
-        raise DataError(
-            f"{where}: sample_period_s should be a number of seconds above zero, found {shortened(repr(period))}; correct the file."
-        )
+    _require(_is_finite(period) and period > 0, f"{where}: sample_period_s should be a number of seconds above zero", period)
     width = m if injection is Injection.INPUT else n
     controller, order = content["controller"], len(content["controller"]["A"])
     shapes = {"A": (order, order), "B": (order, q), "C": (width, order), "D": (width, q)}
@@ -140,11 +137,8 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
     if content["schema"] == _FIRST:
         return replace(observer, replaces=measurement_replaces(observer), internal=_named_memories(lifting.states))
     replaces, internal = content["measurement_replaces_estimate"], content["internal_states"]
-    if type(replaces) is not bool or type(internal) is not int:
-        raise DataError(
-            f"{where}: measurement_replaces_estimate should be true or false and internal_states a number, found {shortened(repr((replaces, internal)), 60)}; "
-            "correct the file."
-        )
+    _require(type(replaces) is bool, f"{where}: measurement_replaces_estimate should be true or false", replaces)
+    _require(type(internal) is int, f"{where}: internal_states should be a whole number", internal)
     return replace(observer, replaces=replaces, internal=internal)
 
 
@@ -169,26 +163,28 @@ def matrix(rows: Any, shape: tuple[int, int], where: str) -> Array:
             found = f"{len(row)} entries" if isinstance(row, list) else shortened(repr(row), 60)
             raise DataError(f"{where}[{i}] should have {shape[1]} numbers, found {found}; correct the file.")
         for j, value in enumerate(row):
-            if not _is_number(value) or not math.isfinite(value):
-                raise DataError(f"{where}[{i}][{j}] should be a finite number, found {shortened(repr(value), 60)}; correct the file.")
+            _require(_is_finite(value), f"{where}[{i}][{j}] should be a finite number", value)
     return np.array(rows, dtype=float).reshape(shape)
 
 
-def _is_number(value: Any) -> bool:
-    """Whether a value is a number that a double can hold."""
+def _require(holds: bool, wanted: str, found: Any) -> None:
+    if not holds:
+        raise DataError(f"{wanted}, found {shortened(repr(found), 60)}; correct the file.")
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether a value is a finite number that a double can hold."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
-    return isinstance(value, float) or value.bit_length() < 1024
+    return math.isfinite(value) if isinstance(value, float) else value.bit_length() < 1024
 
 
 def _text(value: Any, where: str) -> None:
-    if not isinstance(value, str) or not value.strip():
-        raise DataError(f"{where} should be text that is not empty, found {shortened(repr(value), 60)}; correct the file.")
+    _require(isinstance(value, str) and bool(value.strip()), f"{where} should be text that is not empty", value)
 
 
 def _names(values: Any, where: str) -> None:
-    if not isinstance(values, list):
-        raise DataError(f"{where} should be a list of names, found {shortened(repr(values), 60)}; correct the file.")
+    _require(isinstance(values, list), f"{where} should be a list of names", values)
     for i, value in enumerate(values):
         _text(value, f"{where}[{i}]")
 
@@ -203,37 +199,28 @@ def _distinct(names: Sequence[str], where: str) -> None:
 
 def _parameters(values: Any, where: str) -> dict[str, float]:
     """Return the values that are known; null stands for one that every unit has of its own."""
-    if not isinstance(values, dict):
-        raise DataError(f"{where}: parameters should name values, found {shortened(repr(values), 60)}; correct the file.")
+    _require(isinstance(values, dict), f"{where}: parameters should name values", values)
     for name, value in values.items():
-        if value is not None and (not _is_number(value) or not math.isfinite(value)):
-            raise DataError(
-                f"{where}: parameters.{name} should be a finite number or null, found {shortened(repr(value), 60)}; correct the file."
-            )
+        _require(value is None or _is_finite(value), f"{where}: parameters.{name} should be a finite number or null", value)
     return {name: float(value) for name, value in values.items() if value is not None}
 
 
 def _indices(values: Any, count: int, where: str) -> tuple[int, ...]:
     good = isinstance(values, list) and all(type(i) is int and 0 <= i < count for i in values) and len(set(values)) == len(values)
-    if not good:
-        raise DataError(
-            f"{where}: measured should list different states by number, 0 to {count - 1}, found {shortened(repr(values), 60)}; correct the file."
-        )
+    _require(good, f"{where}: measured should list different states by number, 0 to {count - 1}", values)
     return tuple(values)
 
 
 def _runtime(content: Mapping[str, Any], where: str) -> Runtime:
     found = content.get("runtime", {})
-    if not isinstance(found, dict):
-        raise DataError(f"{where}: runtime should be an object, found {shortened(repr(found), 60)}; correct the file.")
     _known(found, Runtime.__dataclass_fields__, f"{where}: runtime")
     for key, value in found.items():
         entries = [value]
         while any(isinstance(entry, list) for entry in entries):
             entries = [e for entry in entries for e in (entry if isinstance(entry, list) else [entry])]
-        bad = [e for e in entries if not (_is_number(e) and math.isfinite(e)) and (e is not None or key in ("delay", "filter_gain"))]
-        if bad:
-            raise DataError(f"{where}: runtime.{key} should hold finite numbers, found {shortened(repr(bad[0]), 60)}; correct the file.")
+        for entry in entries:
+            free = entry is None and key not in ("delay", "filter_gain")  # a limit that is null is infinite
+            _require(free or _is_finite(entry), f"{where}: runtime.{key} should hold finite numbers", entry)
     return Runtime.from_content(content)
 
 
@@ -246,8 +233,7 @@ def _seen(found: Any, measured: int, inputs: int, where: str) -> Seen | None:
 
 
 def _known(found: Any, known: Sequence[str] | Mapping[str, Any] | str, where: str) -> None:
-    if not isinstance(found, dict):
-        raise DataError(f"{where} should be an object, found {shortened(repr(found), 60)}; correct the file.")
+    _require(isinstance(found, dict), f"{where} should be an object", found)
     unknown = [key for key in found if key not in known]
     if unknown:
         raise DataError(f"{where}: unknown key {unknown[0]!r}; known are {', '.join(known)}; correct the file.")

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from kros.report.advice import advice
-from kros.report.sections.outliers import conspicuous_text
+from kros.report.sections.outliers import score_text
 from kros.report.sections.uncertainty import noise_text
 
 NAME = "koopman/worst_case_h2"
@@ -81,8 +81,8 @@ def test_flagged_units_come_first_and_count_until_they_are_dropped() -> None:
 def test_a_flagged_unit_is_described_with_its_range() -> None:
     row = {"unit": "z", "condition": "load", "score": 16.2, "freq_hz": 17.36, "entry": (2, 1)}
     row |= {"excess_db": 16.0, "lowest_db": 10.9, "highest_db": 17.0, "agreement": 0.25}
-    text = conspicuous_text(row, (("position", "velocity", "current"), ("target_position", "target_velocity")))
+    text = score_text(row, (("position", "velocity", "current"), ("target_position", "target_velocity")))
     assert text.startswith("Unit z (loaded) scores 16.2 dB, most at 17.4 Hz in the response of current to target velocity.")
     assert "under every choice of the nominal, by 10.9 to 17.0 dB" in text
     assert "25 %" in text
-    assert conspicuous_text({"unit": "z", "condition": "load", "score": 16.2}, None) == "Unit z (loaded) scores 16.2 dB."
+    assert score_text({"unit": "z", "condition": "load", "score": 16.2}, None) == "Unit z (loaded) scores 16.2 dB."

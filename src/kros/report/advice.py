@@ -107,5 +107,5 @@ def _recordings(metrics: Mapping[str, Any]) -> list[str]:
     if share >= MANY:
         return [f"Record longer or more episodes: {100 * share:.0f} % {differ} comes from the recordings' length."]
     return [
-        f"Longer recordings of these units would change little: {100 * (1 - share):.0f} % {differ} is there whatever is drawn from the episodes."
+        f"Longer recordings of these units would change little: {100 * (1 - share):.0f} % {differ} remains when episodes are resampled."
     ]

@@ -57,8 +57,8 @@ FIGURES: dict[str, Row] = {
     "robustness": Row("Disturbed measurements", "observers.robustness"),
     "robustness_second": Row("Disturbed measurements, the second hidden state", "observers.robustness", {"number": 1}),
     "outlier_scores": Row("Outlier scores", "outliers.scores"),
-    "outlier_ratio": Row("The most conspicuous unit against the cover of the others", "outliers.ratio"),
-    "outlier_residuals": Row("The most conspicuous unit, entry by entry", "outliers.residuals"),
+    "outlier_ratio": Row("The highest-scoring unit against the cover of the others", "outliers.ratio"),
+    "outlier_residuals": Row("The highest-scoring unit, entry by entry", "outliers.residuals"),
 }
 
 

@@ -24,11 +24,12 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         return None
     flagged = [r for r in rows if r["outlier"]]
     text = (
-        "A unit's score is how far its residual sticks out of the cover of all the others, in whatever direction and at whatever frequency it does most. "
-        "Scores look at the recordings only, never at serial or group. Some unit always sticks out most, so there is a threshold; above it a unit is flagged."
+        "A unit's score is by how much its residual exceeds the cover of all the others, in the direction and at the frequency where it does most. "
+        "Scores look at the recordings only, never at serial or group. Some unit always has the highest score, so there is a threshold; above it a unit is "
+        "flagged."
     )
     verdict = f"Flagged: {flagged_text(flagged)}." if flagged else "No unit is flagged."
-    paragraphs = [text, verdict, *undecided_text(rows), _MEANING, *(conspicuous_text(r, _names(run, r)) for r in flagged[:_MOST])]
+    paragraphs = [text, verdict, *undecided_text(rows), _MEANING, *(score_text(r, _names(run, r)) for r in flagged[:_MOST])]
     more = [("As in the paper, entry by entry", ["outlier_residuals"])]
     return Section("outliers", "Outliers", paragraphs, [_scores(run, rows)], ["outlier_scores", "outlier_ratio"], more=more)
 
@@ -43,8 +44,8 @@ def undecided_text(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return texts
 
 
-def conspicuous_text(row: Mapping[str, Any], names: Names | None) -> str:
-    """Say where and how clearly a flagged unit sticks out."""
+def score_text(row: Mapping[str, Any], names: Names | None) -> str:
+    """Say where and how clearly a flagged unit exceeds the others."""
     text = f"Unit {row['unit']} ({condition_label(row['condition'])}) scores {number(row['score'])} dB"
     if row.get("freq_hz") is None:
         return f"{text}."

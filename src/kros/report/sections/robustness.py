@@ -19,8 +19,8 @@ _TEXT = (
     "held-out episodes are disturbed in one way at a time, and the observers are not informed."
 )
 _MEMBERS = (
-    "A worst case is a bound. Random members of the set show what is typical in it, and how close the bound is: they stand exactly where the certificate "
-    "puts them, in the study's form between its weights."
+    "A worst case is a bound. Random members of the set show what is typical in it, and how close the bound is: they enter at the uncertainty location of the "
+    "certificate, in the study's form between its weights."
 )
 
 

@@ -27,14 +27,14 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
 def _caption(run: RunFolder, chosen: list[str]) -> str:
     text = "The whole held-out episode from the true first state and the recorded inputs alone, no measurement fed back. "
     lifted = [n for n in chosen if is_koopman(n)]
-    if lifted and len(chosen) == 2 and _carries(run, chosen):
-        text += "The linear model follows the average; the Koopman model carries the gearbox oscillation as well. "
+    if lifted and len(chosen) == 2 and _reproduces(run, chosen):
+        text += "The linear model follows the average; the Koopman model reproduces the gearbox oscillation as well. "
     free = run.evaluation["free_run"]
     parts = [f"{model_label(n)} " + ", ".join(f"{c} {number(v['median'])} %" for c, v in free[n].items()) for n in chosen if n in free]
     return text + (f"Median error over units: {'; '.join(parts)}." if parts else "")
 
 
-def _carries(run: RunFolder, chosen: list[str]) -> bool:
+def _reproduces(run: RunFolder, chosen: list[str]) -> bool:
     """Whether the Koopman model leaves less than half of the linear one's power around the gearbox frequency in some state."""
     if not run.band_hz:
         return False

@@ -1,4 +1,4 @@
-"""The most conspicuous unit against the cover of all the others, all directions at once (the paper's Figure 15 as a bound)."""
+"""The highest-scoring unit against the cover of all the others, all directions at once (the paper's Figure 15 as a bound)."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     legend(figure, axes[0, 0])
     text = (
         f"Largest singular value of every unit's {form_label(first.form.value)} residual over the smallest diagonal cover of all units but {unit}, "
-        f"{condition_label(condition)}, nominal unit {first.nominal_id}. Dashed: what the others need. {sticks_out(found, unit)}"
+        f"{condition_label(condition)}, nominal unit {first.nominal_id}. Dashed: what the others need. {excess_text(found, unit)}"
     )
     return figure, text
 
 
-def sticks_out(found: dict[str, UnitResiduals], unit: str) -> str:
+def excess_text(found: dict[str, UnitResiduals], unit: str) -> str:
     """Say where a unit leaves the cover of the others, and by how much."""
     parts = []
     for name, residuals in found.items():

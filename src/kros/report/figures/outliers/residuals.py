@@ -1,4 +1,4 @@
-"""Residual of the most conspicuous unit against those of all the others, entry by entry (the paper's Figure 15)."""
+"""Residual of the highest-scoring unit against those of all the others, entry by entry (the paper's Figure 15)."""
 
 from __future__ import annotations
 
@@ -16,6 +16,6 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     names = {n: entry_names(r.form, run.condition_models(n, condition)) for n, r in found.items()}
     text = (
         f"Entries of the {form_label(first.form.value)} residuals against unit {first.nominal_id}, {condition_label(condition)}, beside weights that are "
-        f"fitted to all units but {unit}. It is conspicuous where it leaves them; the figure above judges all entries at once."
+        f"fitted to all units but {unit}. It differs where it leaves them; the figure above judges all entries at once."
     )
     return entries_figure(found, names, alarm=unit), text

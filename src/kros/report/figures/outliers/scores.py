@@ -22,7 +22,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     rate, units = number(100 * first.false_alarm_rate, 2), len(first.unit_ids)
     caveat = f"; {units} units alone cannot show so rare an event, so the rate rests on that model" if first.extrapolated else ""
     text = (
-        f"How far every unit sticks out of the cover of all the others by its {form_label(first.form.value)} residual: the median over all nominal units, "
+        f"By how much every unit exceeds the cover of all the others with its {form_label(first.form.value)} residual: the median over all nominal units, "
         f"and as a bar the range with each of them as the only nominal. Dashed: threshold at a nominal false-alarm rate of {rate} % for "
         f"each good unit, from a generalised extreme value model of the scores of the others{caveat}. "
     )

@@ -41,7 +41,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
 def _panel(axes: Axes, run: RunFolder, name: str, syntheses: dict[str, Synthesis]) -> list[tuple[float, str, str]]:
     models = run.models[name]
     freqs = models.frequencies(_POINTS, decades=5)
-    plant = models.systems([str(run.choice["nominal"])])[0].frequency_response(freqs) * models.input_scale / models.output_scale[:, None]
+    plant = models.scaled_responses(freqs, [str(run.choice["nominal"])])[0]
     curves = [("plant G", plant, Tone.INK.light, "-")]
     if name in run.uncertain:
         weight = run.uncertain[name].weight

@@ -41,9 +41,9 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     panel.set_xlabel("H2 norm of the error over its certified bound")
     legend(figure, panel)
     return figure, (
-        f"{sets[order[0]]['members']} random stable causal perturbations of norm up to one, constant and all-pass ones of several orders, stand where the "
-        "certificate allows any contraction: a histogram of every observer's error, over its own bound. Ticks below are the models of the population's "
-        "units. None may lie right of one. Where noise makes most of an error, all machines have nearly the same."
+        f"{sets[order[0]]['members']} random stable causal perturbations of norm up to one, constant and all-pass ones of several orders, in place of "
+        "the contraction that the certificate allows: a histogram of every observer's error, over its own bound. Ticks below are the models of the "
+        "population's units. None may lie right of one. Where noise makes most of an error, all machines have nearly the same."
     )
 
 

@@ -62,7 +62,7 @@ def paper_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tuple[Ar
     """Return frequencies and bounds of the published pipeline's output forms, on a few frequencies."""
     every = max(1, len(model.freqs_hz) // _PAPER_POINTS)
     freqs = model.freqs_hz[::every]
-    response = models.systems(model.unit_ids).frequency_response(freqs) * models.input_scale / models.output_scale[:, None]
+    response = models.scaled_responses(freqs, model.unit_ids)
     found = {}
     for form in _PAPER_FORMS:
         nominal = model.nominals.get(form)

@@ -22,7 +22,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     bounds = {n: entry_bounds(model, run.models[n]) for n, model in chosen.items()}
     text = (
         "Thin: largest magnitude of each entry over all units, for the nominal unit that suits each form best. Thick: largest singular value, which bounds "
-        "all directions at once and lies above every entry. Reading entries alone takes a form for smaller than it is."
+        "all directions at once and lies above every entry. Entries alone make a form look smaller than it is."
     )
     figure, axes = grid(len(chosen), len(Form), 1.75, sharex=True, sharey="row")
     for row, (name, model) in zip(axes, chosen.items(), strict=True):
@@ -43,7 +43,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
 def entry_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tuple[Array, Array]]:
     """Return frequencies and largest magnitudes of entries, shape (frequency, p', m'), of every form with its own nominal."""
     freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // _POINTS)]
-    G = models.systems(model.unit_ids).frequency_response(freqs) * models.input_scale / models.output_scale[:, None]
+    G = models.scaled_responses(freqs, model.unit_ids)
     own = model.scaled_nominal().frequency_response(freqs)
     found = {}
     for form in model.bounds:

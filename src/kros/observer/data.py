@@ -173,13 +173,7 @@ class ObserverData:
         return {name: parameters[name] for name in self.lifting.parameters if name in parameters}
 
     def values(self, parameters: Mapping[str, npt.ArrayLike] | None = None, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
-        """Return the lifting's parameters: those that are given, the observer's own for the others.
-
-        Parameters
-        ----------
-        parameters : mapping of str to array_like
-        shape : tuple of int, optional
-            What every value has to broadcast to.
+        """Return the lifting's parameters: those that are given, the observer's own for the others; each broadcasts to `shape` where that is given.
 
         Raises
         ------

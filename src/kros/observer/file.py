@@ -90,13 +90,7 @@ def read_observer(path: Path) -> ObserverData:
 
 
 def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
-    """Make an observer from the content of a file.
-
-    Parameters
-    ----------
-    content : mapping
-    where : str
-        What messages begin with.
+    """Make an observer from the content of a file; messages begin with `where`.
 
     Raises
     ------

@@ -101,13 +101,7 @@ class RunningObserver:
         return self._forward(self._steps.x[0, 0])
 
     def filter(self, y: npt.ArrayLike) -> Estimate:
-        """Return the estimate of the state at k from what arrived up to k; nothing moves on.
-
-        Parameters
-        ----------
-        y : array_like, shape (q,)
-            What arrives at k; NaN where a measurement is missing.
-        """
+        """Return the estimate of the state at k from what arrived up to k, y of shape (q,), NaN where a measurement is missing; nothing moves on."""
         o = self.observer
         if len(self._inputs) < o.runtime.delay:
             return self.estimate

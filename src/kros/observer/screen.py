@@ -101,15 +101,7 @@ class Screen:
         return cls(Bounds.of_measurements(q, seen=sizes[0]), Bounds.of_inputs(m, seen=sizes[1]))
 
     def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
-        """Judge samples in the order in which they arrive.
-
-        Parameters
-        ----------
-        y : ndarray, shape (n_samples, batch, q)
-        u : ndarray, shape (n_samples, batch, m)
-        held : Held, optional
-            What is known before the first sample; nothing by default.
-        """
+        """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m) in the order in which they arrive; `held` is known before the first."""
         before = Held.nothing(*u.shape[1:]) if held is None else held
         if self.measured.pass_all(y) and self.inputs.pass_all(u):
             return _as_they_are(y, u, before)
@@ -127,14 +119,7 @@ class Screen:
 
 
 def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:
-    """Return the bits of `SampleStatus` of every sample, shape (n_samples, batch), as the observer takes them in a batch.
-
-    Parameters
-    ----------
-    observer : Observer
-    y : ndarray, shape (n_samples, batch, q)
-    u : ndarray, shape (n_samples, batch, m)
-    """
+    """Return the bits of `SampleStatus` of every sample, shape (n_samples, batch), as the observer takes y and u in a batch."""
     return screened(observer, y, u).status
 
 

@@ -50,20 +50,9 @@ class FilteredDifference:
             )
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Estimate the rates of a batch of episodes, at rest before the first sample.
+        """Estimate the rates from measurements y (n_samples, batch, q), at rest before the first sample; shape (n_samples, batch, n).
 
-        Parameters
-        ----------
-        y : ndarray, shape (n_samples, batch, q)
-        u : ndarray
-            Not looked at.
-        parameters : mapping
-            Not looked at.
-
-        Returns
-        -------
-        ndarray, shape (n_samples, batch, n)
-            Row k from measurements up to k - 1; NaN for states that are no rate of a measured one.
+        Row k from measurements up to k - 1; NaN for states that are no rate of a measured one. Inputs and parameters play no part.
         """
         from scipy.signal import butter, lfilter
 

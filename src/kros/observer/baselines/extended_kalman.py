@@ -69,19 +69,10 @@ class ExtendedKalman:
             )
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Estimate a batch of episodes.
+        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n); parameters of shape (batch,).
 
-        Parameters
-        ----------
-        y : ndarray, shape (n_samples, batch, q)
-            NaN or infinite where a measurement is missing: nothing is corrected at that sample, and the covariance grows.
-        u : ndarray, shape (n_samples, batch, m)
-        parameters : mapping of str to array_like, shape (batch,)
-
-        Returns
-        -------
-        ndarray, shape (n_samples, batch, n)
-            Row k is the prediction from data up to k - 1; row 0 is the start.
+        Row k is the prediction from data up to k - 1; row 0 is the start. Where a measurement is not finite, nothing is corrected at that sample, and
+        the covariance grows.
         """
         return self.run_all(y, u, parameters)[0]
 

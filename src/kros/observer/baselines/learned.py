@@ -61,14 +61,7 @@ class Features:
         return tuple(i for i, formula in enumerate(self.lifting.formulas) if set(formula.used) <= seen)
 
     def channels(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Return z, shape (n_samples, batch, channels).
-
-        Parameters
-        ----------
-        y : ndarray, shape (n_samples, batch, q)
-        u : ndarray, shape (n_samples, batch, m)
-        parameters : mapping of str to array_like, shape (batch,)
-        """
+        """Return z, shape (n_samples, batch, channels), of y (n_samples, batch, q) and u (n_samples, batch, m); parameters of shape (batch,)."""
         if y.shape[:-1] != u.shape[:-1] or y.shape[-1] != len(self.measured) or u.shape[-1] + 1 != self.static.shape[1]:
             raise DimensionError(
                 f"Learned estimator: expected {len(self.measured)} measurements and {self.static.shape[1] - 1} inputs, found {y.shape} and {u.shape}."
@@ -118,14 +111,7 @@ class Moments:
         batch: EpisodeBatch,
         thin: int = 4,
     ) -> Moments:
-        """Collect the moments of training episodes.
-
-        Parameters
-        ----------
-        features : Features
-        batch : EpisodeBatch
-        thin : int
-            Every so many samples count.
+        """Collect the moments of training episodes; every `thin`-th sample counts.
 
         Raises
         ------
@@ -155,14 +141,9 @@ class Moments:
         return cls(features, estimated, names, gram / counts[:, None, None], cross / counts[:, None, None])
 
     def estimator(self, without: Collection[str] = (), ridge: float = RIDGE) -> Learned:
-        """Train on all units but some.
+        """Train on all units but some; names of units that took no part are ignored.
 
-        Parameters
-        ----------
-        without : collection of str
-            Units that take no part; names of others are ignored.
-        ridge : float
-            Penalty relative to the regressors' mean squares; the constant is not penalised.
+        `ridge` is a penalty relative to the regressors' mean squares; the constant is not penalised.
 
         Raises
         ------
@@ -203,18 +184,9 @@ class Learned:
     response: Array
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Estimate the states of a batch of episodes; what came before the first sample is taken to equal it.
+        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n); parameters of shape (batch,).
 
-        Parameters
-        ----------
-        y : ndarray, shape (n_samples, batch, q)
-        u : ndarray, shape (n_samples, batch, m)
-        parameters : mapping of str to array_like, shape (batch,)
-
-        Returns
-        -------
-        ndarray, shape (n_samples, batch, n)
-            Row k from data up to k - 1; NaN for states that are not estimated.
+        Row k from data up to k - 1, what came before the first sample taken to equal it; NaN for states that are not estimated.
         """
         from scipy.fft import irfft, next_fast_len, rfft
 

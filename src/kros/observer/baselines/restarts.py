@@ -16,12 +16,7 @@ Array = npt.NDArray[np.float64]
 def restarted(run: Callable[[Array, Array, Mapping[str, Any]], Array], samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
     """Run a batch, and every member once more from each sample at which it starts again to the next; shape (n_samples, batch, n).
 
-    Parameters
-    ----------
-    run : callable
-        From measurements, inputs and parameters to estimates, row 0 being the start.
-    samples : Screened
-    parameters : mapping of str to array_like, shape (batch,)
+    `run` takes measurements, inputs and parameters, shape (batch,), to estimates whose row 0 is the start.
     """
     n_samples, batch = samples.starts.shape
     found = run(samples.y, samples.u, parameters)

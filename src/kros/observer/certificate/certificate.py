@@ -100,10 +100,7 @@ class ReliftCertificate:
     def initial_energy(self, error: npt.ArrayLike) -> Array:
         """Return V(e_0) in scaled units, shape (...): the price of starting with an error, shape (..., n_window), the controller at rest.
 
-        Parameters
-        ----------
-        error : array_like, shape (..., n_window)
-            First error, in physical units; behind it earlier errors where the lifting has delays.
+        The first error is in physical units; behind it are earlier errors where the lifting has delays.
         """
         e = np.asarray(error, dtype=float)
         energies = [np.sum((e @ R[:, : e.shape[-1]].T) ** 2, axis=-1) for R in self.roots]

@@ -81,13 +81,7 @@ class ReliftScales:
     def typical(cls, ranges: npt.ArrayLike, residual: Array, noise: npt.ArrayLike) -> ReliftScales:
         """Return the scales for which a population's residual has unit power: its gain then *is* the error that is certified on a typical unit.
 
-        Parameters
-        ----------
-        ranges : array_like, shape (n,)
-        residual : ndarray, shape (..., n)
-            One-step residuals of the population.
-        noise : array_like, shape (q,)
-            Standard deviation of every measurement's noise.
+        Of ranges, shape (n,), one-step residuals of the population, shape (..., n), and the standard deviation of every measurement's noise, shape (q,).
         """
         n, sigma = residual.shape[-1], np.atleast_1d(np.asarray(noise, dtype=float))
         rms = np.sqrt(np.mean(residual.reshape(-1, n) ** 2, axis=0))
@@ -172,19 +166,7 @@ def error_system(
     *,
     clipped: bool = False,
 ) -> ErrorSystem:
-    """Return the error dynamics of an observer as it runs.
-
-    Parameters
-    ----------
-    observer : ObserverData
-    scales : ReliftScales, optional
-        One by default.
-    box : mapping of str to (lower, upper), optional
-        Ranges of states and inputs inside which slopes are bounded; what is not named may be anything.
-    parameters : mapping of str to number or (lower, upper), optional
-        Ranges of the lifting's parameters; what is not named may be anything, so that one certificate holds for every unit.
-    clipped : bool
-        The lifted functions see the estimate clipped to the box: then the true state alone must stay inside, and the box of slopes includes zero.
+    """Return the error dynamics of an observer as it runs; arguments as in `relift_certificate`.
 
     Raises
     ------

@@ -28,12 +28,7 @@ _WELL_INSIDE = 0.25
 def best_multipliers(H: Array, width: int) -> Array | None:
     """Return multipliers for which the gain is close to least, shape (n_p,); None where no multipliers prove stability.
 
-    Parameters
-    ----------
-    H : ndarray, shape (f, n_p + n_z, n_p + n_w)
-        Frequency responses from [p, w] to [q, z].
-    width : int
-        n_p.
+    H are responses from [p, w] to [q, z], shape (f, n_p + n_z, n_p + n_w); `width` is n_p.
     """
     largest = np.argsort(-np.linalg.norm(H, axis=(1, 2)))[: _MOST_FREQUENCIES // 2]
     H = H[np.union1d(largest, np.linspace(0, len(H) - 1, _MOST_FREQUENCIES // 2).astype(int))]

@@ -45,17 +45,9 @@ def steps(n_corners: int, n_words: int) -> Iterator[tuple[int, int, int]]:
 
 
 def margin(roots: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> float:
-    """Return ``1 - max ||.||^2`` over corners in the coordinates where every P is the identity; positive for a proof, up to rounding.
+    """Return ``1 - max ||.||^2`` over corners (A, B) in the coordinates where every P is the identity; positive for a proof, up to rounding.
 
-    Parameters
-    ----------
-    roots : ndarray, shape (n_words, n, n)
-        Upper triangular R with ``P = R'R``.
-    corners : sequence of (A, B)
-    C : ndarray, shape (n_z, n)
-    gain : float
-    D : ndarray, shape (n_z, n_w), optional
-        Zero by default.
+    `roots`, shape (n_words, n, n), are upper triangular R with ``P = R'R``; C has shape (n_z, n), and D, zero by default, (n_z, n_w).
     """
     worst = 0.0
     for c, word, following in steps(len(corners), len(roots)):

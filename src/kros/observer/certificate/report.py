@@ -132,12 +132,7 @@ def first_error(observer: ObserverData, error: Array, width: int) -> Array:
 def frozen_response(system: ErrorSystem, w: Array, first: Array) -> tuple[Array, Array]:
     """Return the scaled error with slopes in the middle, and the movement of the lifted functions it can cause.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    w : ndarray, shape (n_samples - 1, batch, k)
-        Scaled residual, and noise where ``k`` is as wide as the system's input.
-    first : ndarray, shape (batch, n_window)
+    `w` is the scaled residual, shape (n_samples - 1, batch, k), with noise where k is as wide as the system's input; `first` has shape (batch, n_window).
     """
     xi = np.zeros((len(w) + 1, w.shape[1], len(system.A)))
     xi[0, :, : first.shape[1]] = first

@@ -39,15 +39,7 @@ def sdp_proposal(
 ) -> tuple[Proposal | None, str]:
     """Return the best proposal that holds in floating point, and what the solver said.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    corners : sequence of (A, B)
-        Corners of every mode.
-    lookahead : int
-        Number of coming corners that the Lyapunov function knows.
-    time_limit_s : float
-        For each program.
+    `corners` are those (A, B) of every mode; the Lyapunov function looks at so many coming corners as `lookahead` says; the time limit is one for each program.
     """
     cp: Any = import_module("cvxpy")  # takes a second; its own annotations do not describe what it exports
     n, n_words = len(system.A), len(corners) ** lookahead

@@ -140,17 +140,15 @@ class PastMoments:
     ) -> tuple[Array, Array, Array]:
         """Return a stable model ``h+ = F h + G z``, ``x_h = H h`` of an order, of all units but some; F (order, order).
 
+        `importance`, shape (h,) or a number, weights the hidden states' mean square errors, each relative to what the whole basis leaves of it.
+        With `deviation` every lifted function's effect is known but for an independent factor 1 +- deviation, which differs from machine to machine.
+
         Raises
         ------
         DataError
             When no unit is left.
         DimensionError
             When the order is below the number of hidden states.
-
-        Notes
-        -----
-        `importance`, shape (h,) or a number, weights the hidden states' mean square errors, each relative to what the whole basis leaves of it.
-        With `deviation` every lifted function's effect is known but for an independent factor 1 +- deviation, which differs from machine to machine.
         """
         rows = [i for i, unit in enumerate(self.units) if unit not in without]
         if not rows:

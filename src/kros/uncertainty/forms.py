@@ -35,6 +35,7 @@ from .small_matrices import condition_number, entries_first, entries_last, multi
 Array = npt.NDArray[Any]
 E = TypeVar("E", bound=Enum)
 
+_OUTSIDE = 1e-9  # what may stick out of a range, relative to the matrix tested
 MAX_CONDITION = 1e12  # beyond this an inverse form cannot rebuild the plant
 
 
@@ -155,23 +156,19 @@ def inverted_matrix(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) 
     return np.eye(product.shape[-1]) - product
 
 
-def existence(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike, *, rtol: float = 1e-9) -> Array:
-    """Tell where, shape (...), a residual of this form rebuilds the perturbed plant exactly.
-
-    `rtol` is what may stick out of a range or row space, relative to the matrix tested.
-    """
+def existence(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> Array:
+    """Tell where, shape (...), a residual of this form rebuilds the perturbed plant exactly."""
     form = as_form(form)
     G, Gp = _plants(nominal, perturbed)
     if form is Form.ADDITIVE:
         return np.ones(np.broadcast_shapes(G.shape, Gp.shape)[:-2], bool)
-    rows, columns = (lambda a, b: _in_range(adjoint(a), adjoint(b), rtol)), (lambda a, b: _in_range(a, b, rtol))
+    inner, outer = (G, Gp) if form.inverse else (Gp - G, G)
+    rows = form in (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
+    inside = _in_range(adjoint(inner), adjoint(outer)) if rows else _in_range(inner, outer)
+    if form is Form.INVERSE_ADDITIVE:
+        inside &= _in_range(adjoint(Gp), adjoint(G))
     if not form.inverse:
-        return columns(Gp - G, G) if form is Form.INPUT_MULTIPLICATIVE else rows(Gp - G, G)
-    inside = {
-        Form.INVERSE_ADDITIVE: lambda: columns(G, Gp) & rows(Gp, G),
-        Form.INVERSE_INPUT_MULTIPLICATIVE: lambda: columns(G, Gp),
-        Form.INVERSE_OUTPUT_MULTIPLICATIVE: lambda: rows(G, Gp),
-    }[form]()
+        return inside
     matrix = inverted_matrix(form, G, residual(form, G, Gp))
     return inside & (condition_number(matrix) < MAX_CONDITION)
 
@@ -277,7 +274,7 @@ def _inverse(matrices: Array) -> Array:
         return np.where(regular[..., None, None], np.linalg.inv(safe), np.nan)
 
 
-def _in_range(inner: Array, outer: Array, rtol: float) -> Array:
+def _in_range(inner: Array, outer: Array) -> Array:
     """Tell where range(inner) lies in range(outer)."""
     out = inner - outer @ (np.linalg.pinv(outer) @ inner)
-    return np.linalg.norm(out, axis=(-2, -1)) <= rtol * np.linalg.norm(inner, axis=(-2, -1))
+    return np.linalg.norm(out, axis=(-2, -1)) <= _OUTSIDE * np.linalg.norm(inner, axis=(-2, -1))

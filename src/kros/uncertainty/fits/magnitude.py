@@ -76,10 +76,6 @@ class FittedMagnitude:
     within_tolerance: bool
     proven_db: float = float("nan")
 
-    def inverse(self) -> StateSpace:
-        """Return the inverse system, stable because the system is minimum phase."""
-        return invert(self.system)
-
 
 def fit_magnitude(
     freqs_hz: npt.ArrayLike,

@@ -91,20 +91,27 @@ def _fit_checked(
     residuals: Residuals, freqs_hz: Array, dt: float, structure: Structure, limits: tuple[int, float], checks: Checks
 ) -> tuple[Weight, Cover]:
     """Scalar or diagonal weights; `limits` are the largest order and the tolerance."""
-    dense, claimed = checks.grid(freqs_hz, dt), checks.claimed(freqs_hz, dt)
-    checked = _Checked(dense, residuals(dense))
-    fitter = _Fitter(dt, *limits, (freqs_hz[0], freqs_hz[-1]))
-    of_fit, lowest = checks.of_fit(freqs_hz), 0
+    fitter, claimed = _Fitter(residuals, dt, *limits, (freqs_hz[0], freqs_hz[-1])), checks.claimed(freqs_hz, dt)
+    checked, of_fit, lowest = fitter.sampled(checks.grid(freqs_hz, dt)), checks.of_fit(freqs_hz), 0
+
+    def ratio(at_hz: Array) -> Array:
+        return fitter.sampled(at_hz).ratio(unscaled)
+
     for _ in range(_PROOFS):
-        unscaled = _fit(fitter, residuals, of_fit, structure, checked, lowest)
-        proof = _proof(unscaled, residuals, checks, claimed)
-        found = np.array([proof.freq_hz])
+        grid = fitter.sampled(of_fit)
+        if structure is Structure.DIAGONAL and grid.E.any() and grid.E.shape[2:] != (1, 1):
+            unscaled = fitter.diagonal(grid, checked)
+        else:  # of one entry, diagonal weights are scalar ones
+            unscaled = fitter.scalar(grid, checked, structure, lowest)
+        proof = checks.proof(ratio, claimed, unscaled.left, unscaled.right)
+        found = fitter.sampled(np.array([proof.freq_hz]))
         if proof.peak <= _LIFT * max(1.0, float(checked.ratio(unscaled).max(initial=0.0))):
             break
-        checked, of_fit = checked.with_points(found, residuals(found)), joined(of_fit, found)[0]
+        checked, of_fit = checked.joined(found), joined(of_fit, found.freqs_hz)[0]
         lowest = max(max(unscaled.left_orders) - 1, 0)  # further points do not make a lower order better
     best = optimal_cover(residuals(freqs_hz), structure)
-    return _finish(unscaled, checked, proof, claimed).measured(freqs_hz, best, fitter.tolerance_db), best
+    weight = _lifted(unscaled, checked.some(np.isin(checked.freqs_hz, claimed)), proof)
+    return weight.measured(freqs_hz, best, fitter.tolerance_db), best
 
 
 def _fit_entries(
@@ -142,8 +149,8 @@ def _fit_entries(
 
 
 @dataclass(frozen=True, eq=False)
-class _Checked:
-    """Residuals on the dense grid."""
+class _Sampled:
+    """Residuals at some frequencies."""
 
     freqs_hz: Array
     E: Array
@@ -153,119 +160,98 @@ class _Checked:
         used = weight.magnitudes(self.freqs_hz)
         return cover_ratio(self.E, used.left, used.right)
 
-    def at(self, freqs_hz: Array) -> _Checked:
-        """Return those of some frequencies, and of none beyond them."""
-        some = np.isin(self.freqs_hz, freqs_hz)
-        return _Checked(self.freqs_hz[some], self.E[:, some])
+    def some(self, index: Array) -> _Sampled:
+        """Return those of some frequencies."""
+        return _Sampled(self.freqs_hz[index], self.E[:, index])
 
-    def with_points(self, freqs_hz: Array, E: Array) -> _Checked:
+    def joined(self, other: _Sampled) -> _Sampled:
         """Return the same with further frequencies."""
-        freqs, index = joined(self.freqs_hz, freqs_hz)
-        return _Checked(freqs, np.concatenate([self.E, E], axis=1)[:, index])
-
-    def added(self, worst: Array, freqs_hz: Array, E: Array) -> tuple[Array, Array]:
-        """Grid and residuals with the worst frequencies in them."""
-        freqs, index = joined(freqs_hz, self.freqs_hz[worst])
-        return freqs, np.concatenate([E, self.E[:, worst]], axis=1)[:, index]
+        freqs, index = joined(self.freqs_hz, other.freqs_hz)
+        return _Sampled(freqs, np.concatenate([self.E, other.E], axis=1)[:, index])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Fitter:
-    """Settings of the fits."""
+    """Residuals, and settings of the fits to them."""
 
+    residuals: Residuals
     sample_period_s: float
     max_order: int
     tolerance_db: float
     band_hz: tuple[float, float]
 
+    def sampled(self, freqs_hz: Array) -> _Sampled:
+        """Return the residuals at some frequencies."""
+        return _Sampled(freqs_hz, self.residuals(freqs_hz))
+
     def inside(self, freqs_hz: Array) -> Array:
         """Whether frequencies are within the band that was asked for."""
         return (freqs_hz >= self.band_hz[0]) & (freqs_hz <= self.band_hz[1])
 
-    def weight(self, sections: Sections, n_left: int) -> Weight:
-        """Return the systems, not yet checked."""
+    def scalar(self, grid: _Sampled, checked: _Sampled, structure: Structure, lowest: int) -> Weight:
+        """One magnitude for the largest singular values, fitted again with the frequencies at which it is exceeded."""
+        dt, (p, m) = self.sample_period_s, grid.E.shape[2:]
+        options: dict[str, Any] = {"max_order": self.max_order, "tolerance_db": self.tolerance_db}
+        for _ in range(_ROUNDS):
+            size = optimal_cover(grid.E, Structure.SCALAR).left[:, 0]
+            fit = fit_magnitude(grid.freqs_hz, size, dt, min_order=lowest, **options)
+            lowest = max(fit.order - 1, 0)
+            left = block_diagonal([fit.system] * p)
+            weight = Weight(left, gain(np.eye(m), dt), (fit.order,) * p, (0,) * m, structure, np.nan, np.nan)
+            ratio = checked.ratio(weight).max(axis=0)
+            if ratio.max(initial=0.0) <= _LIFT:
+                break
+            _LOG.debug("Weight: exceeded %.3f times between grid points, refining the grid", ratio.max())
+            grid = grid.joined(checked.some(_peaks(ratio)))
+        return weight
+
+    def diagonal(self, grid: _Sampled, checked: _Sampled) -> Weight:
+        """Joint fit, and again with the frequencies and units at which it is exceeded or costs more than it should."""
+        best = optimal_cover(grid.E)
+        size, beyond = optimal_cover(grid.E, Structure.SCALAR).left[:, 0], np.flatnonzero(~self.inside(checked.freqs_hz))
+        cost = np.where(best.left.min(axis=1) > 0, np.sqrt(np.maximum(10 ** (best.cost_db() / 10), 0.0)), 0.0)
+        chosen = np.union1d(_marked(grid.freqs_hz, size, _POINTS // 2), _marked(grid.freqs_hz, cost, _POINTS // 2))
+
+        def problem_at(points: _Sampled, ratio: Array | None = None) -> Problem:
+            return self._problem(points, grid.freqs_hz, best, ratio)
+
+        # Sound beyond the band, where nothing has to be tight.
+        problem = problem_at(grid.some(chosen)).joined(problem_at(checked.some(beyond)))
+        found = fit_sections(problem, self.max_order, self.tolerance_db)
+        weight = self._weight(found.sections, grid.E.shape[2])
+        for _ in range(_ROUNDS):
+            bends = np.arctan(np.sqrt(found.sections.bends())) / (np.pi * self.sample_period_s)
+            seen = checked.joined(self.sampled(bends))
+            ratio, used = seen.ratio(weight), weight.magnitudes(grid.freqs_hz)
+            excess = (used.cost_db() - best.cost_db()) - found.excess_db
+            if ratio.max() <= _LIFT and not (excess > _MISSED_DB).any():
+                break
+            _LOG.debug("Weight: exceeded %.3f times, by %.2f dB in cost between the points of the fit", ratio.max(), excess.max())
+            exceeded, costly = _peaks(ratio.max(axis=0)), _peaks(10 ** (np.nan_to_num(excess, nan=0.0, posinf=0.0) / 20))
+            problem = problem.joined(problem_at(seen.some(exceeded), ratio[:, exceeded])).joined(problem_at(grid.some(costly)))
+            found = refit(problem, found.sections)
+            weight = self._weight(found.sections, grid.E.shape[2])
+        return weight
+
+    def _weight(self, sections: Sections, n_left: int) -> Weight:
+        """The systems, not yet checked."""
         systems, orders = sections.systems(self.sample_period_s), tuple(int(n) for n in sections.orders)
         left, right = block_diagonal(systems[:n_left]), block_diagonal(systems[n_left:])
         return Weight(left, right, orders[:n_left], orders[n_left:], Structure.DIAGONAL, np.nan, np.nan)
 
-
-def _fit(
-    fitter: _Fitter,
-    residuals: Residuals,
-    freqs_hz: Array,
-    structure: Structure,
-    checked: _Checked,
-    lowest: int,
-) -> Weight:
-    """Fit diagonal or scalar magnitudes; of one entry, diagonal weights are scalar ones."""
-    E = residuals(freqs_hz)
-    if structure is Structure.DIAGONAL and E.any() and E.shape[2:] != (1, 1):
-        return _fit_diagonal(fitter, residuals, freqs_hz, E, optimal_cover(E), checked)
-    return _fit_scalar(fitter, freqs_hz, E, checked, structure, lowest)
+    def _problem(self, points: _Sampled, grid_hz: Array, best: Cover, ratio: Array | None) -> Problem:
+        """Residuals with the cost of the optimal cover from the grid; frequencies where there is nothing to cover are left out."""
+        freqs_hz, E = points.freqs_hz, points.E
+        known = np.flatnonzero(best.left.min(axis=1) > 0)
+        cost = np.log(best.left[known]).mean(axis=1) + np.log(best.right[known]).mean(axis=1)
+        optimal = np.where(self.inside(freqs_hz), np.interp(freqs_hz, grid_hz[known], cost), np.inf)
+        near = known[np.searchsorted(grid_hz[known], freqs_hz).clip(0, len(known) - 1)]
+        ratio = cover_ratio(E, best.left[near], best.right[near]) if ratio is None else ratio
+        some = np.abs(E).max(axis=(0, 2, 3), initial=0.0) > 0
+        return Problem(freqs_hz[some], bilinear_squared(freqs_hz[some], self.sample_period_s), E[:, some], optimal[some], ratio[:, some])
 
 
-def _fit_scalar(fitter: _Fitter, freqs_hz: Array, E: Array, checked: _Checked, structure: Structure, lowest: int) -> Weight:
-    """One magnitude for the largest singular values, fitted again with the frequencies at which it is exceeded."""
-    dt, p, m = fitter.sample_period_s, E.shape[2], E.shape[3]
-    options: dict[str, Any] = {"max_order": fitter.max_order, "tolerance_db": fitter.tolerance_db}
-    for _ in range(_ROUNDS):
-        size = optimal_cover(E, Structure.SCALAR).left[:, 0]
-        fit = fit_magnitude(freqs_hz, size, dt, min_order=lowest, **options)
-        lowest = max(fit.order - 1, 0)
-        left = block_diagonal([fit.system] * p)
-        weight = Weight(left, gain(np.eye(m), dt), (fit.order,) * p, (0,) * m, structure, np.nan, np.nan)
-        ratio = checked.ratio(weight).max(axis=0)
-        if ratio.max(initial=0.0) <= _LIFT:
-            break
-        _LOG.debug("Weight: exceeded %.3f times between grid points, refining the grid", ratio.max())
-        freqs_hz, E = checked.added(_peaks(ratio), freqs_hz, E)
-    return weight
-
-
-def _fit_diagonal(fitter: _Fitter, residuals: Residuals, freqs_hz: Array, E: Array, best: Cover, checked: _Checked) -> Weight:
-    """Joint fit, and again with the frequencies and units at which it is exceeded or costs more than it should."""
-    problem = _problem(fitter, freqs_hz, E, best, checked)
-    found = fit_sections(problem, fitter.max_order, fitter.tolerance_db)
-    weight = fitter.weight(found.sections, E.shape[2])
-    for _ in range(_ROUNDS):
-        bends = np.arctan(np.sqrt(found.sections.bends())) / (np.pi * fitter.sample_period_s)
-        seen = checked.with_points(bends, residuals(bends))
-        ratio, used = seen.ratio(weight), weight.magnitudes(freqs_hz)
-        excess = (used.cost_db() - best.cost_db()) - found.excess_db
-        if ratio.max() <= _LIFT and not (excess > _MISSED_DB).any():
-            break
-        _LOG.debug("Weight: exceeded %.3f times, by %.2f dB in cost between the points of the fit", ratio.max(), excess.max())
-        exceeded, costly = _peaks(ratio.max(axis=0)), _peaks(10 ** (np.nan_to_num(excess, nan=0.0, posinf=0.0) / 20))
-        problem = problem.joined(_problem_at(fitter, seen.freqs_hz[exceeded], seen.E[:, exceeded], freqs_hz, best, ratio[:, exceeded]))
-        problem = problem.joined(_problem_at(fitter, freqs_hz[costly], E[:, costly], freqs_hz, best))
-        found = refit(problem, found.sections)
-        weight = fitter.weight(found.sections, E.shape[2])
-    return weight
-
-
-def _problem(fitter: _Fitter, freqs_hz: Array, E: Array, best: Cover, checked: _Checked) -> Problem:
-    """Where the size of the residuals bends and where the cover does; sound beyond the band, where nothing has to be tight."""
-    size, beyond = optimal_cover(E, Structure.SCALAR).left[:, 0], np.flatnonzero(~fitter.inside(checked.freqs_hz))
-    cost = np.sqrt(np.maximum(10 ** (best.cost_db() / 10), 0.0))
-    chosen = np.union1d(
-        _telling(freqs_hz, size, _POINTS // 2), _telling(freqs_hz, np.where(best.left.min(axis=1) > 0, cost, 0.0), _POINTS // 2)
-    )
-    inner = _problem_at(fitter, freqs_hz[chosen], E[:, chosen], freqs_hz, best)
-    return inner.joined(_problem_at(fitter, checked.freqs_hz[beyond], checked.E[:, beyond], freqs_hz, best))
-
-
-def _problem_at(fitter: _Fitter, freqs_hz: Array, E: Array, grid_hz: Array, best: Cover, ratio: Array | None = None) -> Problem:
-    """Residuals at some frequencies, with the cost of the optimal cover from the grid; frequencies where there is nothing to cover are left out."""
-    known = np.flatnonzero(best.left.min(axis=1) > 0)
-    cost = np.log(best.left[known]).mean(axis=1) + np.log(best.right[known]).mean(axis=1)
-    optimal = np.where(fitter.inside(freqs_hz), np.interp(freqs_hz, grid_hz[known], cost), np.inf)
-    near = known[np.searchsorted(grid_hz[known], freqs_hz).clip(0, len(known) - 1)]
-    ratio = cover_ratio(E, best.left[near], best.right[near]) if ratio is None else ratio
-    some = np.abs(E).max(axis=(0, 2, 3), initial=0.0) > 0
-    return Problem(freqs_hz[some], bilinear_squared(freqs_hz[some], fitter.sample_period_s), E[:, some], optimal[some], ratio[:, some])
-
-
-def _telling(freqs_hz: Array, size: Array, count: int) -> Array:
+def _marked(freqs_hz: Array, size: Array, count: int) -> Array:
     """Indices of both ends, the highest peaks, and points as dense as a size bends, a share of them evenly spaced."""
     inner = np.flatnonzero((size > 0) & (freqs_hz > 0))
     ends = [0, len(freqs_hz) - 1]
@@ -280,24 +266,14 @@ def _telling(freqs_hz: Array, size: Array, count: int) -> Array:
     return np.unique(np.concatenate([inner[peaks], inner[spread], ends]))
 
 
-def _proof(weight: Weight, residuals: Residuals, checks: Checks, claimed_hz: Array) -> Certificate:
-    """Largest ratio wherever the bound is claimed."""
-
-    def ratio(freqs_hz: Array) -> Array:
-        used = weight.magnitudes(freqs_hz)
-        return cover_ratio(residuals(freqs_hz), used.left, used.right)
-
-    return checks.proof(ratio, claimed_hz, weight.left, weight.right)
-
-
-def _finish(weight: Weight, checked: _Checked, proof: Certificate, claimed_hz: Array) -> Weight:
+def _lifted(weight: Weight, claimed: _Sampled, proof: Certificate) -> Weight:
     """Scale the left weight until it touches the residuals from above, between grid points too, and measure what is returned."""
     if not proof.peak > 0:
         return replace(weight, cover_max=0.0, remaining_margin=1.0)
     bound = proof.peak * (1 + proof.margin) if proof.method is Method.LEVEL_SETS else proof.peak
     lift = bound * (1 + _MARGIN)
     weight = weight.scaled(lift)
-    on_grid = float(checked.at(claimed_hz).ratio(weight).max())
+    on_grid = float(claimed.ratio(weight).max())
     return replace(weight, cover_max=on_grid, method=proof.method, remaining_margin=1 - max(bound / lift, on_grid))
 
 

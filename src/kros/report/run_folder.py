@@ -6,11 +6,11 @@ have raises `NotShownError` with a sentence that the report prints in place of a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 from urllib.parse import quote, unquote
 
 import numpy as np
@@ -22,10 +22,8 @@ from ..data.population import Channel, EpisodeKey, Population, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..identify.refine import RefinedModels
 from ..synthesis.result import Synthesis
-
-if TYPE_CHECKING:
-    from ..uncertainty import OutlierModel, Tightness, UncertainModel, VariationAndNoise
-    from ..uncertainty.unit_residuals import UnitResiduals
+from ..uncertainty import OutlierModel, Tightness, UncertainModel, VariationAndNoise
+from ..uncertainty.unit_residuals import UnitResiduals
 
 Array = npt.NDArray[Any]
 T = TypeVar("T")
@@ -145,15 +143,13 @@ class RunFolder:
     @cached_property
     def models(self) -> dict[str, ModelSet]:
         """Models of the condition that was identified on, Koopman models first."""
-        folders = self._folders("models", "model.json", "no models have been identified yet")
-        found = {f.name: ModelSet.load(f) for f in folders if "@" not in f.name}
+        found = self._load("models", "model.json", ModelSet.load, "no models have been identified yet", at_home=True)
         return dict(sorted(found.items(), key=lambda item: (not item[0].startswith("koopman"), item[0])))
 
     @cached_property
     def refined(self) -> dict[str, RefinedModels]:
         """What the refinement found out, by kind of model, Koopman models first."""
-        folders = self._folders("refinement", "refinement.json", "this study has no refined models")
-        found = {f.name: RefinedModels.load(f) for f in folders}
+        found = self._load("refinement", "refinement.json", RefinedModels.load, "this study has no refined models")
         return dict(sorted(found.items(), key=lambda item: not item[0].startswith("koopman")))
 
     def condition_models(self, name: str, condition: str) -> ModelSet:
@@ -167,53 +163,36 @@ class RunFolder:
     @cached_property
     def uncertain(self) -> dict[str, UncertainModel]:
         """Uncertain models of the condition that was identified on."""
-        from ..uncertainty import UncertainModel
-
-        folders = self._folders("uncertainty", "*.json", "the uncertainty has not been quantified yet")
-        return {f.name: UncertainModel.load(f) for f in folders if "@" not in f.name}
+        return self._load("uncertainty", "*.json", UncertainModel.load, "the uncertainty has not been quantified yet", at_home=True)
 
     @cached_property
     def noise(self) -> dict[str, VariationAndNoise]:
         """Variation and noise, by kind of model."""
-        from ..uncertainty import VariationAndNoise
-
         reason = "variation and noise were not separated; it takes two training episodes of every unit"
-        folders = self._folders("uncertainty", "noise/*.json", reason)
-        return _in_order({f.name: VariationAndNoise.load(f / "noise") for f in folders})
+        return _in_order(self._load("uncertainty", "noise/*.json", VariationAndNoise.load, reason))
 
     @cached_property
     def orders(self) -> dict[str, Tightness]:
         """Overbound over order, by kind of model."""
-        from ..uncertainty import Tightness
-
-        folders = self._folders("uncertainty", "order/*.json", "no weights of different orders have been compared")
-        return _in_order({f.name: Tightness.load(f / "order") for f in folders})
+        return _in_order(self._load("uncertainty", "order/*.json", Tightness.load, "no weights of different orders have been compared"))
 
     @cached_property
     def unit_residuals(self) -> dict[str, UnitResiduals]:
         """Residuals of all units beside the weights, by kind of model."""
-        from ..uncertainty.unit_residuals import UnitResiduals
-
-        folders = self._folders("uncertainty", "units/*.json", "the residuals of the units were not kept")
-        return _in_order({f.name: UnitResiduals.load(f / "units") for f in folders})
+        return _in_order(self._load("uncertainty", "units/*.json", UnitResiduals.load, "the residuals of the units were not kept"))
 
     @cached_property
     def others(self) -> tuple[str, dict[str, UnitResiduals]]:
         """Condition of the highest outlier score, and there the residuals of all units beside the cover of the others, by kind of model."""
-        from ..uncertainty.unit_residuals import UnitResiduals
-
         reason = "no unit was compared with the cover of the others; it takes two others in a condition"
-        folders = self._folders("outliers", "others/*.json", reason)
-        found = {f.name.partition("@")[0]: UnitResiduals.load(f / "others") for f in folders}
-        return self._condition(folders[0].name), _in_order(found)
+        found = self._load("outliers", "others/*.json", UnitResiduals.load, reason)
+        return self._condition(next(iter(found))), _in_order({name.partition("@")[0]: one for name, one in found.items()})
 
     @cached_property
     def outlier_models(self) -> dict[str, OutlierModel]:
         """Scores with all that is known about them, by condition."""
-        from ..uncertainty import OutlierModel
-
-        folders = self._folders("outliers", "outlier_model.json", "outlier scores need at least three units in a condition")
-        return {self._condition(f.name): OutlierModel.load(f) for f in folders}
+        reason = "outlier scores need at least three units in a condition"
+        return {self._condition(name): one for name, one in self._load("outliers", "outlier_model.json", OutlierModel.load, reason).items()}
 
     def _condition(self, name: str) -> str:
         """Condition of a folder of models."""
@@ -227,8 +206,7 @@ class RunFolder:
     @cached_property
     def syntheses(self) -> dict[str, Synthesis]:
         """Syntheses by ``model/method``."""
-        methods = self._folders("synthesis/*", "synthesis.json", "no observer has been synthesized yet")
-        return {f"{m.parent.name}/{m.name}": Synthesis.load(m) for m in methods}
+        return self._load("synthesis/*", "synthesis.json", Synthesis.load, "no observer has been synthesized yet")
 
     @cached_property
     def observers_record(self) -> dict[str, Any]:
@@ -296,16 +274,22 @@ class RunFolder:
         self._require(f"{place}/arrays.npz", reason)
         return dict(read_arrays(self.folder / place / "arrays.npz"))
 
-    def _folders(self, place: str, file: str, reason: str) -> list[Path]:
-        """Return the folders `place`/* that hold a file; both may be patterns, a star for one part of a name."""
+    def _load(self, place: str, file: str, load: Callable[[Path], T], reason: str, at_home: bool = False) -> dict[str, T]:
+        """Load what lies beside `file` in all folders `place`/*, by their names below the first; both may be patterns, a star for one part of a name.
+
+        With `at_home` of the condition that was identified on alone.
+        """
         pattern = f"{place}/*/{file}"
         depth, below = pattern.count("/"), file.count("/")
-        found = {
-            PurePosixPath(name).parents[below] for name in self.files if name.count("/") == depth and PurePosixPath(name).match(pattern)
-        }
+        paths = [PurePosixPath(name) for name in self.files if name.count("/") == depth]
+        found = {path.parents[below]: path.parent for path in paths if path.match(pattern)}
         if not found:
             raise NotShownError(reason)
-        return [self.folder / name for name in sorted(found)]
+        return {
+            "/".join(folder.parts[1:]): load(self.folder / found[folder])
+            for folder in sorted(found)
+            if not (at_home and "@" in folder.name)
+        }
 
     def _require(self, name: str, reason: str) -> None:
         if not self.has(name):

@@ -6,15 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError
 from ..data import Population
-from ..identify import ModelSet
-from .adopted import AdoptedModel
+from ..identify import KoopmanMatrices, ModelSet, Ranges, combine, episode_factors, residual_covariance
 from .pykoop import from_pykoop
-
-Array = npt.NDArray[np.float64]
 
 
 def models_from_pykoop(pipelines: Mapping[str, Any], population: Population, *, condition: str | None = None) -> ModelSet:
@@ -57,9 +53,9 @@ def models_from_pykoop(pipelines: Mapping[str, Any], population: Population, *, 
             f"models_from_pykoop: models of a population share one lifting, of the channels as they are; units {odd} have other functions than "
             f"{next(iter(adopted))}, units {centred} are centred; scale with MaxAbsScaler (or with_mean=False), or transform the recordings before."
         )
-    facts = [_facts(model, population, unit, condition) for unit, model in adopted.items()]
-    n = lifting.n_lifted
-    peak = np.max([f[0] for f in facts], axis=0)
+    each = episode_factors(population, {unit: population.keys(unit, condition) for unit in adopted}, lifting)
+    factor, matrices = combine(each), KoopmanMatrices(*(np.stack([getattr(model, name) for model in models]) for name in "AB"))
+    ranges = Ranges.of(factor, lifting.n_lifted)
     return ModelSet(
         name="pykoop",
         condition=condition,
@@ -67,25 +63,12 @@ def models_from_pykoop(pipelines: Mapping[str, Any], population: Population, *, 
         channels=population.channels,
         sample_period_s=population.sample_period_s,
         unit_ids=tuple(adopted),
-        A=np.stack([model.A for model in models]),
-        B=np.stack([model.B for model in models]),
+        A=matrices.A,
+        B=matrices.B,
         parameters={},
-        residual_covariance=np.stack([f[1] for f in facts]),
-        output_scale=peak[:n],
-        input_scale=peak[n:],
-        longest_s=max(len(population.read(key)) for unit in adopted for key in population.keys(unit, condition))
-        * population.sample_period_s,
-        status=tuple("ok" if np.abs(np.linalg.eigvals(model.A)).max() < 1 else "unstable" for model in models),
+        residual_covariance=residual_covariance(factor.R, lifting.n_lifted, matrices, factor.n_samples),
+        output_scale=ranges.outputs,
+        input_scale=ranges.inputs,
+        longest_s=int(each.n_samples.max()) * population.sample_period_s,
+        status=tuple("ok" if radius < 1 else "unstable" for radius in matrices.spectral_radius()),
     )
-
-
-def _facts(model: AdoptedModel, population: Population, unit: str, condition: str) -> tuple[Array, Array]:
-    """Return the largest magnitude of every lifted state and input, and the covariance of the one-step residual."""
-    peaks, total, count = [], np.zeros_like(model.A), 0
-    for key in population.keys(unit, condition):
-        lifted, inputs = model.lift(*population.read_parts(key))
-        residual = lifted[1:] - lifted[:-1] @ model.A.T - inputs[:-1] @ model.B.T
-        peaks.append(np.abs(np.concatenate([lifted, inputs], axis=1)).max(axis=0))
-        total += residual.T @ residual
-        count += len(residual)
-    return np.max(peaks, axis=0), total / max(count, 1)

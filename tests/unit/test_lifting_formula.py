@@ -70,16 +70,16 @@ def test_error_names_what_is_known():
         parse("sin(speed)", NAMES)
 
 
-def test_jacobian_agrees_with_finite_differences():
+def test_slopes_agree_with_finite_differences():
     lifting = Lifting(("position", "velocity"), ("sin(3*position + phase)", "position*velocity**2"), ("phase",))
     x = np.random.default_rng(1).normal(size=(7, 2))
     phase = {"phase": np.linspace(0, 6, 7)}
-    jacobian = lifting.jacobian(x, phase)
+    slopes = lifting.slopes(x, phase)
     for j in range(2):
         step = np.zeros(2)
         step[j] = 1e-6
-        slope = (lifting.lift(x + step, phase) - lifting.lift(x - step, phase)) / 2e-6
-        np.testing.assert_allclose(jacobian[..., j], slope, rtol=1e-7, atol=1e-8)
+        slope = (lifting.lift(x + step, phase) - lifting.lift(x - step, phase))[..., 2:] / 2e-6
+        np.testing.assert_allclose(slopes[..., j], slope, rtol=1e-7, atol=1e-8)
 
 
 def test_c_expression_computes_the_same(tmp_path):

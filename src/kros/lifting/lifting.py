@@ -24,7 +24,7 @@ from ..core.errors import ConfigError, DimensionError
 from .continuity import slope_bounds_of
 from .evaluation import Columns
 from .formula import Formula, base_and_delay, require_text
-from .intervals import Box, bounds_of
+from .intervals import Box
 from .separation import Separation
 from .window import Window
 
@@ -239,15 +239,6 @@ class Lifting:
         """Return the original states, a slice of the lifted ones."""
         return np.asarray(lifted, dtype=float)[..., : self.n_states]
 
-    def jacobian(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the derivative of the lifted states by every entry of the window, shape (..., n + p, n_window)."""
-        x = self._windows(x)
-        n = self.n_states
-        jacobian = np.zeros((*x.shape[:-1], self.n_lifted, x.shape[-1]))
-        jacobian[..., range(n), range(n)] = 1.0
-        jacobian[..., n:, :] = self.slopes(x, parameters)
-        return jacobian
-
     def slopes(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the derivative of the lifted functions alone by every entry of the window, shape (..., p, n_window)."""
         x = self._windows(x)
@@ -269,19 +260,6 @@ class Lifting:
         slopes = np.empty((*window.shape[:-1], len(self.input_functions) * window.shape[-1]))
         self._input_derivatives.fill(self._values(window, parameters, window[..., self.n_states :], u), slopes)
         return slopes.reshape(*window.shape[:-1], len(self.input_functions), window.shape[-1])
-
-    def value_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
-        """Return bounds of every lifted function over an operating box, each of shape (p,).
-
-        Parameters
-        ----------
-        box : mapping of str to (lower, upper) or number
-            Ranges of states and inputs; what is not named may be anything. An earlier value has the range of its quantity.
-        parameters : mapping of str to number or (lower, upper)
-            A parameter that is not named may be anything.
-        """
-        lower, upper = bounds_of([f.expression for f in self.formulas], {**(box or {}), **(parameters or {})})
-        return lower, upper
 
     def slope_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
         """Return bounds of the slopes of every lifted function by every entry of the window over an operating box.

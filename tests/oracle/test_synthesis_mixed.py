@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from paper_plant import paper_plant, reduced_plant
 from scipy.linalg import expm
+from youla import youla_bound
 
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, h2, mixed
@@ -14,9 +16,8 @@ from kros.synthesis.mixed_norms.balance import balance
 from kros.synthesis.mixed_norms.candidates import by_inequalities
 from kros.synthesis.mixed_norms.channels import part, scaled, verify
 from kros.synthesis.mixed_norms.inequalities import MixedInequalities
+from kros.synthesis.mixed_norms.lower_bounds import hinf_lower_bound
 from kros.synthesis.mixed_norms.solvers import Program, solve
-from kros.synthesis.mixed_norms.youla import hinf_lower_bound, youla_bound
-from kros.synthesis.problem.paper_plant import paper_plant, reduced_plant
 from kros.synthesis.problem.plants import mixed_plant
 from kros.synthesis.reduction.truncation import truncate
 from kros.synthesis.worst_case.certificate import certify
@@ -89,9 +90,9 @@ def free_optimum(plant):
     return found, hinf_norm(part(plant, plant.close(found.controller), 2))
 
 
-def candidates(plant, gamma, scalings, extended=False):
+def candidates(plant, gamma, scalings):
     reasons = []
-    found = by_inequalities(plant, gamma, scalings, 8, time.perf_counter() + 60, reasons, [], ("BARRIER",), extended)
+    found = by_inequalities(plant, gamma, scalings, 8, time.perf_counter() + 60, reasons, [], ("BARRIER",))
     return found, reasons
 
 
@@ -113,27 +114,13 @@ def test_inequalities_bound_the_norms_and_agree_with_another_solver():
     free, peak = free_optimum(plant)
     gamma = 0.9 * peak
     balanced = balance(scaled(plant, 16.0))
-    for extended in (False, True):
-        inequalities = MixedInequalities(balanced, gamma, extended)
-        program = Program(inequalities.objective(), inequalities.blocks(), inequalities.start())
-        own, other = solve(program, "BARRIER", 20.0, 1e-6), solve(program, "CLARABEL", 20.0, 1e-7)
-        assert own.value == pytest.approx(other.value, rel=1e-4)
-        checked = verify(plant, inequalities.controller(own.x), gamma, "inequalities")
-        assert free.h2_norm <= checked.h2 <= balanced.size * np.sqrt(own.value)
-        assert checked.hinf < gamma
-
-
-def test_extended_inequalities_are_never_worse():
-    for seed in (3, 12):
-        plant = two_channel(np.random.default_rng(seed), n=2)
-        _, peak = free_optimum(plant)
-        balanced = balance(plant)
-        values = []
-        for extended in (False, True):
-            inequalities = MixedInequalities(balanced, 0.9 * peak, extended)
-            values.append(solve(Program(inequalities.objective(), inequalities.blocks(), inequalities.start()), "BARRIER", 20.0).value)
-        assert values[1] <= values[0] * (1 + 1e-3)
-        assert values[1] < 0.95 * values[0], "here a Lyapunov matrix for each channel should pay"
+    inequalities = MixedInequalities(balanced, gamma)
+    program = Program(inequalities.objective(), inequalities.blocks(), inequalities.start())
+    own, other = solve(program, "BARRIER", 20.0, 1e-6), solve(program, "CLARABEL", 20.0, 1e-7)
+    assert own.value == pytest.approx(other.value, rel=1e-4)
+    checked = verify(plant, inequalities.controller(own.x), gamma, "inequalities")
+    assert free.h2_norm <= checked.h2 <= balanced.size * np.sqrt(own.value)
+    assert checked.hinf < gamma
 
 
 def test_scaling_of_the_channel_helps():

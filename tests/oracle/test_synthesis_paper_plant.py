@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from paper_plant import paper_plant, reduced_plant
 
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, h2
 from kros.synthesis.assumptions import Assumption, h2_violations
-from kros.synthesis.problem.paper_plant import paper_plant, reduced_plant
 
 DT = 1e-3
 

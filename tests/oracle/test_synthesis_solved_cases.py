@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
+from youla import youla_bound
 
 from kros.core import StateSpace, SynthesisError, hinf_norm
-from kros.synthesis import GeneralizedPlant, Status, h2, hinf, mixed, youla_bound
+from kros.synthesis import GeneralizedPlant, Status, h2, hinf, mixed
 from kros.synthesis.mixed_norms.channels import part
 
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from youla import Family, youla_bound
 
 from kros.core import ConfigError, SynthesisError, h2_norm, hinf_norm
-from kros.synthesis import GeneralizedPlant, h2, hinf, youla_bound
+from kros.synthesis import GeneralizedPlant, h2, hinf
 from kros.synthesis.mixed_norms.channels import part
-from kros.synthesis.mixed_norms.youla import hinf_lower_bound, mixed_lower_bound
-from kros.synthesis.mixed_norms.youla_family import Family
+from kros.synthesis.mixed_norms.lower_bounds import hinf_lower_bound, mixed_lower_bound
 
 
 def random_plant(seed, n=3, radius=0.7, split=None):

@@ -4,12 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from paper_plant import reduced_plant
 
 from kros.core.lti import StateSpace, gain
 from kros.design.methods.published import as_published, design_published, entrywise_weight
 from kros.design.task import DesignResult
 from kros.synthesis import Injection, ObserverProblem
-from kros.synthesis.problem.paper_plant import reduced_plant
 from kros.synthesis.problem.plants import mixed_plant
 from kros.uncertainty import residual
 

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from paper_plant import paper_plant
 
 import kros.synthesis
 from kros.core import ConfigError, DataError, DimensionError, StateSpace, SynthesisError, block_diagonal, gain, h2_norm, hinf_norm
@@ -21,7 +22,6 @@ from kros.synthesis import (
     worst_case_h2,
     worst_case_hinf,
 )
-from kros.synthesis.problem.paper_plant import paper_plant
 from kros.synthesis.riccati.constant_gain import luenberger
 from kros.synthesis.worst_case.certificate import certify
 

@@ -14,7 +14,6 @@ from ..core.lazy import lazy_names
 if TYPE_CHECKING:
     from .generalized_plant import GeneralizedPlant
     from .mixed_norms.optimal import mixed
-    from .mixed_norms.youla import YoulaBound, youla_bound
     from .problem.observer_problem import ObserverProblem
     from .reduction.polishing import polish
     from .reduction.truncation import reduce_controller
@@ -43,7 +42,6 @@ _HOME = {
     "Status": "result",
     "Synthesis": "result",
     "UnitCheck": "worst_case.unit_check",
-    "YoulaBound": "mixed_norms.youla",
     "check_units": "worst_case.unit_check",
     "dk_iteration": "structured.dk",
     "h2": "riccati.h2_optimal",
@@ -61,7 +59,6 @@ _HOME = {
     "shaping_filter": "residual_shaped.shaping_filter",
     "worst_case_h2": "worst_case.worst_case_h2",
     "worst_case_hinf": "worst_case.worst_case_hinf",
-    "youla_bound": "mixed_norms.youla",
 }
 
 __all__ = [
@@ -75,7 +72,6 @@ __all__ = [
     "Status",
     "Synthesis",
     "UnitCheck",
-    "YoulaBound",
     "check_units",
     "dk_iteration",
     "h2",
@@ -93,7 +89,6 @@ __all__ = [
     "shaping_filter",
     "worst_case_h2",
     "worst_case_hinf",
-    "youla_bound",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)

@@ -36,7 +36,7 @@ def installed_solvers() -> list[str]:
     """Return the semidefinite solvers that cvxpy finds."""
     import cvxpy as cp
 
-    return [name for name in cp.installed_solvers() if name in ("CLARABEL", "SCS", "SDPA", "MOSEK")]
+    return [name for name in cp.installed_solvers() if name in ("CLARABEL", "MOSEK")]
 
 
 def _version(name: str) -> str | None:

@@ -12,7 +12,7 @@ from ...core.errors import SynthesisError
 from ...core.norms import hinf_norm
 from ..generalized_plant import GeneralizedPlant
 from ..riccati.hinf_bound import proven_bound
-from .youla import hinf_lower_bound, samples_infeasible
+from .lower_bounds import hinf_lower_bound, samples_infeasible
 
 _TOLERANCE = 1e-4
 

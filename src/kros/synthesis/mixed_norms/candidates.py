@@ -29,43 +29,40 @@ def by_inequalities(
     reasons: list[str],
     notes: list[str],
     solvers: Sequence[str] | None = None,
-    extended: bool = False,
 ) -> list[Verified]:
-    """Candidates from the matrix inequalities, one for each scaling that works; with two Lyapunov matrices too where that is asked for."""
+    """Candidates from the matrix inequalities, one for each scaling that works."""
     small, done = reduced(plant, max_states)
     notes += done
     found: list[Verified] = []
-    for kind in (False, True) if extended else (False,):
-        # With a Lyapunov matrix for each channel the scaling hardly matters.
-        for a in scalings[:1] if kind else scalings:
-            left = end - time.perf_counter()
-            if left <= 0:
-                reasons.append("the time limit was reached")
-                return found
+    for a in scalings:
+        left = end - time.perf_counter()
+        if left <= 0:
+            reasons.append("the time limit was reached")
+            break
+        try:
+            balanced = balance(scaled(small, a))
+            inequalities = MixedInequalities(balanced, gamma)
+            program = Program(inequalities.objective(), inequalities.blocks(), inequalities.start())
+        except (SynthesisError, LinAlgError, ValueError) as error:
+            reasons.append(f"scaling {a:g}: {error}")
+            continue
+        label = f"inequalities, scaling {a:g}"
+
+        def check(answer: Answer, inequalities: MixedInequalities = inequalities, label: str = label) -> Verified | str:
+            assert answer.x is not None
             try:
-                balanced = balance(scaled(small, a))
-                inequalities = MixedInequalities(balanced, gamma, kind)
-                program = Program(inequalities.objective(), inequalities.blocks(), inequalities.start())
-            except (SynthesisError, LinAlgError, ValueError) as error:
-                reasons.append(f"scaling {a:g}: {error}")
-                continue
-            label = f"{'extended' if kind else 'common'} inequalities, scaling {a:g}"
+                K = absorb_feedthrough(inequalities.controller(answer.x), plant.D22)
+            except (LinAlgError, KrosError) as error:
+                return f"{answer.solver}: the controller cannot be recovered ({error})"
+            value = inequalities.balanced.size * np.sqrt(max(answer.value, 0.0))
+            return verify(
+                plant, K, gamma, f"{answer.solver} ({answer.word}), {label}, their value {value:.6g}", answer.solver.lower(), answer.optimal
+            )
 
-            def check(
-                answer: Answer, inequalities: MixedInequalities = inequalities, size: float = balanced.size, label: str = label
-            ) -> Verified | str:
-                assert answer.x is not None
-                try:
-                    K = absorb_feedthrough(inequalities.controller(answer.x), plant.D22)
-                except (LinAlgError, KrosError) as error:
-                    return f"{answer.solver}: the controller cannot be recovered ({error})"
-                origin = f"{answer.solver} ({answer.word}), {label}, their value {size * np.sqrt(max(answer.value, 0.0)):.6g}"
-                return verify(plant, K, gamma, origin, answer.solver.lower(), answer.optimal)
-
-            result = solve_with_fallback(program, check, time_limit_s=left, solvers=solvers)
-            reasons += [f"{label}, {note}" for note in result.notes]
-            if result.accepted is not None:
-                found.append(result.accepted)
+        result = solve_with_fallback(program, check, time_limit_s=left, solvers=solvers)
+        reasons += [f"{label}, {note}" for note in result.notes]
+        if result.accepted is not None:
+            found.append(result.accepted)
     return found
 
 

@@ -1,28 +1,27 @@
-r"""The linear matrix inequalities of mixed H2/H-infinity synthesis in discrete time, with one Lyapunov matrix or with two.
+r"""The linear matrix inequalities of mixed H2/H-infinity synthesis in discrete time, with one Lyapunov matrix for both channels.
 
-With a matrix ``G`` (the common Lyapunov matrix, or a slack) partitioned as the plant and the controller, ``G = [[X, *], [U, *]]`` and
-``G^-1 = [[Y', *], [V', *]]``, the change of variables
+With the Lyapunov matrix ``G`` partitioned as the plant and the controller, ``G = [[X, *], [U, *]]`` and ``G^-1 = [[Y, *], [V', *]]``, the change of
+variables
 
-    C_n = D^c C2 X + C^c U,   B_n = Y B2 D^c + V B^c,   D_n = D^c,   S = Y X + V U,
-    A_n = Y (A + B2 D^c C2) X + V B^c C2 X + Y B2 C^c U + V A^c U - S
+    C_n = D^c C2 X + C^c U,   B_n = Y B2 D^c + V B^c,   D_n = D^c,   I = Y X + V U,
+    A_n = Y (A + B2 D^c C2) X + V B^c C2 X + Y B2 C^c U + V A^c U - I
 
-makes ``G~ = [[X, I], [S, Y]]`` and the closed-loop matrices A~, B~, C~, D~ affine. Sampled plants have A close to I, and then the inequality
+makes ``G~ = [[X, I], [I, Y]]`` and the closed-loop matrices A~, B~, C~, D~ affine. Sampled plants have A close to I, and then the inequality
 between G~ and A~ is a small difference of large matrices. So the unknown is ``W = A~ - G~`` and the rows are combined accordingly (a congruence):
 
-    H2:    [[-W-W', W+P-G~', B~1], [., G~+G~'-P, 0], [., ., I]] > 0,   [[Z, C~1, D~11], [., G~+G~'-P, 0], [., ., I]] > 0,   min tr Z
-    Hinf:  [[-W-W', W+P-G~', B~2, -C~2'], [., G~+G~'-P, 0, C~2'], [., ., I, D~22'], [., ., ., gamma^2 I]] > 0
+    H2:    [[-W-W', W, B~1], [., G~, 0], [., ., I]] > 0,   [[Z, C~1, D~11], [., G~, 0], [., ., I]] > 0,   min tr Z
+    Hinf:  [[-W-W', W, B~2, -C~2'], [., G~, 0, C~2'], [., ., I, D~22'], [., ., ., gamma^2 I]] > 0
 
-*Common*: ``P = G~`` symmetric, S = I, in both. *Extended*: a P for each channel, X, Y and S free; never worse than common, with three times the
-variables. In balanced coordinates G~ has the diagonal (s, s); rows and columns are divided by its root.
+A Lyapunov matrix for each channel (de Oliveira, Geromel, Bernussou 2002) has three times the variables and, after local improvement, ended at the
+same controllers. In balanced coordinates G~ has the diagonal (s, s); rows and columns are divided by its root.
 
 References
 ----------
-C. Scherer, P. Gahinet, M. Chilali, IEEE Trans. Automatic Control 42 (1997) 896-911. M. C. de Oliveira, J. C. Geromel, J. Bernussou, "Extended
-H2 and H-infinity norm characterizations and controller parametrizations for discrete-time systems", Int. J. Control 75 (2002) 666-679.
+C. Scherer, P. Gahinet, M. Chilali, IEEE Trans. Automatic Control 42 (1997) 896-911.
 
 Symbols
 -------
-X, Y, S, A_n, B_n, C_n, D_n, Z, P1, P2 : the variables
+X, Y, A_n, B_n, C_n, D_n, Z : the variables
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from .barrier import Block
 Array = npt.NDArray[Any]
 Values = dict[str, Array]
 
-# Least eigenvalue of the scaled Lyapunov matrices: keeps S - Y X away from singular, without which the controller cannot be recovered.
+# Least eigenvalue of the scaled Lyapunov matrices: keeps I - Y X away from singular, without which the controller cannot be recovered.
 _MARGIN = 1e-3
 
 
@@ -53,23 +52,19 @@ class MixedInequalities:
     balanced : Balanced
     gamma : float
         Level of the H-infinity constraint.
-    extended : bool
-        Two Lyapunov matrices and a slack instead of one common matrix.
     """
 
     balanced: Balanced
     gamma: float
-    extended: bool = False
 
     @property
     def shapes(self) -> dict[str, tuple[int, int, bool]]:
         """Rows, columns and symmetry of every variable, in order."""
-        p, free = self.balanced.plant, not self.extended
+        p = self.balanced.plant
         n, _, n_u, _, n_y = p.sizes
         n_z1 = p.C1[p.rows(1)].shape[0]
-        shapes = {"X": (n, n, free), "Y": (n, n, free), "An": (n, n, False), "Bn": (n, n_y, False), "Cn": (n_u, n, False)}
-        shapes |= {"Dn": (n_u, n_y, False), "Z": (n_z1, n_z1, True)}
-        return shapes if free else {**shapes, "S": (n, n, False), "P1": (2 * n, 2 * n, True), "P2": (2 * n, 2 * n, True)}
+        shapes = {"X": (n, n, True), "Y": (n, n, True), "An": (n, n, False), "Bn": (n, n_y, False), "Cn": (n_u, n, False)}
+        return shapes | {"Dn": (n_u, n_y, False), "Z": (n_z1, n_z1, True)}
 
     @property
     def size(self) -> int:
@@ -95,12 +90,8 @@ class MixedInequalities:
     def start(self) -> Array:
         """Variables of no correction, with the Lyapunov matrices that are expected."""
         values = {name: np.zeros(shape[:2]) for name, shape in self.shapes.items()}
-        n = len(self.balanced.spread)
         values["X"] = values["Y"] = 2 * np.diag(self.balanced.spread)
         values["Z"] = 2 * np.eye(len(values["Z"]))
-        if self.extended:
-            values["S"] = np.eye(n)
-            values["P1"] = values["P2"] = np.block([[values["X"], np.eye(n)], [np.eye(n), values["Y"]]])
         parts = [values[k][np.triu_indices(rows)] if symmetric else values[k].ravel() for k, (rows, _, symmetric) in self.shapes.items()]
         return np.concatenate(parts)
 
@@ -120,28 +111,22 @@ class MixedInequalities:
         scale = 1 / np.sqrt(np.concatenate([self.balanced.spread] * 2))
         frame = scale[:, None] * scale
         less = p.A - eye
-        G = frame * _blocks([[v["X"], eye], [v.get("S", eye), v["Y"]]])
+        G = frame * _blocks([[v["X"], eye], [eye, v["Y"]]])
         W = frame * _blocks([[less @ v["X"] + p.B2 @ v["Cn"], less + p.B2 @ v["Dn"] @ p.C2], [v["An"], v["Y"] @ less + v["Bn"] @ p.C2]])
-        Gt, Wt = G.swapaxes(-1, -2), W.swapaxes(-1, -2)
-        found = []
+        Wt = W.swapaxes(-1, -2)
+        found = [G - _MARGIN * np.eye(2 * n)]
         for channel in (1, 2):
-            P = frame * v[f"P{channel}"] if self.extended else G
             B, C, D = self._channel(channel, v, scale)
             if channel == 2 and not (B.shape[-1] and C.shape[-2]):
                 continue
             Bt, Ct, Dt, one = (m.swapaxes(-1, -2) for m in (B, C, D, np.eye(B.shape[-1])))
-            corner, slack, off = -W - Wt, G + Gt - P, W + P - Gt
             zero = np.zeros((2 * n, B.shape[-1]))
-            if channel == 1 or self.extended:
-                found.append(P - _MARGIN * np.eye(2 * n))
             if channel == 1:
-                found.append(_blocks([[corner, off, B], [off.swapaxes(-1, -2), slack, zero], [Bt, zero.T, one]]))
-                found.append(_blocks([[v["Z"], C, D], [Ct, slack, zero], [Dt, zero.T, one]]))
+                found.append(_blocks([[-W - Wt, W, B], [Wt, G, zero], [Bt, zero.T, one]]))
+                found.append(_blocks([[v["Z"], C, D], [Ct, G, zero], [Dt, zero.T, one]]))
             else:
                 level = self.gamma**2 * np.eye(C.shape[-2])
-                found.append(
-                    _blocks([[corner, off, B, -Ct], [off.swapaxes(-1, -2), slack, zero, Ct], [Bt, zero.T, one, Dt], [-C, C, D, level]])
-                )
+                found.append(_blocks([[-W - Wt, W, B, -Ct], [Wt, G, zero, Ct], [Bt, zero.T, one, Dt], [-C, C, D, level]]))
         return found
 
     def _channel(self, channel: int, v: Values, scale: Array) -> tuple[Array, Array, Array]:
@@ -155,21 +140,21 @@ class MixedInequalities:
         return scale[:, None] * B, C * scale, D11 + part.D12 @ v["Dn"] @ D21
 
     def controller(self, x: Array) -> StateSpace:
-        """Controller of the plant before balancing (for D22 = 0) from the variables; ``V U = S - Y X``.
+        """Controller of the plant before balancing (for D22 = 0) from the variables; ``V U = I - Y X``.
 
         Raises
         ------
         LinAlgError
-            When ``S - Y X`` is singular.
+            When ``I - Y X`` is singular.
         """
         p, v = self.balanced.plant, self.values(x)
         X, Y, Bn, Cn, Dn = (v[name] for name in ("X", "Y", "Bn", "Cn", "Dn"))
-        S = v.get("S", np.eye(len(X)))
-        left, s, right = np.linalg.svd(S - Y @ X)
+        eye = np.eye(len(X))
+        left, s, right = np.linalg.svd(eye - Y @ X)
         V, U = left * np.sqrt(s), np.sqrt(s)[:, None] * right
         C = np.linalg.solve(U.T, (Cn - Dn @ p.C2 @ X).T).T
         B = np.linalg.solve(V, Bn - Y @ p.B2 @ Dn)
-        middle = v["An"] + S - V @ B @ p.C2 @ X - Y @ p.B2 @ C @ U - Y @ (p.A + p.B2 @ Dn @ p.C2) @ X
+        middle = v["An"] + eye - V @ B @ p.C2 @ X - Y @ p.B2 @ C @ U - Y @ (p.A + p.B2 @ Dn @ p.C2) @ X
         A = np.linalg.solve(V, np.linalg.solve(U.T, middle.T).T)
         return self.balanced.controller(StateSpace(A, B, C, Dn, p.dt))
 

@@ -29,20 +29,16 @@ from ..worst_case.certificate import certify
 from .attainable import require_reachable
 from .candidates import by_inequalities
 from .channels import Verified
+from .solvers import QUICK
 
+# Least measurement noise in the inequalities, as a fraction of the measured channel's range, tenfold where the solver fails: they do not resolve an
+# encoder's 1e-7. The certificate uses the true noise.
+_NOISE_FLOOR = 1e-3
 _NOTHING = 1e-3  # an observer this much worse than no correction may be owed to the reduction of the plant
 
 
 def for_observer(
-    problem: ObserverProblem,
-    noise_floor: float,
-    penalty_floor: float,
-    *,
-    gamma: float,
-    scalings: Sequence[float] | None,
-    max_states: int,
-    time_limit_s: float,
-    solvers: Sequence[str] | None,
+    problem: ObserverProblem, gamma: float, scalings: Sequence[float] | None, max_states: int, time_limit_s: float
 ) -> Synthesis:
     """Solve the reduced observer problem on noise that the inequalities resolve; certify the filter on the set, in physical units."""
     problem.require_sound()
@@ -54,28 +50,29 @@ def for_observer(
         return _without_correction(problem, nothing, start)
     best: Synthesis | None = None
     reasons: list[str] = []
-    quick = ("BARRIER",) if solvers is None else solvers
     # What the quick solver cannot do on any of the problems is asked of all the others on the first.
-    rows = [(floor, states, quick) for floor in (noise_floor, 10 * noise_floor) for states in _around(max_states)]
-    for floor, states, tried_solvers in [*rows, (noise_floor, max_states, solvers)]:
+    rows: list[tuple[float, int, Sequence[str] | None]] = [
+        (floor, states, QUICK) for floor in (_NOISE_FLOOR, 10 * _NOISE_FLOOR) for states in _around(max_states)
+    ]
+    for floor, states, solvers in [*rows, (_NOISE_FLOOR, max_states, None)]:
         noisy = replace(problem, noise=np.maximum(problem.noise, floor * (np.abs(problem.C) @ problem.output_scale)))
-        plant = mixed_plant(noisy, noise_floor=0.0, penalty_floor=penalty_floor)
+        plant = mixed_plant(noisy, noise_floor=0.0)
         require_reachable(plant, gamma)  # K does not enter T22, so that this is all there is to say about the constraint
         for tried in canonical_scalings(plant) if scalings is None else [tuple(scalings)]:
             failed: list[str] = []
             notes: list[str] = []
-            found = by_inequalities(plant, gamma, tried, states, end, failed, notes, tried_solvers)
+            found = by_inequalities(plant, gamma, tried, states, end, failed, notes, solvers)
             if found:
                 made = _certified(problem, noisy, min(found, key=lambda v: v.h2), notes, start)
                 best = made if best is None or _worst(made) < _worst(best) else best
                 break
             reasons.append(f"with measurement noise of {floor:g} of the range and {states} states: {'; '.join(dict.fromkeys(failed))}")
-        if best is not None and (_worst(best) <= idle * (1 + _NOTHING) or floor > noise_floor):
+        if best is not None and (_worst(best) <= idle * (1 + _NOTHING) or floor > _NOISE_FLOOR):
             return best
     if best is not None:
         return best
     raise SynthesisError(
-        f"Mixed synthesis of an observer: no controller survived; {'. '.join(dict.fromkeys(reasons))}. Raise noise_floor, gamma or the time limit."
+        f"Mixed synthesis of an observer: no controller survived; {'. '.join(dict.fromkeys(reasons))}. Raise the noise, gamma or the time limit."
     )
 
 

@@ -6,15 +6,15 @@ r"""Mixed H2/H-infinity synthesis (7)-(8): ``min ||T11||_2`` subject to ``||T22|
     is gamma within reach of any controller? --(no)--> error with the least norm of T22
         |
         v
-    matrix inequalities: common and extended, several scalings of channel 2  -->  candidates
+    matrix inequalities, several scalings of channel 2                       -->  candidates
     H-infinity controllers of both channels together                         -->  candidates
         |
         v
     verification on the full plant --> local improvement --> verification --> lower bound and gap
 
 The inequalities with one Lyapunov matrix for both channels bound ``||T11||_2`` from above, often by far. Scaling the second channel
-(``w2 -> a w2``, ``z2 -> z2 / a``) leaves the problem as it is and changes that bound; so does a Lyapunov matrix for each channel. The unscaled
-common inequalities are always among the candidates, so that nothing is ever worse than they are.
+(``w2 -> a w2``, ``z2 -> z2 / a``) leaves the problem as it is and changes that bound. The unscaled
+inequalities are always among the candidates, so that nothing is ever worse than they are.
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ from .candidates import by_hinf, by_inequalities
 from .channels import Verified, part, verify
 from .continuous import continuous_controller, discrete_twin, speed
 from .improvement import polish
+from .lower_bounds import mixed_lower_bound
 from .singular import is_degenerate, is_singular, on_the_plant, regularised
-from .youla import mixed_lower_bound
+from .solvers import QUICK
 
 _SCALINGS = (1.0, 4.0, 16.0)
 _LAST_SCALINGS = (64.0, 256.0)
@@ -52,10 +53,6 @@ def mixed(
     scalings: Sequence[float] | None = None,
     max_states: int = 8,
     time_limit_s: float = 20.0,
-    polished: bool = True,
-    noise_floor: float = 1e-3,
-    penalty_floor: float = 3e-2,
-    solvers: Sequence[str] | None = None,
 ) -> Synthesis:
     """Return a controller with a small H2 norm in channel 1 and an H-infinity norm below `gamma` in channel 2.
 
@@ -75,15 +72,6 @@ def mixed(
         the states, and states of no consequence make them ill-conditioned). The controller is verified on the full plant.
     time_limit_s : float
         For the whole search; what was found by then is returned.
-    polished : bool
-        Improve the best candidates locally. Observer problems are never polished.
-    noise_floor : float
-        For observer problems: least measurement noise in the inequalities, as a fraction of the measured channel's range; tenfold where the
-        solver fails. Inequalities do not resolve an encoder's 1e-7. The certificate uses the true noise.
-    penalty_floor : float
-        For observer problems: least weight of the scaled correction in the inequalities.
-    solvers : sequence of str, optional
-        Solver and its fallbacks, see `kros.synthesis.mixed_norms.solvers.installed`.
 
     Returns
     -------
@@ -115,28 +103,18 @@ def mixed(
     if isinstance(plant, ObserverProblem):
         from .observer import for_observer
 
-        return for_observer(
-            plant,
-            noise_floor,
-            penalty_floor,
-            gamma=gamma,
-            scalings=scalings,
-            max_states=max_states,
-            time_limit_s=time_limit_s,
-            solvers=solvers,
-        )
+        return for_observer(plant, gamma, scalings, max_states, time_limit_s)
     require_plant(plant, "Mixed synthesis")
     if not plant.sizes[0]:
         raise SynthesisError(
             "Mixed synthesis needs a plant with states, found none; without dynamics the best gain is a small convex problem."
         )
     if plant.dt == 0:
-        options: dict[str, Any] = {"scalings": scalings, "max_states": max_states, "time_limit_s": time_limit_s, "polished": polished}
-        return _continuous(plant, gamma, **options, solvers=solvers)
+        return _continuous(plant, gamma, scalings=scalings, max_states=max_states, time_limit_s=time_limit_s)
     start = time.perf_counter()
     end = start + time_limit_s
     if is_singular(plant):
-        return _singular(plant, gamma, tried, max_states, start, end, polished, solvers)
+        return _singular(plant, gamma, tried, max_states, start, end)
     free = h2(performance(plant))
     unconstrained = verify(plant, free.controller, gamma, "H2 optimum without the constraint", "riccati")
     if isinstance(unconstrained, Verified):
@@ -145,24 +123,22 @@ def mixed(
     require_attainable(plant, gamma, hinf_norm(part(plant, plant.close(free.controller), 2)), time_limit_s / 10)
     notes: list[str] = []
     reasons: list[str] = []
-    quick = ("BARRIER",) if solvers is None else solvers
-    found = by_inequalities(plant, gamma, tried, max_states, end, reasons, notes, quick, extended=True)
+    found = by_inequalities(plant, gamma, tried, max_states, end, reasons, notes, QUICK)
     found += by_hinf(plant, gamma, end, reasons)
     if not found:
         easier = reached(plant)
         if easier is not plant:  # the inequalities have not been tried yet
             found = on_the_plant(
-                plant, by_inequalities(easier, gamma, (*tried, *_LAST_SCALINGS), max_states, end, reasons, notes, quick), gamma
+                plant, by_inequalities(easier, gamma, (*tried, *_LAST_SCALINGS), max_states, end, reasons, notes, QUICK), gamma
             )
         else:
-            found = by_inequalities(plant, gamma, _LAST_SCALINGS if scalings is None else tried, max_states, end, reasons, notes, solvers)
+            found = by_inequalities(plant, gamma, _LAST_SCALINGS if scalings is None else tried, max_states, end, reasons, notes)
     if not found:
         why = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
         raise SynthesisError(
             f"Mixed synthesis: no controller survived; {why}. Raise gamma = {gamma:g}, max_states, noise or the time limit."
         )
-    if polished:
-        found += _improved(plant, found, gamma, end)
+    found += _improved(plant, found, gamma, end)
     best = min(found, key=lambda v: v.h2)
     lower = free.lower_bound or 0.0
     if best.h2 > 1.01 * lower and time.perf_counter() < end:
@@ -178,8 +154,6 @@ def _singular(
     max_states: int,
     start: float,
     end: float,
-    polished: bool,
-    solvers: Sequence[str] | None,
 ) -> Synthesis:
     """Solve a plant without penalty or noise in channel 1; there is no lower bound but for a degenerate one."""
     require_reachable(plant, gamma)
@@ -187,7 +161,7 @@ def _singular(
     notes: list[str] = []
     reasons: list[str] = []
     for tried in [(a,) for a in (*scalings, *_LAST_SCALINGS)] if degenerate else [tuple(scalings)]:
-        found = by_inequalities(regular, gamma, tried, max_states, end, reasons, notes, solvers, extended=not degenerate)
+        found = by_inequalities(regular, gamma, tried, max_states, end, reasons, notes)
         found = on_the_plant(plant, found, gamma)
         if found:
             break
@@ -203,7 +177,7 @@ def _singular(
         notes.append(
             "T11 is the same for every controller, so each that meets the constraint is optimal; this one is that of the inequalities."
         )
-    elif polished:
+    else:
         found += _improved(plant, found, gamma, end)
     best = min(found, key=lambda v: v.h2)
     notes.append(

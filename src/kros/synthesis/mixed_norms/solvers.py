@@ -1,6 +1,6 @@
 """Solvers of matrix inequalities and their fallbacks: each within a time limit, nothing accepted that does not survive a check.
 
-The first is the package's own barrier method, then Clarabel, both free of licences; SDPA, SCS and MOSEK follow where they are installed.
+The first is the package's own barrier method, then Clarabel, both free of licences; MOSEK follows where it is installed.
 A solver that finds the inequalities infeasible is asked again by the next ones, since conic solvers say so of ill-conditioned problems too.
 """
 
@@ -22,8 +22,8 @@ from .barrier import Block, Ending, minimise
 Array = npt.NDArray[Any]
 T = TypeVar("T")
 
-_MODULES = {"BARRIER": "numpy", "CLARABEL": "clarabel", "SDPA": "sdpap", "SCS": "scs", "MOSEK": "mosek"}
-_FIRST_ORDER_S = 5.0  # a first-order method that needs longer has not returned a stabilising controller in our tests
+_MODULES = {"BARRIER": "numpy", "CLARABEL": "clarabel", "MOSEK": "mosek"}
+QUICK = ("BARRIER",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,18 +103,9 @@ def solve(program: Program, solver: str, time_limit_s: float, rtol: float = 1e-4
         found = minimise(program.c, program.blocks, program.start, rtol=rtol, time_limit_s=time_limit_s)
         x = found.x if np.isfinite(found.value) else None
         return Answer(solver, found.ending.value, found.ending is Ending.SOLVED, x, found.value)
-    return _with_cvxpy(program, solver, _settings(solver, time_limit_s, rtol))
-
-
-def _settings(solver: str, time_limit_s: float, rtol: float) -> dict[str, Any]:
-    """Settings that bound the time (for SDPA, which knows no clock, the iterations)."""
     if solver == "CLARABEL":
-        return {"time_limit": time_limit_s, "tol_gap_abs": rtol, "tol_gap_rel": rtol, "tol_feas": 1e-2 * rtol}
-    if solver == "SCS":
-        return {"time_limit_secs": min(time_limit_s, _FIRST_ORDER_S), "eps": 1e-2 * rtol, "max_iters": 200000}
-    if solver == "SDPA":
-        return {"maxIteration": 60, "epsilonStar": 1e-2 * rtol, "epsilonDash": 1e-2 * rtol}
-    return {"mosek_params": {"MSK_DPAR_OPTIMIZER_MAX_TIME": time_limit_s}}
+        return _with_cvxpy(program, solver, {"time_limit": time_limit_s, "tol_gap_abs": rtol, "tol_gap_rel": rtol, "tol_feas": 1e-2 * rtol})
+    return _with_cvxpy(program, solver, {"mosek_params": {"MSK_DPAR_OPTIMIZER_MAX_TIME": time_limit_s}})
 
 
 def _with_cvxpy(program: Program, solver: str, settings: dict[str, Any]) -> Answer:

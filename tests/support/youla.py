@@ -1,43 +1,116 @@
-r"""What a longer controller could still gain: finite impulse response programs over Q, and lower bounds that no controller beats.
+r"""What a longer controller could still gain: finite impulse response programs over Q, an upper bound beside the lower ones of `kros`.
 
-*From above* (`youla_bound`): ``min ||T11(Q)||_2`` subject to ``||T22(Q)||_inf < gamma`` over the taps of Q is convex. The constraint is set at
-frequencies, the norm between them is computed from the closed loop by level sets, and peaks join the frequencies until it holds. The number of taps is
-doubled until the value changes by less than half a percent. The value is the norm of a controller that exists (of high order), so it falls to the
-optimum from above.
+``min ||T11(Q)||_2`` subject to ``||T22(Q)||_inf < gamma`` over the taps of Q is convex. The constraint is set at frequencies, the norm between them is
+computed from the closed loop by level sets, and peaks join the frequencies until it holds. The number of taps is doubled until the value changes by
+less than half a percent. The value is the norm of a controller that exists (of high order), so it falls to the optimum from above. Around the
+*open loop* of a stable plant F = L = L0 = 0, and T(Q) = P11 + P12 Q P21.
 
-*From below* (`mixed_lower_bound`): around the H2 optimum ``||T11||^2 = f*^2 + ||Q||^2``, and the first N samples of the impulse response of T22 form a block
-Toeplitz matrix whose norm is at most ``||T22||_inf``. So
-
-.. math:: f_*^2 + \min \Big\{ \sum_{k<N} \|q_k\|^2 : \|\mathrm{Toep}_N(T_{22}(q))\| \le \gamma \Big\}
-
-is below the square of every controller's norm, and rises to the optimum with N. In the same way `hinf_lower_bound` is below every ``||T22||_inf``.
-
-References
-----------
-S. Boyd, C. Barratt, *Linear Controller Design: Limits of Performance*, Prentice Hall 1991, chapter 15.
+S. Boyd, C. Barratt, *Linear Controller Design: Limits of Performance*, Prentice Hall 1991, chapters 7 and 15.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
-from ...core.errors import ConfigError, SynthesisError
-from ...core.lti import StateSpace
-from ...core.norms import h2_norm, hinf_norm
-from ..generalized_plant import GeneralizedPlant
-from .barrier import Block, Ending, Outcome, minimise
-from .channels import part
-from .youla_family import Family, markov, responses
+from kros.core.errors import ConfigError, SynthesisError
+from kros.core.lti import StateSpace
+from kros.core.norms import gramian, h2_norm, hinf_norm
+from kros.synthesis.generalized_plant import GeneralizedPlant
+from kros.synthesis.mixed_norms import lower_bounds
+from kros.synthesis.mixed_norms.barrier import Block, Ending, Outcome, minimise
+from kros.synthesis.mixed_norms.channels import part
+from kros.synthesis.mixed_norms.lower_bounds import symmetric
+from kros.synthesis.riccati.h2_optimal import absorb_feedthrough
 
 Array = npt.NDArray[Any]
 Objective = Literal["h2", "mixed", "hinf"]
 
 _GRID, _ROUNDS, _BACK_OFF = 60, 8, 2e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Family(lower_bounds.Family):
+    """All stabilising controllers, around the open loop too; `orthonormal` around the H2 optimum."""
+
+    orthonormal: bool = True
+
+    @classmethod
+    def around_open_loop(cls, plant: GeneralizedPlant) -> Family:
+        """Return the family of a stable plant with Q from y - P22 u to u."""
+        if not plant.open_loop().is_stable():
+            raise SynthesisError(
+                f"Youla program: the plant has spectral radius {float(plant.open_loop().spectral_radius()):.6g}; "
+                "an unstable plant needs centre = 'h2'."
+            )
+        n, _, n_u, _, n_y = plant.sizes
+        return cls(plant, np.zeros((n_u, n)), np.zeros((n, n_y)), np.zeros((n_u, n_y)), np.eye(n_u), np.eye(n_y), False)
+
+    def controller(self, q: Array) -> StateSpace:
+        """Controller of the plant for the taps q; n + (taps - 1) n_y states."""
+        p, (taps, _, n_y) = self.plant, q.shape
+        n = p.sizes[0]
+        Q = self.left @ q @ self.right
+        shift = np.eye((taps - 1) * n_y, k=-n_y)
+        enter, tail = np.eye((taps - 1) * n_y, n_y), np.hstack([*Q[1:], np.zeros((Q.shape[1], 0))])
+        direct = self.L0 + Q[0]
+        C = np.hstack([self.F - direct @ p.C2, tail])
+        B = np.vstack([self.L + p.B2 @ direct, enter])
+        A = np.block([[p.A - self.L @ p.C2, np.zeros((n, shift.shape[0]))], [-enter @ p.C2, shift]])
+        A[:n] += p.B2 @ C
+        return absorb_feedthrough(StateSpace(A, B, C, direct, p.dt), p.D22)
+
+    def energy(self, taps: int) -> tuple[Array, Array, float]:
+        """Squared H2 norm of channel 1 as ``q'Hq + 2 g'q + c`` over the flattened taps, exact (by Gramians, not by truncated responses)."""
+        one, two, three = self.channel(1)
+        P = gramian(one.A, one.B, one.dt)
+        constant = float(np.trace(one.C @ P @ one.C.T) + np.sum(one.D**2))
+        n_u, n_y = two.n_inputs, three.n_outputs
+        if self.orthonormal:
+            return np.eye(taps * n_u * n_y), np.zeros(taps * n_u * n_y), constant
+        pairs = [StateSpace(two.A, two.B[:, [i]], two.C, two.D[:, [i]], two.dt) @ _row(three, j) for i in range(n_u) for j in range(n_y)]
+        forward, backward = _correlations([*pairs, one], taps)
+        m = len(pairs)
+        H = np.zeros((taps, m, taps, m))
+        for k in range(taps):
+            for j in range(taps):
+                H[k, :, j] = forward[j - k, :m, :m] if j >= k else forward[k - j, :m, :m].T
+        return H.reshape(taps * m, taps * m), backward[:, :m, m].ravel(), constant
+
+
+def responses(family: Family, channel: int, freqs_hz: Array, taps: int) -> tuple[Array, Array]:
+    """Frequency response of a channel without Q, (f, p, m), and what each tap adds, (taps n_u n_y, f, p, m)."""
+    one, two, three = (system.frequency_response(freqs_hz) for system in family.channel(channel))
+    delay = np.exp(-2j * np.pi * np.outer(np.arange(taps), freqs_hz) * family.plant.dt)
+    products = np.einsum("kf,fpi,fjm->kijfpm", delay, two, three)
+    return one, products.reshape(-1, *one.shape)
+
+
+def _row(system: StateSpace, j: int) -> StateSpace:
+    return replace(system, C=system.C[[j]], D=system.D[[j]])
+
+
+def _correlations(systems: list[StateSpace], lags: int) -> tuple[Array, Array]:
+    """``sum_t tr h_a(t + m) h_b(t)'`` and ``sum_t tr h_a(t) h_b(t + m)'`` of systems with a common input, each (lags, a, b)."""
+    A, B = block_diag(*(s.A for s in systems)), np.vstack([s.B for s in systems])
+    ends = np.cumsum([s.n_states for s in systems])
+    C = np.zeros((len(systems), systems[0].n_outputs, len(A)))
+    for a, s in enumerate(systems):
+        C[a, :, ends[a] - s.n_states : ends[a]] = s.C
+    D = np.stack([s.D for s in systems])
+    P = gramian(A, B, systems[0].dt)
+    found = np.zeros((lags, len(systems), len(systems)))
+    found[0] = np.einsum("apx,xy,bpy->ab", C, P, C) + np.einsum("apm,bpm->ab", D, D)
+    state = np.einsum("xy,bpy->bxp", A @ P, C) + np.einsum("xm,bpm->bxp", B, D)
+    for m in range(1, lags):
+        found[m] = np.einsum("apx,bxp->ab", C, state)
+        state = A @ state
+    return found, found.swapaxes(-1, -2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,15 +167,6 @@ def youla_bound(
         When an option is out of range.
     SynthesisError
         For a continuous plant, an unstable one around the open loop, or when no filter of this length meets the bound.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.synthesis import GeneralizedPlant, h2
-    >>> from kros.synthesis.mixed_norms.youla import youla_bound
-    >>> plant = GeneralizedPlant([[0.5]], [[1.0, 0.0]], [[1.0]], [[1.0], [0.0]], [[1.0]], np.zeros((2, 2)), [[0], [1.0]], [[0, 1.0]], [[0]], 1.0)
-    >>> bool(abs(youla_bound(plant).value / h2(plant).h2_norm - 1) < 1e-6)
-    True
     """
     if objective not in ("h2", "mixed", "hinf") or taps < 1 or max_taps < taps or not change > 0 or not time_limit_s > 0:
         raise ConfigError(
@@ -140,115 +204,11 @@ def youla_bound(
     return YoulaBound(*best, history=tuple(history), converged=converged)
 
 
-def mixed_lower_bound(plant: GeneralizedPlant, gamma: float, value: float, horizon: int = 24, time_limit_s: float = 5.0) -> float:
-    """Return a number that ``||T11||_2`` of no controller with ``||T22||_inf < gamma`` is below.
-
-    Parameters
-    ----------
-    plant : GeneralizedPlant
-        Discrete, regular in channel 1.
-    gamma : float
-    value : float
-        H2 norm of a controller that is known: better ones have a Q of less energy, which bounds the variables.
-    horizon : int
-        Samples of the impulse response of T22 that count; halved where time runs out.
-    time_limit_s : float
-    """
-    family = Family.around_h2(plant)
-    _, _, free = family.energy(1)
-    end = time.perf_counter() + time_limit_s
-    best = float(np.sqrt(free))
-    room = float(np.sqrt(max(value**2 - free, 0.0))) * 1.01 + 1e-9 * value
-    for samples in (max(horizon // 4, 1), max(horizon // 2, 1), horizon):
-        left = end - time.perf_counter()
-        if left <= 0:
-            break
-        block = _toeplitz_block(family, samples, gamma)
-        n = block.basis.shape[0]
-        # In units of the largest Q that could still be better.
-        inside = Block(block.constant, block.basis * room)
-        found = minimise(np.zeros(n), [inside], np.zeros(n), Q=2 * np.eye(n), rtol=1e-3, time_limit_s=left, box=1.0 + 1e-6)
-        if np.isfinite(found.lower):
-            best = max(best, float(np.sqrt(free + room**2 * max(found.lower, 0.0))))
-    return best
-
-
-def hinf_lower_bound(plant: GeneralizedPlant, horizon: int = 24, time_limit_s: float = 5.0) -> float:
-    """Return a number that ``||T22||_inf`` of no controller is below (up to the accuracy of the solver), by the norm of a Toeplitz matrix."""
-    family = Family.around_h2(plant)
-    block = _in_units(_toeplitz_block(family, horizon, 0.0), family)
-    n, d = block.basis.shape[0], block.constant.shape[-1]
-    basis = np.concatenate([block.basis, np.eye(d)[None, None]])
-    c = np.zeros(n + 1)
-    c[n] = 1.0
-    start = np.zeros(n + 1)
-    size = float(np.linalg.norm(block.constant[0], 2))
-    start[n] = 1.1 * size + 1e-9
-    found = minimise(c, [Block(block.constant, basis)], start, rtol=1e-3, time_limit_s=time_limit_s)
-    return max(found.lower, 0.0)
-
-
-def samples_infeasible(plant: GeneralizedPlant, gamma: float, horizon: int = 24, time_limit_s: float = 5.0) -> bool:
-    """Tell whether the first samples of T22 alone are shown to have no norm below `gamma`; this needs no optimum, so it is quick."""
-    family = Family.around_h2(plant)
-    block = _in_units(_toeplitz_block(family, horizon, gamma), family)
-    found = minimise(np.zeros(len(block.basis)), [block], np.zeros(len(block.basis)), time_limit_s=time_limit_s)
-    return found.ending is Ending.INFEASIBLE
-
-
-def _in_units(block: Block, family: Family) -> Block:
-    """Taps in units of what they do to T22, so that the solver's box is no limit for controllers that hardly reach it; rounding is left out."""
-    sizes = np.linalg.norm(block.basis, axis=(-2, -1)).max(axis=-1)
-    _, two, three = family.channel(2)
-    whole = _uncancelled(two) * _uncancelled(three)
-    constant = max(float(np.linalg.norm(block.constant)), 1e-300)
-    unit = np.where((sizes > 1e-13 * whole) & (sizes > 0), constant / np.where(sizes > 0, sizes, 1.0), 0.0)
-    return Block(block.constant, block.basis * unit[:, None, None, None])
-
-
-def _uncancelled(system: StateSpace) -> float:
-    """Size of the impulse response if nothing in it cancelled; it does not depend on the units of the states."""
-    size, state = float(np.linalg.norm(system.D)), system.B
-    for _ in range(2 * system.n_states):
-        size = max(size, float(np.linalg.norm(np.abs(system.C) @ np.abs(state))))
-        state = system.A @ state
-    return size
-
-
 def _family(plant: GeneralizedPlant, centre: str | None) -> Family:
     if centre not in (None, "open_loop", "h2"):
         raise ConfigError(f"Youla program: centre = {centre!r} should be 'open_loop' or 'h2'.")
     fast = float(plant.open_loop().spectral_radius()) < 0.9
     return Family.around_open_loop(plant) if centre == "open_loop" or (centre is None and fast) else Family.around_h2(plant)
-
-
-def _toeplitz_block(family: Family, samples: int, gamma: float) -> Block:
-    """``[[gamma I, H], [H', gamma I]]`` with the lower triangular Toeplitz matrix H of the first samples of T22."""
-    free, products = markov(family, 2, samples)
-    _, p, m = free.shape
-
-    def toeplitz(impulse: Array) -> Array:
-        H = np.zeros((*impulse.shape[:-3], samples * p, samples * m))
-        for t in range(samples):
-            for s in range(samples - t):
-                H[..., (t + s) * p : (t + s + 1) * p, s * m : (s + 1) * m] = impulse[..., t, :, :]
-        return H
-
-    delayed = np.zeros((samples, *products.shape))
-    for k in range(samples):
-        delayed[k, :, k:] = products[:, : samples - k]
-    taps = toeplitz(delayed.reshape(-1, samples, p, m))
-    return Block(_symmetric(toeplitz(free), gamma)[None], _symmetric(taps, 0.0)[:, None])
-
-
-def _symmetric(H: Array, diagonal: float) -> Array:
-    """``[[d I, H], [H', d I]]`` for a stack of matrices."""
-    p, m = H.shape[-2:]
-    found = np.zeros((*H.shape[:-2], p + m, p + m))
-    found[..., :p, p:] = H
-    found[..., p:, :p] = H.swapaxes(-1, -2)
-    found += diagonal * np.eye(p + m)
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,6 +294,6 @@ def _embedded(T: Array, diagonal: float) -> Array:
     """Real symmetric matrices that are positive semidefinite when ``sigma_max(T) <= diagonal``; affine in T and the diagonal."""
     p, m = T.shape[-2:]
     if min(p, m) == 1:
-        return _symmetric(np.concatenate([T.real, T.imag], axis=-1).reshape(*T.shape[:-2], 1, -1), diagonal)
+        return symmetric(np.concatenate([T.real, T.imag], axis=-1).reshape(*T.shape[:-2], 1, -1), diagonal)
     real = np.concatenate([np.concatenate([T.real, -T.imag], axis=-1), np.concatenate([T.imag, T.real], axis=-1)], axis=-2)
-    return _symmetric(real, diagonal)
+    return symmetric(real, diagonal)

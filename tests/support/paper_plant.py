@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DimensionError
-from ...core.lti import StateSpace
-from ..generalized_plant import GeneralizedPlant
+from kros.core.errors import DimensionError
+from kros.core.lti import StateSpace
+from kros.synthesis.generalized_plant import GeneralizedPlant
 
 Array = npt.NDArray[Any]
 

@@ -49,7 +49,7 @@ class PredictorSettings(Settings):
 
 
 class ObserverSettings(Settings):
-    """Which observers are compared, and which one is handed over.
+    """Which observers are compared, and which one is deployed.
 
     The extended Kalman filter runs on the first lifted model (on a linear one it is the tuned Kalman filter); ``filtered_difference`` and
     ``learned`` need no model.

@@ -62,7 +62,7 @@ class EvaluateConfig(Settings):
     """Evaluation on units that took no part, on disturbed measurements, and on machines that might be.
 
     With `folds` the pooled units are parted into so many folds, and for each the study is made once more on all other units; 0 leaves that out.
-    With `robustness` observers of the kind of model that is handed over run on disturbed measurements of a few units, with "all" every observer on all
+    With `robustness` observers of the deployed kind of model run on disturbed measurements of a few units, with "all" every observer on all
     units in all conditions. `monte_carlo` is the number of random members of the certified set that observers are computed for; 0 leaves that out.
     """
 

@@ -92,7 +92,7 @@ class Trial:
 def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, dict[str, float]], roles: Mapping[str, str]) -> Trial | None:
     """Return what is run on disturbed measurements; None where the study asks for nothing of it.
 
-    By default the observers of the kind of model that is handed over, on the first seconds of one held-out episode of few units; with
+    By default the observers of the deployed kind of model, on the first seconds of one held-out episode of few units; with
     ``robustness = "all"`` all observers, units and conditions.
     """
     config = context.config.evaluate

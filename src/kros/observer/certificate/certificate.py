@@ -48,6 +48,7 @@ class ReliftCertificate:
         What has to hold, in words.
     box, parameters : mapping of str to (lower, upper)
     clipped : bool
+    dropped : Dropped
         What was asked; see `relift_certificate`.
     status : ReliftStatus
     reason : str
@@ -79,6 +80,7 @@ class ReliftCertificate:
     box: Box
     parameters: Box
     clipped: bool
+    dropped: Dropped
     status: ReliftStatus = ReliftStatus.UNBOUNDED
     reason: str = ""
     certified: bool = False
@@ -115,7 +117,7 @@ class ReliftCertificate:
         y = x[list(observer.measured)]
         scales = ReliftScales(self.scales.error * x[:n], self.scales.residual * x[:n], self.scales.noise * y)
         box = {name: tuple(np.multiply(value, by_name.get(name, 1.0)).tolist()) for name, value in self.box.items()}
-        assumptions = tuple(text.replace(_ranges(self.box), _ranges(box)) for text in self.assumptions) if box else self.assumptions
+        assumptions = _assumptions(observer, box, self.parameters, self.dropped, clipped=self.clipped)
         roots = self.roots.copy()
         if roots.size:
             roots[:, :, : len(errors)] /= errors
@@ -134,7 +136,9 @@ class ReliftCertificate:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "relift")
         values: dict[str, Any] = {name: content[name] for name in _PLAIN}
-        values |= {"status": ReliftStatus(content["status"])} | {name: tuple(content[name]) for name in ("channels", "assumptions")}
+        values |= {"status": ReliftStatus(content["status"]), "dropped": Dropped(content["dropped"])} | {
+            name: tuple(content[name]) for name in ("channels", "assumptions")
+        }
         scales = ReliftScales(**{name: arrays[f"scales/{name}"] for name in ReliftScales.__dataclass_fields__})
         values |= {name: arrays[name] for name in _ARRAYS}
         return cls(scales=scales, **values)
@@ -204,7 +208,7 @@ def relift_certificate(
     """
     start, dropped = time.perf_counter(), Dropped(dropped)
     assumptions = _assumptions(observer, box, parameters, dropped, clipped=clipped)
-    asked = ReliftCertificate(scales or ReliftScales.ones(observer), assumptions, dict(box or {}), dict(parameters or {}), clipped)
+    asked = ReliftCertificate(scales or ReliftScales.ones(observer), assumptions, dict(box or {}), dict(parameters or {}), clipped, dropped)
     try:
         system = asked.system(observer)
     except (UnboundedSlopeError, UncoveredRuntimeError) as error:

@@ -75,7 +75,8 @@ def test_the_short_way_is_the_study(example: tuple[Path, dict[str, Any]]) -> Non
 @pytest.mark.slow
 def test_what_runs_has_names(example: tuple[Path, dict[str, Any]]) -> None:
     names = example[1]
-    assert names["x_hat"]["velocity"] == names["running"].states[1]
+    assert names["running"].states == ("position", "velocity", "current")
+    assert names["x_hat"]["velocity"] == np.asarray(names["x_hat"])[1]
     for name in ("models", "uncertain", "design", "study"):
         assert "\n" not in repr(names[name])
         assert len(repr(names[name])) < 250

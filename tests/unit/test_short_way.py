@@ -1,0 +1,147 @@
+"""The functions of the short way by themselves: what they take, what they refuse, and what follows from formulas."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+import kros
+from kros.core.errors import ConfigError, DataError, SynthesisError
+from kros.core.work import Work
+from kros.data import Population
+from kros.identify import IdentifiedModels
+from kros.identify.kinds import kind_of, kinds_for
+from kros.identify.presets import lifting_settings, resolve_lifting, resolve_phase
+from kros.identify.settings import CalibrationSettings
+from kros.lifting import Lifting
+from kros.plants import PLANTS
+from kros.uncertainty import UncertainModels
+
+STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "target_velocity")
+
+
+@pytest.fixture(scope="module")
+def population() -> Population:
+    """Four DC motors, given as arrays."""
+    made = PLANTS["dc-motor"](n_units=4, n_episodes=3, seconds=1.2, seed=3).simulate().population
+    data = {unit: [made.read(key) for key in made.keys(unit)] for unit in made.unit_ids}
+    period = made.sample_period_s
+    return kros.from_arrays(data, states=made.states, inputs=made.inputs, measured=["position"], sample_period_s=period)
+
+
+@pytest.fixture(scope="module")
+def uncertain(population: Population) -> UncertainModels:
+    models = kros.identify(population, refine=False)
+    return kros.quantify(models, n_freqs=60, max_order=1, structure="scalar")
+
+
+def test_from_arrays_to_a_step(uncertain: UncertainModels, population: Population) -> None:
+    design = kros.synthesize(uncertain, method="kalman_tuned")
+    x = population.read(population.keys()[0])
+    n = len(population.states)
+    running = design.observer.start(x[0, :1])
+    for row in x[:50]:
+        estimate = running.step(row[:1], row[n:])
+    assert running.states == population.states
+    assert estimate["velocity"] == np.asarray(estimate)[running.states.index("velocity")]
+    assert design.name == "linear_edmd/kalman_tuned"
+    assert design.facts["hidden_error_percent"] > 0
+
+
+def test_everything_is_designed_where_no_method_is_named(uncertain: UncertainModels) -> None:
+    observer = {"baselines": ("open_loop", "kalman_white")}
+    design = kros.synthesize(uncertain, methods=("residual_h2",), observer=observer)
+    assert design.name.split("/")[1] in ("open_loop", "kalman_white", "residual_h2")
+    with pytest.raises(SynthesisError, match="there is no such observer"):
+        kros.synthesize(uncertain, methods=(), observer=observer | {"deployed": "koopman/memory"})
+
+
+def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Population) -> None:
+    with pytest.raises(ConfigError, match="no method 'memory'; known are linear_edmd/open_loop"):
+        kros.synthesize(uncertain, method="memory")
+    with pytest.raises(ConfigError, match="Synthesize: penalti: unknown key"):
+        kros.synthesize(uncertain, penalti=1.0)
+    with pytest.raises(ConfigError, match="Identify: alpha_factor"):
+        kros.identify(population, alpha_factor=0.5)
+    with pytest.raises(ConfigError, match="is one text; give a list"):
+        kros.identify(population, "sin(position)")
+    with pytest.raises(ConfigError, match="Quantify: form"):
+        kros.quantify(uncertain.models, form="additiv")
+    with pytest.raises(DataError, match="identify_on = 'loaded'"):
+        kros.identify(population, identify_on="loaded")
+    with pytest.raises(DataError, match="there are none, only linear_edmd"):
+        uncertain.models.models("koopman")
+
+
+def test_steps_are_told_to_whoever_listens(population: Population) -> None:
+    class Listener:
+        def __init__(self) -> None:
+            self.seen: list[str] = []
+
+        def start(self, stage: str, total: int | None) -> None:
+            self.seen.append(stage)
+
+        def advance(self) -> None: ...
+
+        def finish(self, stage: str, seconds: float, skipped: bool) -> None: ...
+
+    listener = Listener()
+    kros.identify(population, refine=False, work=Work(progress=listener))
+    assert listener.seen == ["read", "identify (default)"]
+
+
+def recorded(states: Sequence[str] = STATES, **metadata: float) -> Population:
+    samples = np.random.default_rng(0).standard_normal((2, 50, len(states) + 2))
+    return kros.from_arrays(
+        {"a": list(samples)}, states=states, inputs=INPUTS, measured=[states[0]], sample_period_s=1e-3, metadata=metadata
+    )
+
+
+@pytest.mark.parametrize(
+    ("functions", "metadata", "declared", "ratio"),
+    [
+        (["sin(100*position + phase)"], {}, {}, 100.0),
+        (["cos(phase + 2*50*position)", "velocity*sin(100*position + phase)"], {}, {}, 100.0),
+        (["sin(100*position + phase)"], {"gear_ratio": 50.0}, {}, 50.0),
+        (["sin(100*position + phase)"], {"gear_ratio": 50.0}, {"ratio": 80.0}, 80.0),
+    ],
+)
+def test_the_ratio_of_a_calibrated_angle_follows_from_the_formula(
+    functions: list[str], metadata: dict[str, float], declared: dict[str, float], ratio: float
+) -> None:
+    population = recorded(**metadata)
+    calibration = CalibrationSettings.of(declared, "calibrate")
+    lifting = resolve_lifting(lifting_settings(functions), calibration, population)
+    spec = resolve_phase(calibration, population, lifting)
+    assert spec is not None
+    assert (spec.angle, spec.ratio) == ("position", ratio)
+
+
+@pytest.mark.parametrize(
+    "functions", [["sin(100*position + phase)", "sin(50*position + phase)"], ["sin(position**2 + phase)"], ["phase*position"]]
+)
+def test_a_ratio_that_does_not_follow_is_asked_for(functions: list[str]) -> None:
+    population = recorded()
+    lifting = resolve_lifting(lifting_settings(functions), CalibrationSettings(), population)
+    with pytest.raises(ConfigError, match=r"set calibrate\.ratio"):
+        resolve_phase(CalibrationSettings(), population, lifting)
+
+
+def test_kinds_of_models() -> None:
+    lifted = Lifting(STATES, ("sin(position)",))
+    assert [k.name for k in kinds_for(lifted, refined=False)] == ["koopman_edmd", "linear_edmd"]
+    assert [k.name for k in kinds_for(Lifting(STATES), refined=True)] == ["linear"]
+    assert kind_of("linear").lifting(lifted) == Lifting(STATES)
+    with pytest.raises(ConfigError, match="known are koopman, linear"):
+        kind_of("edmd")
+
+
+def test_models_are_saved_with_their_recordings(uncertain: UncertainModels, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    models = uncertain.models
+    models.save(tmp_path)
+    loaded = IdentifiedModels.load(tmp_path)
+    assert repr(loaded) == repr(models)
+    assert loaded.sizes == models.sizes
+    np.testing.assert_array_equal(loaded.models().A, models.models().A)

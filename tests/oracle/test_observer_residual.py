@@ -7,7 +7,7 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from kros.core import StateSpace
 from kros.lifting import Lifting
 from kros.observer import mean_error_dynamics, one_step_residual, residual_spectra
-from kros.synthesis import Basis, Injection, Status, kalman, residual_h2, shaping_filter
+from kros.synthesis import Basis, Injection, ResidualProblem, Status, kalman, residual_h2, shaping_filter
 
 DT = 1e-2
 A = np.array([[1.0, 0.01], [-0.05, 0.95]])
@@ -77,7 +77,7 @@ def response(K):
 def test_known_shaping_filter_gives_its_optimum():
     truth = autoregression()
     reference, best = optimum(truth)
-    found = residual_h2(A, C, spectrum(truth)[None], NOISE, SCALE, DT, [Basis(2)], tolerance_percent=0)
+    found = residual_h2(ResidualProblem(A, C, spectrum(truth)[None], NOISE, SCALE, DT), [Basis(2)], tolerance_percent=0)
     assert (found.status, found.injection, found.method) == (Status.OPTIMAL, Injection.STATE, "residual_h2")
     assert found.h2_norm == pytest.approx(best, rel=1e-5)
     assert achieved(found.controller, truth) == pytest.approx(best, rel=1e-5)
@@ -89,7 +89,7 @@ def test_measured_residual_gives_nearly_that_optimum():
     reference, best = optimum(truth)
     omega = simulate(truth, 20500, 8, seed=1)
     spectra = residual_spectra(omega, [len(omega)] * 8, ["a"] * 4 + ["b"] * 4)
-    found = residual_h2(A, C, spectra, NOISE, SCALE, DT, tolerance_percent=0)
+    found = residual_h2(ResidualProblem(A, C, spectra, NOISE, SCALE, DT), tolerance_percent=0)
     # 160 000 samples: parameters of an autoregression are known to 1/400, the loss is of second order.
     assert best <= achieved(found.controller, truth) < 1.01 * best
     error = np.abs(response(found.controller) - response(reference))
@@ -100,7 +100,9 @@ def test_a_filter_outside_the_class_is_approached():
     zero = StateSpace(np.diag([0.97, 0.9]), ROOT, np.array([[0.3, 0.0], [0.4, -0.7]]), ROOT, DT)
     _, best = optimum(zero)
     loss = [
-        achieved(residual_h2(A, C, spectrum(zero)[None], NOISE, SCALE, DT, [basis], tolerance_percent=0).controller, zero) / best - 1
+        achieved(residual_h2(ResidualProblem(A, C, spectrum(zero)[None], NOISE, SCALE, DT), [basis], tolerance_percent=0).controller, zero)
+        / best
+        - 1
         for basis in (Basis(1), Basis(4), Basis(8), Basis(2, (0.9, 0.97)))
     ]
     assert loss[0] > loss[1] > loss[2] > -1e-9
@@ -111,7 +113,7 @@ def test_a_filter_outside_the_class_is_approached():
 def test_white_residual_gives_the_ordinary_kalman_gain():
     Q = ROOT @ ROOT.T
     flat = np.broadcast_to(Q + 0j, (1, FREQS, 2, 2))
-    found = residual_h2(A, C, flat, NOISE, SCALE, DT)
+    found = residual_h2(ResidualProblem(A, C, flat, NOISE, SCALE, DT))
     ordinary = kalman(A, C, Q, np.diag(NOISE**2), DT)
     assert found.controller.n_states == 0
     np.testing.assert_allclose(found.controller.D, ordinary.controller.D, rtol=1e-6)
@@ -119,7 +121,7 @@ def test_white_residual_gives_the_ordinary_kalman_gain():
 
 def test_white_recording_gives_nearly_the_ordinary_kalman_gain():
     omega = np.random.default_rng(2).standard_normal((40000, 4, 2)) @ ROOT.T
-    found = residual_h2(A, C, residual_spectra(omega, [40000] * 4, list("aabb")), NOISE, SCALE, DT)
+    found = residual_h2(ResidualProblem(A, C, residual_spectra(omega, [40000] * 4, list("aabb")), NOISE, SCALE, DT))
     ordinary = kalman(A, C, ROOT @ ROOT.T, np.diag(NOISE**2), DT)
     np.testing.assert_allclose(found.controller.D, ordinary.controller.D, rtol=0.05)
 
@@ -127,8 +129,8 @@ def test_white_recording_gives_nearly_the_ordinary_kalman_gain():
 def test_reduction_costs_what_it_says():
     truth = autoregression()
     shaped = spectrum(truth)[None]
-    full = residual_h2(A, C, shaped, NOISE, SCALE, DT, tolerance_percent=0)
-    small = residual_h2(A, C, shaped, NOISE, SCALE, DT, tolerance_percent=1)
+    full = residual_h2(ResidualProblem(A, C, shaped, NOISE, SCALE, DT), tolerance_percent=0)
+    small = residual_h2(ResidualProblem(A, C, shaped, NOISE, SCALE, DT), tolerance_percent=1)
     assert small.controller.n_states < 6 < full.controller.n_states
     assert 0 <= small.gap_percent <= 1
     assert small.h2_norm == pytest.approx(achieved(small.controller, truth), rel=1e-4)
@@ -136,7 +138,7 @@ def test_reduction_costs_what_it_says():
 
 
 def test_lifted_rows_are_not_corrected():
-    found = residual_h2(A, C, spectrum(autoregression())[None], NOISE, SCALE, DT, n_lifted=5)
+    found = residual_h2(ResidualProblem(A, C, spectrum(autoregression())[None], NOISE, SCALE, DT), n_lifted=5)
     assert found.controller.n_outputs == 5
     assert not found.controller.C[2:].any()
     assert not found.controller.D[2:].any()
@@ -163,11 +165,13 @@ def test_worst_unit_against_a_search_over_mixtures():
 
     def observer(weights, **options):
         return residual_h2(
-            A, C, np.tensordot(weights, spectra, 1)[None], NOISE, SCALE, DT, [Basis(8)], tolerance_percent=0, **options
+            ResidualProblem(A, C, np.tensordot(weights, spectra, 1)[None], NOISE, SCALE, DT), [Basis(8)], tolerance_percent=0, **options
         ).controller
 
-    found = hidden(residual_h2(A, C, spectra, NOISE, SCALE, DT, [Basis(8)], tolerance_percent=0, worst_unit=True).controller)
-    mean = hidden(residual_h2(A, C, spectra, NOISE, SCALE, DT, [Basis(8)], tolerance_percent=0).controller)
+    found = hidden(
+        residual_h2(ResidualProblem(A, C, spectra, NOISE, SCALE, DT), [Basis(8)], tolerance_percent=0, worst_unit=True).controller
+    )
+    mean = hidden(residual_h2(ResidualProblem(A, C, spectra, NOISE, SCALE, DT), [Basis(8)], tolerance_percent=0).controller)
     best = min(hidden(observer([t, 1 - t])).max() for t in np.linspace(0, 1, 21))
     assert found.max() <= mean.max()
     assert found.max() <= 1.03 * best

@@ -9,7 +9,7 @@ from kros.core.lti import gain
 from kros.evaluate import unit_interval
 from kros.lifting import Lifting
 from kros.observer import Observer, one_step_rows, residual_models, run_observer, tune_observer
-from kros.synthesis import Injection, kalman, residual_h2
+from kros.synthesis import Injection, ResidualProblem, kalman, residual_h2
 
 DT = 0.01
 LIFTING = Lifting(("x", "v"), ("sin(5*x + phase)",), ("phase",))
@@ -44,7 +44,7 @@ def test_rows_that_help_come_first_and_their_promise_is_kept():
     assert sorted(m.refitted for m in models) == [(), (0,), (0, 1)]
     best = models[0]
     assert best.refitted == (0, 1)
-    K = residual_h2(best.dynamics, np.eye(1, 2), best.spectra, noise, scale, DT, n_lifted=3).controller
+    K = residual_h2(ResidualProblem(best.dynamics, np.eye(1, 2), best.spectra, noise, scale, DT), n_lifted=3).controller
     estimate = run_observer(Observer("o", LIFTING, best.A, best.B, (0,), ("u",), K, Injection.STATE, DT), x[..., :1], u, phase)
     assert np.sqrt(np.mean((estimate - x)[50:, :, 1] ** 2)) == pytest.approx(best.promised[1], rel=0.1)
 

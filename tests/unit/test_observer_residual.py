@@ -6,7 +6,7 @@ import pytest
 from kros.core import DataError, DimensionError, SynthesisError
 from kros.lifting import Lifting
 from kros.observer import one_step_residual, residual_spectra
-from kros.synthesis import Basis, residual_h2, shaping_filter
+from kros.synthesis import Basis, ResidualProblem, residual_h2, shaping_filter
 
 A, C, NOISE, SCALE, DT = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[1.0, 0.0]]), [1e-3], [1.0, 1.0], 1e-2
 
@@ -49,24 +49,24 @@ def test_residual_that_can_be_predicted(tone):
     spectra = residual_spectra(residual, [2000], ["a"], segment=1000)
     spectra[..., 0, 1] = spectra[..., 1, 0] = 0
     with pytest.raises(SynthesisError, match="can be predicted"):
-        residual_h2(A, C, spectra, NOISE, SCALE, DT)
+        residual_h2(ResidualProblem(A, C, spectra, NOISE, SCALE, DT))
 
 
 def test_no_residual():
     with pytest.raises(SynthesisError, match="nothing to shape"):
-        residual_h2(A, C, np.zeros((1, 65, 2, 2), complex), NOISE, SCALE, DT)
+        residual_h2(ResidualProblem(A, C, np.zeros((1, 65, 2, 2), complex), NOISE, SCALE, DT))
 
 
 def test_a_channel_without_residual_is_no_obstacle():
     spectra = np.zeros((1, 65, 2, 2), complex)
     spectra[..., 1, 1] = 1e-4
-    found = residual_h2(A, C, spectra, NOISE, SCALE, DT)
+    found = residual_h2(ResidualProblem(A, C, spectra, NOISE, SCALE, DT))
     assert found.spectral_radius < 1
 
 
 def test_shapes_are_named():
     with pytest.raises(DimensionError, match=r"spectra \(unit, f, n, n\)"):
-        residual_h2(A, C, np.ones((65, 2, 2), complex), NOISE, SCALE, DT)
+        residual_h2(ResidualProblem(A, C, np.ones((65, 2, 2), complex), NOISE, SCALE, DT))
     with pytest.raises(DimensionError, match=r"\(f, n, n\)"):
         shaping_filter(np.ones((65, 2, 3), complex), Basis(), DT)
 
@@ -79,4 +79,4 @@ def test_banks_that_make_no_sense(options):
 
 def test_unobservable_plants_are_refused():
     with pytest.raises(SynthesisError, match="not detectable"):
-        residual_h2(np.diag([0.5, 1.2]), C, np.broadcast_to(np.eye(2) + 0j, (1, 65, 2, 2)), NOISE, SCALE, DT)
+        residual_h2(ResidualProblem(np.diag([0.5, 1.2]), C, np.broadcast_to(np.eye(2) + 0j, (1, 65, 2, 2)), NOISE, SCALE, DT))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .problem.observer_problem import ObserverProblem
     from .reduction.polishing import polish
     from .reduction.truncation import reduce_controller
-    from .residual_shaped.residual_h2 import residual_h2
+    from .residual_shaped.residual_h2 import ResidualProblem, residual_h2
     from .residual_shaped.shaping_filter import Basis, shaping_filter
     from .result import Injection, Status, Synthesis
     from .riccati.constant_gain import kalman, luenberger
@@ -38,6 +38,7 @@ _HOME = {
     "Injection": "result",
     "MuBounds": "structured.bounds",
     "ObserverProblem": "problem.observer_problem",
+    "ResidualProblem": "residual_shaped.residual_h2",
     "RobustGain": "worst_case.robust_gain",
     "Status": "result",
     "Synthesis": "result",
@@ -68,6 +69,7 @@ __all__ = [
     "Injection",
     "MuBounds",
     "ObserverProblem",
+    "ResidualProblem",
     "RobustGain",
     "Status",
     "Synthesis",

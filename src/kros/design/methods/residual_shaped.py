@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ...core.errors import SynthesisError
 from ...observer import Observer, ResidualModel, residual_models, tune_observer
-from ...synthesis import Synthesis, residual_h2
+from ...synthesis import ResidualProblem, Synthesis, residual_h2
 from ..task import DesignResult, DesignTask, first_of
 from ..validation import ValidationSet
 from .tuned import tuned_where_better
@@ -90,12 +90,7 @@ def gains_for(task: DesignTask, model: ResidualModel) -> Synthesis:
     """Return the synthesis for a model."""
     models, n = task.models, task.models.lifting.n_states
     return residual_h2(
-        model.dynamics,
-        task.selector[:, :n],
-        model.spectra,
-        task.noise,
-        models.output_scale[:n],
-        models.sample_period_s,
+        ResidualProblem(model.dynamics, task.selector[:, :n], model.spectra, task.noise, models.output_scale[:n], models.sample_period_s),
         n_lifted=models.lifting.n_lifted,
         max_order=MAX_ORDER,
     )

@@ -24,7 +24,7 @@ from ...core.errors import DataError
 from ...core.linalg import least_squares
 from ...data import EpisodeBatch
 from ...lifting import Lifting
-from ...synthesis.residual_shaped.residual_h2 import promised_errors
+from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, promised_errors
 from .one_step import mean_error_dynamics, one_step_residual, residual_spectra
 
 Array = npt.NDArray[np.float64]
@@ -129,7 +129,7 @@ def residual_models(
             matrix[list(rows)] = other[list(rows)]
         dynamics = mean_error_dynamics(lifting, own[0], x, u, values)
         chosen = spectra[..., picked, :][..., picked]
-        promised = promised_errors(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, batch.sample_period_s)
+        promised = promised_errors(ResidualProblem(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, batch.sample_period_s))
         models.append(ResidualModel(rows, own[0], own[1], dynamics, chosen, promised))
     return sorted(models, key=lambda m: float(np.sum(np.log(np.maximum(m.promised[hidden], np.finfo(float).tiny)))))
 

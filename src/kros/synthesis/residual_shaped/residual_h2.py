@@ -38,13 +38,56 @@ _CLOSE = 1.02
 _NEGLIGIBLE = 1e-12
 
 
+@dataclass(frozen=True, eq=False)
+class ResidualProblem:
+    """What a residual-shaped observer must be good at: error dynamics, the residuals of a population, measurement noise.
+
+    Parameters
+    ----------
+    A : ndarray, shape (n, n)
+        Error dynamics of the original states (`kros.observer.mean_error_dynamics`).
+    C : ndarray, shape (q, n)
+        Selects the measured states.
+    spectra : ndarray, shape (unit, f, n, n), complex
+        Cross spectral density of every unit's one-step residual (`kros.observer.residual_spectra`), physical units.
+    noise : ndarray, shape (q,)
+        Standard deviation of the measurement noise.
+    scale : ndarray, shape (n,)
+        Range of every state; norms are of errors in these units.
+    dt : float, s
+
+    Raises
+    ------
+    DimensionError
+        When the shapes do not fit together.
+    """
+
+    A: Array
+    C: Array
+    spectra: Spectra
+    noise: Array
+    scale: Array
+    dt: float
+
+    def __post_init__(self) -> None:
+        for name in ("A", "C", "noise", "scale"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        n, q = len(self.A), len(self.C)
+        found = self.A.shape, self.C.shape, self.noise.shape, self.scale.shape, self.spectra.shape[2:]
+        if found != ((n, n), (q, n), (q,), (n,), (n, n)) or self.spectra.ndim != 4:
+            raise DimensionError(
+                "Residual-shaped observer: needs A (n, n), C (q, n), spectra (unit, f, n, n), noise (q,), scale (n,), "
+                f"found {self.A.shape}, {self.C.shape}, {self.spectra.shape}, {self.noise.shape}, {self.scale.shape}."
+            )
+
+    def scaled(self, basis: Basis) -> _Scaled:
+        """Return the problem in scaled coordinates, for a basis of the shaping filter."""
+        x = self.scale
+        return _Scaled(self.A / x[:, None] * x, self.C * x, self.noise, self.spectra / np.outer(x, x), basis, self.dt)
+
+
 def residual_h2(
-    A: npt.ArrayLike,
-    C: npt.ArrayLike,
-    spectra: Spectra,
-    noise: npt.ArrayLike,
-    scale: npt.ArrayLike,
-    dt: float,
+    problem: ResidualProblem,
     bases: Sequence[Basis] = BASES,
     tolerance_percent: float = 1.0,
     worst_unit: bool = False,
@@ -55,19 +98,9 @@ def residual_h2(
 
     Parameters
     ----------
-    A : array_like, shape (n, n)
-        Error dynamics of the original states (`kros.observer.mean_error_dynamics`).
-    C : array_like, shape (q, n)
-        Selects the measured states.
-    spectra : ndarray, shape (unit, f, n, n), complex
-        Cross spectral density of every unit's one-step residual (`kros.observer.residual_spectra`), physical units.
-    noise : array_like, shape (q,)
-        Standard deviation of the measurement noise.
-    scale : array_like, shape (n,)
-        Range of every state; norms are of errors in these units.
-    dt : float, s
+    problem : ResidualProblem
     bases : sequence of Basis
-        Memories of the shaping filter that are tried: the one with the least error under the spectra as they were measured is kept. A lag
+        Bases of the shaping filter that are tried: the one with the least error under the spectra as they were measured is kept. A lag
         with a pole near one is a disturbance state, for loads.
     tolerance_percent : float
         What the reduction of the order from ``n * basis.size`` may cost in the RMS error of any state that is not measured; 0 keeps every
@@ -90,45 +123,34 @@ def residual_h2(
     SynthesisError
         When the residual has no spectrum to shape, or the Riccati equation no solution.
     """
-    A, C, noise, scale = (np.asarray(x, dtype=float) for x in (A, C, noise, scale))
-    n, q = len(A), len(C)
-    if (
-        A.shape != (n, n)
-        or C.shape != (q, n)
-        or noise.shape != (q,)
-        or scale.shape != (n,)
-        or spectra.ndim != 4
-        or spectra.shape[2:] != (n, n)
-    ):
-        raise DimensionError(
-            "Residual-shaped observer: needs A (n, n), C (q, n), spectra (unit, f, n, n), noise (q,), scale (n,), "
-            f"found {A.shape}, {C.shape}, {spectra.shape}, {noise.shape}, {scale.shape}."
-        )
     start = time.perf_counter()
-    scaled = A / scale[:, None] * scale, C * scale, noise, spectra / np.outer(scale, scale)
-    problem = (
-        min((_Problem(*scaled, basis, dt) for basis in bases), key=_Problem.promise) if len(bases) > 1 else _Problem(*scaled, bases[0], dt)
+    scaled = [problem.scaled(basis) for basis in bases]
+    shaped = min(scaled, key=_Scaled.promise) if len(scaled) > 1 else scaled[0]
+    weights, note = (
+        shaped.worst_unit()
+        if worst_unit
+        else (np.full(len(shaped.spectra), 1 / len(shaped.spectra)), f"mean of {len(shaped.spectra)} units")
     )
-    weights, note = problem.worst_unit() if worst_unit else (np.full(len(spectra), 1 / len(spectra)), f"mean of {len(spectra)} units")
-    full = problem.filter(weights)
-    K = problem.correction(full)
-    best = problem.norm(full, K)
+    full = shaped.filter(weights)
+    K = shaped.correction(full)
+    best = shaped.norm(full, K)
     if not np.isfinite(best):
         raise SynthesisError(
             "Residual-shaped observer: the error of the optimal observer is not bounded; check the nominal model and what is measured."
         )
-    K = problem.reduced(full, K, tolerance_percent, max_order)
-    norm, radius = problem.norm(full, K), float(problem.error_system(K).spectral_radius())
-    note += f", {problem.basis.delays} delays, lags {problem.basis.poles}"
+    K = shaped.reduced(full, K, tolerance_percent, max_order)
+    norm, radius = shaped.norm(full, K), float(shaped.error_system(K).spectral_radius())
+    note += f", {shaped.basis.delays} delays, lags {shaped.basis.poles}"
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
-    lower, gap, notes = enclosed(norm, problem.lower_bound(full))
+    lower, gap, notes = enclosed(norm, shaped.lower_bound(full))
+    scale, n, q = problem.scale[:, None], *problem.C.shape[::-1]
     rows = np.zeros(((n_lifted or n) - n, q))
     controller = StateSpace(
         K.A,
         K.B,
-        np.vstack([scale[:, None] * K.C, np.zeros((len(rows), K.n_states))]),
-        np.vstack([scale[:, None] * K.D, rows]),
-        dt,
+        np.vstack([scale * K.C, np.zeros((len(rows), K.n_states))]),
+        np.vstack([scale * K.D, rows]),
+        problem.dt,
     )
     return Synthesis(
         method="residual_h2",
@@ -145,21 +167,21 @@ def residual_h2(
     )
 
 
-def promised_errors(A: Array, C: Array, spectra: Spectra, noise: Array, scale: Array, dt: float, basis: Basis = BASES[1]) -> Array:
+def promised_errors(problem: ResidualProblem) -> Array:
     """Return the root mean square error of every state, as a share of its largest value, that a residual-shaped observer would have on the spectra as measured.
 
-    Parameters as in `residual_h2`; the mean over units is taken, the order is not reduced. Infinite where there is no observer.
+    The mean over units is taken, the order is not reduced. Infinite where there is no observer.
     """
-    problem = _Problem(A / scale[:, None] * scale, C * scale, noise, spectra / np.outer(scale, scale), basis, dt)
+    shaped = problem.scaled(BASES[1])
     try:
-        K = problem.correction(problem.filter(np.full(len(spectra), 1 / len(spectra))))
+        K = shaped.correction(shaped.filter(np.full(len(shaped.spectra), 1 / len(shaped.spectra))))
     except SynthesisError:
-        return np.full(len(A), np.inf)
-    return np.asarray(np.sqrt(problem.unit_errors(K).mean(axis=0)))
+        return np.full(len(shaped.A), np.inf)
+    return np.asarray(np.sqrt(shaped.unit_errors(K).mean(axis=0)))
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _Scaled:
     """The problem in scaled coordinates."""
 
     A: Array

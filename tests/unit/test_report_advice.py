@@ -72,7 +72,7 @@ def test_flagged_units_come_first_and_count_until_they_are_dropped() -> None:
         {"unit": u, "condition": "load", "score": s, "outlier": s > 5, "freq_hz": 17.4} for u, s in (("a", 6.0), ("z", 9.0), ("b", 1.0))
     ]
     (first, *_) = advice(metrics(outliers=rows, units=[{"unit": u, "group": ""} for u in "abz"]))
-    assert first.startswith("Inspect z (loaded, stands out most at 17.4 Hz), a (loaded, stands out most at 17.4 Hz) before shipping.")
+    assert first.startswith("Inspect z (loaded, differs most at 17.4 Hz), a (loaded, differs most at 17.4 Hz) before shipping.")
     assert "drop_outliers" in first
     filed = metrics(outliers=rows[1:], units=[{"unit": "z", "group": "outliers"}])
     assert "drop_outliers" not in advice(filed)[0]

@@ -97,7 +97,7 @@ def test_verdict_tells_the_numbers() -> None:
     told = {**METRICS["study"], "channels": {"velocity": "rad/s"}}  # type: ignore[dict-item]
     rows = [{**r, "rms": {"b": 0.01, "c": 0.03}.get(str(r["unit"]), 9.0)} for r in ROWS]
     text = " ".join(verdict({**METRICS, "study": told, "evaluation": rows}, ("position",)))
-    assert "velocity to 0.300 % of the largest value (RMS 0.0200 rad/s) (0.400 % on the worst unit, c)" in text
+    assert "velocity to 0.300 % of the largest value (RMS 0.0200 rad/s; 0.400 % on the worst unit, c)" in text
     assert "Open loop, the nominal model alone, gives velocity 0.600 % (2.0 times as much)." in text
     assert "The tuned Kalman filter diverges on some units." in text
     assert "at most 12.0 % above" in text

@@ -54,12 +54,12 @@ def _undecided(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _where(row: Mapping[str, Any]) -> str:
-    at = f", stands out most at {number(row['freq_hz'])} Hz" if row.get("freq_hz") is not None else ""
+    at = f", differs most at {number(row['freq_hz'])} Hz" if row.get("freq_hz") is not None else ""
     return f"{condition_label(row['condition'])}{at}"
 
 
 def _observer(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str]:
-    """Export it where it is better than nothing at all."""
+    """Say whether the deployed observer should be used."""
     name = metrics["study"]["deployed"]
     tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
     if not tables or name not in tables[0].cells:

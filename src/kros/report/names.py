@@ -36,7 +36,7 @@ _METHOD_TONES = {
     "filtered_difference": Tone.GOLD,
     "learned": Tone.GREEN,
 }
-BASELINES = ("open_loop", "kalman_white", "kalman_tuned", "luenberger", "ekf", "filtered_difference", "learned")
+BASELINES = tuple(_METHOD_TONES)
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNITS = {"1": "fraction", "": ""}
 

@@ -87,9 +87,9 @@ def _better(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
 
 def _channel(table: ErrorTable, name: str, channel: str, unit: str) -> str:
     cell = table.cells[name][channel]
-    worst = f" ({number(cell.worst)} % on the worst unit, {cell.worst_unit})" if cell.worst is not None else ""
-    rms = f" (RMS {number(cell.rms)}{' ' + unit if unit not in ('', '1') else ''})" if cell.rms is not None else ""
-    return f"{channel.replace('_', ' ')} to {number(cell.mean)} % of the largest value{rms}{worst}"
+    more = [f"RMS {number(cell.rms)}{' ' + unit if unit not in ('', '1') else ''}"] if cell.rms is not None else []
+    more += [f"{number(cell.worst)} % on the worst unit, {cell.worst_unit}"] if cell.worst is not None else []
+    return f"{channel.replace('_', ' ')} to {number(cell.mean)} % of the largest value" + (f" ({'; '.join(more)})" if more else "")
 
 
 def _comparison(table: ErrorTable, name: str, method: str, label: str, channels: list[str]) -> list[str]:

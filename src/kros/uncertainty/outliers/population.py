@@ -50,8 +50,8 @@ def score_population(models: IdentifiedModels, settings: UncertaintySettings) ->
             false_alarm_rate=settings.false_alarm_rate,
             deviations=[recorded.deviations(e) for e in evidence],
         )
-        judged = tuple(recorded.judged(*pair) for pair in zip(outliers.scores, evidence, strict=True))
-        found[place] = outliers = replace(outliers, scores=judged)
+        qualified = tuple(recorded.qualified(*pair) for pair in zip(outliers.scores, evidence, strict=True))
+        found[place] = outliers = replace(outliers, scores=qualified)
         for score, data in zip(outliers.scores, evidence, strict=True):
             keys, used = (models.facts.keys(part, score.unit, condition) for part in ("test", "train"))
             seconds = data.n_samples * own.sample_period_s * (1 + len(keys) / len(used))  # episodes that are held out, like the others

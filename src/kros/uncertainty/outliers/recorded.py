@@ -125,7 +125,7 @@ class Recorded:
         clearly = ratio > chi2.ppf(_UNLIKELY, own - 1) / (own - 1)
         return draws * np.sqrt(ratio) if clearly else draws
 
-    def judged(self, score: OutlierScore, evidence: Evidence) -> OutlierScore:
+    def qualified(self, score: OutlierScore, evidence: Evidence) -> OutlierScore:
         """Return what can be said about a unit; nothing where it was recorded for less than any episode of the study, of which none can be drawn."""
         if _STEP * evidence.n_samples >= self.shortest:
             return score

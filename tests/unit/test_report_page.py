@@ -9,6 +9,7 @@ import sys
 from html.parser import HTMLParser
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import matplotlib
@@ -23,8 +24,11 @@ from kros.core.errors import ConfigError, DataError
 from kros.core.lti import StateSpace, gain
 from kros.data import from_arrays, write_parquet
 from kros.data.population import Channel, EpisodeKey, Population, Role, Unit
+from kros.data.survey import RecordingFacts
+from kros.design import Design
 from kros.evaluate import standard_disturbances
 from kros.identify import KoopmanMatrices, ModelSet, PhaseCalibration, PhaseSpec, UnitPhase
+from kros.identify.identified import IdentifiedModels
 from kros.identify.refine import RefinedModels, TradeOff
 from kros.lifting import Lifting
 from kros.observer import Observer
@@ -57,6 +61,7 @@ from kros.uncertainty import (
     residual,
     score_outliers,
 )
+from kros.uncertainty.quantify import UncertainModels
 from kros.uncertainty.unit_residuals import UnitResiduals
 
 DT = 0.001
@@ -660,3 +665,26 @@ def test_a_run_is_plotted_by_any_figure_of_its_report(finished: tuple[Path, dict
         plot(run, name="load_torque")
     with pytest.raises(ConfigError, match="no figure 'beauty'"):
         plot(run, name="beauty")
+
+
+def test_results_of_the_short_way_are_plotted(uncertain: dict[str, UncertainModel]) -> None:
+    keys = [EpisodeKey(unit, "noload", "1") for unit in UNITS]
+    signals = np.hstack(shown_signals(0))
+    population = Population(CHANNELS, DT, tuple(Unit(u) for u in UNITS), tuple(keys), lambda key: signals)
+    facts = RecordingFacts("noload", {u: "" for u in UNITS}, tuple(keys), tuple(keys), {})
+    kind = "linear_edmd"
+    found = IdentifiedModels(population, facts, Lifting(STATES), None, (kind,), {kind: models(kind, "noload", 1)})
+    assert len(plot(found).axes) == len(STATES) * 2
+    sets = UncertainModels(found, "001", "002", (), {kind: uncertain[kind]})
+    assert len(plot(sets).axes) == 3
+    assert len(plot(sets, entries=True).axes) == 4
+    with pytest.raises(ConfigError, match="no set of kind 'koopman'"):
+        plot(sets, kind="koopman")
+    made = synthesis(len(STATES), "h2")
+    own = found.models()
+    observer = Observer(f"{kind}/h2", own.lifting, own.A[1], own.B[1], (0,), own.inputs, made.controller, Injection.STATE, DT)
+    design = Design(observer.name, observer, made, SimpleNamespace(certified=True, gain=2.0), {"hidden_error_percent": 1.0})
+    assert any(text.get_text() == "gain 2.00" for text in plot(design).axes[1].texts)
+    drawn = plot(design, models=found).axes[1].lines
+    assert [line.get_label() for line in drawn] == ["recorded", observer_label(observer.name)]
+    assert drawn[0].get_ydata().max() == pytest.approx(signals[:, 1].max())

@@ -64,9 +64,12 @@ def entries_figure(found: Mapping[str, UnitResiduals], names: Mapping[str, Names
     for name, residuals in found.items():
         p, m = sizes[name]
         _draw_block(axes[top : top + p, left : left + m], residuals, names[name], model_label(name), alarm)
-        for panel in [] if together else axes[top : top + p, m:].ravel():
+        if together:
+            left += m
+            continue
+        for panel in axes[top : top + p, m:].ravel():
             panel.axis("off")
-        top, left = (top, left + m) if together else (top + p, left)
+        top += p
     for panel in axes[:, 0]:
         panel.set_ylabel(f"{panel.get_ylabel()}\n(dB)")
     axes[0, 0].set_ylim(*_limits([decibel(r.entries) for r in found.values()]))

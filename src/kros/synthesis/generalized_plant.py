@@ -180,9 +180,13 @@ class GeneralizedPlant:
         return StateSpace(A, np.vstack([self.B1 + self.B2 @ u_w, K.B @ y_w]), C, self.D11 + self.D12 @ u_w, self.dt)
 
 
-def partitioned(system: StateSpace, w: dict[str, int], z: dict[str, int]) -> GeneralizedPlant:
-    """Cut a system from (w, u) to (z, y) into the nine matrices; channel 1 is all but the perturbation's part."""
-    n_w, n_z = sum(w.values()), sum(z.values())
+def split(system: StateSpace, n_w: int, n_z: int, **parts: Any) -> GeneralizedPlant:
+    """Cut a system from (w, u) to (z, y) into the nine matrices; `parts` as in `GeneralizedPlant`."""
     B, C, D = system.B, system.C, system.D
     matrices = (system.A, B[:, :n_w], B[:, n_w:], C[:n_z], C[n_z:], D[:n_z, :n_w], D[:n_z, n_w:], D[n_z:, :n_w], D[n_z:, n_w:])
-    return GeneralizedPlant(*matrices, system.dt, n_w1=w.get("w1"), n_z1=z.get("z1"), w_parts=w, z_parts=z)
+    return GeneralizedPlant(*matrices, system.dt, **parts)
+
+
+def partitioned(system: StateSpace, w: dict[str, int], z: dict[str, int]) -> GeneralizedPlant:
+    """Cut a system from (w, u) to (z, y); channel 1 is all but the perturbation's part."""
+    return split(system, sum(w.values()), sum(z.values()), n_w1=w.get("w1"), n_z1=z.get("z1"), w_parts=w, z_parts=z)

@@ -21,7 +21,7 @@ import numpy as np
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
-from ..generalized_plant import GeneralizedPlant
+from ..generalized_plant import GeneralizedPlant, split
 from ..riccati.hinf_coordinates import to_discrete
 
 
@@ -49,21 +49,7 @@ def discrete_twin(plant: GeneralizedPlant, a: float) -> GeneralizedPlant:
         np.block([[D11, D12], [plant.D21, np.zeros((n_y, n_u))]]),
         0.0,
     )
-    d = to_discrete(system, 1.0)
-    return GeneralizedPlant(
-        d.A,
-        d.B[:, :n_w],
-        d.B[:, n_w:],
-        d.C[:n_z],
-        d.C[n_z:],
-        d.D[:n_z, :n_w],
-        d.D[:n_z, n_w:],
-        d.D[n_z:, :n_w],
-        d.D[n_z:, n_w:],
-        1.0,
-        plant.n_w1,
-        plant.n_z1,
-    )
+    return split(to_discrete(system, 1.0), n_w, n_z, n_w1=plant.n_w1, n_z1=plant.n_z1)
 
 
 def continuous_controller(K: StateSpace, a: float) -> StateSpace:

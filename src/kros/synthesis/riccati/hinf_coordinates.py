@@ -22,7 +22,7 @@ from scipy.linalg import LinAlgError, matrix_balance
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
-from ..generalized_plant import GeneralizedPlant
+from ..generalized_plant import GeneralizedPlant, split
 from ..reduction.balancing import Balancing, gramian_root
 from .equations import solve_riccati
 from .h2_optimal import absorb_feedthrough
@@ -143,10 +143,7 @@ def _feed_back(p: GeneralizedPlant, K: Array) -> GeneralizedPlant:
 
 
 def _continuous(p: GeneralizedPlant) -> GeneralizedPlant:
-    _, n_w, _, n_z, _ = p.sizes
-    s = to_continuous(p.open_loop())
-    B, C, D = s.B, s.C, s.D
-    return GeneralizedPlant(s.A, B[:, :n_w], B[:, n_w:], C[:n_z], C[n_z:], D[:n_z, :n_w], D[:n_z, n_w:], D[n_z:, :n_w], D[n_z:, n_w:], 0.0)
+    return split(to_continuous(p.open_loop()), p.sizes[1], p.sizes[3])
 
 
 def scaled(p: GeneralizedPlant) -> GeneralizedPlant:

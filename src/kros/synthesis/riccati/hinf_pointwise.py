@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.linalg import adjoint
 from ..generalized_plant import GeneralizedPlant
 from .hinf_pencil import Side
 
@@ -81,11 +82,11 @@ def _at(s: Side, rad: Array) -> Array:
     # Constraints that only rounding tells from others are none: where K has no effect on z the kernel is larger than sizes say.
     free = np.ones((len(rad), n + m), bool)
     free[:, : values.shape[1]] = values <= 10 * (n + m) * _EPS * values[:, :1]
-    kernel = np.conj(np.swapaxes(Vh, 1, 2)) * free[:, None, :]
+    kernel = adjoint(Vh) * free[:, None, :]
     # Combinations of the kernel with w = 0 prove nothing; those with next to none only as much as rounding leaves.
     _, values, Vh = np.linalg.svd(kernel[:, n:])
     kept = values > _RANK
     k = values.shape[1]
-    signals = kernel @ np.conj(np.swapaxes(Vh[:, :k], 1, 2)) * np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)[:, None, :]
+    signals = kernel @ adjoint(Vh[:, :k]) * np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)[:, None, :]
     found = np.linalg.norm(s.C @ signals[:, :n] + s.D @ signals[:, n:], 2, axis=(-2, -1))
     return np.asarray(found * (1 - 100 * (n + m) * _EPS / np.where(kept, values, 1.0).min(axis=1)))

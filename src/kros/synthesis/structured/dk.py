@@ -26,7 +26,7 @@ from ...core.frequency import log_grid
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.norms import h2_norm, hinf_norm
 from ...uncertainty.fits.magnitude import invert
-from ..generalized_plant import GeneralizedPlant
+from ..generalized_plant import GeneralizedPlant, split
 from ..reduction.balancing import Balancing, gramian_root
 from ..result import Status, Synthesis
 from ..riccati.h2_optimal import stability_margin
@@ -142,10 +142,7 @@ def scale(plant: GeneralizedPlant, left: StateSpace, right: StateSpace) -> Gener
     if system.is_stable():  # the Riccati equations lose digits in the coordinates of a series connection
         balancing = Balancing.of(gramian_root(system.A, system.B, system.dt), gramian_root(system.A.T, system.C.T, system.dt))
         system = balancing.truncated(system, system.n_states)
-    n_w, n_z = plant.sizes[1], plant.sizes[3]
-    B1, B2, C1, C2 = system.B[:, :n_w], system.B[:, n_w:], system.C[:n_z], system.C[n_z:]
-    D = system.D
-    return GeneralizedPlant(system.A, B1, B2, C1, C2, D[:n_z, :n_w], D[:n_z, n_w:], D[n_z:, :n_w], D[n_z:, n_w:], plant.dt)
+    return split(system, plant.sizes[1], plant.sizes[3])
 
 
 def _pass_through(system: StateSpace, others: int) -> StateSpace:

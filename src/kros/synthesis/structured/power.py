@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.linalg import adjoint
 from .blocks import Structure
 
 Array = npt.NDArray[Any]
@@ -53,7 +54,7 @@ def power_iteration(M: Array, structure: Structure, starts: int = 5, iterations:
         for _ in range(iterations):
             a = _unit(M @ b[..., None])
             left = _left(a, r, structure)
-            r = _unit(np.conj(np.swapaxes(M, -1, -2)) @ left[..., None])
+            r = _unit(adjoint(M) @ left[..., None])
             b = (_perturbation(a, r, structure) @ a[..., None])[..., 0]
         Delta = _perturbation(a, r, structure)
         value = np.abs(np.linalg.eigvals(M @ Delta)).max(axis=-1)

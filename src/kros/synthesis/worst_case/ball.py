@@ -112,8 +112,8 @@ class Ball:
         U_q, _, _ = np.linalg.svd(self.right)
         k = min(P.shape[-1], self.right.shape[-2])
         starts = (
-            _polar(adjoint(self.left) @ self.center @ adjoint(self.right)),  # aligned with the centre
-            _polar(adjoint(P) @ (T @ self.center) @ adjoint(self.right)),  # aligned with the centre, as T sees it
+            polar(adjoint(self.left) @ self.center @ adjoint(self.right)),  # aligned with the centre
+            polar(adjoint(P) @ (T @ self.center) @ adjoint(self.right)),  # aligned with the centre, as T sees it
             adjoint(Vh_p)[..., :k] @ adjoint(U_q)[..., :k, :],  # worst without the centre
         )
         best, best_value = starts[0], np.full(T.shape[:-2], -1.0)
@@ -124,7 +124,7 @@ class Ball:
                     value = np.linalg.norm(error, axis=(-2, -1))
                     better = value > best_value * (1 + 1e-6)
                     best, best_value = np.where(better[..., None, None], theta, best), np.where(better, value, best_value)
-                theta = _polar(adjoint(P) @ error @ adjoint(self.right))
+                theta = polar(adjoint(P) @ error @ adjoint(self.right))
         return best
 
 
@@ -149,6 +149,7 @@ def below(spectrum: Array) -> Array:
     return power * np.clip(least, 0.0, 1.0)[:, None]
 
 
-def _polar(matrix: Array) -> Array:
+def polar(matrix: Array) -> Array:
+    """Return the unitary polar factors, shape (f, a, b)."""
     U, _, Vh = np.linalg.svd(matrix, full_matrices=False)
     return U @ Vh

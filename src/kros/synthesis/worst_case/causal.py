@@ -25,9 +25,10 @@ import numpy.typing as npt
 from ...core.linalg import adjoint
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.norms import h2_norm
-from ..generalized_plant import GeneralizedPlant
+from ..generalized_plant import split
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import generalized_plant
+from .ball import polar
 from .disturbance import design_grid
 
 Array = npt.NDArray[Any]
@@ -80,20 +81,10 @@ def perturbed(problem: ObserverProblem, closed: StateSpace, delta: StateSpace, r
     u, y = np.concatenate(acts), np.concatenate(sees)
     w = np.setdiff1d(np.arange(closed.n_inputs), u)
     z = plant.part("z", "z1")
-    D = closed.D
-    split = GeneralizedPlant(
-        closed.A,
-        closed.B[:, w],
-        closed.B[:, u],
-        closed.C[z],
-        closed.C[y],
-        D[np.ix_(z, w)],
-        D[np.ix_(z, u)],
-        D[np.ix_(y, w)],
-        D[np.ix_(y, u)],
-        closed.dt,
-    )
-    return split.close(block_diagonal([delta, rest]) if len(acts) == 2 and rest is not None else delta)
+    ins, outs = np.concatenate([w, u]), np.concatenate([z, y])
+    ordered = StateSpace(closed.A, closed.B[:, ins], closed.C[outs], closed.D[np.ix_(outs, ins)], closed.dt)
+    whole = split(ordered, len(w), len(z))
+    return whole.close(block_diagonal([delta, rest]) if len(acts) == 2 and rest is not None else delta)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +140,8 @@ class _Parts:
             better = value > best
             best = np.where(better, value, best)
             best_R, best_rest = np.where(better[:, None, None], R, best_R), np.where(better[:, None, None], rest, best_rest)
-            R = _polar(np.real(np.conj(lag) * (adjoint(left) @ error @ adjoint(right))).sum(axis=1))
-            rest = _polar(np.real(adjoint(self.T_r) @ error @ adjoint(self.M_r)).sum(axis=1))
+            R = polar(np.real(np.conj(lag) * (adjoint(left) @ error @ adjoint(right))).sum(axis=1))
+            rest = polar(np.real(adjoint(self.T_r) @ error @ adjoint(self.M_r)).sum(axis=1))
         return best, best_R, best_rest
 
 
@@ -164,8 +155,3 @@ def _times(a: StateSpace, R: Array) -> StateSpace:
     """``a(z) R`` for one filter a and a matrix."""
     R = R * (1 - 1e-12)
     return block_diagonal([a] * len(R)) @ gain(R, a.dt)
-
-
-def _polar(matrix: Array) -> Array:
-    U, _, Vh = np.linalg.svd(matrix, full_matrices=False)
-    return U @ Vh

@@ -24,6 +24,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.linalg import adjoint
+
 Array = npt.NDArray[Any]
 
 _SWEEPS = 10
@@ -42,7 +44,7 @@ def dual_bound(a: Array, P: Array, Q: Array) -> Array:
     U, s, _ = np.linalg.svd(P, full_matrices=False)
     _, q, Hh = np.linalg.svd(Q, full_matrices=False)
     d = (s[..., :, None] * q[..., None, :]) ** 2
-    rotated = np.conj(np.swapaxes(U, -1, -2)) @ a @ np.conj(np.swapaxes(Hh, -1, -2))
+    rotated = adjoint(U) @ a @ adjoint(Hh)
     c = d * np.abs(rotated) ** 2
     g, multipliers = _without_centre(s, q)
     g = g + np.sqrt(c.sum(axis=(-2, -1)) / max(s.shape[-1], 1))[..., None]

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.linalg import adjoint
 from ...core.lti import StateSpace
 from .arcs import Enclosure, least_ratio
 from .ball import below
@@ -122,7 +123,7 @@ class Everywhere:
             size_L = np.linalg.norm(L, axis=-1)
             least_L = np.maximum(size_L - reach_L, 0.0)
         else:
-            size_L = np.sqrt(below(L @ np.conj(np.swapaxes(L, -1, -2))))
+            size_L = np.sqrt(below(L @ adjoint(L)))
             least_L = size_L * _kept(size_L, np.linalg.norm(reach_L, axis=-1))
         return share * np.maximum(size_Q - far_Q, 0.0)[:, None] * least_L, share * size_Q[:, None] * size_L
 

@@ -87,6 +87,13 @@ def decibel(values: npt.ArrayLike) -> Array:
     return 20 * np.log10(np.where(magnitude > 0, magnitude, np.nan))
 
 
+def line_over_shade(axes: Axes, freqs_hz: Array, line: Array, shade: Array, colour: str, style: str = "-") -> None:
+    """Draw magnitudes over frequency in dB, above a broad light line of what they are compared with."""
+    freqs, below = thin_log(freqs_hz, shade)
+    axes.plot(freqs, decibel(below), color=colour, lw=3.2, alpha=0.3, solid_capstyle="butt")
+    axes.plot(freqs, decibel(thin_log(freqs_hz, line)[1]), style, color=colour)
+
+
 def lines_of_units(axes: Axes, freqs_hz: Array, lines: Array, colour: str, label: str) -> None:
     """Draw thin lines, shape (unit, frequency) in dB, a unit each; a unit without a residual is left out."""
     from matplotlib.collections import LineCollection

@@ -38,7 +38,18 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     )
     text += _beyond(chosen)
     text += " Dashed: the paper's variants of both output forms, 0 dB and more everywhere whatever the units do." if variants else ""
-    return forms_figure(chosen, variants), text
+    figure, axes = grid(1, len(chosen), 3.3, sharey=True)
+    for panel, (name, model) in zip(axes[0], chosen.items(), strict=True):
+        draw_forms(panel, model)
+        _draw_variants(panel, variants.get(name, {}))
+        panel.set_title(model_label(name))
+    axes[0, 0].set_ylabel("largest residual (dB)")
+    limits = [window(model) for model in chosen.values()]
+    axes[0, 0].set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
+    last = list(chosen.values())[-1]
+    ends = [(float(decibel(bound)[-1]), form_label(form.value), FORM_TONES[form].light) for form, bound in last.bounds.items()]
+    end_labels(axes[0, -1], ends, spacing=0.06)
+    return figure, text
 
 
 def _beyond(models: Mapping[str, UncertainModel]) -> str:
@@ -69,22 +80,6 @@ def paper_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tuple[Ar
         row = model.unit_ids.index(nominal) if nominal in model.unit_ids else 0
         found[form] = (freqs, bounds(form, response, paper=True, nominals=[row])[0])
     return found
-
-
-def forms_figure(models: Mapping[str, UncertainModel], variants: Mapping[str, Mapping[Form, tuple[Array, Array]]]) -> Figure:
-    """Draw the bounds of six forms, a panel a model, and variants of a form (frequencies and bounds) dashed."""
-    figure, axes = grid(1, len(models), 3.3, sharey=True)
-    for panel, (name, model) in zip(axes[0], models.items(), strict=True):
-        draw_forms(panel, model)
-        _draw_variants(panel, variants.get(name, {}))
-        panel.set_title(model_label(name))
-    axes[0, 0].set_ylabel("largest residual (dB)")
-    limits = [window(model) for model in models.values()]
-    axes[0, 0].set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
-    last = list(models.values())[-1]
-    ends = [(float(decibel(bound)[-1]), form_label(form.value), FORM_TONES[form].light) for form, bound in last.bounds.items()]
-    end_labels(axes[0, -1], ends, spacing=0.06)
-    return figure
 
 
 def window(model: UncertainModel) -> tuple[float, float]:

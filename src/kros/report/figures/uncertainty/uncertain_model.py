@@ -6,7 +6,7 @@ from ....core.errors import ConfigError
 from ....identify import ModelSet
 from ....uncertainty import UncertainModel
 from ....uncertainty.quantify import UncertainModels
-from ...canvas import Axes, Figure, decibel, end_labels, frequency_axis, grid, thin_log
+from ...canvas import Axes, Figure, decibel, end_labels, frequency_axis, grid, line_over_shade
 from ...names import form_label
 from ...theme import HUES
 from ..residuals import beside, entries_figure, entry_names, ratio_panel
@@ -53,9 +53,7 @@ def _weights(axes: Axes, model: UncertainModel) -> None:
     cover = in_gauge(model.cover, fitted)
     for side, lines, covers, style in (("left", fitted.left, cover.left, "-"), ("right", fitted.right, cover.right, "--")):
         for i, tone in zip(range(lines.shape[1]), HUES, strict=False):
-            freqs, line = thin_log(model.freqs_hz, lines[:, i])
-            axes.plot(freqs, decibel(thin_log(model.freqs_hz, covers[:, i])[1]), color=tone.light, lw=3, alpha=0.3)
-            axes.plot(freqs, decibel(line), style, color=tone.light)
+            line_over_shade(axes, model.freqs_hz, lines[:, i], covers[:, i], tone.light, style)
             ends.append((float(decibel(lines[:, i])[-1]), f"{side} {i + 1}", tone.light))
     axes.set_title("weights as used, over the optimal cover (shaded)")
     end_labels(axes, ends)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from ....uncertainty import Cover, Form, Structure, UncertainModel, sigma_max
-from ....uncertainty.unit_residuals import UnitResiduals
-from ...canvas import Array, Axes, Figure, decibel, frequency_axis, grid, label_below, note, thin_log
+from ...canvas import Array, Axes, Figure, decibel, frequency_axis, grid, label_below, line_over_shade, note
 from ...names import best_models, model_label, number
 from ...run_folder import NotShownError, RunFolder
 from ...theme import HUES, Tone
@@ -32,30 +31,23 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     except NotShownError:
         found = {}
     text += " Last column: every unit over the weights; at most 0 dB, so all are covered." if found else ""
-    return weights_figure(chosen, names, found), text
+    square = all(m.weight.left.n_outputs == m.weight.right.n_outputs for m in chosen.values())
+    titles = ["left weight", "right weight", *(["product"] if square else []), *(["units over weights"] if found else [])]
+    figure, axes = grid(len(chosen), len(titles), 2.0, sharex=True)
+    for row, (name, model) in zip(axes, chosen.items(), strict=True):
+        _draw_row(row, model, names[name], square)
+        if name in found:
+            ratio_panel(row[-1], found[name])
+        row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
+    for panel, title in zip(axes[0], titles, strict=True):
+        panel.set_title(title)
+    label_below(axes[-1])
+    return figure, text
 
 
 def _entry_names(model: UncertainModel, run: RunFolder, name: str) -> Sequence[str] | None:
     models = run.models.get(name)
     return None if models is None or model.form not in _INPUT_SIDE else models.inputs
-
-
-def weights_figure(
-    models: Mapping[str, UncertainModel], names: Mapping[str, Sequence[str] | None], residuals: Mapping[str, UnitResiduals]
-) -> Figure:
-    """Draw left and right weights, their product, and every unit over the weights where known, a row a model; `names` are the signals behind entries."""
-    square = all(m.weight.left.n_outputs == m.weight.right.n_outputs for m in models.values())
-    titles = ["left weight", "right weight", *(["product"] if square else []), *(["units over weights"] if residuals else [])]
-    figure, axes = grid(len(models), len(titles), 2.0, sharex=True)
-    for row, (name, model) in zip(axes, models.items(), strict=True):
-        _draw_row(row, model, names[name], square)
-        if name in residuals:
-            ratio_panel(row[-1], residuals[name])
-        row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
-    for panel, title in zip(axes[0], titles, strict=True):
-        panel.set_title(title)
-    label_below(axes[-1])
-    return figure
 
 
 def _draw_row(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] | None, square: bool) -> None:
@@ -87,11 +79,8 @@ def _draw_entries(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, 
     ends = []
     frequency_axis(axes, freqs_hz, "", 4)
     for i, tone in zip(range(magnitudes.shape[1]), HUES, strict=False):
-        freqs, line = thin_log(freqs_hz, magnitudes[:, i])
-        _, below = thin_log(freqs_hz, cover[:, i])
-        axes.plot(freqs, decibel(below), color=tone.light, lw=3.2, alpha=0.3, solid_capstyle="butt")
-        axes.plot(freqs, decibel(line), color=tone.light, lw=1.2)
-        ends.append((float(decibel(line)[0]), labels[i].replace("_", " "), tone.light))
+        line_over_shade(axes, freqs_hz, magnitudes[:, i], cover[:, i], tone.light)
+        ends.append((float(decibel(magnitudes[0, i])), labels[i].replace("_", " "), tone.light))
     if np.allclose(magnitudes, 1.0):
         axes.set_ylim(-20, 10)
     _start_labels(axes, ends)
@@ -105,12 +94,8 @@ def _start_labels(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
         note(axes, text, (0, 1), (5, -9 * place - 1), va="top", color=colour)
 
 
-def _draw_product(axes: Axes, freqs_hz: Array, product: Array, cover: Array | None) -> None:
+def _draw_product(axes: Axes, freqs_hz: Array, product: Array, cover: Array) -> None:
     frequency_axis(axes, freqs_hz, "", 4)
-    freqs, line = thin_log(freqs_hz, product)
-    if cover is not None:
-        _, below = thin_log(freqs_hz, cover)
-        axes.plot(freqs, decibel(below), color=Tone.INK.light, lw=3.2, alpha=0.25, solid_capstyle="butt")
-    axes.plot(freqs, decibel(line), color=Tone.INK.light, lw=1.2)
+    line_over_shade(axes, freqs_hz, product, cover, Tone.INK.light)
     axes.axhline(0, color=Tone.ALARM.light, lw=0.9, ls="--")
     note(axes, "0 dB", (0, 0), (4, -3), xycoords=("axes fraction", "data"), va="top", color=Tone.ALARM.light)

@@ -96,9 +96,18 @@ def norm(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, dt: float, 
 
 
 def gridded(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, dt: float) -> float:
-    """Largest gain on a dense grid around the poles."""
-    response = np.linalg.norm(StateSpace(A, B, C, D, dt).frequency_response(dense(A, dt)), 2, axis=(-2, -1))
-    return float(response.max())
+    """Largest gain on a dense grid around the poles, refined between the neighbours of its highest points."""
+    system, freqs = StateSpace(A, B, C, D, dt), dense(A, dt)
+    gains = np.linalg.norm(system.frequency_response(freqs), 2, axis=(-2, -1))
+    best = float(gains.max())
+    for k in np.argsort(-gains)[:5]:
+        low, high = freqs[max(k - 1, 0)], freqs[min(k + 1, len(freqs) - 1)]
+        for _ in range(6):
+            inner = np.linspace(low, high, 21)
+            found = np.linalg.norm(system.frequency_response(inner), 2, axis=(-2, -1))
+            best, top = max(best, float(found.max())), int(found.argmax())
+            low, high = inner[max(top - 1, 0)], inner[min(top + 1, 20)]
+    return best
 
 
 def dense(A: np.ndarray, dt: float) -> np.ndarray:

@@ -97,7 +97,7 @@ def hinf(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The best controller so far with its recomputed norm, and the proven bound; later frames are for levels where earlier ones fail."""
+    """The best controller so far with its recomputed norm, and the proven bound; later coordinates are for levels where earlier ones fail."""
 
     plant: GeneralizedPlant
     frames: tuple[Coordinates, ...]

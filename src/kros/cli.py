@@ -28,6 +28,7 @@ app = typer.Typer(
 Quiet = Annotated[bool, typer.Option("--json", help="Print metrics.json and nothing else on standard output.")]
 Workers = Annotated[int | None, typer.Option(help="Processes for maps over units; default: one a core.")]
 Scheduler = Annotated[str | None, typer.Option(help="Address of a Dask scheduler to use instead of processes.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the study.")]
 Seed = Annotated[int, typer.Option(min=0)]
 
 
@@ -58,6 +59,7 @@ def demo(
     episodes: Annotated[int, typer.Option(min=2, max=1000)] = 10,
     seconds: Annotated[float, typer.Option(min=5)] = 20.0,
     seed: Seed = 0,
+    set_: Overrides = None,
     workers: Workers = None,
     quiet: Quiet = False,
 ) -> None:
@@ -66,7 +68,7 @@ def demo(
     from .study.engine.progress import make_progress
 
     with make_progress(quiet) as progress:
-        result = run_demo(out, units, episodes, seconds, seed, _count(workers), progress)
+        result = run_demo(out, units, episodes, seconds, seed, _count(workers), progress, set_ or ())
     _finish(result, quiet)
 
 
@@ -114,7 +116,7 @@ def run(
     until: Annotated[
         str, typer.Option(help="Last stage: read, calibrate, identify, quantify, synthesize, evaluate, left_out or report.")
     ] = "report",
-    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the study.")] = None,
+    set_: Overrides = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     quiet: Quiet = False,

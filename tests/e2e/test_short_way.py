@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import kros
+from kros.data import write_parquet
 from kros.design import Design
 from kros.plants import PLANTS
 from kros.study import load_config, run_study
@@ -59,17 +61,44 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, di
 @pytest.mark.slow
 def test_the_short_way_is_the_study(example: tuple[Path, dict[str, Any]]) -> None:
     folder, names = example
-    study = run_study(load_config(folder / "study.toml"), folder / "toml", until="synthesize").folder
-    names["design"].observer.save(folder / "deployed.json")
-    deployed = (folder / "deployed.json").read_bytes()
-    assert deployed == (study / "observers" / "deployed.json").read_bytes()
+    observers = folder / "runs" / "x" / "observers"
+    assert (observers / "deployed.json").read_bytes() == saved(names["design"], folder / "deployed.json")
     named = kros.synthesize(names["uncertain"], method="worst_case_h2")
-    named.observer.save(folder / "named.json")
-    assert (folder / "named.json").read_bytes() == (study / "observers" / f"{named.name}.json").read_bytes()
-    assert named.lower_bound == pytest.approx(named.synthesis.lower_bound)
+    assert (observers / f"{named.name}.json").read_bytes() == saved(named, folder / "named.json")
+    assert named.lower_bound == named.synthesis.lower_bound
     assert names["study"].folder == Path("runs/x")
     assert (folder / "runs" / "x" / "report.html").is_file()
-    assert deployed == (folder / "runs" / "x" / "observers" / "deployed.json").read_bytes()
+
+
+def saved(design: Design, path: Path) -> bytes:
+    design.observer.save(path)
+    return path.read_bytes()
+
+
+def test_a_study_of_arrays_of_a_folder_and_of_a_file_is_the_same(example: tuple[Path, dict[str, Any]]) -> None:
+    """Everything here is quick: EDMD models, few frequencies, gains alone."""
+    folder, names = example
+    quick: dict[str, Any] = {
+        "identify": {"refine": False},
+        "uncertainty": {"n_freqs": 60, "max_order": 1, "structure": "scalar"},
+        "synthesis": {"methods": ["residual_h2"], "input_weight": 3.0},
+        "observer": {"baselines": ["open_loop", "kalman_white"]},
+    }
+    file = [f"{table}.{key}={json.dumps(value)}" for table, keys in quick.items() for key, value in keys.items()]
+    write_parquet(names["population"], folder / "parquet")
+    runs = [
+        run_study(load_config(folder / "study.toml", file), folder / "a", until="synthesize"),
+        kros.run(names["population"], folder / "b", until="synthesize", lifting=[LIFTING], **quick),
+        kros.run(folder / "parquet", folder / "c", until="synthesize", lifting=[LIFTING], **quick),
+        kros.run(folder / "study.toml", folder / "d", until="synthesize", **quick),
+    ]
+    written = [(run.folder / "observers" / "deployed.json").read_bytes() for run in runs]
+    assert len(set(written)) == 1
+    models = kros.identify(names["population"], [LIFTING], **quick["identify"])
+    uncertain = kros.quantify(models, **quick["uncertainty"])
+    assert saved(kros.synthesize(uncertain, observer=quick["observer"], **quick["synthesis"]), folder / "quick.json") == written[0]
+    again = kros.run(names["population"], folder / "b", until="synthesize", lifting=[LIFTING], **quick)
+    assert again.metrics["timing_s"]["identify"] == runs[1].metrics["timing_s"]["identify"]  # skipped: the arrays are the same
 
 
 @pytest.mark.slow

@@ -136,14 +136,14 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
     """
     path = Path(path)
     raw = read_toml(path, "Study")
+    raw.setdefault("name", path.stem)
+    return validate_config(raw, path.parent, str(path), overrides)
+
+
+def validate_config(raw: dict[str, Any], base: Path, origin: str = "study", overrides: Sequence[str] = ()) -> StudyConfig:
+    """Validate a study given as nested tables, with overrides as in `load_config`; a relative source is relative to `base`."""
     for override in overrides:
         _apply(raw, override)
-    raw.setdefault("name", path.stem)
-    return validate_config(raw, path.parent, str(path))
-
-
-def validate_config(raw: dict[str, Any], base: Path, origin: str = "study") -> StudyConfig:
-    """Validate a study given as nested tables; a relative source is relative to `base`."""
     config = _validated(raw, f"Study {origin}")
     source = (base / config.data.source).resolve()
     return config.model_copy(update={"data": config.data.model_copy(update={"source": source})})

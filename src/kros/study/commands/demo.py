@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,9 @@ def simulate_to(
     return truth
 
 
-def run_demo(out: Path, units: int, episodes: int, seconds: float, seed: int, workers: int, progress: Progress) -> RunResult:
+def run_demo(
+    out: Path, units: int, episodes: int, seconds: float, seed: int, workers: int, progress: Progress, overrides: Sequence[str] = ()
+) -> RunResult:
     """Simulate a population with one badly assembled drive and run the study on it, all below one folder.
 
     An earlier demo there is continued, or changed to what is asked now.
@@ -70,7 +73,7 @@ def run_demo(out: Path, units: int, episodes: int, seconds: float, seed: int, wo
         When the folder holds anything but an earlier demo.
     """
     out = Path(out).absolute()
-    config = validate_config({"name": "demo", "data": {"source": str(out / _RECORDINGS), "reader": "parquet"}}, out)
+    config = validate_config({"name": "demo", "data": {"source": str(out / _RECORDINGS), "reader": "parquet"}}, out, overrides=overrides)
     with open_run(out, config) as store:
         _simulate_in(store, units, episodes, seconds, seed, progress)
         require_usable(config, Stage.REPORT)

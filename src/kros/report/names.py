@@ -162,6 +162,11 @@ def condition_label(condition: str) -> str:
     return {"noload": "no load", "load": "loaded"}.get(condition, condition)
 
 
+def in_condition(condition: str) -> str:
+    """Return a condition as a part of a sentence, with its comma; nothing for the only one of recordings that name none."""
+    return "" if condition == DEFAULT_CONDITION else f", {condition_label(condition)}"
+
+
 def shorten(text: str, most: int) -> str:
     """Return a text cut to a number of characters."""
     return text if len(text) <= most else f"{text[: most - 1]}…"

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ...data.population import DEFAULT_CONDITION
 from ..content import Cell, Section, Table, where
 from ..error_tables import PAPER, ErrorCell, ErrorTable, left_out_tables
-from ..names import condition_label, minus, number, observer_label
+from ..names import in_condition, minus, number, observer_label
 from ..run_folder import RunFolder
 
 
@@ -51,8 +50,7 @@ def _table(table: ErrorTable, facts: Mapping[str, Mapping[str, Any]], folds: int
     head = ["mean", "95 %", "worst", *(["band (dB)"] if powers else [])]
     titles = [c.replace("_", " ") + ("" if c in table.ranked else " (not ranked)") for c in channels]
     groups = [("", 2), ("certified", 2), *((title, len(head)) for title in titles)]
-    condition = "" if table.condition == DEFAULT_CONDITION else f", {condition_label(table.condition)}"
-    caption = f"Errors on units that were left out, percent of the largest value{condition}. Best in bold."
+    caption = f"Errors on units that were left out, percent of the largest value{in_condition(table.condition)}. Best in bold."
     if powers:
         caption += f" Band: power of the error around the gearbox frequency, relative to “{observer_label(PAPER)}”."
     head = ["observer", "states", "as it runs", "for the set", *(head * len(channels))]

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ...data.population import DEFAULT_CONDITION
 from ..content import Cell, Section, Table, where
 from ..error_tables import ErrorCell, ErrorTable, error_table
-from ..names import axis_label, channel_units, condition_label, number, observer_label
+from ..names import axis_label, channel_units, in_condition, number, observer_label
 from ..run_folder import RunFolder
 
 
@@ -46,8 +45,7 @@ def _errors(table: ErrorTable, deployed: str | None, measured: tuple[str, ...], 
     ]
     head = ["observer", *(title for c in channels for title in ("nominal", "mean", "worst", axis_label("RMS", channel_units.get(c, ""))))]
     groups = [("", 1), *((c.replace("_", " ") + ("" if c in table.ranked else " (not ranked)"), 4) for c in channels)]
-    condition = "" if table.condition == DEFAULT_CONDITION else f", {condition_label(table.condition)}"
-    caption = f"Errors in percent of the largest value, and as RMS in the channel's unit{condition}."
+    caption = f"Errors in percent of the largest value, and as RMS in the channel's unit{in_condition(table.condition)}."
     if len(table.ranked) < len(table.channels):
         caption += " The current's error under load is the load's torque itself: reported, not ranked."
     return Table(head, rows, caption, groups, emphasised=where(table.cells, deployed))

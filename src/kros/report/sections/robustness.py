@@ -10,7 +10,7 @@ import numpy as np
 from ...evaluate import Kind, severity_of_growth
 from ..content import Cell, Cells, Section, Table, where
 from ..disturbances import AXES, Curve, curves, severity_text
-from ..names import condition_label, number, observer_label
+from ..names import in_condition, number, observer_label
 from ..run_folder import RunFolder
 
 Rows = Sequence[Mapping[str, Any]]
@@ -48,7 +48,7 @@ def _doubling(rows: Rows, condition: str, measured: Sequence[str], deployed: str
     kinds = [kind for kind in Kind if any(kind in c for c in found.values())]
     cells = [[observer_label(name), *(_doubled(kind, own.get(kind, {}), measured) for kind in kinds)] for name, own in found.items()]
     caption = (
-        f"Severity at which the error doubles, {condition_label(condition)}: geometric mean over the states that are not measured. A dash: not within what "
+        f"Severity at which the error doubles{in_condition(condition)}: geometric mean over the states that are not measured. A dash: not within what "
         "was tried. Gaps take a tenth of the time."
     )
     return Table(["observer", *(AXES[kind].title for kind in kinds)], cells, caption, emphasised=where(found, deployed))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ...canvas import Axes, Figure
 from ...error_tables import ErrorCell, error_table
-from ...names import condition_label, observer_look
+from ...names import in_condition, observer_look
 from ...run_folder import NotShownError, RunFolder
 from ..rows import best_last, keep_comparable, row_panels, say_diverged
 
@@ -22,7 +22,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
             _draw_row(panel, place, cell, observer_look(order[place]).colour)
         keep_comparable(panel, [v for c in cells.values() for v in (c.mean, c.worst, c.nominal) if v is not None])
     return figure, (
-        f"RMS error in percent of the largest value, {condition_label(run.identify_on)}, held-out episodes. Disc: mean over off-nominal units; bar: worst of "
+        f"RMS error in percent of the largest value{in_condition(run.identify_on)}, held-out episodes. Disc: mean over off-nominal units; bar: worst of "
         "them; ring: nominal unit. Logarithmic axes; best on top by the channels that are not measured; the deployed observer in bold."
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...canvas import Axes, Figure
 from ...error_tables import ErrorTable, left_out_tables
-from ...names import condition_label, observer_look
+from ...names import in_condition, observer_look
 from ...run_folder import NotShownError, RunFolder
 from ..rows import best_last, keep_comparable, row_panels, say_diverged
 
@@ -29,7 +29,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     for panel, channel in zip(panels, channels, strict=True):
         _draw_panel(panel, table, channel, order, taking_part)
     return figure, (
-        f"Error of every unit, {condition_label(home)}, on its held-out episodes. Discs: estimated by observers that were designed without the unit; rings "
+        f"Error of every unit{in_condition(home)}, on its held-out episodes. Discs: estimated by observers that were designed without the unit; rings "
         "below: by those of the whole population. Bar: mean over the units that were left out. Logarithmic axes; best on top."
     )
 

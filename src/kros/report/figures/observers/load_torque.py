@@ -7,7 +7,7 @@ import numpy as np
 from ....core.artifacts import read_arrays, read_json
 from ....evaluate.errors import error_spectrum
 from ...canvas import Figure, frequency_axis, grid, legend, logarithmic
-from ...names import Look, condition_label, model_label
+from ...names import Look, in_condition, model_label
 from ...run_folder import NotShownError, RunFolder
 from ...theme import Tone
 from ..episodes import TRUTH, clip_to, draw_lines, hide_times
@@ -54,4 +54,4 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
         for r in content["rows"]
     ]
     text = f"Errors below 5 Hz over all units whose load was not known: {'; '.join(parts)}."
-    return figure, f"Unit {unit}, {condition_label(condition)}. {text}"
+    return figure, f"Unit {unit}{in_condition(condition)}. {text}"

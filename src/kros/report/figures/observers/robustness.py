@@ -9,7 +9,7 @@ import numpy as np
 from ....evaluate import Kind
 from ...canvas import Axes, Figure, grid, log_ticks, logarithmic
 from ...disturbances import AXES, Curve, curves, look, shown_observers
-from ...names import condition_label, method_label, model_label, split_observer
+from ...names import in_condition, method_label, model_label, split_observer
 from ...run_folder import NotShownError, RunFolder
 from ...theme import Tone
 
@@ -76,10 +76,10 @@ def _panel(panel: Axes, kind: Kind, lines: Mapping[str, Curve], deployed: str | 
 
 def _caption(run: RunFolder, channel: str, condition: str) -> str:
     found, model = run.disturbed, split_observer(run.deployed or "")[0]
-    where = f"{condition_label(condition)}, mean over {len(found['units'])} units, the first {found['seconds']:g} s of a held-out episode"
+    where = f"mean over {len(found['units'])} units, the first {found['seconds']:g} s of a held-out episode"
     return (
-        f"RMS error of the {channel.replace('_', ' ')}, {where}, with one disturbance at a time; at the left of every panel there is none. "
-        f"Observers are those of the {model_label(model)} model. Gaps take a tenth of the time, whatever their length. The dotted line is an error as "
+        f"RMS error of the {channel.replace('_', ' ')}{in_condition(condition)}, {where}, with one disturbance at a time; at the left of every panel "
+        f"there is none. Observers are those of the {model_label(model)} model. Gaps take a tenth of the time, whatever their length. The dotted line is an error as "
         "large as the signal; lines that leave the panel have diverged. Observers and the extended Kalman filter predict where a measurement is missing; "
         "the filtered difference and the learned estimator cannot, and get the last measurement that arrived."
     )

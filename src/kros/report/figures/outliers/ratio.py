@@ -6,7 +6,7 @@ import numpy as np
 
 from ....uncertainty.unit_residuals import UnitResiduals
 from ...canvas import Figure, decibel, grid, legend
-from ...names import condition_label, form_label, model_label, number
+from ...names import form_label, in_condition, model_label, number
 from ...run_folder import RunFolder
 from ..residuals import ratio_panel
 
@@ -25,8 +25,8 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     axes[0, 0].set_ylabel("residual over\ncover (dB)")
     legend(figure, axes[0, 0])
     text = (
-        f"Largest singular value of every unit's {form_label(first.form.value)} residual over the smallest diagonal cover of all units but {unit}, "
-        f"{condition_label(condition)}, nominal unit {first.nominal_id}. Dashed: what the others need. {excess_text(found, unit)}"
+        f"Largest singular value of every unit's {form_label(first.form.value)} residual over the smallest diagonal cover of all units but "
+        f"{unit}{in_condition(condition)}, nominal unit {first.nominal_id}. Dashed: what the others need. {excess_text(found, unit)}"
     )
     return figure, text
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ...canvas import Figure
-from ...names import condition_label, form_label
+from ...names import form_label, in_condition
 from ...run_folder import RunFolder
 from ..residuals import entries_figure, entry_names
 
@@ -15,7 +15,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     unit = first.outside[0]
     names = {n: entry_names(r.form, run.condition_models(n, condition)) for n, r in found.items()}
     text = (
-        f"Entries of the {form_label(first.form.value)} residuals against unit {first.nominal_id}, {condition_label(condition)}, beside weights that are "
+        f"Entries of the {form_label(first.form.value)} residuals against unit {first.nominal_id}{in_condition(condition)}, beside weights that are "
         f"fitted to all units but {unit}. It differs where it leaves them; the figure above judges all entries at once."
     )
     return entries_figure(found, names, alarm=unit), text

@@ -80,6 +80,6 @@ def _caption(run: RunFolder, channel: str, condition: str) -> str:
     return (
         f"RMS error of the {channel.replace('_', ' ')}{in_condition(condition)}, {where}, with one disturbance at a time; at the left of every panel "
         f"there is none. Observers are those of the {model_label(model)} model. Gaps take a tenth of the time, whatever their length. The dotted line is an "
-        "error as large as the signal; lines that leave the panel have diverged. Observers and the extended Kalman filter predict where a measurement is missing; "
-        "the filtered difference and the learned estimator cannot, and get the last measurement that arrived."
+        "error as large as the signal; lines that leave the panel have diverged. Observers and the extended Kalman filter predict where a measurement is "
+        "missing; the filtered difference and the learned estimator cannot, and get the last measurement that arrived."
     )

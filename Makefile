@@ -30,7 +30,7 @@ demo: $(INSTALLED)  ## simulate a population of drives and run the whole study o
 	$(BIN)/kros demo --out $(DEMO)
 
 test: $(INSTALLED_DEV)  ## run all tests and measure their coverage
-	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --benchmark-skip --cov --cov-report=term
+	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadgroup --benchmark-skip --cov --cov-report=term
 
 check: $(INSTALLED_DEV)  ## lint, formatting, types, import layers and circles
 	$(BIN)/ruff check .

@@ -18,6 +18,13 @@ settings.register_profile("kros", derandomize=True, deadline=None, suppress_heal
 settings.load_profile("kros")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep the tests of a file in one process, and all files that need the demo's study in one, so that it is made once."""
+    needing = {item.path for item in items if "demo" in getattr(item, "fixturenames", ())}
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group("demo" if item.path in needing else str(item.path)))
+
+
 @pytest.fixture(scope="session")
 def recordings() -> Path:
     """Folder of real recordings, named by the environment variable KROS_DATA."""

@@ -138,14 +138,6 @@ def test_new_units_are_scored(kros, demo, tmp_path):
     assert result.exit_code == (3 if any(r["outlier"] for r in scores) else 0)
 
 
-def test_the_report_can_be_written_again_from_the_run_folder_alone(kros, demo, tmp_path):
-    page = (demo / "report.html").read_bytes()
-    assert kros("report", demo).exit_code == 0
-    assert len((demo / "report.html").read_bytes()) == pytest.approx(len(page), rel=0.02)
-    assert kros("figures", demo, tmp_path / "figures").exit_code == 0
-    assert len(list((tmp_path / "figures").glob("*.png"))) >= 8
-
-
 def test_what_the_refinement_found_out_is_kept(demo):
     for name in ("koopman", "linear"):
         found, models = RefinedModels.load(demo / "refinement" / name), ModelSet.load(demo / "models" / name)

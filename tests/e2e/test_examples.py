@@ -19,8 +19,14 @@ def run_example(name, recordings, out, *options):
 
 
 def test_double_pendulum(recordings, tmp_path):
-    # a fixed weight of the inputs, and no trials: they are most of the time, and other studies' tests do them
-    quick = ["synthesis.input_weight=3.0", "uncertainty.n_freqs=200", "evaluate.robustness=false", "evaluate.monte_carlo=0"]
+    # EDMD models, a fixed weight of the inputs, no trials: the rest is most of the time, and tests of other studies do it
+    quick = [
+        "identify.refine=false",
+        "synthesis.input_weight=3.0",
+        "uncertainty.n_freqs=200",
+        "evaluate.robustness=false",
+        "evaluate.monte_carlo=0",
+    ]
     metrics = run_example("double_pendulum", recordings, tmp_path / "run", *(part for setting in quick for part in ("--set", setting)))
     assert metrics["study"]["units"] == 6
     assert metrics["study"]["sample_period_s"] == 0.0025

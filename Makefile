@@ -1,7 +1,7 @@
 # Everything is built in .venv from the two lock files; nothing outside this folder changes.
 # A Python other than the newest found:  make install PYTHON=/path/to/python3.12
 
-.PHONY: help install demo test check bench docs lock clean
+.PHONY: help install demo test coverage check bench docs lock clean
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 
@@ -20,6 +20,8 @@ PIP := $(CLEAN_ENV) $(BIN)/python -m pip --disable-pip-version-check
 # Two workers of two threads each would fight for two cores.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
+TEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadgroup --benchmark-skip
+
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' Makefile
 
@@ -29,8 +31,11 @@ demo: $(INSTALLED)  ## simulate a population of drives and run the whole study o
 	rm -rf $(DEMO)
 	$(BIN)/kros demo --out $(DEMO)
 
-test: $(INSTALLED_DEV)  ## run all tests and measure their coverage
-	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadgroup --benchmark-skip --cov --cov-report=term
+test: $(INSTALLED_DEV)  ## run all tests
+	$(TEST)
+
+coverage: $(INSTALLED_DEV)  ## run all tests and measure their branch coverage, which takes half as long again
+	$(TEST) --cov --cov-report=term
 
 check: $(INSTALLED_DEV)  ## lint, formatting, types, import layers and circles
 	$(BIN)/ruff check .

@@ -24,7 +24,7 @@ import numpy as np
 from kros.core.artifacts import read_json, write_json
 from kros.core.work import Work
 from kros.data import EpisodeBatch, read_parquet
-from kros.design.methods.table import design
+from kros.design.methods.design import design
 from kros.design.synthesize import tasks_of
 from kros.observer import Observer, ReliftScales, one_step_residual, relift_certificate, relift_report
 from kros.study import run_study, validate_config

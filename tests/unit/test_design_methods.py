@@ -2,10 +2,12 @@
 
 import logging
 
+from kros.design.methods.design import DESIGNS
 from kros.design.methods.table import METHODS, preferred, slowest_first, suitable
 
 
-def test_ranks_decide():
+def test_every_method_has_a_design():
+    assert {method.name for method in METHODS} == set(DESIGNS)
     assert len({method.rank for method in METHODS}) == len(METHODS)
 
 

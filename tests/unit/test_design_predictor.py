@@ -8,9 +8,9 @@ import pytest
 
 from kros.data.population import EpisodeKey
 from kros.design.certificates import certify_running
+from kros.design.methods.design import design
 from kros.design.methods.predictor import on_the_circle
 from kros.design.methods.residual_shaped import TUNED, tuned
-from kros.design.methods.table import design
 from kros.design.methods.tuned import held_out, tuned_where_better
 from kros.design.settings import PredictorSettings, SynthesisSettings
 from kros.design.task import DesignResult, DesignTask

@@ -27,10 +27,9 @@ from ..observer import Observer, ReliftCertificate, in_sizes
 from ..synthesis import ObserverProblem, Synthesis
 from ..uncertainty.quantify import UncertainModels
 from .certificates import DIVERGED, Running, certify_running
-from .methods.table import BY_NAME, design, preferred, slowest_first, suitable
+from .methods.table import BY_NAME, preferred, slowest_first, suitable
 from .settings import ObserverSettings, PredictorSettings, SynthesisSettings
 from .task import DesignResult, DesignTask, split_name
-from .uncertain_set import certificate, usable_problem
 from .validation import TrainingSet
 
 log = logging.getLogger(__name__)
@@ -217,6 +216,8 @@ def tasks_of(
     uncertain: UncertainModels, kind: str, wanted: Iterable[str], settings: SynthesisSettings, predictor: PredictorSettings
 ) -> list[DesignTask]:
     """Return a task for every observer of one kind of model, in channels divided by their ranges."""
+    from .uncertain_set import usable_problem
+
     identified = uncertain.models
     recorded, own = identified.models(kind), uncertain.sets[kind]
     models = recorded.normalised()
@@ -237,6 +238,8 @@ def measurement_noise(identified: IdentifiedModels, models: ModelSet, settings: 
 
 def designed(tasks: list[DesignTask], work: Work) -> list[DesignResult]:
     """Design the observers of all tasks; those that take longest start first, so that no worker waits for them in the end."""
+    from .methods.design import design  # Riccati equations and solvers are there when something is designed
+
     order = slowest_first([task.method for task in tasks])
     made = dict(zip(order, work.map("synthesize", design, [tasks[i] for i in order]), strict=True))
     return [made[i] for i in range(len(tasks))]
@@ -244,6 +247,8 @@ def designed(tasks: list[DesignTask], work: Work) -> list[DesignResult]:
 
 def certified(tasks: list[DesignTask], results: list[DesignResult], work: Work) -> tuple[dict[str, Design], list[Running]]:
     """Certify the observers that were made: on every member of the uncertain set, and as they run."""
+    from .uncertain_set import certificate
+
     pairs = [(task, found) for task, found in zip(tasks, results, strict=True) if found.observer is not None]
     on_the_set = work.run("certify", [partial(certificate, task, found, certified_problem(task, pairs)) for task, found in pairs])
     kinds = [[pair for pair in pairs if pair[0].models.name == kind] for kind in dict.fromkeys(task.models.name for task in tasks)]

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import matrix_balance
 
 from ..core.errors import DimensionError, SynthesisError
 from .generalized_plant import GeneralizedPlant
@@ -134,6 +133,8 @@ def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
 
 def _balanced(A: Array, B: Array) -> tuple[Array, Array]:
     """States in units that balance A, and inputs in units that make B as large as A: the test must not depend on anyone's units."""
+    from scipy.linalg import matrix_balance
+
     if not A.size:
         return A, B
     A, (scale, _) = matrix_balance(A, permute=False, separate=True)

@@ -1,18 +1,12 @@
-"""The methods of observer design, in one table: what they do, in which order they are named, which start first, and which are preferred."""
+"""The methods of observer design, in one table: in which order they are named, which start first, and which are preferred."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
-from ...core.errors import SynthesisError
-from ..task import DesignResult, DesignTask, split_name
-from .gains import design_kalman_tuned, design_kalman_white, design_luenberger, design_open_loop
-from .predictor import design_predictor
-from .published import design_published
-from .residual_shaped import design_residual_h2
-from .robust import design_mixed, design_worst_case_h2, design_worst_case_hinf
+from ..task import split_name
 
 log = logging.getLogger(__name__)
 
@@ -24,8 +18,6 @@ class Method:
     Parameters
     ----------
     name : str
-    design : callable
-        From a task to a result.
     seconds : float
         Roughly what it takes: those that take longest start first, so that no worker waits for them in the end.
     rank : int
@@ -35,7 +27,6 @@ class Method:
     """
 
     name: str
-    design: Callable[[DesignTask], DesignResult]
     seconds: float
     rank: int
     not_refined: str = ""
@@ -45,26 +36,18 @@ class Method:
 _LIFTED = "the paper's problem spends its correction on lifted modes that the observer as it runs does not have"
 _FITTED = "it is fitted to recordings, not to models, and would be that of the refined ones again"
 METHODS = (
-    Method("open_loop", design_open_loop, 0.0, 9),
-    Method("kalman_white", design_kalman_white, 0.0, 8),
-    Method("kalman_tuned", design_kalman_tuned, 1.0, 6),
-    Method("luenberger", design_luenberger, 0.5, 7),
-    Method("mixed", design_mixed, 0.9, 3, not_refined=_LIFTED),
-    Method("paper", design_published, 1.5, 10, not_refined=_LIFTED),
-    Method("worst_case_h2", design_worst_case_h2, 4.0, 1),
-    Method("worst_case_hinf", design_worst_case_hinf, 8.0, 2),
-    Method("residual_h2", design_residual_h2, 2.0, 4),
-    Method("memory", design_predictor, 5.0, 5, refined_only=_FITTED),
+    Method("open_loop", 0.0, 9),
+    Method("kalman_white", 0.0, 8),
+    Method("kalman_tuned", 1.0, 6),
+    Method("luenberger", 0.5, 7),
+    Method("mixed", 0.9, 3, not_refined=_LIFTED),
+    Method("paper", 1.5, 10, not_refined=_LIFTED),
+    Method("worst_case_h2", 4.0, 1),
+    Method("worst_case_hinf", 8.0, 2),
+    Method("residual_h2", 2.0, 4),
+    Method("memory", 5.0, 5, refined_only=_FITTED),
 )
 BY_NAME = {method.name: method for method in METHODS}
-
-
-def design(task: DesignTask) -> DesignResult:
-    """Design one observer; a failure is a result too, with its reason."""
-    try:
-        return BY_NAME[task.method].design(task)
-    except SynthesisError as error:
-        return DesignResult(task.name, None, None, {"status": "failed", "reason": str(error)}, task.problem)
 
 
 def suitable(wanted: Iterable[str], kind: str, refined: bool) -> list[Method]:

@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import solve_triangular
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[Any]
@@ -132,4 +131,6 @@ def _positive(F: Integers) -> bool:
 
 
 def _right_divide(matrix: Array, R: Array) -> Array:
+    from scipy.linalg import solve_triangular
+
     return np.asarray(solve_triangular(R, matrix.T, trans="T").T)

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import solve_discrete_are
 
 from ...core.lti import StateSpace
 from ...core.norms import gramian, hinf_norm
@@ -80,6 +79,8 @@ def frequency_bound(system: ErrorSystem) -> tuple[Array, float]:
 
 def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Array | None:
     """Return the triangular factor of a Lyapunov matrix for one gain, or None where the Riccati equation has no solution."""
+    from scipy.linalg import solve_discrete_are
+
     width = system.L.shape[1]
     root = np.sqrt(multipliers)
     inputs = np.hstack([system.L / root, system.B / gain])

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import null_space
 
 from ...core.linalg import least_squares
 from ...core.lti import gain
@@ -87,6 +86,8 @@ def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], 
     Observer
         Its lifting has ``memory_1, ...`` after the original states; measurements replace the estimates of measured states.
     """
+    from scipy.linalg import null_space
+
     lifting, measured = past.lifting, past.measured
     n, q, m, hidden = lifting.n_states, len(measured), batch.inputs.shape[-1], hidden_of(lifting, measured)
     F, G, H = model

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
 
 from ...core.errors import DataError
 from ...data import EpisodeBatch
@@ -131,6 +130,8 @@ class _Tuning:
         Coefficients are those of all states and channels, white along the recordings, in the rows of white states: directions that change no
         estimate, and those between nearly alike channels, cost nothing.
         """
+        from scipy.linalg import block_diag
+
         blocks, model = point.blocks, joined(point.blocks)
         n, outputs = len(model[0]), len(self.truth)
         into, out = self._whitening(blocks)

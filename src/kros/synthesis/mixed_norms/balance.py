@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import LinAlgError
+from numpy.linalg import LinAlgError
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace

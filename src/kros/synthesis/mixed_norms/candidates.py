@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import LinAlgError
+from numpy.linalg import LinAlgError
 
 from ...core.errors import KrosError, SynthesisError
 from ..generalized_plant import GeneralizedPlant

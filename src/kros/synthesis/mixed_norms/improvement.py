@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
 
 from ...core.lti import StateSpace
 from ...core.norms import h2_norm, hinf_norm
@@ -119,6 +118,8 @@ def polish(plant: GeneralizedPlant, controller: StateSpace, gamma: float, time_l
 
 
 def _programme(problem: _Problem, x: Array, freqs_hz: Array, level: float, iterations: int) -> Array:
+    from scipy.optimize import minimize
+
     remembered: dict[bytes, tuple[Array, Array]] = {}
 
     def gains(point: Array) -> tuple[Array, Array]:

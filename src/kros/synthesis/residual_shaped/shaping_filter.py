@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
 
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace
@@ -56,6 +55,8 @@ class Basis:
     @cached_property
     def scalar(self) -> tuple[Array, Array]:
         """Dynamics and input of the basis of one channel."""
+        from scipy.linalg import block_diag
+
         shift = np.eye(self.delays, k=-1)
         poles = np.array(self.poles)
         first = np.eye(self.delays, 1)[:, 0]

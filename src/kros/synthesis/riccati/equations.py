@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import LinAlgError, solve_continuous_are, solve_continuous_lyapunov, solve_discrete_are
+from numpy.linalg import LinAlgError
 
 from ...core.errors import SynthesisError
 
@@ -36,6 +36,8 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, m
     SynthesisError
         When there is no stabilising solution or its residual is large.
     """
+    from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov, solve_discrete_are
+
     if not A.size:
         return np.zeros((0, 0))
     if dt == 0 and not B.shape[1]:

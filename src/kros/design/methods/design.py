@@ -1,0 +1,34 @@
+"""From a task to an observer, by the method that it names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from ...core.errors import SynthesisError
+from ..task import DesignResult, DesignTask
+from .gains import design_kalman_tuned, design_kalman_white, design_luenberger, design_open_loop
+from .predictor import design_predictor
+from .published import design_published
+from .residual_shaped import design_residual_h2
+from .robust import design_mixed, design_worst_case_h2, design_worst_case_hinf
+
+DESIGNS: dict[str, Callable[[DesignTask], DesignResult]] = {
+    "open_loop": design_open_loop,
+    "kalman_white": design_kalman_white,
+    "kalman_tuned": design_kalman_tuned,
+    "luenberger": design_luenberger,
+    "mixed": design_mixed,
+    "paper": design_published,
+    "worst_case_h2": design_worst_case_h2,
+    "worst_case_hinf": design_worst_case_hinf,
+    "residual_h2": design_residual_h2,
+    "memory": design_predictor,
+}
+
+
+def design(task: DesignTask) -> DesignResult:
+    """Design one observer; a failure is a result too, with its reason."""
+    try:
+        return DESIGNS[task.method](task)
+    except SynthesisError as error:
+        return DesignResult(task.name, None, None, {"status": "failed", "reason": str(error)}, task.problem)

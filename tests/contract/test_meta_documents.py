@@ -110,3 +110,9 @@ def test_page_of_reliability_is_that_of_the_results(monkeypatch: pytest.MonkeyPa
     monkeypatch.syspath_prepend(folder)
     page = importlib.import_module("page")
     assert (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8") == page.render(), "run benchmarks/reliability/page.py"
+
+
+def test_the_drawn_ways_name_modules_that_are_there() -> None:
+    drawn = re.findall(r">([a-z_/0-9]+\.py)<", (ROOT / "docs" / "two-ways.svg").read_text())
+    assert len(drawn) <= 16
+    assert [name for name in drawn if not (ROOT / "src" / "kros" / name).is_file()] == []

@@ -23,7 +23,7 @@ _CIRCLE = {"sin": "cos", "cos": "sin"}
 
 
 def design_predictor(task: DesignTask) -> DesignResult:
-    """An observer whose hidden states are identified from the past of what it sees, with states that remember it.
+    """An observer whose hidden states are identified from the past of what it sees, with internal states that hold it.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def identified(task: DesignTask, lifting: Lifting, data: ValidationSet, **option
 
 
 def on_the_circle(lifting: Lifting) -> Lifting:
-    """Return the lifting with a cosine beside every sine of a calibrated angle, and a sine beside every cosine: what remembers sees the angle itself."""
+    """Return the lifting with a cosine beside every sine of a calibrated angle, and a sine beside every cosine: a predictor sees the angle itself."""
     functions = list(lifting.functions)
     for formula in lifting.formulas:
         outer = type(formula.written).__name__

@@ -33,7 +33,7 @@ def design_worst_case_h2(task: DesignTask) -> DesignResult:
         model = DisturbanceModel(wanted)
         assumed = model.of(problem)
         return task.designed(of_few_states(task, assumed, worst_case_h2(assumed, max_order=task.max_order)), assumed, **model.facts())
-    rough = partial(worst_case_h2, tolerance_db=3.0, refinements=0, fit=remembering(fit_magnitude), causal=False)
+    rough = partial(worst_case_h2, tolerance_db=3.0, refinements=0, fit=cached(fit_magnitude), causal=False)
     model = best_model(task, problem, partial(rough, bounded=False, max_order=1))
     assumed = model.of(problem)
     _, synthesis = best_design(
@@ -55,7 +55,7 @@ def of_few_states(task: DesignTask, problem: ObserverProblem, synthesis: Synthes
 def design_worst_case_hinf(task: DesignTask) -> DesignResult:
     """Worst-case H-infinity with the disturbance model asked for, or the best one; of low order, to keep the search short."""
     problem, wanted = task.require_problem(), task.settings.input_weight
-    rough = partial(worst_case_hinf, max_order=2, tolerance_db=3.0, refinements=0, fit=remembering(fit_magnitude))
+    rough = partial(worst_case_hinf, max_order=2, tolerance_db=3.0, refinements=0, fit=cached(fit_magnitude))
     model = best_model(task, problem, partial(rough, bounded=False)) if wanted == TUNED else DisturbanceModel(wanted)
     assumed = model.of(problem)
     return task.designed(rough(assumed), assumed, **model.facts())
@@ -88,8 +88,8 @@ def best_design(task: DesignTask, designs: Sequence[Callable[[], Synthesis]]) ->
     return best, made[best]
 
 
-def remembering(fit: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a fit that remembers: candidates that differ in noise alone share their shaping filters."""
+def cached(fit: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a fit that keeps its results: candidates that differ in noise alone share their shaping filters."""
     known: dict[Any, Any] = {}
 
     def fitted(freqs_hz: Array, magnitude: Array, dt: float, **options: Any) -> Any:

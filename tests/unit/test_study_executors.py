@@ -39,5 +39,5 @@ def test_work_that_is_abandoned_is_not_waited_for():
 
 
 def test_a_worker_that_is_ended_from_outside_is_an_error_with_a_remedy():
-    with pytest.raises(KrosError, match="fewer --workers"), open_executor(2) as executor:
+    with pytest.raises(KrosError, match="fewer workers"), open_executor(2) as executor:
         list(executor.map(die, range(3)))

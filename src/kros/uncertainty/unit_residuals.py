@@ -114,10 +114,15 @@ def unit_residuals(
 
     Parameters
     ----------
+    form : Form
     nominal, responses : ndarray, shape (frequency, p, m) and (unit, frequency, p, m), complex
         In scaled coordinates.
     weights : Weight or Cover
         Systems, or magnitudes at the frequencies.
+    freqs_hz : ndarray, shape (frequency,), Hz
+    sample_period_s : float, s
+    unit_ids : sequence of str
+    nominal_id : str
     outside : collection of str
         Units that the weights need not cover; they take no part in the entrywise bounds.
     max_order, tolerance_db

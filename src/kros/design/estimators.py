@@ -63,7 +63,7 @@ class Baseline:
     takes_missing : bool
         Whether it knows what to do where a measurement is missing; others get the last one that arrived.
     seen : Seen, optional
-        Largest sizes in training: samples are datad as those of an observer are.
+        Largest sizes in training: samples are screened as those of an observer are.
     """
 
     by_unit: Mapping[str, Estimator]

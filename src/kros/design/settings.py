@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 from pydantic import Field, field_validator
 
+from ..core.errors import ConfigError
 from ..core.settings import Settings
 
 METHODS = Literal["mixed", "paper", "worst_case_h2", "worst_case_hinf", "residual_h2", "memory"]
@@ -46,6 +48,14 @@ class PredictorSettings(Settings):
             if not 0 < weight < float("inf"):
                 raise ValueError(f"predictor.importance.{name} should be a positive number")
         return value
+
+    def require_hidden(self, states: Sequence[str], measured: Sequence[str]) -> None:
+        """Refuse an importance of what is no hidden state of a population."""
+        hidden = [name for name in states if name not in measured]
+        if unknown := sorted(set(self.importance) - set(hidden)):
+            raise ConfigError(
+                f"predictor.importance: {', '.join(unknown)} should be among the states that are not measured, {', '.join(hidden)}."
+            )
 
 
 class ObserverSettings(Settings):

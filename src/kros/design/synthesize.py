@@ -219,6 +219,7 @@ def tasks_of(
     from .uncertain_set import usable_problem
 
     identified = uncertain.models
+    predictor.require_hidden(identified.population.states, identified.population.measured)
     recorded, own = identified.models(kind), uncertain.sets[kind]
     models = recorded.normalised()
     noise = measurement_noise(identified, recorded, settings) / recorded.output_scale[list(recorded.measured)]

@@ -32,21 +32,19 @@ _KIND = "models"
 class Stored(Mapping[str, T]):
     """Results in a folder, each loaded when it is asked for and then kept."""
 
-    def __init__(self, names: tuple[str, ...], load: Callable[[str], T]) -> None:
-        self._names, self._load, self._known = names, load, dict[str, T]()
+    def __init__(self, load: Callable[[Path], T], places: Mapping[str, Path]) -> None:
+        self._load, self._places, self._known = load, dict(places), dict[str, T]()
 
     def __getitem__(self, name: str) -> T:
-        if name not in self._names:
-            raise KeyError(name)
         if name not in self._known:
-            self._known[name] = self._load(name)
+            self._known[name] = self._load(self._places[name])
         return self._known[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
+        return iter(self._places)
 
     def __len__(self) -> int:
-        return len(self._names)
+        return len(self._places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +127,9 @@ class IdentifiedModels:
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Conditions that models were identified in, that of synthesis first."""
-        found = sorted({k.condition for k in self.facts.train}, key=lambda c: c != self.facts.identify_on)
+        """Conditions that models were identified in, that of synthesis first; none where no unit of it can be modelled."""
+        own = self.parameters
+        found = sorted({k.condition for k in self.facts.train if k.unit in own}, key=lambda c: c != self.facts.identify_on)
         return tuple(found)
 
     @property
@@ -194,9 +193,9 @@ class IdentifiedModels:
     def load_models(cls, folder: Path, population: Population, facts: RecordingFacts) -> IdentifiedModels:
         """Read what `save_models` wrote, of recordings that are open already."""
         content, _ = load_artifact(folder / "models", _KIND)
-        sets = Stored(tuple(content["sets"]), lambda place: ModelSet.load(folder / "models" / place))
-        factors = Stored(tuple(content["conditions"]), lambda c: EpisodeFactors.load(folder / "factors" / quote(c, safe="")))
-        refined = Stored(tuple(content["refined"]), lambda kind: RefinedModels.load(folder / "refinement" / kind))
+        sets = Stored(ModelSet.load, {place: folder / "models" / place for place in content["sets"]})
+        factors = Stored(EpisodeFactors.load, {c: folder / "factors" / quote(c, safe="") for c in content["conditions"]})
+        refined = Stored(RefinedModels.load, {kind: folder / "refinement" / kind for kind in content["refined"]})
         lifting = next(sets[kind.name].lifting for kind in KINDS if kind.name in sets)
         calibration = PhaseCalibration.load(folder / "calibration") if lifting.parameters else None
         return cls(population, facts, lifting, calibration, tuple(content["kinds"]), sets, factors, refined)

@@ -97,6 +97,10 @@ def identify(
         spec = resolve_phase(declared, population, found)
         calibration = None if spec is None else calibrate(population, facts, spec, work)
     base = IdentifiedModels(population, facts, found, calibration if isinstance(calibration, PhaseCalibration) else None)
+    if facts.identify_on not in base.conditions:
+        raise IdentificationError(
+            f"Identifying in condition {facts.identify_on!r}: none of the units recorded in it could be calibrated; set data.identify_on to another one."
+        )
     sets, factors, refined = dict[str, ModelSet](), dict[str, EpisodeFactors](), dict[str, RefinedModels]()
     for condition in base.conditions:
         factors[condition], models, found_out = identify_condition(base, condition, asked, work)

@@ -123,7 +123,7 @@ def run(
         tables["lifting"] = {"functions": tables["lifting"]}
     if isinstance(source, Population):
         raw = {"name": Path(out).name, **tables, "data": {**tables.get("data", {}), "source": read.ARRAYS, "reader": read.ARRAYS}}
-        return run_study(validate_config(raw, Path(), "of arrays"), out, until, workers, None, progress, source)
+        return run_study(validate_config(raw, Path(out), "of arrays"), out, until, workers, None, progress, source)
     if isinstance(source, StudyConfig):
         raw, base = source.dump(), Path()
     elif Path(source).is_dir():
@@ -138,7 +138,7 @@ def run(
 
 def require_usable(config: StudyConfig, until: Stage, population: Population | None = None) -> None:
     """Refuse what can be refused from the names of recordings alone."""
-    population = population or read.open_source(config)
+    population = read.open_source(config, population)
     read.check_source(config, population, single_allowed=list(Stage).index(until) <= list(Stage).index(Stage.IDENTIFY))
     if left_out.wanted(config):
         left_out.check_folds(config, population)

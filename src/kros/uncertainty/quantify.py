@@ -95,8 +95,8 @@ class UncertainModels:
     def load_sets(cls, folder: Path, models: IdentifiedModels) -> UncertainModels:
         """Read what `save_sets` wrote, of models that are there already."""
         content, _ = load_artifact(folder / "uncertainty", _KIND)
-        sets = Stored(tuple(content["kinds"]), lambda kind: UncertainModel.load(folder / "uncertainty" / kind))
-        outliers = Stored(tuple(content["outliers"]), lambda place: OutlierModel.load(folder / "outliers" / place))
+        sets = Stored(UncertainModel.load, {kind: folder / "uncertainty" / kind for kind in content["kinds"]})
+        outliers = Stored(OutlierModel.load, {place: folder / "outliers" / place for place in content["outliers"]})
         scores = tuple(read_json(folder / "outliers" / "scores.json")["rows"])
         dropped, order = tuple(content["dropped"]), content["max_order"]
         return cls(models, content["nominal"], content["worst_off_nominal"], dropped, sets, scores, outliers, order)

@@ -100,4 +100,5 @@ def _inputs_key(context: Context) -> str:
     given = context.given
     if given is None:
         return source_key(context.config.data.source)
-    return hash_of([repr(given), [[str(k), sha256(np.ascontiguousarray(given.read(k)).tobytes()).hexdigest()] for k in given.episodes]])
+    declared = repr((given.channels, given.sample_period_s, given.units, sorted(given.metadata.items())))
+    return hash_of([declared, [[str(k), sha256(np.ascontiguousarray(given.read(k)).tobytes()).hexdigest()] for k in given.episodes]])

@@ -5,6 +5,8 @@ from __future__ import annotations
 from ...core.artifacts import save_artifact
 from ...core.errors import ConfigError, DataError
 from ...data import Population, read
+from ...data.prepare import prepare
+from ...data.steps import parse_steps
 from ...data.survey import check_usable, survey
 from ...identify.presets import resolve_lifting, resolve_phase
 from ..config import StudyConfig
@@ -13,12 +15,17 @@ from ..engine.context import Context
 PARQUET, ARRAYS = "parquet", "arrays"
 
 
-def open_source(config: StudyConfig) -> Population:
-    """Open the study's recordings, lazily, without the units that are excluded."""
+def open_source(config: StudyConfig, given: Population | None = None) -> Population:
+    """Open the study's recordings, or take those that are given, lazily, prepared and without the units that are excluded."""
     data = config.data
-    if data.reader == ARRAYS:
+    if given is not None:
+        if data.csv is not None:
+            raise ConfigError("data.csv: maps the columns of CSV files, and the recordings are a population already; leave it out.")
+        population = prepare(given, parse_steps(data.prepare))
+    elif data.reader == ARRAYS:
         raise ConfigError("Study of arrays: they are gone with the program that held them; give the population to kros.run again.")
-    population = read(data.source, data.reader, mapping=data.csv, prepare=data.prepare)
+    else:
+        population = read(data.source, data.reader, mapping=data.csv, prepare=data.prepare)
     unknown = [unit for unit in data.exclude if unit not in population.unit_ids]
     if unknown:
         raise ConfigError(f"data.exclude: the recordings have no unit {', '.join(unknown)}, only {', '.join(population.unit_ids)}.")
@@ -29,11 +36,7 @@ def check_source(config: StudyConfig, population: Population, single_allowed: bo
     """Refuse what can be refused from names alone, before anything is written."""
     check_usable(population, config.split.test, config.data.identify_on, single_allowed)
     resolve_phase(config.calibrate, population, resolve_lifting(config.lifting, config.calibrate, population, config.split.test))
-    hidden = [name for name in population.states if name not in population.measured]
-    if unknown := sorted(set(config.predictor.importance) - set(hidden)):
-        raise ConfigError(
-            f"predictor.importance: {', '.join(unknown)} should be among the states that are not measured, {', '.join(hidden)}."
-        )
+    config.predictor.require_hidden(population.states, population.measured)
 
 
 def run(context: Context) -> None:
@@ -42,7 +45,7 @@ def run(context: Context) -> None:
     in_place = config.data.reader == PARQUET and not config.data.prepare
     folder = None if in_place else context.store.draft("recordings")
     _, facts = survey(
-        context.given or open_source(config), config.split.test, config.data.identify_on, config.data.on_nan, folder, context.work
+        open_source(config, context.given), config.split.test, config.data.identify_on, config.data.on_nan, folder, context.work
     )
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them first with on_nan = 'drop_episode'.")

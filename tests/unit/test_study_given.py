@@ -1,0 +1,93 @@
+"""Studies of recordings that are given as a population: what is declared about them counts as it does for recordings on disk."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kros
+from kros.core.errors import ConfigError, IdentificationError
+from kros.data import Population
+from kros.data.population import EpisodeKey
+from kros.identify.identified import IdentifiedModels
+from kros.plants import PLANTS
+
+
+def population() -> Population:
+    """Four DC motors."""
+    return PLANTS["dc-motor"](n_units=4, n_episodes=3, seconds=1.0, seed=3).simulate().population
+
+
+def groups(given: Population, out: Path, **data: Any) -> dict[str, str]:
+    """Read a population into a run folder; return what the run says about its units."""
+    rows = kros.run(given, out, until="read", data=data).metrics["units"]
+    return {row["unit"]: row["group"] for row in rows}
+
+
+def test_what_is_declared_about_recordings_is_read_again_where_it_changed(tmp_path):
+    given = population()
+    first, *others = given.units
+    before = groups(given, tmp_path / "run")
+    after = groups(replace(given, units=(replace(first, group="outliers"), *others)), tmp_path / "run")
+    assert after == before | {first.id: "outliers"}
+
+
+def test_units_that_are_excluded_take_no_part(tmp_path):
+    given = population()
+    assert tuple(groups(given, tmp_path / "run", exclude=[given.unit_ids[0]])) == given.unit_ids[1:]
+    with pytest.raises(ConfigError, match="no unit nobody"):
+        groups(given, tmp_path / "none", exclude=["nobody"])
+
+
+def test_preparation_steps_are_applied_to_what_is_given(tmp_path):
+    groups(population(), tmp_path / "run", prepare=[{"step": "resample", "period_s": 0.004}])
+    assert kros.read(tmp_path / "run" / "recordings").sample_period_s == 0.004
+
+
+def test_a_mapping_of_csv_columns_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="population already"):
+        groups(population(), tmp_path / "run", csv={"files": "x"})
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_working_folder_does_not_matter(tmp_path, monkeypatch):
+    given = population()
+    before = groups(given, tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    assert groups(given, tmp_path / "run") == before
+
+
+def drives(unsteady: str, condition: str) -> Population:
+    """Drives, one of which never runs at constant velocity and is recorded in a condition of its own."""
+    whole = PLANTS["harmonic-drive"](n_units=3, n_episodes=2, seconds=3.0, seed=2, conditions=("noload",)).simulate().population
+    keys = {EpisodeKey(k.unit, condition if k.unit == unsteady else k.condition, k.episode): k for k in whole.episodes}
+    velocity = (whole.states + whole.inputs).index("target_velocity")
+
+    def source(key: EpisodeKey) -> np.ndarray:
+        values = whole.read(keys[key]).copy()
+        if key.unit == unsteady:
+            values[:, velocity] += np.random.default_rng(int(key.episode)).normal(size=len(values))
+        return values
+
+    return replace(whole, episodes=tuple(keys), source=source)
+
+
+def test_a_condition_whose_units_cannot_be_calibrated_has_no_models():
+    given = drives("001002", "load")
+    models = kros.identify(given, refine=False)
+    assert models.conditions == ("noload",)
+    assert set(models.sizes) == set(given.states + given.inputs)
+    with pytest.raises(IdentificationError, match="condition 'load': none of the units"):
+        kros.identify(given, refine=False, identify_on="load")
+
+
+def test_models_in_a_folder_can_be_sent_to_another_process(tmp_path):
+    kros.run(population(), tmp_path / "run", until="identify", identify={"refine": False})
+    loaded = IdentifiedModels.load(tmp_path / "run")
+    again = pickle.loads(pickle.dumps(loaded))
+    np.testing.assert_array_equal(again.models().A, loaded.models().A)

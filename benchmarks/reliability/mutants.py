@@ -27,7 +27,7 @@ FAST = f"{sys.executable} -m pytest -q -x -p no:cacheprovider -m 'not slow'"
 TESTS = {
     "src/kros/synthesis/worst_case": "synthesis_shaping synthesis_worst_case synthesis_forms synthesis_lower_bounds",
     "src/kros/uncertainty/weights": "uncertainty_weights uncertainty_cover uncertainty_entrywise uncertainty_certificate",
-    "src/kros/observer/certificate": "observer_relift_study observer_relift",
+    "src/kros/observer/certificate": "design_certificates observer_certificate",
     "src/kros/evaluate/errors.py": "evaluate_errors evaluate_spectra",
 }
 

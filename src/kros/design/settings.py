@@ -28,6 +28,11 @@ class SynthesisSettings(Settings):
     tune: bool = Field(False, description="whether residual_h2 is tuned on training episodes, which takes some seconds a kind of model")
     time_limit_s: float = Field(60.0, gt=0)
 
+    def require_measured(self, measured: Sequence[str]) -> None:
+        """Refuse the noise of what is not measured in a population."""
+        if unknown := sorted(set(self.noise) - set(measured)):
+            raise ConfigError(f"synthesis.noise: {', '.join(unknown)} should be among the states that are measured, {', '.join(measured)}.")
+
 
 class PredictorSettings(Settings):
     """The observer with a memory.

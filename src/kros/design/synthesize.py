@@ -61,10 +61,9 @@ class Design:
     facts: Mapping[str, Any]
 
     def __repr__(self) -> str:
-        error, holds = self.facts.get("hidden_error_percent"), "certified" if self.certificate.certified else "not certified"
-        return (
-            f"<Design {self.name}: {self.facts['order']} states beside the recorded ones, training error {error:.3g} %, {holds} as it runs>"
-        )
+        percent, holds = self.facts.get("hidden_error_percent"), "certified" if self.certificate.certified else "not certified"
+        error = "diverges in training" if percent is None or not np.isfinite(percent) else f"training error {percent:.3g} %"
+        return f"<Design {self.name}: {self.facts['order']} states beside the recorded ones, {error}, {holds} as it runs>"
 
     @property
     def lower_bound(self) -> float | None:
@@ -220,6 +219,7 @@ def tasks_of(
 
     identified = uncertain.models
     predictor.require_hidden(identified.population.states, identified.population.measured)
+    settings.require_measured(identified.population.measured)
     recorded, own = identified.models(kind), uncertain.sets[kind]
     models = recorded.normalised()
     noise = measurement_noise(identified, recorded, settings) / recorded.output_scale[list(recorded.measured)]

@@ -119,7 +119,7 @@ def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
 
 
 def diagnostic_entry(store: Store, name: str) -> dict[str, Any]:
-    """Return what was told about one uncertain model beside its weights: share of noise, and overbounds of a scalar magnitude over order."""
+    """Return what was found out about one uncertain model beside its weights: share of noise, and overbounds of a scalar magnitude over order."""
     entry: dict[str, Any] = {}
     if store.holds("uncertainty", name, "noise"):
         noise = VariationAndNoise.load(store.path("uncertainty", name, "noise"))

@@ -112,7 +112,7 @@ def run(
     until, workers, progress
         As in `run_study`.
     **sections
-        Tables of a study in place of its own, for example ``lifting={"functions": ["sin(100*position + phase)"]}``, or ``lifting=[...]``.
+        Tables of a study, whose keys stand in place of its own, for example ``lifting={"functions": ["sin(100*position + phase)"]}``, or ``lifting=[...]``.
 
     Returns
     -------

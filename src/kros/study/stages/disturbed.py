@@ -1,4 +1,4 @@
-"""Observers of a study on disturbed measurements: which ones, on which episodes, and what is told about them."""
+"""Observers of a study on disturbed measurements: which ones, on which episodes, and what the records say about them."""
 
 from __future__ import annotations
 
@@ -154,16 +154,18 @@ def contents(
 ) -> dict[str, Any]:
     """Return what the records say; what was not asked for is absent."""
     episodes, channels = trial.episodes(), trial.population.states
-    told: dict[str, Any] = {
+    content: dict[str, Any] = {
         "units": list(dict.fromkeys(k.unit for k in trial.keys)),
         "seconds": trial.samples * trial.population.sample_period_s,
     }
     if config.robustness:
-        told["robustness"] = [row for name, (found, own) in errors.items() for row in robustness_rows(name, found, episodes, channels, own)]
+        content["robustness"] = [
+            row for name, (found, own) in errors.items() for row in robustness_rows(name, found, episodes, channels, own)
+        ]
     if config.monte_carlo:
         noise = [row for name, (found, own) in errors.items() for row in noise_rows(name, found, trial, own)]
-        told["monte_carlo"] = {"members": config.monte_carlo, "sets": sets, "noise": noise}
-    return told
+        content["monte_carlo"] = {"members": config.monte_carlo, "sets": sets, "noise": noise}
+    return content
 
 
 def noise_rows(name: str, errors: Array, trial: Trial, estimated: Sequence[int] | None) -> list[dict[str, Any]]:

@@ -138,19 +138,19 @@ def facts_of_folds(found: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict
     ``made`` and the certificates count folds: ``relift_certified`` as it runs, ``robust`` for the uncertain set. Both are None for what has no
     model and so can have none. Reasons are those that were given, without repetition.
     """
-    told = {}
+    facts = {}
     for name in dict.fromkeys(name for fold in found for name in fold):
         entries = [fold[name] for fold in found if name in fold]
         made = [e for e in entries if e.get("status") != "failed"]
         observers = [e for e in made if "relift_certified" in e]
-        told[name] = {
+        facts[name] = {
             "made": len(made),
             "orders": sorted({e["order"] for e in observers}),
             "relift_certified": sum(bool(e["relift_certified"]) for e in observers) if observers else None,
             "robust": sum(e.get("worst_case_h2") is not None for e in observers) if observers else None,
             "reasons": sorted({str(e[key]) for e in entries for key in ("reason", "relift_reason") if e.get(key)}),
         }
-    return told
+    return facts
 
 
 @dataclass(frozen=True)

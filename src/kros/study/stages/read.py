@@ -37,6 +37,7 @@ def check_source(config: StudyConfig, population: Population, single_allowed: bo
     check_usable(population, config.split.test, config.data.identify_on, single_allowed)
     resolve_phase(config.calibrate, population, resolve_lifting(config.lifting, config.calibrate, population, config.split.test))
     config.predictor.require_hidden(population.states, population.measured)
+    config.synthesis.require_measured(population.measured)
 
 
 def run(context: Context) -> None:

@@ -52,7 +52,9 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version(__name__)
-    raise AttributeError(f"Asked for kros.{name}; the package has {', '.join(_SUBPACKAGES)} and __version__.")
+    raise AttributeError(
+        f"Asked for kros.{name}; there are the functions identify, {', '.join(_VERBS)}, and the packages {', '.join(_SUBPACKAGES)}."
+    )
 
 
 def __dir__() -> list[str]:

@@ -59,9 +59,19 @@ def test_everything_is_designed_where_no_method_is_named(uncertain: UncertainMod
 
 
 def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Population) -> None:
-    with pytest.raises(ConfigError, match="no method 'memory'; known are linear_edmd/open_loop"):
+    with pytest.raises(ConfigError, match=r"'memory': it is not made for these kinds of models.*known are linear_edmd/open_loop"):
         kros.synthesize(uncertain, method="memory")
-    with pytest.raises(ConfigError, match="Synthesize: penalti: unknown key"):
+    with pytest.raises(ConfigError, match="Quantify: needs IdentifiedModels, found Population; identify the population first"):
+        kros.quantify(population)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="Synthesize: needs UncertainModels, found IdentifiedModels"):
+        kros.synthesize(uncertain.models)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="Identify: needs Population, found dict; read recordings"):
+        kros.identify({"a": []})
+    with pytest.raises(ConfigError, match="Run: needs a Population, a folder or a study, found dict"):
+        kros.run({"a": []}, "out")
+    with pytest.raises(ConfigError, match="'learned': it is a baseline"):
+        kros.synthesize(uncertain, method="learned")
+    with pytest.raises(ConfigError, match="Synthesize: penalti: unknown key; known are methods, injection"):
         kros.synthesize(uncertain, penalti=1.0)
     with pytest.raises(ConfigError, match="Identify: alpha_factor"):
         kros.identify(population, alpha_factor=0.5)
@@ -73,6 +83,28 @@ def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Populati
         kros.identify(population, identify_on="loaded")
     with pytest.raises(DataError, match="there are none, only linear_edmd"):
         uncertain.models.models("koopman")
+
+
+def test_units_that_were_not_recorded_where_it_counts_are_named(population: Population, caplog: pytest.LogCaptureFixture) -> None:
+    keys = population.keys
+    data = {unit: {"cold" if i < 2 else "warm": [population.read(k) for k in keys(unit)]} for i, unit in enumerate(population.unit_ids)}
+    names = {"states": population.states, "inputs": population.inputs, "measured": ["position"]}
+    found = kros.identify(kros.from_arrays(data, **names, sample_period_s=population.sample_period_s), refine=False)
+    assert len(found.models().unit_ids) == 2
+    assert f"Units {', '.join(population.unit_ids[2:])} were not recorded in condition 'cold'" in caplog.text
+
+
+def test_episodes_with_gaps_can_be_dropped(population: Population, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    data = {unit: [population.read(k).copy() for k in population.keys(unit)] for unit in population.unit_ids}
+    data[population.unit_ids[0]][1][7, 2] = np.nan
+    names = {"states": population.states, "inputs": population.inputs, "measured": ["position"]}
+    gaps = kros.from_arrays(data, **names, sample_period_s=population.sample_period_s)
+    with pytest.raises(DataError, match="NaN"):
+        kros.identify(gaps, refine=False)
+    found = kros.identify(gaps, refine=False, on_nan="drop_episode")
+    assert len(found.facts.dropped) == 1
+    run = kros.run(gaps, tmp_path / "run", until="identify", identify={"refine": False}, data={"on_nan": "drop_episode"})
+    assert run.metrics["study"]["units"] == len(population.unit_ids)
 
 
 def test_steps_are_told_to_whoever_listens(population: Population) -> None:

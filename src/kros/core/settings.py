@@ -27,15 +27,35 @@ class Settings(BaseModel):
         try:
             return cls.model_validate(raw)
         except ValidationError as error:
-            problems = "; ".join(f"{'.'.join(str(p) for p in e['loc'])}: {_explain(e)}" for e in error.errors())
+            problems = "; ".join(f"{'.'.join(str(p) for p in e['loc'])}: {cls._explain(e)}" for e in error.errors())
             raise ConfigError(f"{asked}: {shortened(problems, 2000)}.") from error
         except (TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, RecursionError) as error:  # of a family's arguments
             found = f"{type(error).__name__}: {shortened(str(error))}"
             raise ConfigError(f"{asked}: {found}; check the values of [[lifting.families]].") from error
 
+    @classmethod
+    def _explain(cls, error: Any) -> str:
+        if error["type"] == "extra_forbidden":
+            return f"unknown key; known are {', '.join(cls._names_in(error['loc'][:-1]))}"
+        found = error.get("input")
+        return f"{error['msg'].lower()}, found {shortened(repr(found))}" if not isinstance(found, dict) else str(error["msg"]).lower()
 
-def _explain(error: Any) -> str:
-    if error["type"] == "extra_forbidden":
-        return "unknown key; check the spelling against the documentation"
-    found = error.get("input")
-    return f"{error['msg'].lower()}, found {shortened(repr(found))}" if not isinstance(found, dict) else str(error["msg"]).lower()
+    @classmethod
+    def _names_in(cls, place: tuple[Any, ...]) -> list[str]:
+        """Return the names that are known in a table inside these settings."""
+        settings: Any = cls
+        for name in place:
+            settings = settings.model_fields[name].annotation
+        return list(settings.model_fields)
+
+
+def require_kind(value: object, kind: type, asked: str, instead: str) -> None:
+    """Refuse a value of another class than a function takes.
+
+    Raises
+    ------
+    ConfigError
+        With what was found, and what to do instead.
+    """
+    if not isinstance(value, kind):
+        raise ConfigError(f"{asked}: needs {kind.__name__}, found {type(value).__name__}; {instead}.")

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,7 @@ import numpy.typing as npt
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.errors import ConfigError, SynthesisError
 from ..core.loading import loader
+from ..core.settings import require_kind
 from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
@@ -28,7 +29,7 @@ from ..synthesis import ObserverProblem, Synthesis
 from ..uncertainty.quantify import UncertainModels
 from .certificates import DIVERGED, Running, certify_running
 from .methods.table import BY_NAME, preferred, slowest_first, suitable
-from .settings import ObserverSettings, PredictorSettings, SynthesisSettings
+from .settings import BASELINES, ObserverSettings, PredictorSettings, SynthesisSettings
 from .task import DesignResult, DesignTask, split_name
 from .validation import TrainingSet
 
@@ -152,6 +153,7 @@ def synthesize(
     ConfigError
         When there is no such method.
     """
+    require_kind(uncertain, UncertainModels, "Synthesize", "quantify the models first, kros.quantify(models)")
     asked = SynthesisSettings.of(settings, "Synthesize")
     among, of = ObserverSettings.of(observer or {}, "Synthesize, observer"), PredictorSettings.of(predictor or {}, "Synthesize, predictor")
     if method is None:
@@ -207,7 +209,12 @@ def named(uncertain: UncertainModels, method: str) -> str:
     every = [f"{kind}/{m.name}" for kind in uncertain.models.kinds for m in suitable(BY_NAME, kind, kind_of(kind).refined)]
     found = [name for name in every if method in (name, split_name(name)[1])]
     if not found:
-        raise ConfigError(f"Synthesize: there is no method {method!r}; known are {', '.join(every)}.")
+        reason = "there is no such method"
+        if method in get_args(BASELINES):
+            reason = "it is a baseline that runs where a study evaluates, and no design"
+        elif split_name(method)[1] in BY_NAME:
+            reason = "it is not made for these kinds of models; lifted functions are given to kros.identify"
+        raise ConfigError(f"Synthesize, method {method!r}: {reason}; known are {', '.join(every)}.")
     return found[0]
 
 

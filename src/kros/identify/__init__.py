@@ -5,7 +5,6 @@ Python binds a package's name to the package, so the package itself is made call
 
 import sys
 from types import ModuleType
-from typing import Any
 
 from .bootstrap import ModelSamples, bootstrap_edmd, bootstrap_refined, episode_weights, one_step_deviations
 from .calibration import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
@@ -51,9 +50,7 @@ __all__ = [
 class _CallablePackage(ModuleType):
     """The package, which called is its verb."""
 
-    def __call__(self, *arguments: Any, **options: Any) -> IdentifiedModels:
-        """Identify models of a population: see `kros.identify.identify`."""
-        return identify(*arguments, **options)
+    __call__ = staticmethod(identify)
 
 
 sys.modules[__name__].__class__ = _CallablePackage

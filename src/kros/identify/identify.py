@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from ..core.errors import DataError, IdentificationError
 from ..core.linalg import radius_text
+from ..core.settings import require_kind
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
 from ..data.survey import RecordingFacts, check_usable, survey
@@ -49,6 +50,7 @@ def identify(
     *,
     identify_on: str | None = None,
     test: Iterable[str] | None = None,
+    on_nan: str = "error",
     calibration: PhaseCalibration | CalibrationSettings | Mapping[str, Any] | None = None,
     facts: RecordingFacts | None = None,
     work: Work | None = None,
@@ -66,6 +68,8 @@ def identify(
         Condition that feeds synthesis; default ``noload``, else the first.
     test : iterable of str, optional
         Names of held-out episodes; default the last tenth of each unit and condition.
+    on_nan : {"error", "drop_episode"}
+        What is done with episodes that hold NaN or infinity.
     calibration : mapping or PhaseCalibration, optional
         How the lifting's parameter ``phase`` is calibrated, as ``[calibrate]`` of a study, or its known values.
     facts : RecordingFacts, optional
@@ -86,10 +90,11 @@ def identify(
     IdentificationError
         When no stable models are found, or too few units can be calibrated.
     """
+    require_kind(population, Population, "Identify", "read recordings with kros.read, or make a population of arrays with kros.from_arrays")
     asked, work = IdentifySettings.of(settings, "Identify"), work or Work()
     if facts is None:
         check_usable(population, test, identify_on, single_allowed=True)
-        population, facts = survey(population, test, identify_on, work=work)
+        population, facts = survey(population, test, identify_on, on_nan, work=work)
     known = isinstance(calibration, PhaseCalibration)
     declared = CalibrationSettings() if known else CalibrationSettings.of(calibration or {}, "Calibrate")
     found = lifting if isinstance(lifting, Lifting) else resolve_lifting(lifting_settings(lifting), declared, population, test)
@@ -100,6 +105,14 @@ def identify(
     if facts.identify_on not in base.conditions:
         raise IdentificationError(
             f"Identifying in condition {facts.identify_on!r}: none of the units recorded in it could be calibrated; set data.identify_on to another one."
+        )
+    elsewhere = [u for u in facts.pooled if not facts.keys("train", u, facts.identify_on)]
+    if elsewhere:
+        log.warning(
+            "Units %s were not recorded in condition %r, which feeds synthesis: they take no part in it, and are not compared with the others. "
+            "Where conditions stand for units, give all the same one.",
+            ", ".join(elsewhere),
+            facts.identify_on,
         )
     sets, factors, refined = dict[str, ModelSet](), dict[str, EpisodeFactors](), dict[str, RefinedModels]()
     for condition in base.conditions:

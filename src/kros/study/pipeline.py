@@ -124,6 +124,8 @@ def run(
     if isinstance(source, Population):
         raw = {"name": Path(out).name, **tables, "data": {**tables.get("data", {}), "source": read.ARRAYS, "reader": read.ARRAYS}}
         return run_study(validate_config(raw, Path(out), "of arrays"), out, until, workers, None, progress, source)
+    if not isinstance(source, StudyConfig | str | Path):
+        raise ConfigError(f"Run: needs a Population, a folder or a study, found {type(source).__name__}; make one with kros.from_arrays.")
     if isinstance(source, StudyConfig):
         raw, base = source.dump(), Path()
     elif Path(source).is_dir():

@@ -17,6 +17,7 @@ import numpy as np
 from ..core.artifacts import load_artifact, read_json, save_artifact, write_json
 from ..core.errors import IdentificationError
 from ..core.loading import loader
+from ..core.settings import require_kind
 from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored
@@ -124,6 +125,7 @@ def quantify(models: IdentifiedModels, *, work: Work | None = None, **settings: 
     IdentificationError
         When fewer than two units are left, or the nominal is none of them.
     """
+    require_kind(models, IdentifiedModels, "Quantify", "identify the population first, kros.identify(population)")
     asked = UncertaintySettings.of(settings, "Quantify")
     outliers, scores = score_population(models, asked)
     dropped = {row["unit"] for row in scores if row["outlier"]} if asked.drop_outliers else set()
@@ -131,7 +133,8 @@ def quantify(models: IdentifiedModels, *, work: Work | None = None, **settings: 
     units = [u for u in models.facts.pooled if u in first.unit_ids and u not in dropped]
     if len(units) < 2:
         raise IdentificationError(
-            f"Uncertainty: {len(units)} units are left of {len(models.facts.pooled)}, at least two are needed; dropped are {sorted(dropped)}."
+            f"Uncertainty: {len(units)} units are left of {len(models.facts.pooled)}, at least two are needed; dropped are {sorted(dropped)}. "
+            "Record more units in the condition that feeds synthesis, or keep outliers."
         )
     nominal = choose_unit(first, units, asked)
     tasks = [partial(quantify_models, models.models(kind), units, asked, nominal) for kind in models.kinds]

@@ -1,0 +1,5 @@
+"""``python -m kros`` is the command `kros`."""
+
+from .cli import app
+
+app()

@@ -36,7 +36,7 @@ class Stored(Mapping[str, T]):
         self._load, self._places, self._known = load, dict(places), dict[str, T]()
 
     def __repr__(self) -> str:
-        return f"<Stored: {', '.join(self._names)}>"
+        return f"<Stored: {', '.join(self._places)}>"
 
     def __getitem__(self, name: str) -> T:
         if name not in self._known:

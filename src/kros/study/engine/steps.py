@@ -10,6 +10,8 @@ from hashlib import sha256
 
 import numpy as np
 
+from ...data.checks import NonFiniteError
+from ...data.population import EpisodeKey, Population
 from ..config import Stage, StudyConfig
 from .context import Context
 from .store import code_key, hash_of, source_key
@@ -101,4 +103,12 @@ def _inputs_key(context: Context) -> str:
     if given is None:
         return source_key(context.config.data.source)
     declared = repr((given.channels, given.sample_period_s, given.units, sorted(given.metadata.items())))
-    return hash_of([declared, [[str(k), sha256(np.ascontiguousarray(given.read(k)).tobytes()).hexdigest()] for k in given.episodes]])
+    return hash_of([declared, [[str(k), _digest(given, k)] for k in given.episodes]])
+
+
+def _digest(given: Population, key: EpisodeKey) -> str:
+    """Return a digest of an episode; of one that is not finite, what is said of it: it is dropped, or an error."""
+    try:
+        return sha256(np.ascontiguousarray(given.read(key)).tobytes()).hexdigest()
+    except NonFiniteError as error:
+        return str(error)

@@ -39,7 +39,7 @@ KOOPMAN = Lifting(("position", "velocity", "current"), ("sin(100*position + phas
 LINEAR = Lifting(("position", "velocity", "current"))
 ORDERS = (0, 4, 9, 12)  # of the corrections: gains, worst-case H2, residual-shaped, the paper's
 COUNTS = (8, 2, 2, 2)  # of either lifting, for refined and plain models together
-MEMORIES = 12  # states of the observer with a memory
+MEMORIES = 12  # states of the subspace-identified predictor
 TOGETHER = 2  # run side by side: at this size a study has memory for no more
 
 
@@ -70,7 +70,7 @@ def main() -> None:
             work = partial(run_observers, [observer(lifting, order)] * TOGETHER, y, u, values)
             estimate = timed(f"{count} {name} observers, {order} filter states", work, count // TOGETHER)[0]
         work = partial(run_observer, observer(with_internal(lifting), 0), y, u, values)
-        timed(f"1 {name} observer with a memory of {MEMORIES} states", work)
+        timed(f"1 {name} subspace-identified predictor of {MEMORIES} states", work)
     A = np.pad(0.3 * rng.normal(size=(3, 4)), ((0, 1), (0, 0)))
     extended = ExtendedKalman(KOOPMAN, A, np.zeros((4, 2)), (0,), ("a", "b"), 0.01 * np.eye(3), np.eye(1), np.eye(3))
     timed("extended Kalman filter", lambda: extended.run(y, u, phase))

@@ -6,7 +6,7 @@ Every population is simulated and studied with ``[evaluate] folds``: for each fo
 every condition: in how many folds an observer is certified as it runs ("runs") and for the uncertain set ("set"), and in how many it could be made
 where not in all; mean over the units with the 95 % interval of a bootstrap over units, and the worst unit, of the states that are not measured, in
 percent of the largest value; power of the error around the gearbox frequency in dB relative to the paper's own observer, `koopman_edmd/mixed`. Below it:
-what is asked of the table, and by how much it is met or missed. Observers with a memory are tuned longer than a study does by default, with
+what is asked of the table, and by how much it is met or missed. Subspace-identified predictors are tuned longer than a study does by default, with
 velocity first. ``--set KEY=VALUE`` changes the study; with ``--out`` runs are kept, and found done
 the next time (``kros run`` on a population's study.toml adds the report).
 """

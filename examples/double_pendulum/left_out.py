@@ -1,7 +1,7 @@
 """Observers on measured drives that they do not know: every drive, or both of a build, left out of a study and estimated by what came out of it.
 
 A study (`study.toml`, with any `--set` of `kros run`) is made once a fold, from the training episodes of all other drives. Its observers, the extended
-Kalman filter of its first lifted model, a filtered difference, a regression on the past and observers with a memory run on every episode of the
+Kalman filter of its first lifted model, a filtered difference, a regression on the past and subspace-identified predictors run on every episode of the
 drives that were left out, those in which the drive stands still excepted. Errors are in percent of the largest value of an episode.
 """
 
@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--drives", nargs="+", help="leave out these alone")
     parser.add_argument("--builds", action="store_true", help="leave out both drives of a build at once")
     parser.add_argument("--alone", action="store_true", help="without the other joint's motion as inputs: the commanded torque alone")
-    parser.add_argument("--memories", type=int, nargs="*", default=[4, 12], help="states of the observers with a memory")
+    parser.add_argument("--memories", type=int, nargs="*", default=[4, 12], help="internal states of the subspace-identified predictors")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="as for kros run")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
@@ -120,12 +120,12 @@ def of_study(folder: Path) -> list[tuple[str, Observer, Mapping[str, Any]]]:
 
 
 def with_memory(training: TrainingSet, memories: Sequence[int]) -> list[tuple[str, Observer, Mapping[str, Any]]]:
-    """Return linear observers with a memory from all training episodes, as regression gives them and tuned."""
+    """Return linear subspace-identified predictors from all training episodes, as regression gives them and tuned."""
     batch, population = training.read().batch, training.population
     found = []
     for count in memories:
         for steps, how in ((0, ""), (25, ", tuned")):
-            name = f"all training episodes, memory of {count}{how}"
+            name = f"all training episodes, predictor of {count} internal states{how}"
             observer = identify_predictor(
                 name, Lifting(population.states), (0,), population.inputs, batch, count, episodes=len(batch.keys), iterations=steps
             )

@@ -72,7 +72,7 @@ def test_a_drive_that_was_left_out_is_estimated_as_well_as_by_a_regression(recor
     options = ["--out", tmp_path / "out", "--json", "--drives", "C.0-elbow", "--alone", "--memories", "4", *settings]
     found = json.loads(run_script("left_out.py", recordings, *options))
     velocity = {name: row["velocity"]["mean"] for name, row in found.items()}
-    for name in ("koopman_edmd/residual_h2", "all training episodes, memory of 4, tuned"):
+    for name in ("koopman_edmd/residual_h2", "all training episodes, predictor of 4 internal states, tuned"):
         assert found[name]["running"] == 1
         assert velocity[name] < min(1.3 * velocity["learned"], 0.8 * velocity["filtered_difference"])
         assert velocity[name] < 0.1 * velocity["koopman_edmd/open_loop"]

@@ -18,6 +18,7 @@ settings.register_profile("kros", derandomize=True, deadline=None, suppress_heal
 settings.load_profile("kros")
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep the tests of a file in one process, and all files that need the demo's study in one, so that it is made once."""
     needing = {item.path for item in items if "demo" in getattr(item, "fixturenames", ())}

@@ -321,7 +321,7 @@ def lives(pid: int) -> bool:
 def test_a_run_that_is_stopped_leaves_no_workers_and_resumes(kros, fast, finished, tmp_path, number):
     run = tmp_path / "run"
     process = start(fast, run, "--workers", "2", "--until", "synthesize")
-    wait_for(lambda: (run / "stages" / "identify.json").exists() or process.poll() is not None)
+    wait_for(lambda: (run / "stages" / "read.json").exists() or process.poll() is not None)  # early: a busy machine may be late
     workers = children(process.pid)
     assert len(workers) >= 2
     process.send_signal(number)

@@ -17,7 +17,7 @@ from kros.identify.presets import lifting_settings, resolve_lifting, resolve_pha
 from kros.identify.settings import CalibrationSettings
 from kros.lifting import Lifting
 from kros.plants import PLANTS
-from kros.uncertainty import UncertainModels
+from kros.uncertainty import UncertainModels, quantify_systems
 
 STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "target_velocity")
 
@@ -177,3 +177,10 @@ def test_models_are_saved_with_their_recordings(uncertain: UncertainModels, tmp_
     assert repr(loaded) == repr(models)
     assert loaded.sizes == models.sizes
     np.testing.assert_array_equal(loaded.models().A, models.models().A)
+
+
+def test_systems_are_quantified_by_the_same_verb(uncertain: UncertainModels) -> None:
+    systems = uncertain.models.models().systems()
+    options = {"freqs_hz": np.geomspace(0.5, 100, 40), "structure": "scalar", "max_order": 1}
+    found = kros.quantify(systems, "additive", **options)
+    assert found.peak_db == quantify_systems(systems, "additive", **options).peak_db

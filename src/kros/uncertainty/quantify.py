@@ -6,17 +6,18 @@ models of the others --smallest peak residual--> nominal --residuals, covered by
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
 from ..core.artifacts import load_artifact, read_json, save_artifact, write_json
 from ..core.errors import IdentificationError
 from ..core.loading import loader
+from ..core.lti import StateSpace
 from ..core.settings import require_kind
 from ..core.work import Work
 from ..identify import ModelSet
@@ -103,13 +104,19 @@ class UncertainModels:
         return cls(models, content["nominal"], content["worst_off_nominal"], dropped, sets, scores, outliers, order)
 
 
-def quantify(models: IdentifiedModels, *, work: Work | None = None, **settings: Any) -> UncertainModels:
+@overload
+def quantify(models: IdentifiedModels, *, work: Work | None = None, **settings: Any) -> UncertainModels: ...
+@overload
+def quantify(models: StateSpace | Sequence[Any], *arguments: Any, **settings: Any) -> UncertainModel: ...
+def quantify(models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: Any, work: Work | None = None, **settings: Any) -> Any:
     """Quantify how the units of a population differ.
 
     Parameters
     ----------
     models : IdentifiedModels
-        Of `kros.identify`.
+        Of `kros.identify`. A batch or list of systems is taken as well; then all is as in `quantify_systems`.
+    *arguments
+        Of `quantify_systems` alone.
     work : Work, optional
         Where it runs.
     **settings
@@ -125,7 +132,10 @@ def quantify(models: IdentifiedModels, *, work: Work | None = None, **settings: 
     IdentificationError
         When fewer than two units are left, or the nominal is none of them.
     """
+    if isinstance(models, StateSpace | list | tuple):
+        return quantify_systems(models, *arguments, **settings)
     require_kind(models, IdentifiedModels, "Quantify", "identify the population first, kros.identify(population)")
+    assert isinstance(models, IdentifiedModels)
     asked = UncertaintySettings.of(settings, "Quantify")
     outliers, scores = score_population(models, asked)
     dropped = {row["unit"] for row in scores if row["outlier"]} if asked.drop_outliers else set()

@@ -69,6 +69,8 @@ def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Populati
         kros.identify({"a": []})
     with pytest.raises(ConfigError, match="Run: needs a Population, a folder or a study, found dict"):
         kros.run({"a": []}, "out")
+    with pytest.raises(ConfigError, match=r"data\.source and data\.reader name recordings"):
+        kros.run(population, "out", data={"reader": "parquet"})
     with pytest.raises(ConfigError, match="'learned': it is a baseline"):
         kros.synthesize(uncertain, method="learned")
     with pytest.raises(ConfigError, match="Synthesize: penalti: unknown key; known are methods, injection"):

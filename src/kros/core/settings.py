@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from .errors import ConfigError
 from .files import shortened
+
+T = TypeVar("T")
 
 
 class Settings(BaseModel):
@@ -49,8 +51,8 @@ class Settings(BaseModel):
         return list(settings.model_fields)
 
 
-def require_kind(value: object, kind: type, asked: str, instead: str) -> None:
-    """Refuse a value of another class than a function takes.
+def require_kind(value: object, kind: type[T], asked: str, instead: str) -> T:
+    """Return a value of the class that a function takes, and refuse any other.
 
     Raises
     ------
@@ -59,3 +61,4 @@ def require_kind(value: object, kind: type, asked: str, instead: str) -> None:
     """
     if not isinstance(value, kind):
         raise ConfigError(f"{asked}: needs {kind.__name__}, found {type(value).__name__}; {instead}.")
+    return value

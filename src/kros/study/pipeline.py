@@ -121,12 +121,12 @@ def run(
     tables: dict[str, Any] = dict(sections)
     if isinstance(tables.get("lifting"), list | tuple):
         tables["lifting"] = {"functions": tables["lifting"]}
-    if isinstance(source, Population):
-        raw = {"name": Path(out).name, **tables, "data": {**tables.get("data", {}), "source": read.ARRAYS, "reader": read.ARRAYS}}
-        return run_study(validate_config(raw, Path(out), "of arrays"), out, until, workers, None, progress, source)
-    if not isinstance(source, StudyConfig | str | Path):
+    if not isinstance(source, Population | StudyConfig | str | Path):
         raise ConfigError(f"Run: needs a Population, a folder or a study, found {type(source).__name__}; make one with kros.from_arrays.")
-    if isinstance(source, StudyConfig):
+    raw: dict[str, Any]
+    if isinstance(source, Population):
+        raw, base = {"name": Path(out).name, "data": {"source": read.ARRAYS, "reader": read.ARRAYS}}, Path(out)
+    elif isinstance(source, StudyConfig):
         raw, base = source.dump(), Path()
     elif Path(source).is_dir():
         reader = detect_reader(Path(source))
@@ -135,7 +135,11 @@ def run(
         raw, base = load_config(source).dump(), Path(source).parent
     for name, table in tables.items():
         raw[name] = {**raw.get(name, {}), **table} if isinstance(table, Mapping) else table
-    return run_study(validate_config(raw, base, str(source)), out, until, workers, None, progress)
+    given = source if isinstance(source, Population) else None
+    if given is not None and set(tables.get("data", ())) & {"source", "reader"}:
+        raise ConfigError("Run: data.source and data.reader name recordings, and a population is given already; leave them out.")
+    origin = str(source) if given is None else "of arrays"
+    return run_study(validate_config(raw, base, origin), out, until, workers, None, progress, given)
 
 
 def require_usable(config: StudyConfig, until: Stage, population: Population | None = None) -> None:

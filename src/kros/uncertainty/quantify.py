@@ -134,8 +134,7 @@ def quantify(models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: 
     """
     if isinstance(models, StateSpace | list | tuple):
         return quantify_systems(models, *arguments, **settings)
-    require_kind(models, IdentifiedModels, "Quantify", "identify the population first, kros.identify(population)")
-    assert isinstance(models, IdentifiedModels)
+    models = require_kind(models, IdentifiedModels, "Quantify", "identify the population first, kros.identify(population)")
     asked = UncertaintySettings.of(settings, "Quantify")
     outliers, scores = score_population(models, asked)
     dropped = {row["unit"] for row in scores if row["outlier"]} if asked.drop_outliers else set()

@@ -28,7 +28,7 @@ Array = npt.NDArray[Any]
 BANDS = 48
 _ROUNDING = 1e-13  # of a channel's energy: correlations by FFT and their sums with weights below 2 / lag
 _ITERATIONS = 60
-_RIDGE = 1e-9  # of a channel's largest energy in a band, where all residuals lie in fewer directions
+_RIDGE = 1e-6  # of the largest energy, in every direction: where all lie in fewer of them, the iteration needs its square above rounding
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,7 +98,7 @@ def test_models_in_a_folder_can_be_sent_to_another_process(tmp_path):
 @pytest.mark.parametrize(
     ("section", "reason"),
     [
-        ({"synthesis": {"noise": {"velocity": 1e-3}}}, "synthesis.noise: velocity should be among the states that are measured, position"),
+        ({"sensor": {"velocity": {"noise": 1e-3}}}, "sensor: velocity should be among the states that are measured, position"),
         (
             {"predictor": {"importance": {"position": 2.0}}},
             "predictor.importance: position should be among the states that are not measured",

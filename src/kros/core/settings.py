@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -46,8 +46,8 @@ class Settings(BaseModel):
     def _names_in(cls, place: tuple[Any, ...]) -> list[str]:
         """Return the names that are known in a table inside these settings."""
         settings: Any = cls
-        for name in place:
-            settings = settings.model_fields[name].annotation
+        for name in place:  # a mapping's keys are free
+            settings = get_args(settings)[1] if get_origin(settings) is dict else settings.model_fields[name].annotation
         return list(settings.model_fields)
 
 

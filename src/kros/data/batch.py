@@ -27,6 +27,10 @@ class EpisodeBatch:
     sample_period_s : float
     parameters : dict of str to ndarray, shape (batch,)
         Lifting parameters of every episode's unit.
+    shown : ndarray, shape (n_samples, batch, n), optional
+        The states as a sensor shows them to an observer; as recorded by default.
+    lost : ndarray of bool, shape (n_samples, batch, n), optional
+        Samples that do not arrive.
     """
 
     keys: tuple[EpisodeKey, ...]
@@ -35,6 +39,8 @@ class EpisodeBatch:
     inputs: Array
     sample_period_s: float
     parameters: dict[str, Array] = field(default_factory=dict)
+    shown: Array | None = None
+    lost: npt.NDArray[np.bool_] | None = None
 
     @classmethod
     def read(
@@ -63,10 +69,20 @@ class EpisodeBatch:
         """The unit of every episode."""
         return tuple(k.unit for k in self.keys)
 
+    def measurements(self, measured: Sequence[int], arrived: bool = True) -> Array:
+        """Return what the sensor shows of some states, shape (n_samples, batch, q).
+
+        NaN where a sample does not arrive; what would have arrived there where `arrived` is false.
+        """
+        at = list(measured)
+        y = np.ascontiguousarray((self.states if self.shown is None else self.shown)[..., at])
+        return np.where(self.lost[..., at], np.nan, y) if arrived and self.lost is not None else y
+
     def head(self, n_samples: int) -> EpisodeBatch:
         """Return the same episodes, cut to so many samples."""
         lengths, inputs = np.minimum(self.lengths, n_samples), np.ascontiguousarray(self.inputs[:n_samples])
-        return replace(self, lengths=lengths, states=self.states[:n_samples], inputs=inputs)
+        shown, lost = None if self.shown is None else self.shown[:n_samples], None if self.lost is None else self.lost[:n_samples]
+        return replace(self, lengths=lengths, states=self.states[:n_samples], inputs=inputs, shown=shown, lost=lost)
 
     def take(self, rows: Sequence[int]) -> EpisodeBatch:
         """Return some of the episodes."""
@@ -78,6 +94,8 @@ class EpisodeBatch:
             states=self.states[:, rows],
             inputs=np.ascontiguousarray(self.inputs[:, rows]),
             parameters={name: values[rows] for name, values in self.parameters.items()},
+            shown=None if self.shown is None else self.shown[:, rows],
+            lost=None if self.lost is None else self.lost[:, rows],
         )
 
     def first_states(self, history: int = 0) -> Array:
@@ -100,3 +118,16 @@ class EpisodeBatch:
                     f"Free run over {key}: needs {history + 1} samples for delays of up to {history}, found {length}; leave the episode out."
                 )
         return np.swapaxes(self.states[: history + 1], 0, 1)
+
+
+def hold_missing(y: Array) -> Array:
+    """Return measurements with the last one that arrived in place of those that are missing; zero before the first, shape (n_samples, ...).
+
+    For estimators that have no answer of their own to a missing measurement.
+    """
+    there = np.isfinite(y)
+    if there.all():
+        return y
+    shape = (-1, *[1] * (y.ndim - 1))
+    last = np.maximum.accumulate(np.where(there, np.arange(len(y)).reshape(shape), 0), axis=0)
+    return np.take_along_axis(np.where(there, y, 0.0), last, axis=0)

@@ -75,7 +75,7 @@ class Baseline:
 
     def run(self, batch: EpisodeBatch, parameters: Parameters) -> Array:
         """Estimate all episodes, each with the estimator of its unit; NaN for states that are not estimated."""
-        return self.estimate(batch.keys, batch.states[..., list(self.measured)], batch.inputs, parameters)
+        return self.estimate(batch.keys, batch.measurements(self.measured), batch.inputs, parameters)
 
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Parameters) -> Array:
         """Estimate episodes from measurements and inputs of any origin, shape (n_samples, batch, q) and (..., m); not finite where one is missing."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, get_args
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, get_args
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from ..core.errors import ConfigError
 from ..core.settings import Settings
@@ -20,7 +20,6 @@ class SynthesisSettings(Settings):
     methods: tuple[METHODS, ...] = ("mixed", "worst_case_h2", "residual_h2", "memory")
     injection: Literal["state", "input"] = "state"
     input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
-    noise: dict[str, float] = Field(default_factory=dict, description="standard deviation of the measurement noise per measured channel")
     penalty: float = Field(1e-3, gt=0)
     max_states: int | None = Field(
         None, ge=0, description="most states of the filter of worst_case_h2; reduced and polished where it has more"
@@ -28,10 +27,12 @@ class SynthesisSettings(Settings):
     tune: bool = Field(False, description="whether residual_h2 is tuned on training episodes, which takes some seconds a kind of model")
     time_limit_s: float = Field(60.0, gt=0)
 
-    def require_measured(self, measured: Sequence[str]) -> None:
-        """Refuse the noise of what is not measured in a population."""
-        if unknown := sorted(set(self.noise) - set(measured)):
-            raise ConfigError(f"synthesis.noise: {', '.join(unknown)} should be among the states that are measured, {', '.join(measured)}.")
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, raw: Any) -> Any:
+        if isinstance(raw, Mapping) and "noise" in raw:
+            raise ValueError("noise is declared with the sensor since version 0.3, [sensor.position] noise = 1e-6; move it there")
+        return raw
 
 
 class PredictorSettings(Settings):

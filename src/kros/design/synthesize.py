@@ -24,7 +24,8 @@ from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..identify.kinds import kind_of
-from ..observer import Observer, ReliftCertificate, in_sizes
+from ..observer import Observer, ReliftCertificate, Sensor, Sensors, in_sizes
+from ..observer.sensor import require_measured
 from ..synthesis import ObserverProblem, Synthesis
 from ..uncertainty.quantify import UncertainModels
 from .certificates import DIVERGED, Running, certify_running
@@ -120,6 +121,7 @@ def synthesize(
     *,
     observer: Mapping[str, Any] | None = None,
     predictor: Mapping[str, Any] | None = None,
+    sensor: Mapping[str, Any] | None = None,
     robust: bool = False,
     work: Work | None = None,
     **settings: Any,
@@ -135,12 +137,15 @@ def synthesize(
         tried, and the most accurate one on training episodes that is certified as it runs and tolerates dropouts is returned.
     observer, predictor : mapping, optional
         As ``[observer]`` and ``[predictor]`` of a study.
+    sensor : mapping of str to mapping, optional
+        What the sensors of measured states are like, as ``[sensor.<state>]`` of a study: ``{"position": {"noise": 1e-5, "delay_samples": 1}}``, see
+        `kros.observer.Sensor`.
     robust : bool
         Whether only observers that are certified for the uncertain set are deployed, where there are any.
     work : Work, optional
         Where it runs.
     **settings
-        Of `SynthesisSettings`: ``methods``, ``injection``, ``input_weight``, ``noise``, ``penalty``, ``max_states``, ``tune``, ``time_limit_s``.
+        Of `SynthesisSettings`: ``methods``, ``injection``, ``input_weight``, ``penalty``, ``max_states``, ``tune``, ``time_limit_s``.
 
     Returns
     -------
@@ -156,13 +161,14 @@ def synthesize(
     require_kind(uncertain, UncertainModels, "Synthesize", "quantify the models first, kros.quantify(models)")
     asked = SynthesisSettings.of(settings, "Synthesize")
     among, of = ObserverSettings.of(observer or {}, "Synthesize, observer"), PredictorSettings.of(predictor or {}, "Synthesize, predictor")
+    told = {name: Sensor.of(own, f"Synthesize, sensor.{name}") for name, own in (sensor or {}).items()}
     if method is None:
-        found = synthesize_all(uncertain, asked, among, of, robust=robust, work=work)
+        found = synthesize_all(uncertain, asked, among, of, told, robust=robust, work=work)
         return found.designs[found.deployed]
     name = named(uncertain, method)
     kind, short = split_name(name)
     with_set = {short, _SURROUNDED} if _SURROUNDED in asked.methods else {short}
-    tasks = tasks_of(uncertain, kind, with_set, asked, of)
+    tasks = tasks_of(uncertain, kind, with_set, asked, of, told)
     results = designed(tasks, work or Work())
     failed = {found.name: found.facts["reason"] for found in results if found.observer is None}
     if name in failed:
@@ -175,6 +181,7 @@ def synthesize_all(
     settings: SynthesisSettings | None = None,
     observer: ObserverSettings | None = None,
     predictor: PredictorSettings | None = None,
+    sensor: Sensors | None = None,
     *,
     robust: bool = False,
     work: Work | None = None,
@@ -193,7 +200,7 @@ def synthesize_all(
         work or Work(),
     )
     wanted = {*observer.baselines, *settings.methods}
-    tasks = [task for kind in uncertain.models.kinds for task in tasks_of(uncertain, kind, wanted, settings, predictor)]
+    tasks = [task for kind in uncertain.models.kinds for task in tasks_of(uncertain, kind, wanted, settings, predictor, sensor)]
     results = designed(tasks, work)
     for task, found in zip(tasks, results, strict=True):
         if found.observer is None and found.facts["reason"] != task.refusal:
@@ -219,29 +226,41 @@ def named(uncertain: UncertainModels, method: str) -> str:
 
 
 def tasks_of(
-    uncertain: UncertainModels, kind: str, wanted: Iterable[str], settings: SynthesisSettings, predictor: PredictorSettings
+    uncertain: UncertainModels,
+    kind: str,
+    wanted: Iterable[str],
+    settings: SynthesisSettings,
+    predictor: PredictorSettings,
+    sensor: Sensors | None = None,
 ) -> list[DesignTask]:
     """Return a task for every observer of one kind of model, in channels divided by their ranges."""
     from .uncertain_set import usable_problem
 
     identified = uncertain.models
     predictor.require_hidden(identified.population.states, identified.population.measured)
-    settings.require_measured(identified.population.measured)
+    require_measured(sensor or {}, identified.population.measured)
     recorded, own = identified.models(kind), uncertain.sets[kind]
-    models = recorded.normalised()
-    noise = measurement_noise(identified, recorded, settings) / recorded.output_scale[list(recorded.measured)]
+    training, models = TrainingSet.of(identified, recorded, sensor).normalised(recorded), recorded.normalised()
+    noise = measurement_noise(identified, recorded, sensor or {}) / recorded.output_scale[list(recorded.measured)]
     problem, refusal = usable_problem(models, own, noise, settings)
     shared: dict[str, Any] = {"models": models, "unit": uncertain.nominal, "problem": problem, "refusal": refusal, "noise": noise}
-    shared |= {"training": TrainingSet.of(identified, recorded).normalised(recorded), "covered": own.unit_ids}
+    shared |= {"training": training, "covered": own.unit_ids}
     shared |= {"max_order": uncertain.max_order, "settings": settings, "predictor": predictor}
     methods = suitable(wanted, kind, kind_of(kind).refined)
     return [DesignTask(f"{kind}/{method.name}", method.name, **shared) for method in methods]
 
 
-def measurement_noise(identified: IdentifiedModels, models: ModelSet, settings: SynthesisSettings) -> Array:
-    """Return the standard deviation of every measurement's noise: as declared, else that of the quantisation found in the data."""
-    names = [models.lifting.states[i] for i in models.measured]
-    return np.array([settings.noise.get(n, identified.facts.resolution[n] / np.sqrt(12)) for n in names])
+def measurement_noise(identified: IdentifiedModels, models: ModelSet, sensor: Sensors) -> Array:
+    """Return the standard deviation of every measurement's noise: as declared, jitter at the speed of the training episodes, and the rounding.
+
+    The resolution is the coarser of the one that is declared and the one found in the data.
+    """
+    names, steps = [models.lifting.states[i] for i in models.measured], np.zeros(len(models.measured))
+    if any(own.jitter_samples for own in sensor.values()):
+        steps = TrainingSet.of(identified, models).read().steps(models.measured)
+    told = [sensor.get(name, Sensor()) for name in names]
+    found = [max(own.resolution or 0.0, identified.facts.resolution[name]) for name, own in zip(names, told, strict=True)]
+    return np.sqrt([own.model_copy(update={"resolution": r}).variance(s) for own, r, s in zip(told, found, steps, strict=True)])
 
 
 def designed(tasks: list[DesignTask], work: Work) -> list[DesignResult]:

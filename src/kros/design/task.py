@@ -13,7 +13,8 @@ from ..core.errors import SynthesisError
 from ..core.lti import gain
 from ..identify import ModelSet
 from ..lifting import Lifting
-from ..observer import Observer
+from ..observer import Observer, Runtime, Sensors
+from ..observer.sensor import delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .settings import PredictorSettings, SynthesisSettings
 from .validation import TrainingSet, rank
@@ -74,12 +75,24 @@ class DesignTask:
             injection=synthesis.injection,
             sample_period_s=models.sample_period_s,
             parameters={name: float(values[row]) for name, values in models.parameters.items()},
+            runtime=self.runtime,
             seen=self.training.seen,
+            sensor=self.sensor,
         )
 
     def designed(self, synthesis: Synthesis, problem: ObserverProblem | None = None, **facts: Any) -> DesignResult:
         """Return the result of a method that corrects the nominal model; `problem` is the set that it was designed for, else the task's."""
         return DesignResult(self.name, self.observer(synthesis), synthesis, facts, self.problem if problem is None else problem)
+
+    @property
+    def sensor(self) -> Sensors:
+        """What is declared of the sensors of measured states, by name, in the task's channels."""
+        return self.training.sensor
+
+    @property
+    def runtime(self) -> Runtime:
+        """What observers have to know of the machine: that measurements arrive late."""
+        return Runtime(delay=delay_of(self.sensor))
 
     @property
     def dynamics(self) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,10 +11,11 @@ import numpy.typing as npt
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..data.scaled import scale_population
-from ..evaluate import error_percent
+from ..evaluate import as_shown, error_percent
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
-from ..observer import Observer, Seen, run_observer, run_observers
+from ..observer import Observer, Seen, Sensors, run_observer, run_observers
+from ..observer.sensor import in_units
 
 Array = npt.NDArray[np.float64]
 TUNING_UNITS = 12
@@ -25,26 +26,31 @@ SIDE_BY_SIDE = 20  # keeps a study of twelve units below 200 MB
 
 @dataclass(frozen=True, eq=False)
 class TrainingSet:
-    """Training episodes of some units, with each unit's lifting parameters; `seen` are the sizes in all training episodes."""
+    """Training episodes of some units, as the sensor shows them, with each unit's lifting parameters; `seen` are the sizes in all training episodes."""
 
     population: Population
     keys: tuple[EpisodeKey, ...]
     parameters: dict[str, dict[str, float]]
     seen: Seen | None = None
+    sensor: Sensors = field(default_factory=dict)
 
     @classmethod
-    def of(cls, identified: IdentifiedModels, models: ModelSet) -> TrainingSet:
+    def of(cls, identified: IdentifiedModels, models: ModelSet, sensor: Sensors | None = None) -> TrainingSet:
         """Take some of the first units, and of each some episodes from the first to the last: those recorded one after the other may be alike."""
         facts, known = identified.facts, identified.parameters
         units = [u for u in facts.pooled if u in models.unit_ids][:TUNING_UNITS]
         keys = tuple(k for u in units for k in spread(facts.keys("train", u, facts.identify_on), TUNING_EPISODES))
-        return cls(identified.population.select(units), keys, {u: known[u] for u in units}, seen_by(identified, models.measured))
+        return cls(
+            identified.population.select(units), keys, {u: known[u] for u in units}, seen_by(identified, models.measured), sensor or {}
+        )
 
     def normalised(self, models: ModelSet) -> TrainingSet:
         """Return the same in channels divided by the ranges of models."""
         outputs, inputs = models.output_scale[list(models.measured)], models.input_scale[: len(models.recorded_inputs)]
         seen = None if self.seen is None else self.seen.times(1 / outputs, 1 / inputs)
-        return replace(self, population=scale_population(self.population, models.sizes), seen=seen)
+        return replace(
+            self, population=scale_population(self.population, models.sizes), seen=seen, sensor=in_units(self.sensor, models.sizes)
+        )
 
     def first_of_units(self) -> TrainingSet:
         """Return the first episode of every unit."""
@@ -55,14 +61,31 @@ class TrainingSet:
         """Read the episodes, cut short."""
         limit = round(TUNING_S / self.population.sample_period_s)
         batch = EpisodeBatch.read(self.population, self.keys, limit, self.parameters)
-        return ValidationSet(batch)
+        states = self.population.states
+        return ValidationSet(as_shown(batch, self.sensor, states), self.sensor, states)
 
 
 @dataclass(frozen=True, eq=False)
 class ValidationSet:
-    """Training episodes in memory."""
+    """Training episodes in memory, as the sensor that was declared shows them.
+
+    Parameters
+    ----------
+    batch : EpisodeBatch
+    sensor : mapping of str to Sensor
+    states : tuple of str
+        Names of the recorded states.
+    """
 
     batch: EpisodeBatch
+    sensor: Sensors = field(default_factory=dict)
+    states: tuple[str, ...] = ()
+
+    @property
+    def on_time(self) -> ValidationSet:
+        """The same with measurements that are not late: what observers that know of a delay are identified and tuned on."""
+        sensor = {name: own.model_copy(update={"delay_samples": 0}) for name, own in self.sensor.items()}
+        return replace(self, batch=as_shown(replace(self.batch, shown=None, lost=None), sensor, self.states), sensor=sensor)
 
     @property
     def parameters(self) -> dict[str, Array]:
@@ -71,26 +94,30 @@ class ValidationSet:
 
     def first(self, n_samples: float) -> ValidationSet:
         """Return the same episodes, cut to so many samples."""
-        return ValidationSet(self.batch.head(round(n_samples)))
+        return replace(self, batch=self.batch.head(round(n_samples)))
 
     def part(self, rows: Sequence[int]) -> ValidationSet:
         """Return some of the episodes."""
-        return ValidationSet(self.batch.take(rows))
+        return replace(self, batch=self.batch.take(rows))
 
     def measurements(self, measured: Sequence[int]) -> Array:
-        """Return the measured states, shape (n_samples, batch, q)."""
-        return np.ascontiguousarray(self.batch.states[..., list(measured)])
+        """Return what the sensor shows of the measured states, shape (n_samples, batch, q); NaN where a sample does not arrive."""
+        return self.batch.measurements(measured)
+
+    def steps(self, measured: Sequence[int]) -> Array:
+        """Return the RMS change of measured states from sample to sample, shape (q,)."""
+        return np.asarray(np.sqrt(np.mean(np.diff(self.batch.states[..., list(measured)], axis=0) ** 2, axis=(0, 1))))
 
     def percent(self, observer: Observer) -> Array:
         """Return the mean error of every recorded state in percent of the largest value, shape (n,); infinite where the observer diverges."""
         values = self.parameters if observer.lifting.parameters else None
-        estimate = run_observer(observer, self.batch.states[..., list(observer.measured)], self.batch.inputs, values)
+        estimate = run_observer(observer, self.measurements(observer.measured), self.batch.inputs, values)
         return self.compare([estimate])[0]
 
     def percent_of_all(self, observers: Sequence[Observer]) -> Array:
         """Return the same for observers of one model that differ in their corrections, shape (observer, n): several at a time run side by side."""
         values = self.parameters if observers[0].lifting.parameters else None
-        y = self.batch.states[..., list(observers[0].measured)]
+        y = self.measurements(observers[0].measured)
         found = []
         for start in range(0, len(observers), SIDE_BY_SIDE):
             found += [*self.compare(run_observers(observers[start : start + SIDE_BY_SIDE], y, self.batch.inputs, values))]

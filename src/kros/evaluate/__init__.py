@@ -6,6 +6,7 @@ from .errors import ErrorSummary, error_percent, error_rms, error_spectrum, summ
 from .intervals import draw_interval, interval_rows, mean_intervals, unit_interval
 from .monte_carlo import MonteCarlo, sample_errors
 from .robustness import DisturbedEpisodes, robustness_rows, severity_of_growth
+from .sensor import as_shown
 
 __all__ = [
     "SEVERITIES",
@@ -16,6 +17,7 @@ __all__ = [
     "Kind",
     "Measured",
     "MonteCarlo",
+    "as_shown",
     "draw_interval",
     "error_percent",
     "error_rms",

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
+from ..data.batch import hold_missing as hold_missing  # beside what makes them miss
 
 Array = npt.NDArray[np.float64]
 LOST_IN_GAPS = 0.1  # share of samples that gaps take, whatever their length
@@ -150,19 +151,6 @@ class Measured:
                 y[:, i] = _CHANGES[disturbance.kind](self, disturbance.severity, rng)
         flat = {name: values.reshape(-1) for name, values in parameters.items()}
         return Measured(y.reshape(n_samples, -1, q), flat, self.sample_period_s, self.size)
-
-
-def hold_missing(y: Array) -> Array:
-    """Return measurements with the last one that arrived in place of those that are missing; zero before the first, shape (n_samples, ...).
-
-    For estimators that have no answer of their own to a missing measurement.
-    """
-    there = np.isfinite(y)
-    if there.all():
-        return y
-    shape = (-1, *[1] * (y.ndim - 1))
-    last = np.maximum.accumulate(np.where(there, np.arange(len(y)).reshape(shape), 0), axis=0)
-    return np.take_along_axis(np.where(there, y, 0.0), last, axis=0)
 
 
 def _dropped(measured: Measured, severity: float, rng: np.random.Generator) -> Array:

@@ -39,9 +39,9 @@ class DisturbedEpisodes:
 
     @property
     def given(self) -> Measured:
-        """Measurements as recorded; their range is the largest value of all episodes."""
-        y = np.ascontiguousarray(self.batch.states[..., list(self.measured)])
-        return Measured(y, self.batch.parameters, self.batch.sample_period_s, np.abs(y).max(axis=(0, 1)))
+        """Measurements as the sensor shows them; their range is the largest value of all recorded episodes."""
+        size = np.abs(self.batch.states[..., list(self.measured)]).max(axis=(0, 1))
+        return Measured(self.batch.measurements(self.measured), self.batch.parameters, self.batch.sample_period_s, size)
 
     def errors(self, run: Run, estimators: int = 1) -> Array:
         """Run estimators on all episodes under all disturbances.

@@ -16,6 +16,7 @@ from .running import Estimate, RunningObserver
 from .runtime import Runtime, Seen
 from .samples import SampleStatus
 from .screen import sample_status
+from .sensor import Sensor, Sensors
 from .simulate import EstimateKind, run_observer, run_observers
 from .tracking import Tracked, track_parameter
 from .tuning.observer_rows import tune_observer
@@ -41,6 +42,8 @@ __all__ = [
     "Runtime",
     "SampleStatus",
     "Seen",
+    "Sensor",
+    "Sensors",
     "Tracked",
     "cutoffs_hz",
     "driven_coordinates",

@@ -27,6 +27,7 @@ from ..core.lti import StateSpace
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .runtime import Runtime, Seen
+from .sensor import Sensors, require_measured
 
 Array = npt.NDArray[np.float64]
 
@@ -60,11 +61,15 @@ class ObserverData:
         Whether a measurement takes the place of the estimate of the measured state: the correction is a gain, equal to these states' columns of A.
     internal : int
         So many states at the end are the observer's own (`predictor`): recordings do not hold them.
+    sensor : mapping of str to Sensor
+        What it was told of the sensors of measured states, by name. What arrives late is corrected by `runtime`.
 
     Raises
     ------
     DimensionError
         When sizes do not fit, or the correction is not what `replaces` says.
+    ConfigError
+        When a sensor is that of a state that is not measured.
     """
 
     name: str
@@ -81,6 +86,7 @@ class ObserverData:
     seen: Seen | None = None
     replaces: bool = False
     internal: int = 0
+    sensor: Sensors = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "injection", Injection(self.injection))
@@ -106,6 +112,7 @@ class ObserverData:
             raise DimensionError(
                 f"Observer {self.name}: {self.internal} internal states at the end of {n} should leave out the measured ones."
             )
+        require_measured(self.sensor, [self.lifting.states[i] for i in self.measured])
         if self.replaces and not measurement_replaces(self):
             raise DimensionError(
                 f"Observer {self.name}: where measurements replace estimates, the correction is a gain equal to the measured states' columns of A."

@@ -25,6 +25,7 @@ from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .data import ObserverData, measurement_replaces
 from .runtime import Runtime, Seen
+from .sensor import Sensor
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -53,6 +54,7 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         **({} if observer.seen is None else {"seen": {"measured": observer.seen.measured, "inputs": observer.seen.inputs}}),
         "measurement_replaces_estimate": observer.replaces,
         "internal_states": observer.internal,
+        **({"sensor": {name: own.model_dump() for name, own in observer.sensor.items()}} if observer.sensor else {}),
     }
     found: dict[str, Any] = plain(content)
     return found
@@ -126,8 +128,9 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
         parameters,
         _runtime(content, where),
         _seen(content.get("seen"), q, len(content["inputs"]), where),
+        sensor=_sensor(content.get("sensor", {}), where),
     )
-    _known(content, [*observer_content(observer), "runtime", "lifting_inputs", "input_functions", CHECKSUM], where)
+    _known(content, [*observer_content(observer), "runtime", "sensor", "lifting_inputs", "input_functions", CHECKSUM], where)
     if content["schema"] == _FIRST:
         return replace(observer, replaces=measurement_replaces(observer), internal=_named_memories(lifting.states))
     replaces, internal = content["measurement_replaces_estimate"], content["internal_states"]
@@ -224,6 +227,11 @@ def _seen(found: Any, measured: int, inputs: int, where: str) -> Seen | None:
     counts = {"measured": measured, "inputs": inputs}
     _known(found, counts, f"{where}: seen")
     return Seen(*(matrix([found[name]], (1, count), f"{where}: seen.{name}")[0] for name, count in counts.items()))
+
+
+def _sensor(found: Any, where: str) -> dict[str, Sensor]:
+    _require(isinstance(found, dict), f"{where}: sensor should be an object", found)
+    return {name: Sensor.of(own, f"{where}: sensor.{name}") for name, own in found.items()}
 
 
 def _known(found: Any, known: Sequence[str] | Mapping[str, Any] | str, where: str) -> None:

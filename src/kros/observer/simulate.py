@@ -87,7 +87,9 @@ def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, paramet
         raise DimensionError(
             f"Running {len(observers)} observers side by side: they differ in lifting, measured states or inputs; run them one by one."
         )
-    alone = any(o.runtime.delay or o.runtime.limited or not Screen.of(o).same_as(Screen.of(first)) for o in observers)
+    late = first.runtime.delay
+    alone = any(o.runtime.delay != late or o.runtime.limited or not Screen.of(o).same_as(Screen.of(first)) for o in observers)
+    alone |= bool(late and first.lifting.history)
     if alone and len(observers) > 1:
         return np.stack([_run([o], y, u, parameters, EstimateKind.PREDICT)[0] for o in observers])
     return _run(observers, y, u, parameters, EstimateKind.PREDICT)
@@ -123,7 +125,8 @@ def _run(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Para
         if wanted is EstimateKind.FILTER:
             _filter(observer, found[0], samples.y, pending, d)
         if earlier is not None and pending is not None:
-            _predict(observer, found[0], earlier, samples, pending, values)
+            for own, of_one in zip(observers, found, strict=True):
+                _predict(own, of_one, earlier, samples, pending, values)
     return found
 
 

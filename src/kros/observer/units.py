@@ -13,6 +13,7 @@ from ..core.lti import StateSpace
 from ..synthesis.result import Injection
 from .data import ObserverData
 from .runtime import Runtime
+from .sensor import in_units
 
 Array = npt.NDArray[np.float64]
 O = TypeVar("O", bound=ObserverData)  # noqa: E741
@@ -40,6 +41,7 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
         controller=StateSpace(K.A, K.B / y, K.C * into[:, None], K.D * into[:, None] / y, K.dt),
         runtime=_runtime(observer.runtime, x[: lifting.n_states], y, into, u),
         seen=None if observer.seen is None else observer.seen.times(y, u[: len(observer.inputs)]),
+        sensor=in_units(observer.sensor, {lifting.states[i]: 1 / float(x[i]) for i in observer.measured}),
     )
 
 

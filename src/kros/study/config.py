@@ -15,6 +15,7 @@ from ..core.files import parse_toml, read_toml, shortened
 from ..core.settings import Settings
 from ..design.settings import ObserverSettings, PredictorSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
+from ..observer.sensor import Sensor
 from ..uncertainty.settings import UncertaintySettings
 
 RENAMED = {"memory": "predictor"}  # sections of a study, old and new
@@ -116,6 +117,7 @@ class StudyConfig(Settings):
     uncertainty: UncertaintySettings = UncertaintySettings()
     synthesis: SynthesisSettings = SynthesisSettings()
     predictor: PredictorSettings = PredictorSettings()
+    sensor: dict[str, Sensor] = Field(default_factory=dict)
     observer: ObserverSettings = ObserverSettings()
     evaluate: EvaluateConfig = EvaluateConfig()
     load: LoadConfig = LoadConfig()

@@ -26,8 +26,8 @@ from .stages import evaluate, left_out, read, report
 
 STEPS = (
     *LEARNING,
-    Step(Stage.EVALUATE, evaluate.run, ("evaluate", "load")),
-    Step(Stage.LEFT_OUT, left_out.run, ("evaluate",), left_out.wanted),
+    Step(Stage.EVALUATE, evaluate.run, ("evaluate", "sensor", "load")),
+    Step(Stage.LEFT_OUT, left_out.run, ("evaluate", "sensor"), left_out.wanted),
     Step(Stage.REPORT, report.run, ("name", "require")),
 )
 

@@ -34,7 +34,7 @@ def design_predictor(task: DesignTask) -> DesignResult:
     recipe = partial(identified, task, on_the_circle(task.models.lifting))
     try:
         kept, facts = tuned_where_better(
-            task, data, recipe(data, iterations=0), lambda seen, _: recipe(seen), partial(in_coordinates, task)
+            task, data, recipe(data.on_time, iterations=0), lambda seen, _: recipe(seen.on_time), partial(in_coordinates, task)
         )
     except (KrosError, np.linalg.LinAlgError) as error:
         raise SynthesisError(str(error)) from error
@@ -54,7 +54,7 @@ def design_predictor(task: DesignTask) -> DesignResult:
 def identified(task: DesignTask, lifting: Lifting, data: ValidationSet, **options: Any) -> Observer:
     """Return the observer that episodes give; `options` as in `identify_predictor`."""
     models = task.models
-    return identify_predictor(
+    observer = identify_predictor(
         task.name,
         lifting,
         models.measured,
@@ -64,6 +64,7 @@ def identified(task: DesignTask, lifting: Lifting, data: ValidationSet, **option
         [task.predictor.importance.get(name, 1.0) for i, name in enumerate(models.lifting.states) if i not in models.measured],
         **({"episodes": task.predictor.episodes, "iterations": task.predictor.steps} | options),
     )
+    return replace(observer, runtime=task.runtime, sensor=task.sensor)
 
 
 def on_the_circle(lifting: Lifting) -> Lifting:

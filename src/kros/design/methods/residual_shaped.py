@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import SynthesisError
-from ...observer import Observer, ResidualModel, residual_models, tune_observer
+from ...observer import Observer, ResidualModel, Runtime, residual_models, tune_observer
 from ...synthesis import ResidualProblem, Synthesis, residual_h2
 from ..task import DesignResult, DesignTask, first_of
 from ..validation import ValidationSet
@@ -64,7 +64,8 @@ def tuned(task: DesignTask, found: DesignResult) -> DesignResult:
 
 
 def _steps(data: ValidationSet, start: Observer) -> Observer:
-    return tune_observer(start, data.batch, _STEPS)[0]
+    found = tune_observer(replace(start, runtime=Runtime()), data.on_time.batch, _STEPS)[0]
+    return replace(found, runtime=start.runtime)
 
 
 def promising(task: DesignTask) -> list[ResidualModel]:

@@ -76,7 +76,7 @@ class FilteredDifference:
         measured : sequence of int
             Indices of the measured states.
         """
-        states, y = batch.states, batch.states[..., list(measured)]
+        states, y = batch.states, batch.measurements(measured, arrived=False)
         inside = (np.arange(len(y))[:, None] < batch.lengths).astype(float)
         found = replace(self, scales=()).run(y, y[..., :0])
         slopes = []
@@ -132,7 +132,7 @@ def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, i
     tuple of (int, int)
         As `rates`.
     """
-    states, y, sample_period_s = batch.states, batch.states[..., list(measured)], batch.sample_period_s
+    states, y, sample_period_s = batch.states, batch.measurements(measured, arrived=False), batch.sample_period_s
     hidden = [j for j in range(states.shape[-1]) if j not in measured]
     inside = np.arange(len(y))[:, None] < batch.lengths
     share = np.zeros((len(measured), len(hidden)))

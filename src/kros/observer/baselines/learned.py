@@ -21,6 +21,7 @@ import numpy.typing as npt
 from ...core.errors import DataError, DimensionError
 from ...core.linalg import least_squares
 from ...data import EpisodeBatch
+from ...data.batch import hold_missing
 from ...lifting import Lifting
 
 Array = npt.NDArray[np.float64]
@@ -126,7 +127,7 @@ class Moments:
             raise DataError(
                 f"Learned estimator: an episode of unit {units[int(lengths.argmin())]} has {lengths.min()} samples, more than {features.taps} are needed."
             )
-        z = features.channels(states[..., list(features.measured)], batch.inputs, batch.parameters)
+        z = features.channels(hold_missing(batch.measurements(features.measured)), batch.inputs, batch.parameters)
         names = tuple(dict.fromkeys(units))
         f, h = 1 + z.shape[-1] * features.taps, len(estimated)
         gram, cross, counts = np.zeros((len(names), f, f)), np.zeros((len(names), f, h)), np.zeros(len(names))

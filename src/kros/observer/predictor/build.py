@@ -95,7 +95,7 @@ def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], 
     turn = np.vstack([H, null_space(H / np.linalg.norm(H, axis=1)[:, None]).T])
     back = np.linalg.inv(turn)
     F, G = turn @ F @ back, turn @ G
-    following = _measured_rows(F, G, past.channels(batch), batch.states[..., list(measured)])
+    following = _measured_rows(F, G, past.channels(batch), batch.measurements(measured, arrived=False))
     place = [*hidden, *range(n, n + internal)]
     raw = np.zeros((n + internal, q + m + len(lifting.functions)))  # of y, u and sigma, in place of z
     own = np.zeros((n + internal, n + internal))

@@ -112,7 +112,7 @@ class PastMoments:
                 f"found {len(hidden)} and {lengths.min()}."
             )
         basis = basis or Basis(DELAYS, (1 - SHORT / int(lengths.min()),))
-        y = states[..., list(measured)]
+        y = batch.measurements(measured, arrived=False)
         static = _static(inputs, y)
         share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
         free = tuple(int(j) for j in np.flatnonzero(share.max(axis=0) < _FOLLOWS))
@@ -211,7 +211,7 @@ def _static(inputs: Array, y: Array) -> Array:
 
 
 def _channels(lifting: Lifting, measured: tuple[int, ...], static: Array, free: tuple[int, ...], batch: EpisodeBatch) -> Array:
-    y, u, x = batch.states[..., list(measured)], batch.inputs, np.zeros((*batch.states.shape[:-1], lifting.n_states))
+    y, u, x = batch.measurements(measured, arrived=False), batch.inputs, np.zeros((*batch.states.shape[:-1], lifting.n_states))
     x[..., list(measured)] = y
     return np.concatenate([y - u @ static.T, u[..., list(free)], lifting.lift(x, batch.parameters)[..., lifting.n_states :]], axis=-1)
 

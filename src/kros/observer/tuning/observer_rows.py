@@ -105,7 +105,7 @@ class _Tuning:
         if self.radius(observer) > self.slowest:
             return _Point(observer, np.zeros(0), np.zeros(0), np.inf)
         states = self.batch.states
-        estimate = run_observer(observer, states[..., list(observer.measured)], self.batch.inputs, self.values)
+        estimate = run_observer(observer, self.batch.measurements(observer.measured), self.batch.inputs, self.values)
         with np.errstate(over="ignore", invalid="ignore"):
             errors = np.mean((states - estimate)[_SKIP:][..., self.hidden] ** 2, axis=(0, 1))
         return _Point(observer, estimate, errors, mean_log(self.share, errors))
@@ -147,7 +147,8 @@ class _Tuning:
     def _regressors(self, point: _Point) -> Array:
         """Phi along a run, shape (n_samples, batch, n_lifted + m + q + n_c)."""
         lifting, K, measured = point.observer.lifting, point.observer.controller, list(point.observer.measured)
-        innovation = self.batch.states[..., measured] - point.estimate[..., measured]
+        innovation = self.batch.measurements(measured) - point.estimate[..., measured]
+        innovation[~np.isfinite(innovation)] = 0.0  # nothing corrects where nothing arrives
         x_c = np.zeros((*point.estimate.shape[:2], K.n_states))
         for k in range(len(point.estimate) - 1 if K.n_states else 0):
             x_c[k + 1] = x_c[k] @ K.A.T + innovation[k] @ K.B.T

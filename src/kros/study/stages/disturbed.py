@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -21,12 +21,13 @@ from ...evaluate import (
     DisturbedEpisodes,
     Kind,
     Measured,
+    as_shown,
     draw_interval,
     robustness_rows,
     standard_disturbances,
     unit_interval,
 )
-from ...observer import Observer, run_observers
+from ...observer import Observer, Sensors, run_observers
 from ..config import EvaluateConfig
 from ..engine.context import Context
 from .members import member_work
@@ -54,6 +55,8 @@ class Trial:
     disturbances : tuple of Disturbance
     names : tuple of str
         Observers that take part; baselines without a model all do.
+    sensor : mapping of str to Sensor
+        What is declared; disturbances come on top of it.
     """
 
     population: Population
@@ -63,10 +66,12 @@ class Trial:
     measured: tuple[int, ...]
     disturbances: tuple[Disturbance, ...]
     names: tuple[str, ...]
+    sensor: Sensors = field(default_factory=dict)
 
     def episodes(self) -> DisturbedEpisodes:
         """Read the episodes."""
         batch = EpisodeBatch.read(self.population, self.keys, self.samples, self.units)
+        batch = as_shown(batch, self.sensor, self.population.states)
         return DisturbedEpisodes(batch, self.measured, self.disturbances)
 
     def errors_of_observers(self, observers: Sequence[Observer]) -> list[Array]:
@@ -114,12 +119,12 @@ def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, di
     if config.monte_carlo:
         disturbances += noise_draws(context, given, models.measured)
     samples = round((ALL_S if everything else FEW_S) / dt)
-    return Trial(context.population, given, samples, units, models.measured, disturbances, names)
+    return Trial(context.population, given, samples, units, models.measured, disturbances, names, context.config.sensor)
 
 
 def noise_draws(context: Context, keys: Sequence[EpisodeKey], measured: Sequence[int]) -> tuple[Disturbance, ...]:
     """Return realisations of the noise that the study assumes, as declared or that of the quantisation; the largest share of a largest value counts."""
-    noise = measurement_noise(context.identified, context.identified.models(), context.config.synthesis)
+    noise = measurement_noise(context.identified, context.identified.models(), context.config.sensor)
     y = np.concatenate([context.population.read_parts(k)[0][:, list(measured)] for k in keys])
     size = np.abs(y).max(axis=0)
     severity = float(np.max(noise / np.where(size > 0, size, np.inf)))

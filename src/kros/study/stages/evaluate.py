@@ -18,10 +18,10 @@ from ...data.population import EpisodeKey, Population
 from ...design.estimators import Baseline, make_difference, make_extended, make_learned
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
-from ...evaluate import ErrorSummary, summarise
+from ...evaluate import ErrorSummary, as_shown, summarise
 from ...identify import ModelSet, free_run
 from ...identify.presets import gearbox_band_hz
-from ...observer import Observer, run_observers
+from ...observer import Observer, Sensors, run_observers
 from ..engine.context import Context
 from .disturbed import Trial, make_trial, run_disturbed
 from .load import run_load
@@ -57,11 +57,16 @@ class Piece:
 
 
 def evaluate_observers(
-    observers: Sequence[Observer], population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
+    observers: Sequence[Observer],
+    population: Population,
+    keys: tuple[EpisodeKey, ...],
+    units: UnitParameters,
+    shown: tuple[int, ...],
+    sensor: Sensors,
 ) -> list[Outcome]:
-    """Run observers that `alike` puts together on test episodes, as many at a time as fit into memory."""
-    batch, first = EpisodeBatch.read(population, keys, parameters=units), observers[0]
-    y, parameters = batch.states[..., list(first.measured)], batch.parameters if first.lifting.parameters else None
+    """Run observers that `alike` puts together on test episodes as the sensor shows them, as many at a time as fit into memory."""
+    batch, first = as_shown(EpisodeBatch.read(population, keys, parameters=units), sensor, population.states), observers[0]
+    y, parameters = batch.measurements(first.measured), batch.parameters if first.lifting.parameters else None
     together = max(1, _SAMPLES_AT_ONCE // batch.states.size)
     found = []
     for start in range(0, len(observers), together):
@@ -76,14 +81,15 @@ def evaluate_baseline(
     keys: tuple[EpisodeKey, ...],
     units: UnitParameters,
     shown: tuple[int, ...],
+    sensor: Sensors,
     trial: Trial | None = None,
 ) -> Outcome | str:
-    """Make a baseline and run it on test episodes, and on disturbed ones; the reason where it cannot be made."""
+    """Make a baseline and run it on test episodes as the sensor shows them, and on disturbed ones; the reason where it cannot be made."""
     try:
         baseline = make()
     except KrosError as error:
         return str(error)
-    batch = EpisodeBatch.read(population, keys, parameters=units)
+    batch = as_shown(EpisodeBatch.read(population, keys, parameters=units), sensor, population.states)
     outcome = _outcome(baseline.run(batch, batch.parameters), batch, population.sample_period_s, shown)
     disturbed = None if trial is None else trial.errors_of_baseline(baseline)
     return replace(outcome, facts=baseline.facts, estimated=baseline.estimated, disturbed=disturbed)
@@ -160,11 +166,13 @@ def estimation(
     trial: Trial | None = None,
 ) -> list[Piece]:
     """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
-    makers = baseline_makers(context)
-    work = [Piece((name,), partial(evaluate_baseline, make, population, keys, units, shown, trial)) for name, make in makers.items()]
+    makers, sensor = baseline_makers(context), context.config.sensor
+    work = [
+        Piece((name,), partial(evaluate_baseline, make, population, keys, units, shown, sensor, trial)) for name, make in makers.items()
+    ]
     for group in alike(load_observers(context).values()):
         names = tuple(observer.name for observer in group)
-        work.append(Piece(names, partial(evaluate_observers, group, population, keys, units, shown)))
+        work.append(Piece(names, partial(evaluate_observers, group, population, keys, units, shown, sensor)))
     return work
 
 
@@ -180,12 +188,12 @@ def baseline_makers(context: Context) -> dict[str, Callable[[], Baseline]]:
     """Return what makes every baseline that is no correction of a model: the extended filter of the first lifted model, and those without a model."""
     models = {name: context.identified.models(name) for name in context.identified.kinds}
     asked, first = context.config.observer.baselines, next(iter(models.values()))
-    nominal, training = context.uncertain.nominal, TrainingSet.of(context.identified, first)
+    nominal, training = context.uncertain.nominal, TrainingSet.of(context.identified, first, context.config.sensor)
     makers: dict[str, Callable[[], Baseline]] = {}
     if "ekf" in asked:
         lifted = [name for name, found in models.items() if found.lifting.functions or found.lifting.input_functions]
         for name in lifted[:1]:
-            noise = measurement_noise(context.identified, models[name], context.config.synthesis)
+            noise = measurement_noise(context.identified, models[name], context.config.sensor)
             makers[f"{name}/ekf"] = partial(make_extended, training, models[name], nominal, noise)
     if "filtered_difference" in asked:
         makers["filtered_difference"] = partial(make_difference, training, first.measured)

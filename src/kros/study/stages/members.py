@@ -35,7 +35,7 @@ def member_work(context: Context, kind: str, members: int) -> Callable[[], Membe
     if not bounds:
         return dict
     models, uncertain, settings = context.identified.models(kind), context.uncertain.sets[kind], context.config.synthesis
-    base, _ = usable_problem(models, uncertain, measurement_noise(context.identified, models, settings), settings)
+    base, _ = usable_problem(models, uncertain, measurement_noise(context.identified, models, context.config.sensor), settings)
     assert base is not None  # there are bounds
     assumed = DisturbanceModel.recorded(
         facts.get(f"{kind}/worst_case_h2", {})

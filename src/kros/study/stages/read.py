@@ -9,6 +9,7 @@ from ...data.prepare import prepare
 from ...data.steps import parse_steps
 from ...data.survey import check_usable, survey
 from ...identify.presets import resolve_lifting, resolve_phase
+from ...observer.sensor import require_measured
 from ..config import StudyConfig
 from ..engine.context import Context
 
@@ -37,7 +38,7 @@ def check_source(config: StudyConfig, population: Population, single_allowed: bo
     check_usable(population, config.split.test, config.data.identify_on, single_allowed)
     resolve_phase(config.calibrate, population, resolve_lifting(config.lifting, config.calibrate, population, config.split.test))
     config.predictor.require_hidden(population.states, population.measured)
-    config.synthesis.require_measured(population.measured)
+    require_measured(config.sensor, population.measured)
 
 
 def run(context: Context) -> None:

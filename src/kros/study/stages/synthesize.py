@@ -12,7 +12,13 @@ def run(context: Context) -> None:
     """Design and save."""
     config, draft = context.config, context.store.draft
     found = synthesize_all(
-        context.uncertain, config.synthesis, config.observer, config.predictor, robust=config.require.robust, work=context.work
+        context.uncertain,
+        config.synthesis,
+        config.observer,
+        config.predictor,
+        config.sensor,
+        robust=config.require.robust,
+        work=context.work,
     )
     for name, design in found.designs.items():
         design.observer.save(draft("observers", f"{name}.json"))

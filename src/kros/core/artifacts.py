@@ -80,9 +80,14 @@ def plain(value: Any) -> Any:
     return value
 
 
+def json_bytes(content: Any) -> bytes:
+    """Return JSON with a stable layout."""
+    return (json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write JSON with a stable layout."""
-    write_bytes(path, (json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+    write_bytes(path, json_bytes(content))
 
 
 def read_json(path: Path) -> Any:

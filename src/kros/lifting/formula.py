@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
+from .c_code import c_code
 from .evaluation import FUNCTIONS, Evaluator, compile_expression
 from .limits import MAX_EXPONENT, MAX_LENGTH, TooCostlyError, finite, require_size, settled
 
@@ -94,11 +95,7 @@ class Formula:
         An earlier value ``position[-1]`` reads a pointer to the present one. Names in `pointers` are such pointers, and their present
         value is written ``position[0]``.
         """
-        import sympy as sp
-
-        present = {sp.Symbol(name, real=True): sp.Symbol(f"{name}[0]", real=True) for name in pointers}
-        large = {n: sp.Float(n, 17) for n in self.expression.atoms(sp.Integer) if abs(n) >= 2**31}
-        return str(sp.ccode(self.expression.xreplace({**present, **large})))
+        return c_code(self.expression, lambda name: f"{name}[0]" if name in pointers else name)
 
 
 def delayed_name(name: str, delay: int) -> str:

@@ -1,0 +1,104 @@
+"""Generated code, compiled and run from Python: the same estimates without Python's time, and how tests compare both."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import ConfigError, DimensionError
+
+Array = npt.NDArray[np.float64]
+FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fno-math-errno", "-ffp-contract=off")
+COMPILERS = ("cc", "gcc", "clang")
+
+
+def find_compiler() -> str | None:
+    """Return a C compiler on the PATH; None where there is none."""
+    return next((path for name in COMPILERS if (path := shutil.which(name))), None)
+
+
+class CompiledObserver:
+    """An exported observer, compiled into a shared library and loaded.
+
+    Parameters
+    ----------
+    folder : Path
+        What `export_c` wrote.
+    library : Path
+        Where the shared library lies.
+    """
+
+    def __init__(self, folder: Path, library: Path) -> None:
+        manifest = json.loads((Path(folder) / "manifest.json").read_text())
+        self.name, self.states = manifest["name"], tuple(manifest["states"])
+        self.parameters, self.state_bytes = tuple(manifest["parameters"]), int(manifest["state_bytes"])
+        self._q, self._m = len(manifest["measured"]), len(manifest["inputs"])
+        self._real = np.float32 if manifest["precision"] == "float" else np.float64
+        self._c = ctypes.CDLL(str(library))
+        self._step = self._c[f"{self.name}_step_wide" if self._real is np.float32 else f"{self.name}_step"]
+        self._reset = self._c[f"{self.name}_reset_wide" if self._real is np.float32 else f"{self.name}_reset"]
+        self._step.restype = ctypes.c_uint32
+
+    @classmethod
+    def build(cls, folder: Path | str, compiler: str | None = None, flags: Sequence[str] = ()) -> Self:
+        """Compile an exported folder.
+
+        Raises
+        ------
+        ConfigError
+            When there is no C compiler, or it refuses the source.
+        """
+        folder, compiler = Path(folder), compiler or find_compiler()
+        if compiler is None:
+            raise ConfigError(f"Compiling {folder}: no C compiler is on the PATH, tried {', '.join(COMPILERS)}; install one.")
+        name = json.loads((folder / "manifest.json").read_text())["name"]
+        library = folder / f"lib{name}.so"
+        command = [compiler, *FLAGS, *flags, str(folder / f"{name}.c"), str(folder / f"{name}_selftest.c"), "-o", str(library), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise ConfigError(f"Compiling {folder}: {compiler} refused the source: {done.stderr.strip()[:500]}")
+        return cls(folder, library)
+
+    def selftest(self) -> int:
+        """Run the golden vectors; 0 where they agree."""
+        return int(self._c[f"{self.name}_selftest"]())
+
+    def run(self, y: Array, u: Array, parameters: Mapping[str, float] | None = None) -> tuple[Array, npt.NDArray[Any]]:
+        """Estimate one recording, sample by sample.
+
+        Parameters
+        ----------
+        y, u : ndarray, shape (n_samples, q), (n_samples, m)
+        parameters : mapping of str to float, optional
+
+        Returns
+        -------
+        x_hat : ndarray, shape (n_samples, n_recorded)
+            Row k is the prediction for k + 1.
+        status : ndarray of int, shape (n_samples,)
+        """
+        y, u = np.ascontiguousarray(y, dtype=float), np.ascontiguousarray(u, dtype=float)
+        if y.ndim != 2 or u.ndim != 2 or len(y) != len(u) or (y.shape[1], u.shape[1]) != (self._q, self._m):
+            raise DimensionError(f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m}), found {y.shape} and {u.shape}.")
+        state = np.zeros(-(-self.state_bytes // 8))
+        at = state.ctypes.data_as(ctypes.c_void_p)
+        self._c[f"{self.name}_init"](at)
+        for name, value in (parameters or {}).items():
+            real = ctypes.c_float if self._real is np.float32 else ctypes.c_double
+            self._c[f"{self.name}_set_{name}"](at, real(value))
+        x_hat, status = np.empty((len(y), len(self.states))), np.empty(len(y), dtype=np.uint32)
+        self._reset(at, y[:1].ctypes.data_as(ctypes.c_void_p))
+        rows = [ctypes.c_void_p(a.ctypes.data) for a in (y, u, x_hat)]
+        strides = [a.strides[0] for a in (y, u, x_hat)]
+        bases = [r.value or 0 for r in rows]
+        for k in range(len(y)):
+            status[k] = self._step(at, *(ctypes.c_void_p(b + k * s) for b, s in zip(bases, strides, strict=True)))
+        return x_hat, status

@@ -1,0 +1,53 @@
+"""Golden vectors: samples, faults among them, with the estimates and status bits of the observer in Python."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...observer import Observer
+
+Array = npt.NDArray[np.float64]
+SAMPLES = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Golden:
+    """Samples and what becomes of them.
+
+    Parameters
+    ----------
+    y, u : ndarray, shape (n_samples, q), (n_samples, m)
+    x_hat : ndarray, shape (n_samples, n_recorded)
+        Estimates after every sample.
+    status : ndarray of int, shape (n_samples,)
+    size : ndarray, shape (n_recorded,)
+        Largest estimates, which differences are compared with.
+    """
+
+    y: Array
+    u: Array
+    x_hat: Array
+    status: npt.NDArray[Any]
+    size: Array
+
+    @classmethod
+    def of(cls, observer: Observer, count: int = SAMPLES) -> Golden:
+        """Run an observer on smooth signals of the size seen in training, with a missing measurement, a lost input and a spike."""
+        q, m = len(observer.measured), len(observer.inputs)
+        seen = observer.seen
+        y_size, u_size = (np.ones(q), np.ones(m)) if seen is None else (seen.measured, seen.inputs)
+        k = np.arange(count)[:, None]
+        y = y_size * 0.5 * np.sin(0.05 * k + np.arange(q))
+        u = u_size * 0.5 * np.sin(0.05 * (k + 1) + np.arange(m))
+        y[count // 3 : count // 3 + 3] = np.nan
+        u[count // 2] = np.inf
+        if seen is not None:
+            y[2 * count // 3] = 40 * y_size
+        running = observer.start(y[0])
+        found = [(np.asarray(running.step(*sample)), int(running.status)) for sample in zip(y, u, strict=True)]
+        x_hat = np.array([x for x, _ in found])[:, : len(observer.recorded)]
+        return cls(y, u, x_hat, np.array([s for _, s in found]), np.maximum(np.abs(x_hat).max(axis=0), 1e-300))

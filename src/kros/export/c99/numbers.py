@@ -1,0 +1,147 @@
+"""What the C source of an observer consists of: sizes, matrices, limits and formulas, as the templates want them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...lifting.c_code import Precision, c_code
+from ...observer import Observer
+from ...observer.samples import LONGEST
+from ...observer.screen import Bounds, Screen
+from .shift import Shift, find_shift
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """An observer in the terms of its C source.
+
+    Parameters
+    ----------
+    observer : Observer
+    name : str
+        Prefix of everything that is public, a C identifier.
+    precision : Precision
+    shift : Shift or None
+        Of a single-precision build whose origin can move.
+    """
+
+    observer: Observer
+    name: str
+    precision: Precision
+    shift: Shift | None
+
+    @classmethod
+    def of(cls, observer: Observer, name: str, precision: str) -> Source:
+        """Look at an observer."""
+        single = precision == "float"
+        return cls(observer, name, Precision(precision), find_shift(observer) if single else None)
+
+    def context(self) -> dict[str, Any]:
+        """Return everything that the templates name."""
+        o, lifting, run = self.observer, self.observer.lifting, self.observer.runtime
+        n, q, m, K = lifting.n_states, len(o.measured), len(o.inputs), o.controller
+        functions, widened = lifting.n_lifted - n, o.B.shape[1]
+        C = np.eye(n)[list(o.measured)]
+        screen = Screen.of(o)
+        limited = run.limited
+        return {
+            "name": self.name,
+            "NAME": self.name.upper(),
+            "observer": o,
+            "real": self.precision.type,
+            "suffix": self.precision.suffix,
+            "single": self.precision.type == "float",
+            "states": o.recorded,
+            "measured": [lifting.states[i] for i in o.measured],
+            "inputs": o.inputs,
+            "parameters": lifting.parameters,
+            "at": o.measured,
+            "n": n,
+            "recorded": len(o.recorded),
+            "q": q,
+            "m": m,
+            "functions": functions,
+            "widened": widened,
+            "order": K.n_states,
+            "delay": run.delay,
+            "longest": LONGEST,
+            "limited": limited,
+            "clips_estimate": run.lower is not None or run.upper is not None,
+            "clips_correction": run.correction is not None,
+            "width": o.into.shape[1],
+            "history": len(lifting.window.earlier),
+            "window_shift": [int(i) for i in lifting.window._shift] if lifting.history else [],
+            "window_present": [int(i) for i in lifting.window._present] if lifting.history else [],
+            "model": self.matrix(np.hstack([o.A[:n], o.B[:n]])),
+            "correct": self.matrix(o.into[:n] @ np.hstack([K.C, K.D])) if not limited else None,
+            "correction": self.matrix(np.hstack([K.C, K.D])) if limited else None,
+            "into": self.matrix(o.into[:n]) if limited else None,
+            "controller": self.matrix(np.hstack([K.A, K.B])),
+            "filter_gain": self.matrix(o.filter_gain),
+            "lower": self.numbers(_filled(run.lower, n, -np.inf), wide=True),
+            "upper": self.numbers(_filled(run.upper, n, np.inf), wide=True),
+            "largest": self.numbers(_filled(run.correction, o.into.shape[1], np.inf)),
+            "y_bounds": self.bounds(screen.measured),
+            "u_bounds": self.bounds(screen.inputs),
+            "default_parameters": self.numbers(np.array([o.parameters.get(p, 0.0) for p in lifting.parameters])),
+            "sigma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.formulas],
+            "gamma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.input_formulas],
+            "uses_parameters": any(set(f.used) & set(lifting.parameters) for f in (*lifting.formulas, *lifting.input_formulas)),
+            "initial": self.initial(C),
+            "shift": self.shift,
+            "shift_states": None if self.shift is None else self.wide(self.shift.states),
+            "shift_inputs": None if self.shift is None else self.wide(self.shift.inputs),
+            "period": None if self.shift is None else Precision().literal(self.shift.period),
+            "sample_period_s": Precision().literal(o.sample_period_s),
+        }
+
+    def initial(self, C: Array) -> dict[str, Any]:
+        """Return how the observer starts (`ObserverData.initial`): other states at rest, or where the lifted functions hold them."""
+        o, n = self.observer, self.observer.lifting.n_states
+        if not (o.replaces and o.lifting.functions and not o.lifting.history):
+            return {"others": [], "held": None}
+        others = [i for i in range(n) if i not in o.measured]
+        still = np.eye(len(others)) - o.A[np.ix_(others, others)]
+        from ...core.linalg import solve_balanced
+
+        held = solve_balanced(still, o.A[others, n:])
+        return {"others": others, "held": self.matrix(held)}
+
+    def symbol(self, name: str) -> str:
+        """Return what stands for a quantity of a formula in C: window w, parameters p, inputs u."""
+        lifting = self.observer.lifting
+        for names, array in ((lifting.window.names, "w"), (lifting.parameters, "p"), (self.observer.inputs, "u")):
+            if name in names:
+                return f"{array}[{names.index(name)}]"
+        raise KeyError(name)
+
+    def matrix(self, values: Array) -> list[list[str]]:
+        """Return the literals of a matrix, row by row."""
+        return [[self.precision.literal(float(v)) for v in row] for row in values]
+
+    def numbers(self, values: Array, wide: bool = False) -> list[str]:
+        """Return the literals of a row; infinity as the largest number."""
+        precision = Precision() if wide and self.precision.type == "float" else self.precision
+        most = float(np.finfo(np.float32 if precision.type == "float" else np.float64).max)
+        return [precision.literal(float(np.clip(v, -most, most))) for v in values]
+
+    def wide(self, values: Array) -> list[str]:
+        """Return literals in double precision."""
+        return [Precision().literal(float(v)) for v in values]
+
+    def bounds(self, bounds: Bounds) -> list[dict[str, str]]:
+        """Return the bounds of every channel in double precision."""
+        rows = zip(bounds.lower, bounds.upper, bounds.least, bounds.most, strict=True)
+        most = float(np.finfo(float).max)
+        keys = ("lower", "upper", "least", "most")
+        return [dict(zip(keys, (Precision().literal(float(np.clip(v, -most, most))) for v in row), strict=True)) for row in rows]
+
+
+def _filled(values: Array | None, count: int, otherwise: float) -> Array:
+    return np.full(count, otherwise) if values is None else values

@@ -1,0 +1,151 @@
+"""The files of an exported observer: written whole, into a folder of their own."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ...core.artifacts import json_bytes, with_checksum, write_bytes
+from ...core.errors import ConfigError
+from ...data.writers import whole_folder
+from ...observer import Observer
+from ...observer.file import observer_content
+from .golden import Golden
+from .numbers import Source
+
+_TOLERANCE = {"double": 1e-9, "float": 1e-3}
+_C_KEYWORDS = frozenset(
+    "auto break case char const continue default do double else enum extern float for goto if inline int long register restrict return short signed "
+    "sizeof static struct switch typedef union unsigned void volatile while main".split()
+)
+
+
+def export_c(
+    observer: Observer,
+    out: Path | str,
+    name: str = "observer",
+    precision: Literal["double", "float"] = "double",
+    *,
+    units: Mapping[str, str] | None = None,
+    study: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write an observer as C99 source with a self-test, a project and a description.
+
+    Parameters
+    ----------
+    observer : Observer
+    out : path
+        A folder that does not exist, or is empty.
+    name : str
+        Prefix of all public names, a C identifier.
+    precision : {"double", "float"}
+    units : mapping of str to str, optional
+        Units of measure by channel, for the description.
+    study : mapping, optional
+        The resolved study, written beside the source.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    ConfigError
+        When the name is no C identifier, the folder holds something, or a lifted function has no expression in C.
+    """
+    require_identifier(name)
+    if precision not in _TOLERANCE:
+        raise ConfigError(f"Export to C: precision should be 'double' or 'float', found {precision!r}.")
+    files = c_files(observer, name, precision, units or {})
+    if study is not None:
+        files["study.json"] = json_bytes(study).decode()
+    with whole_folder(Path(out)) as folder:
+        for file, text in files.items():
+            write_bytes(folder / file, text.encode())
+    return Path(out)
+
+
+def require_identifier(name: str) -> None:
+    """Refuse what is no C identifier, or a word of the language."""
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name) or name in _C_KEYWORDS:
+        raise ConfigError(
+            f"Export to C: the name {name!r} should be a C identifier of letters, digits and underscores that begins with a letter, and no word of C."
+        )
+
+
+def c_files(observer: Observer, name: str, precision: str, units: Mapping[str, str]) -> dict[str, str]:
+    """Return the text of every file by its name; the same observer gives the same bytes."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    source, golden = Source.of(observer, name, precision), Golden.of(observer)
+    context = source.context() | {"version": version("kros")}
+    context["held_start"] = context.pop("initial")
+    context["sigma_uses_parameters"] = any(set(f.used) & set(observer.lifting.parameters) for f in observer.lifting.formulas)
+    tolerance = _TOLERANCE[precision]
+    context["golden"] = {
+        "y": [[_sample(v) for v in row] for row in golden.y],
+        "u": [[_sample(v) for v in row] for row in golden.u],
+        "x": [[f"{v:.17g}" for v in row] for row in golden.x_hat],
+        "status": [f"{int(s)}u" for s in golden.status],
+        "tolerance": [f"{tolerance * v:.9g}" for v in golden.size],
+    }
+    state_bytes = _state_bytes(context)
+    numbers = sum(len(row) for key in ("model", "correction", "correct", "into", "controller", "filter_gain") for row in context[key] or ())
+    largest = None if observer.seen is None else f"{1.5 * float(observer.seen.measured.max()):.6g}"
+    functions = sorted({f for text in context["sigma"] + context["gamma"] for f in re.findall(r"\b([a-z]+)\(", text)})
+    context |= {
+        "state_bytes": state_bytes,
+        "constant_bytes": numbers * (4 if precision == "float" else 8),
+        "operations": numbers - len(context["filter_gain"]) * context["q"],
+        "largest_angle": largest,
+        "tolerance": tolerance,
+        "library": " and ".join(f"`{f}`" for f in functions) or "nothing",
+        "units": ", ".join(f"{k} {v}" for k, v in units.items() if v),
+    }
+    environment = Environment(loader=PackageLoader("kros.export.c99"), undefined=StrictUndefined, keep_trailing_newline=True)
+    texts = {
+        f"{name}.h": "observer.h",
+        f"{name}.c": "observer.c",
+        f"{name}_selftest.c": "selftest.c",
+        "example_main.c": "example_main.c",
+        "CMakeLists.txt": "CMakeLists.txt",
+        "README.md": "README.md",
+    }
+    files = {file: environment.get_template(f"{template}.jinja").render(context) for file, template in texts.items()}
+    deployed = json_bytes(with_checksum(observer_content(observer)))
+    manifest = {
+        "name": name,
+        "precision": precision,
+        "states": list(observer.recorded),
+        "measured": context["measured"],
+        "inputs": list(observer.inputs),
+        "parameters": list(observer.lifting.parameters),
+        "sample_period_s": observer.sample_period_s,
+        "state_bytes": state_bytes,
+        "observer": observer.name,
+        "kros": version("kros"),
+        "source": "sha256:" + hashlib.sha256(deployed).hexdigest(),
+    }
+    return files | {"manifest.json": json_bytes(manifest).decode()}
+
+
+def _sample(value: float) -> str:
+    return f"{value:.17g}" if np.isfinite(value) else ("ABSENT" if np.isnan(value) else "BEYOND")
+
+
+def _state_bytes(context: Mapping[str, Any]) -> int:
+    """Return the size of the state: doubles first, then numbers of the build's precision, then words of four bytes."""
+    real = 4 if context["single"] else 8
+    doubles = (1 if context["shift"] else 0) + context["m"]
+    reals = context["n"] + context["order"] + context["history"] + len(context["parameters"]) + context["delay"] * context["m"]
+    words = context["m"] + (1 if context["delay"] else 0) + 1
+    size = 8 * doubles + real * reals + 4 * words
+    align = 8 if doubles or real == 8 else 4
+    return -(-size // align) * align

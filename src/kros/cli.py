@@ -181,6 +181,25 @@ def estimate(
     _say(f"estimates of {count} episodes in {out}")
 
 
+export = typer.Typer(help="An observer for machines: source code.", no_args_is_help=True)
+app.add_typer(export, name="export")
+
+
+@export.command("c")
+def export_c(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN")],
+    out: Annotated[Path, typer.Argument(help="New folder for the source.")],
+    name: Annotated[str | None, typer.Option(help="Prefix of all names, a C identifier; default: the study's name.")] = None,
+    precision: Annotated[str, typer.Option(help="double or float")] = "double",
+    observer: Annotated[str, typer.Option(help="Observer of the run; default: the one that is deployed.")] = "deployed",
+) -> None:
+    """Write an observer as C99 source with a self-test."""
+    from .study.commands.export import export_run
+
+    path = export_run(run_folder, out, name, precision, observer)
+    _say(f"C source in {path}; start with {path / 'README.md'}")
+
+
 @app.command()
 def report(run_folder: Annotated[Path, typer.Argument(metavar="RUN")]) -> None:
     """Write the report of a run again, from the run folder only."""

@@ -87,6 +87,11 @@ class _Writer:
 
     def _power(self, exponent: float, base: str) -> str:
         one, suffix = self.precision.literal(1.0), self.precision.suffix
-        plain = {2.0: f"({base} * {base})", 3.0: f"({base} * {base} * {base})", -1.0: f"({one} / {base})", -2.0: f"({one} / ({base} * {base}))"}
+        plain = {
+            2.0: f"({base} * {base})",
+            3.0: f"({base} * {base} * {base})",
+            -1.0: f"({one} / {base})",
+            -2.0: f"({one} / ({base} * {base}))",
+        }
         roots = {0.5: f"sqrt{suffix}({base})", -0.5: f"({one} / sqrt{suffix}({base}))"}
         return {**plain, **roots}.get(exponent, f"pow{suffix}({base}, {self.precision.literal(exponent)})")

@@ -87,7 +87,9 @@ class CompiledObserver:
         """
         y, u = np.ascontiguousarray(y, dtype=float), np.ascontiguousarray(u, dtype=float)
         if y.ndim != 2 or u.ndim != 2 or len(y) != len(u) or (y.shape[1], u.shape[1]) != (self._q, self._m):
-            raise DimensionError(f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m}), found {y.shape} and {u.shape}.")
+            raise DimensionError(
+                f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m}), found {y.shape} and {u.shape}."
+            )
         state = np.zeros(-(-self.state_bytes // 8))
         at = state.ctypes.data_as(ctypes.c_void_p)
         self._c[f"{self.name}_init"](at)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -20,17 +20,17 @@ from .golden import Golden
 from .numbers import Source
 
 _TOLERANCE = {"double": 1e-9, "float": 1e-3}
-_C_KEYWORDS = frozenset(
-    "auto break case char const continue default do double else enum extern float for goto if inline int long register restrict return short signed "
-    "sizeof static struct switch typedef union unsigned void volatile while main".split()
-)
+_C_WORDS = """
+auto break case char const continue default do double else enum extern float for goto if inline int long register restrict return short signed sizeof
+static struct switch typedef union unsigned void volatile while main
+"""
 
 
 def export_c(
     observer: Observer,
     out: Path | str,
     name: str = "observer",
-    precision: Literal["double", "float"] = "double",
+    precision: str = "double",
     *,
     units: Mapping[str, str] | None = None,
     study: Mapping[str, Any] | None = None,
@@ -44,7 +44,8 @@ def export_c(
         A folder that does not exist, or is empty.
     name : str
         Prefix of all public names, a C identifier.
-    precision : {"double", "float"}
+    precision : str
+        ``double`` or ``float``.
     units : mapping of str to str, optional
         Units of measure by channel, for the description.
     study : mapping, optional
@@ -74,7 +75,7 @@ def export_c(
 
 def require_identifier(name: str) -> None:
     """Refuse what is no C identifier, or a word of the language."""
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name) or name in _C_KEYWORDS:
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name) or name in _C_WORDS.split():
         raise ConfigError(
             f"Export to C: the name {name!r} should be a C identifier of letters, digits and underscores that begins with a letter, and no word of C."
         )

@@ -1,0 +1,36 @@
+"""A run's observer as C99 source."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...core.artifacts import load_artifact
+from ...core.errors import ConfigError
+from ...export import export_c
+from ...observer import Observer
+from ..config import Stage
+from ..engine.run_folder import open_finished
+
+DEPLOYED = "deployed"
+
+
+def export_run(run: Path, out: Path, name: str | None, precision: str, observer: str = DEPLOYED) -> Path:
+    """Write one of a run's observers as C source; `name` is the study's by default.
+
+    Raises
+    ------
+    ConfigError
+        When there is no such observer, or no such run.
+    """
+    with open_finished(run, Stage.READ, Stage.SYNTHESIZE) as (config, store):
+        names = load_artifact(store.path("observers"), "observers")[0]["names"]
+        if observer not in (DEPLOYED, *names):
+            raise ConfigError(f"Run {run}: has no observer {observer!r}; known are {', '.join((DEPLOYED, *names))}.")
+        chosen = Observer.load(store.path("observers", f"{observer}.json"))
+        return export_c(chosen, out, name or identifier(config.name), precision, study=config.dump())
+
+
+def identifier(text: str) -> str:
+    """Return a C identifier that looks like a study's name."""
+    plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in text).strip("_") or "observer"
+    return plain if plain[0].isalpha() else f"observer_{plain}"

@@ -9,6 +9,7 @@ from kros.core.lti import StateSpace, gain
 from kros.data import Channel, Role
 from kros.lifting import Lifting
 from kros.observer import (
+    Choice,
     ExtendedKalman,
     Features,
     FilteredDifference,
@@ -103,18 +104,16 @@ def test_rates_follow_from_units_of_measure():
 
 
 def linear_in_the_past(seed=3, units=3, n_samples=900):
-    """Recordings in which the hidden states are linear in the last samples, and differ from unit to unit."""
+    """Recordings in which the hidden states are linear in the last samples, those before the start the first, and differ from unit to unit."""
     rng = np.random.default_rng(seed)
     lifting = Lifting(("x", "v"), ("sin(3*x + phase)", "x*v"), ("phase",))
     phases = rng.normal(size=units)
     u = rng.normal(size=(n_samples, units, 1))
     y = 2 * u + 0.3 + 0.5 * rng.normal(size=u.shape)
-    v = np.zeros(u.shape)
     size = 1 + np.arange(units)[:, None]
-    v[4:] = (
-        size * (0.7 + y[3:-1] - 2 * y[1:-3] + 0.4 * u[2:-2])
-        + (0.5 * np.sin(3 * y[3:-1, :, 0] + phases) + np.cos(3 * y[2:-2, :, 0] + phases))[..., None]
-    )
+    y1, y2, y3, u2 = (a[np.maximum(np.arange(n_samples) - lag, 0)] for a, lag in ((y, 1), (y, 2), (y, 3), (u, 2)))
+    ripple = 0.5 * np.sin(3 * y1[..., 0] + phases) + np.cos(3 * y2[..., 0] + phases)
+    v = size * (0.7 + y1 - 2 * y3 + 0.4 * u2) + ripple[..., None]
     return lifting, np.concatenate([y, v], axis=-1), u, {"phase": phases}
 
 
@@ -124,19 +123,59 @@ def test_learned_estimator_finds_what_is_linear_in_the_past():
     features = Features.of(lifting, (0,), y, u, taps=6)
     assert features.visible == (0,)
     np.testing.assert_allclose(features.static, [[0.3, 2.0]], atol=0.05)
-    learned = Moments.of(features, batch_of(states, u, DT, phases), thin=1).estimator(ridge=1e-12)
+    learned = Moments.of(features, [batch_of(states, u, DT, phases)]).estimator(choices=[Choice(6, 1e-12)])
     found = learned.run(y, u, phases)
     assert np.isnan(found[..., 0]).all()
-    np.testing.assert_allclose(found[10:, :, 1], states[10:, :, 1], atol=1e-6)
+    np.testing.assert_allclose(found[..., 1], states[..., 1], atol=1e-6)
+
+
+def test_learned_estimator_is_ridge_regression_from_the_first_sample_on():
+    """Least squares on regressors written down one by one: two units of two and one episodes, a third measured only at run time."""
+    rng = np.random.default_rng(4)
+    lifting, taps, ridge, lengths = Lifting(("x", "v", "w")), 4, 1e-3, [9, 31, 20]
+    states, u = rng.normal(size=(31, 3, 3)), rng.normal(size=(31, 3, 1))
+    batch = batch_of(states, u, DT, None, lengths, ["a", "a", "b"])
+    features = Features.of(lifting, (1,), states[..., [1]], u, taps)
+    assert features.static[0, 1] == 0  # the input explains nothing of the measurement
+    rows, truths, weights = [], [], []
+    for i, length in enumerate(lengths):
+        z = np.concatenate([states[:, i, [1]] - features.static[0, 0], u[:, i]], axis=1)
+        for k in range(length):
+            past = [z[max(k - 1 - j, 0)] for j in range(taps)]
+            rows.append([1.0, *(v[c] if j == 0 else v[c] - past[j - 1][c] for c in range(2) for j, v in enumerate(past))])
+            truths.append(states[k, i, [0, 2]])
+            weights.append([1.0, 1.0, 2.0][i] / length / np.abs(states[:length, i][:, [0, 2]]).max(axis=0) ** 2)
+    rows, truths, weights = np.array(rows), np.array(truths), np.array(weights) / 4
+    batches = [batch.take([i]).head(lengths[i]) for i in range(3)]
+    found = Moments.of(features, batches).estimator(choices=[Choice(taps, ridge)] * 2).run(states[..., [1]], u)
+    for column, state in enumerate((0, 2)):
+        half = np.sqrt(weights[:, [column]])
+        penalty = np.diag(np.sqrt(ridge * np.sum((half * rows) ** 2, axis=0)) * [0, *[1] * (2 * taps)])
+        wanted = np.linalg.lstsq(np.vstack([half * rows, penalty]), np.append(half[:, 0] * truths[:, column], np.zeros(1 + 2 * taps)))[0]
+        np.testing.assert_allclose(found[: lengths[0], 0, state], (rows @ wanted)[: lengths[0]], rtol=1e-7, atol=1e-9)
+
+
+def test_learned_estimator_chooses_what_does_best_on_units_left_out():
+    lifting, states, u, phases = linear_in_the_past(units=5)
+    batch = batch_of(states, u, DT, phases)
+    moments = Moments.of(Features.of(lifting, (0,), states[..., :1], u, taps=12), [batch])
+    (chosen,) = moments.choose()
+    percent = {}
+    for choice in (chosen, *(Choice(taps, ridge) for taps in (2, 5, 12) for ridge in (1e-8, 1e-3, 0.1))):
+        folds = [[str(i) for i in range(fold, 5, 4)] for fold in range(4)]
+        runs = {unit: moments.estimator(fold, [choice]).run(states[..., :1], u, phases) for fold in folds for unit in fold}
+        errors = [runs[unit][:, int(unit), 1] - states[:, int(unit), 1] for unit in batch.units]
+        percent[choice] = np.mean([np.sqrt(np.mean(e**2)) / np.abs(states[:, i, 1]).max() for i, e in enumerate(errors)])
+    assert percent[chosen] == min(percent.values())
 
 
 def test_a_unit_that_is_left_out_leaves_no_trace():
     lifting, states, u, phases = linear_in_the_past()
     features = Features.of(lifting, (0,), states[..., :1], u, taps=6)
-    moments = Moments.of(features, batch_of(states, u, DT, phases, [900, 900, 700], list("abc")))
+    moments = Moments.of(features, [batch_of(states, u, DT, phases, [900, 900, 700], list("abc"))])
     changed = states.copy()
     changed[:, 1] *= -3
-    others = Moments.of(features, batch_of(changed, u, DT, phases, [900, 900, 700], list("abc")))
+    others = Moments.of(features, [batch_of(changed, u, DT, phases, [900, 900, 700], list("abc"))])
     y = states[..., :1]
     kept, again = (m.estimator(["b"]).run(y, u, phases)[..., 1] for m in (moments, others))
     np.testing.assert_array_equal(kept, again)
@@ -147,12 +186,9 @@ def test_a_unit_that_is_left_out_leaves_no_trace():
 
 def test_learned_estimator_refuses_what_it_cannot_use():
     lifting, states, u, phases = linear_in_the_past()
-    both = Features.of(lifting, (0, 1), states, u)
     with pytest.raises(DataError, match="every state is measured"):
-        Moments.of(both, batch_of(states, u, DT, phases))
+        Moments.of(Features.of(lifting, (0, 1), states, u), [batch_of(states, u, DT, phases)])
     one = Features.of(lifting, (0,), states[..., :1], u)
-    with pytest.raises(DataError, match="unit c has 40 samples"):
-        Moments.of(one, batch_of(states, u, DT, phases, [900, 900, 40], list("abc")))
     with pytest.raises(DimensionError, match="expected 1 measurements"):
         one.channels(states, u, phases)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
@@ -38,6 +38,9 @@ Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, Array]
 _LEVELS = (-4.0, -2.0, 0.0, 2.0, 4.0)  # decades of process noise that the extended filter tries, for either shape
 _EXTENDED_S = 2.0
+_REGRESSORS = 600  # of the learned estimator, at most
+_LEAST = 0.1  # of a state's largest value: what it hardly moves in counts for no more than this
+_WORK = 2e9  # samples times regressors that it is trained on, some seconds: no clock decides, so that every run finds the same
 
 
 class Estimator(Protocol):
@@ -164,17 +167,38 @@ def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baselin
 
 
 def make_learned(training: TrainingSet, lifting: Lifting, measured: tuple[int, ...]) -> Baseline:
-    """Train the learned estimator on the training episodes of all units, once for every unit without it.
+    """Train the learned estimator on whole training episodes of all units, once for every unit without it.
+
+    Parameters
+    ----------
+    training : TrainingSet
+        Of all episodes (`TrainingSet.whole`), of which as many count as a fixed amount of work allows, some seconds of it; always one of every unit
+        and condition.
+    lifting : Lifting
+    measured : tuple of int
 
     Raises
     ------
     DataError
-        When every state is measured, there is one unit only, or episodes are too short.
+        When every state is measured, or there is one unit only.
     """
-    data = training.read()
-    batch, y = data.batch, data.measurements(measured)
-    features = Features.of(lifting, measured, y, batch.inputs)
-    moments = Moments.of(features, batch)
-    estimators: dict[str, Learned] = {unit: moments.estimator([unit]) for unit in moments.units}
-    facts = {"status": "trained", "taps": features.taps, "left_out": "the unit under test"}
-    return Baseline(estimators | {"": moments.estimator()}, measured, moments.estimated, facts, seen=training.seen)
+    few = training.first_of_units().read()
+    y, u = hold_missing(few.measurements(measured)), few.batch.inputs
+    features = Features.of(lifting, measured, y, u)
+    regressors = features.channels(y[:1], u[:1], few.parameters).shape[-1] * features.taps
+    features = replace(features, taps=max(1, features.taps * min(_REGRESSORS, regressors) // regressors))
+    groups, lengths = len({(key.unit, key.condition) for key in training.keys}), list[int]()
+
+    def episodes() -> Iterator[EpisodeBatch]:
+        for number, part in enumerate(training.one_by_one()):
+            if number >= groups and sum(lengths) * min(_REGRESSORS, regressors) > _WORK:
+                return
+            lengths.append(len(part.batch.states))
+            yield part.batch
+
+    moments = Moments.of(features, episodes(), _LEAST * np.abs(few.batch.states).max(axis=(0, 1)))
+    choices = moments.choose()
+    estimators: dict[str, Learned] = {unit: moments.estimator([unit], choices) for unit in moments.units}
+    facts = {"status": "trained", "episodes": len(lengths), "episodes_recorded": len(training.keys), "left_out": "the unit under test"}
+    facts["taps"] = max(choice.taps for choice in choices)
+    return Baseline(estimators | {"": moments.estimator((), choices)}, measured, moments.estimated, facts, seen=training.seen)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +45,17 @@ class TrainingSet:
             identified.population.select(units), keys, {u: known[u] for u in units}, seen_by(identified, models.measured), sensor or {}
         )
 
+    @classmethod
+    def whole(cls, identified: IdentifiedModels, models: ModelSet, sensor: Sensors | None = None) -> TrainingSet:
+        """Take all training episodes of all pooled units in all conditions, one of every unit and condition before the second of any."""
+        facts, known = identified.facts, identified.parameters
+        units = [u for u in facts.pooled if u in models.unit_ids]
+        groups = [facts.keys("train", u, c) for u in units for c in dict.fromkeys(k.condition for k in facts.keys("train", u))]
+        keys = tuple(k for turn in zip_longest(*groups) for k in turn if k is not None)
+        return cls(
+            identified.population.select(units), keys, {u: known[u] for u in units}, seen_by(identified, models.measured), sensor or {}
+        )
+
     def normalised(self, models: ModelSet) -> TrainingSet:
         """Return the same in channels divided by the ranges of models."""
         outputs, inputs = models.output_scale[list(models.measured)], models.input_scale[: len(models.recorded_inputs)]
@@ -59,9 +71,14 @@ class TrainingSet:
 
     def read(self) -> ValidationSet:
         """Read the episodes, cut short."""
-        limit = round(TUNING_S / self.population.sample_period_s)
-        batch = EpisodeBatch.read(self.population, self.keys, limit, self.parameters)
-        states = self.population.states
+        return self._shown(self.keys, round(TUNING_S / self.population.sample_period_s))
+
+    def one_by_one(self) -> Iterator[ValidationSet]:
+        """Read every episode by itself, whole."""
+        return (self._shown([key]) for key in self.keys)
+
+    def _shown(self, keys: Sequence[EpisodeKey], limit: int | None = None) -> ValidationSet:
+        batch, states = EpisodeBatch.read(self.population, keys, limit, self.parameters), self.population.states
         return ValidationSet(as_shown(batch, self.sensor, states), self.sensor, states)
 
 

@@ -3,7 +3,8 @@
 from .baselines.difference import FilteredDifference, cutoffs_hz, followed, rates
 from .baselines.extended_kalman import ExtendedKalman, start_covariance
 from .baselines.kalman import kalman_candidates, like_measurement_noise, luenberger_candidates, noise_covariances
-from .baselines.learned import Features, Learned, Moments
+from .baselines.learned import Features, Learned
+from .baselines.learned_moments import Choice, Moments
 from .certificate.certificate import ReliftCertificate, relift_certificate
 from .certificate.error import ReliftScales
 from .certificate.report import ReliftRow, relift_report
@@ -23,6 +24,7 @@ from .tuning.observer_rows import tune_observer
 from .units import in_sizes
 
 __all__ = [
+    "Choice",
     "Dropped",
     "Estimate",
     "EstimateKind",

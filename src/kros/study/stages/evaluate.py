@@ -198,7 +198,8 @@ def baseline_makers(context: Context) -> dict[str, Callable[[], Baseline]]:
     if "filtered_difference" in asked:
         makers["filtered_difference"] = partial(make_difference, training, first.measured)
     if "learned" in asked:
-        makers["learned"] = partial(make_learned, training, context.lifting, first.measured)
+        whole = TrainingSet.whole(context.identified, first, context.config.sensor)
+        makers["learned"] = partial(make_learned, whole, context.lifting, first.measured)
     return makers
 
 

@@ -1,0 +1,195 @@
+"""Training of the learned estimator, from the moments that every unit leaves of all its samples.
+
+An estimator trained without a unit costs one solution of the normal equations. How many samples of the past count and how much weights are penalised
+is chosen for every estimated state, by the errors on units that were left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DataError
+from ...data import EpisodeBatch
+from ...data.batch import hold_missing
+from .learned import Features, Learned
+
+Array = npt.NDArray[np.float64]
+RIDGE = 1e-5
+_TAPS = (2, 5, 10, 20, 40, 80)
+_RIDGES = tuple(10.0**exponent for exponent in range(-10, 0))
+_FOLDS = 4
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How one state is estimated: samples of the past, and the penalty of weights relative to the regressors' mean squares."""
+
+    taps: int
+    ridge: float
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """What every unit leaves of its training episodes: means of products of regressors and estimated states.
+
+    Regressors are a constant and, for every channel, its sample at k - 1 and the differences of those before it. For every estimated state, episodes are
+    divided by its largest value in them, as errors are.
+
+    Parameters
+    ----------
+    features : Features
+    estimated : tuple of int
+        Indices of the estimated states.
+    units : tuple of str
+    gram : ndarray, shape (unit, h, 1 + f, 1 + f)
+        Of the regressors, ``f = channels * taps``, for every estimated state.
+    cross : ndarray, shape (unit, h, 1 + f)
+    power : ndarray, shape (unit, h)
+        Mean squares of the estimated states.
+    """
+
+    features: Features
+    estimated: tuple[int, ...]
+    units: tuple[str, ...]
+    gram: Array
+    cross: Array
+    power: Array
+
+    @classmethod
+    def of(cls, features: Features, batches: Iterable[EpisodeBatch], least: Array | None = None) -> Moments:
+        """Collect the moments of training episodes, every sample from the first on; all episodes of a unit count the same.
+
+        Parameters
+        ----------
+        features : Features
+        batches : iterable of EpisodeBatch
+        least : ndarray, shape (n,), optional
+            Smallest values that the states' errors are divided by, so that episodes at rest do not count for more than all others.
+
+        Raises
+        ------
+        DataError
+            When every state is measured.
+        """
+        n = features.lifting.n_states
+        estimated = [i for i in range(n) if i not in features.measured]
+        if not estimated:
+            raise DataError("Learned estimator: every state is measured, there is nothing to estimate.")
+        floor = np.finfo(float).tiny + (np.zeros(n) if least is None else least)[estimated]
+        found: dict[str, list[Array]] = {}
+        counts: dict[str, int] = {}
+        for batch in batches:
+            z = features.channels(hold_missing(batch.measurements(features.measured)), batch.inputs, batch.parameters)
+            for i, (unit, length) in enumerate(zip(batch.units, batch.lengths.tolist(), strict=True)):
+                truth = batch.states[:length, i][:, estimated]
+                size = np.maximum(np.abs(truth).max(axis=0), floor)
+                gram, cross, power = episode_moments(z[:length, i], truth / size, features.taps)
+                new = [gram / size[:, None, None] ** 2, cross.T / size[:, None], power]
+                found[unit] = [a + b for a, b in zip(found[unit], new, strict=True)] if unit in found else new
+                counts[unit] = counts.get(unit, 0) + 1
+        gram, cross, power = (np.stack([found[unit][part] / counts[unit] for unit in found]) for part in range(3))
+        return cls(features, tuple(estimated), tuple(found), gram, cross, power)
+
+    def choose(self) -> tuple[Choice, ...]:
+        """Return for every estimated state the choice with the least mean error on units that were left out, in few folds."""
+        folds = [list(range(fold, len(self.units), _FOLDS)) for fold in range(min(_FOLDS, len(self.units)))]
+        if len(folds) < 2:
+            return (Choice(self.features.taps, RIDGE),) * len(self.estimated)
+        tried = [Choice(taps, ridge) for taps in {min(taps, self.features.taps) for taps in _TAPS} for ridge in _RIDGES]
+        errors = np.zeros((len(tried), len(self.estimated)))
+        for held in folds:
+            others = [i for i in range(len(self.units)) if i not in held]
+            for state in range(len(self.estimated)):
+                gram, cross = self.gram[others, state].mean(axis=0), self.cross[others, state].mean(axis=0)
+                weights = np.stack([self._weights(gram, cross, choice) for choice in tried])
+                missed = self.power[held, state] - 2 * weights @ self.cross[held, state].T
+                missed += np.einsum("tf,ufg,tg->tu", weights, self.gram[held, state], weights, optimize=True)
+                errors[:, state] += np.sqrt(np.maximum(missed, 0.0)).sum(axis=1)
+        return tuple(tried[i] for i in errors.argmin(axis=0))
+
+    def estimator(self, without: Collection[str] = (), choices: Sequence[Choice] | None = None) -> Learned:
+        """Train on all units but some; names of units that took no part are ignored.
+
+        Parameters
+        ----------
+        without : collection of str
+        choices : sequence of Choice, optional
+            For every estimated state; all samples and a small penalty by default.
+
+        Raises
+        ------
+        DataError
+            When no unit is left.
+        """
+        rows = [i for i, unit in enumerate(self.units) if unit not in without]
+        if not rows:
+            raise DataError(f"Learned estimator: no unit is left to train on without {', '.join(sorted(without))}; record more units.")
+        taps, h = self.features.taps, len(self.estimated)
+        gram, cross = self.gram[rows].mean(axis=0), self.cross[rows].mean(axis=0)
+        chosen = choices or (Choice(taps, RIDGE),) * h
+        weights = np.stack([self._weights(gram[i], cross[i], choice) for i, choice in enumerate(chosen)], axis=1)
+        response = weights[1:].reshape(-1, taps, h).copy()
+        response[:, :-1] -= weights[1:].reshape(-1, taps, h)[:, 1:]
+        return Learned(self.features, self.estimated, weights[0], response)
+
+    def _weights(self, gram: Array, cross: Array, choice: Choice) -> Array:
+        """Solve the normal equations, shape (1 + f,); weights of samples that do not count are zero, that of the constant is not penalised."""
+        lags = np.arange(len(gram) - 1) % self.features.taps
+        used = np.concatenate([[0], 1 + np.flatnonzero(lags < choice.taps)])
+        gram, cross = gram[np.ix_(used, used)], cross[used]
+        size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+        penalty = np.diag([0.0] + [choice.ridge] * (len(size) - 1))
+        weights = np.zeros(1 + len(lags))
+        weights[used] = np.linalg.solve(gram / np.outer(size, size) + penalty, cross / size) / size
+        return weights
+
+
+def episode_moments(z: Array, truth: Array, taps: int) -> tuple[Array, Array, Array]:
+    """Return the moments of one episode, every sample from the first on.
+
+    Regressors of row k are 1, ``z[k-1]`` and ``z[k-1-j] - z[k-j]`` for j = 1, ..., taps - 1, with z[0] before the start. Products of two differences
+    depend on their lags' difference but for the ends, so that few products of long signals are all it takes.
+
+    Parameters
+    ----------
+    z : ndarray, shape (n_samples, channels)
+    truth : ndarray, shape (n_samples, h)
+    taps : int
+
+    Returns
+    -------
+    gram : ndarray, shape (1 + channels * taps, 1 + channels * taps)
+    cross : ndarray, shape (1 + channels * taps, h)
+    power : ndarray, shape (h,)
+    """
+    (n_samples, c), h, behind = z.shape, truth.shape[1], taps - 1
+    step = np.zeros((c, behind + n_samples))
+    step[:, behind + 1 :] = (z[:-1] - z[1:]).T
+    lagged = [step[:, behind - j : behind - j + n_samples].T for j in range(1, taps)]
+    latest = np.concatenate([z[:1], z[:-1]])
+    signals = np.concatenate([np.ones((n_samples, 1)), latest, truth, *lagged[:1]], axis=1).T.copy()
+    known, state, own = slice(1 + c), slice(1 + c, 1 + c + h), slice(1 + c + h, None)
+    level = signals[known] @ signals[: 1 + c + h].T
+    product = np.stack([signals @ d for d in lagged]) if lagged else np.zeros((0, len(signals), c))
+
+    ends = step[:, n_samples - 1 : n_samples + behind - 1].T[::-1]  # what leaves the sum with every further lag
+    between = np.zeros((behind, behind, c, c))
+    between[:1] = product[None, :, own]
+    for i in range(1, behind):
+        between[i, i:] = between[i - 1, i - 1 : -1] - ends[i - 1, None, :, None] * ends[i - 1 : -1, None, :]
+    later, earlier = np.tril_indices(behind, -1)
+    between[later, earlier] = between[earlier, later].swapaxes(-1, -2)
+
+    blocks, rows, sums = np.zeros((c, taps, c, taps)), np.zeros((c, taps, h)), np.zeros((c, taps))
+    blocks[:, 0, :, 0], blocks[:, 1:, :, 1:] = level[1:, known][:, 1:], between.transpose(2, 0, 3, 1)
+    blocks[:, 0, :, 1:] = product[:, 1 : 1 + c].transpose(1, 2, 0)
+    blocks[:, 1:, :, 0] = product[:, 1 : 1 + c].transpose(2, 0, 1)
+    sums[:, 0], sums[:, 1:] = level[0, 1 : 1 + c], product[:, 0].T
+    rows[:, 0], rows[:, 1:] = level[1:, state], product[:, state].transpose(2, 0, 1)
+    gram = np.block([[np.full((1, 1), n_samples), sums.reshape(1, -1)], [sums.reshape(-1, 1), blocks.reshape(c * taps, -1)]])
+    cross = np.concatenate([level[:1, state], rows.reshape(-1, h)])
+    return gram / n_samples, cross / n_samples, np.mean(truth**2, axis=0)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from kros.core.errors import DimensionError
 from kros.observer import Observer
 from kros.observer.certificate.certificate import ReliftCertificate
-from kros.observer.certificate.error import ErrorSystem, require_covered
+from kros.observer.certificate.error import ErrorSystem
 from kros.observer.certificate.report import first_error
 from kros.observer.certificate.search import frozen_gain
 from kros.observer.simulate import run_observer
@@ -239,7 +239,6 @@ def attack_running(
     """
     if certificate.gain is None:
         raise DimensionError(f"Attack on observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")
-    require_covered(observer)
     observer = replace(observer, seen=None)  # the disturbances are to arrive
     rng, lifting, scales = np.random.default_rng(seed), observer.lifting, certificate.scales
     n, steps, batch = lifting.n_states, len(disturbance), len(start)
@@ -258,12 +257,15 @@ def attack_running(
             lifting.lift(window, values) @ observer.A[:n].T + lifting.lift_inputs(inputs[k], window, values) @ observer.B[:n].T + omega[k]
         )
         earlier = lifting.window.advance(window, inputs[k])
-    y = x[..., list(observer.measured)]
-    y[:-1] += noise
+    late = observer.runtime.delay
+    y = x[np.maximum(np.arange(steps + 1) - late, 0)][..., list(observer.measured)]
+    y[late:-1] += noise[late:]
     estimates = run_observer(observer, y, inputs[: steps + 1], values)
-    first = first_error(observer, x[0] - estimates[0], certificate.roots.shape[1] - observer.controller.n_states)
+    first = first_error(observer, x[0] - estimates[0])
     # A machine may be unstable, its observer is not: what counts is the time until rounding of the machine's state is seen. The bound is causal.
-    seen = np.logical_and.accumulate(np.abs(x / scales.error).max(axis=2) < _FAR, axis=0)
+    # So does the time until the true state leaves declared limits, which the certificate excludes.
+    inside = (x == observer.runtime.clip_estimate(x)).all(axis=2)
+    seen = np.logical_and.accumulate((np.abs(x / scales.error).max(axis=2) < _FAR) & inside, axis=0)
     spent = np.cumsum(np.sum(w**2, axis=2), axis=0)[np.maximum(seen.sum(axis=0) - 2, 0), np.arange(batch)]
     allowed = certificate.gain**2 * spent + certificate.initial_energy(first)
     energy = np.sum(((x - estimates) / scales.error) ** 2, axis=(0, 2), where=seen[..., None])

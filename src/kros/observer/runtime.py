@@ -100,18 +100,14 @@ class Runtime:
         """Whether anything is limited."""
         return any(limit is not None for limit in (self.lower, self.upper, self.correction))
 
-    @property
-    def changes(self) -> tuple[str, ...]:
-        """What is declared that changes the predicted estimate, in words; empty for an observer that runs as its matrices say."""
-        limits = {
-            "the estimate": (self.lower, self.upper),
-            "the correction": (self.correction,),
-            "the inputs": (self.input_lower, self.input_upper),
-        }
-        found = [
-            f"limits of {what}" for what, sides in limits.items() if any(side is not None and np.isfinite(side).any() for side in sides)
-        ]
-        return (*((f"a delay of {self.delay} samples",) if self.delay else ()), *found)
+    def clipped_states(self, n: int) -> list[int]:
+        """Return which of n states have limits."""
+        sides = [np.isfinite(side) for side in (self.lower, self.upper) if side is not None]
+        return [int(i) for i in np.flatnonzero(np.any(sides, axis=0))] if sides else []
+
+    def limited_corrections(self, into: Array) -> list[int]:
+        """Return which corrections have a limit and reach a state; `into`, shape (n, width), is where they enter."""
+        return [] if self.correction is None else [int(i) for i in np.flatnonzero(np.isfinite(self.correction) & np.any(into, axis=0))]
 
     def binds(self, x: Array, y_c: Array) -> bool:
         """Whether an estimate, shape (n,), meets a limit, or a correction, shape (width,), exceeds one."""
@@ -127,6 +123,10 @@ class Runtime:
     def clip_correction(self, y_c: Array) -> Array:
         """Return corrections within their limits, shape (..., width)."""
         return y_c if self.correction is None else np.asarray(np.clip(y_c, -self.correction, self.correction))
+
+    def clip_inputs(self, u: Array) -> Array:
+        """Return inputs within their limits, shape (..., m)."""
+        return u if self.input_lower is None and self.input_upper is None else np.asarray(np.clip(u, self.input_lower, self.input_upper))
 
     def require_fit(self, name: str, n: int, q: int, width: int, m: int) -> None:
         """Refuse limits of another size than the observer's."""

@@ -30,7 +30,7 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.loading import loader
 from ..data import ObserverData
 from ..units import factors
-from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, UncoveredRuntimeError, error_system, without_measurement
+from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes, without_measurement
 from .search import MOST_CORNERS, frozen_gain, mismatch_gain, prove
 from .status import Dropped, ReliftStatus
 
@@ -60,6 +60,8 @@ class ReliftCertificate:
         kappa; 0 where no slope moves, None where it was not found or not asked for.
     lower_bound : float or None
         Gain that a frozen slope attains: no certificate of any kind is below it.
+    start : ndarray, shape (n_xi, n_window)
+        Where the first error enters.
     roots : ndarray, shape (n_words, n_xi, n_xi)
         Upper triangular factors of the Lyapunov matrices, ``P = R'R``; one where slopes to come are not looked at.
     corners : ndarray, shape (n_corners, n_p)
@@ -87,6 +89,7 @@ class ReliftCertificate:
     gain: float | None = None
     mismatch_gain: float | None = None
     lower_bound: float | None = None
+    start: Array = field(default_factory=lambda: np.zeros((0, 0)))
     roots: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     corners: Array = field(default_factory=lambda: np.zeros((0, 0)))
     multipliers: Array = field(default_factory=lambda: np.zeros(0))
@@ -97,15 +100,20 @@ class ReliftCertificate:
 
     def system(self, observer: ObserverData) -> ErrorSystem:
         """Return the error dynamics that the certificate is about."""
-        return error_system(observer, self.scales, self.box, self.parameters, clipped=self.clipped)
+        return self._modes(observer)[0]
+
+    def _modes(self, observer: ObserverData) -> list[ErrorSystem]:
+        """Return it with that of every kind of step without a measurement."""
+        steps = [{}, *without_measurement(self.dropped)]
+        return [error_system(observer, self.scales, self.box, self.parameters, clipped=self.clipped, **step) for step in steps]
 
     def initial_energy(self, error: npt.ArrayLike) -> Array:
         """Return V(e_0) in scaled units, shape (...): the price of starting with an error, shape (..., n_window), the controller at rest.
 
         The first error is in physical units; behind it are earlier errors where the lifting has delays.
         """
-        e = np.asarray(error, dtype=float)
-        energies = [np.sum((e @ R[:, : e.shape[-1]].T) ** 2, axis=-1) for R in self.roots]
+        xi = np.asarray(error, dtype=float) @ self.start[:, : np.shape(error)[-1]].T
+        energies = [np.sum((xi @ R.T) ** 2, axis=-1) for R in self.roots]
         return np.asarray(np.max(energies, axis=0))
 
     def in_sizes(self, observer: ObserverData, sizes: Mapping[str, float]) -> ReliftCertificate:
@@ -120,7 +128,7 @@ class ReliftCertificate:
         assumptions = _assumptions(observer, box, self.parameters, self.dropped, clipped=self.clipped)
         roots = self.roots.copy()
         if roots.size:
-            roots[:, :, : len(errors)] /= errors
+            roots /= state_sizes(observer, self.scales, np.array(errors))
         return replace(self, scales=scales, box=box, assumptions=assumptions, roots=roots)
 
     def save(self, folder: Path) -> None:
@@ -149,7 +157,7 @@ class ReliftCertificate:
         return f"<ReliftCertificate {said}>"
 
 
-_ARRAYS = ("roots", "corners", "multipliers")
+_ARRAYS = ("start", "roots", "corners", "multipliers")
 _PLAIN = tuple(name for name in ReliftCertificate.__dataclass_fields__ if name not in (*_ARRAYS, "scales"))
 
 
@@ -171,7 +179,7 @@ def relift_certificate(
     Parameters
     ----------
     observer : ObserverData
-        Without a delay and limits in its `runtime`: with them there is no certificate, and `reason` says so.
+        With the delay and limits that its `runtime` declares.
     box : mapping of str to (lower, upper), optional
         Ranges of states (and of inputs, for input functions) inside which true and estimated values stay; needed where slopes have no global bound.
     scales : ReliftScales, optional
@@ -210,15 +218,15 @@ def relift_certificate(
     assumptions = _assumptions(observer, box, parameters, dropped, clipped=clipped)
     asked = ReliftCertificate(scales or ReliftScales.ones(observer), assumptions, dict(box or {}), dict(parameters or {}), clipped, dropped)
     try:
-        system = asked.system(observer)
-    except (UnboundedSlopeError, UncoveredRuntimeError) as error:
-        status = ReliftStatus.UNBOUNDED if isinstance(error, UnboundedSlopeError) else ReliftStatus.NOT_COVERED
-        return replace(asked, status=status, reason=f"No certificate: {error}.", solve_s=time.perf_counter() - start)
-    modes = [system, *without_measurement(observer, system, dropped)]
+        modes = asked._modes(observer)
+    except UnboundedSlopeError as error:
+        return replace(asked, status=ReliftStatus.UNBOUNDED, reason=f"No certificate: {error}.", solve_s=time.perf_counter() - start)
+    system = modes[0]
     few, width = system.corner_count <= MOST_CORNERS, system.L.shape[1]
     corners = np.array(list(product((-1.0, 1.0), repeat=width))) if few else np.zeros((0, width))
     found, reason, status = prove(modes, lookahead, time_limit_s, tight=tight)
-    tried = replace(asked, corners=corners, channels=system.channels, status=status, reason=reason)
+    first = np.zeros((0, 0)) if system.start is None else system.start
+    tried = replace(asked, corners=corners, channels=system.channels, status=status, reason=reason, start=first)
     if found is None:
         return replace(tried, solve_s=time.perf_counter() - start)
     proposal, margin = found
@@ -256,6 +264,13 @@ def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None
     elif box:
         found.append(f"true and estimated state stay within {_ranges(box)}")
     found.append("every measurement arrives" if dropped is Dropped.NEVER else f"any measurement may be missing; {_WITHOUT[dropped]}")
+    limits, names = observer.runtime, observer.lifting.states
+    if limits.delay:
+        found.append(f"measurements arrive {limits.delay} samples late")
+    if clips := limits.clipped_states(len(names)):
+        found.append(f"the true {', '.join(names[i] for i in clips)} stays within the limits of the estimate")
+    if any(side is not None and np.isfinite(side).any() for side in (limits.input_lower, limits.input_upper)):
+        found.append("the residual is that of the model with inputs within their limits")
     if observer.seen is not None:
         found.append("no measurement and no input is refused as implausible")
     return tuple(found)

@@ -1,10 +1,10 @@
 r"""The error of an observer that retracts and lifts its state at every step, as a linear system with slopes that move in a box.
 
-            ┌──────────────────────────┐
-     w ────►│ xi+ = A xi + L p + B w   ├────► z = C xi
-       ┌───►│ q   = M xi + D w         ├───┐
-     p │    └──────────────────────────┘   │ q
-       └───────────── diag(d_k) ◄──────────┘            -1 <= d_k <= 1 in every entry, arbitrary from step to step
+            ┌────────────────────────────┐
+     w ────►│ xi+ = A xi + L p + B w     ├────► z = C xi
+       ┌───►│ q   = M xi + E p + D w     ├───┐
+     p │    └────────────────────────────┘   │ q
+       └────────────── diag(d_k) ◄───────────┘            -1 <= d_k <= 1 in every entry, arbitrary from step to step
 
 For a true trajectory ``x+ = f(x, u) + omega`` and measurements ``y = C x + n`` the error ``e = x - x_hat`` obeys this exactly (`docs/relift.md`
 has the proof). A lifted function moves by ``sigma_i(x) - sigma_i(x_hat) = s_i' e`` with s_i its slope at a point between the two, hence in the
@@ -12,7 +12,7 @@ box of its slopes; the middle of the box goes into A, every entry that can move 
 
 Symbols
 -------
-xi        : [e, earlier errors that the lifting reads, x^c], the controller's states last
+xi        : [e, earlier errors that the lifting reads, x^c], with a delay followed by its residuals, the latest first, and the predicted error
 w, z      : [omega / residual, n / noise] and e / error, the scaled signals of `ReliftScales`
 p, q      : what the slopes' movement adds, and what it acts on
 d_k       : position of every slope in its interval
@@ -43,10 +43,6 @@ _CONSTANT = 4e-12  # interval bounds are widened by 1e-12: a slope within that i
 
 class UnboundedSlopeError(KrosError):
     """A lifted function may be arbitrarily steep where the observer may be."""
-
-
-class UncoveredRuntimeError(KrosError):
-    """An observer runs with what the equations of its error do not know."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +106,12 @@ class ErrorSystem:
     dt : float, s
     channels : tuple of str
         What moves in every channel, for people.
+    E : ndarray, shape (n_p, n_p), optional
+        Strictly triangular up to the order of channels; zero by default.
+    rest : ndarray, shape (n_p,), optional
+        Places at which a frozen response is taken: zero, the middle, by default; one where no limit binds.
+    start : ndarray, shape (n_xi, n_window), optional
+        Where the first error goes, with the earlier ones that the lifting reads; the first states by default.
     """
 
     A: Array
@@ -120,15 +122,33 @@ class ErrorSystem:
     C: Array
     dt: float
     channels: tuple[str, ...] = ()
+    E: Array | None = None
+    rest: Array | None = None
+    start: Array | None = None
 
     @property
     def corner_count(self) -> int:
         """Number of corners of the box."""
         return int(2 ** self.L.shape[1])
 
+    @property
+    def nested(self) -> Array:
+        """E, shape (n_p, n_p)."""
+        return np.zeros((self.L.shape[1], self.L.shape[1])) if self.E is None else self.E
+
+    @property
+    def place(self) -> Array:
+        """Places of a frozen response, shape (n_p,)."""
+        return np.zeros(self.L.shape[1]) if self.rest is None else self.rest
+
+    def closed(self, d: npt.ArrayLike) -> Array:
+        """Return ``(I - diag(d) E)^-1 diag(d)``, from what the channels act on but for other channels to what they add; shape (n_p, n_p)."""
+        moved = np.diag(np.asarray(d, dtype=float))
+        return moved if self.E is None else np.asarray(np.linalg.solve(np.eye(len(moved)) - moved @ self.E, moved))
+
     def corner(self, d: npt.ArrayLike) -> tuple[Array, Array]:
-        """Return ``A + L diag(d) M`` and ``B + L diag(d) D`` for slopes at a place in the box, shape (n_p,)."""
-        moved = self.L * np.asarray(d, dtype=float)
+        """Return ``A + L diag(d) M`` and ``B + L diag(d) D``, other channels in between, for slopes at a place in the box, shape (n_p,)."""
+        moved = self.L @ self.closed(d)
         return self.A + moved @ self.M, self.B + moved @ self.D
 
     def corners(self) -> list[tuple[Array, Array]]:
@@ -141,21 +161,53 @@ class ErrorSystem:
         B = np.hstack([self.L / root * gain, self.B])
         C = np.vstack([_WIDER * root[:, None] * self.M, self.C])
         D = np.zeros((len(C), B.shape[1]))
+        D[: len(root), : len(root)] = _WIDER * root[:, None] * self.nested / root * gain
         D[: len(root), len(root) :] = _WIDER * root[:, None] * self.D
         return (self.A, B), C, D
 
-    def frozen(self, d: npt.ArrayLike) -> StateSpace:
-        """Return the system from w to z with slopes that stay where they are."""
-        A, B = self.corner(d)
+    def frozen(self, d: npt.ArrayLike | None = None) -> StateSpace:
+        """Return the system from w to z with slopes that stay where they are, at their place of rest by default."""
+        A, B = self.corner(self.place if d is None else d)
         return StateSpace(A, B, self.C, np.zeros((len(self.C), B.shape[1])), self.dt)
 
-    def mismatch(self) -> ErrorSystem:
-        """Return the system from ``q`` of the frozen response to the rest of the error.
+    def moved(self) -> StateSpace:
+        """Return the system from w to q, what the channels act on, of the frozen response."""
+        A, B = self.corner(self.place)
+        back = self.nested @ self.closed(self.place)
+        return StateSpace(A, B, self.M + back @ self.M, self.D + back @ self.D, self.dt)
 
-        With the frozen response ``xi_0+ = A xi_0 + B w`` the rest obeys ``r+ = (A + L d M) r + L d q_0``, ``q_0 = M xi_0``, from zero.
+    def mismatch(self) -> ErrorSystem:
+        """Return the system from q' of the frozen response to the rest of the error.
+
+        The frozen response has ``p' = d' q'``. With ``r = xi - xi'`` and ``pi = p - p' + d' q'`` the rest obeys ``r+ = A r + L (pi - d' q')``,
+        ``pi = d (M r + E (pi - d' q') + q')``, from zero.
         """
         width = self.L.shape[1]
-        return replace(self, B=np.zeros((len(self.A), width)), D=np.eye(width))
+        return replace(self, B=-self.L * self.place, D=np.eye(width) - self.nested * self.place, start=None)
+
+
+class _Signals:
+    """Rows of signals as functions of [xi, p, w]."""
+
+    def __init__(self, n_xi: int, n_p: int, n_w: int) -> None:
+        self.sizes = n_xi, n_p, n_w
+
+    def _one(self, where: int, first: int, count: int, scale: npt.ArrayLike = 1.0) -> Array:
+        rows = np.zeros((count, sum(self.sizes)))
+        rows[range(count), sum(self.sizes[:where]) + first + np.arange(count)] = scale
+        return rows
+
+    def xi(self, first: int, count: int) -> Array:
+        return self._one(0, first, count)
+
+    def p(self, first: int, count: int) -> Array:
+        return self._one(1, first, count)
+
+    def w(self, first: int, count: int, scale: npt.ArrayLike) -> Array:
+        return self._one(2, first, count, scale)
+
+    def split(self, rows: Array) -> list[Array]:
+        return np.split(rows, np.cumsum(self.sizes)[:-1], axis=1)
 
 
 def error_system(
@@ -165,60 +217,108 @@ def error_system(
     parameters: Box | None = None,
     *,
     clipped: bool = False,
+    arrives: npt.ArrayLike = True,
+    applied: bool = True,
 ) -> ErrorSystem:
-    """Return the error dynamics of an observer as it runs; arguments as in `relift_certificate`.
+    """Return the error dynamics of an observer as it runs, its delay and limits included; arguments as in `relift_certificate`.
+
+    Parameters
+    ----------
+    arrives : bool or array_like of bool, shape (q,)
+        Which measurements arrive at this step; the innovation of the others is zero. The channels are the same whatever arrives.
+    applied : bool
+        Whether the correction is applied at this step.
 
     Raises
     ------
     UnboundedSlopeError
         When a slope is unbounded in the box; name ranges of the states it depends on.
-    UncoveredRuntimeError
-        When the observer runs with a delay or limits.
     """
-    require_covered(observer)
     scales = scales or ReliftScales.ones(observer)
     lifting, K, q = observer.lifting, observer.controller, len(observer.measured)
-    n = lifting.n_states
+    n, delay, limits = lifting.n_states, observer.runtime.delay, observer.runtime
     if (scales.error.shape, scales.residual.shape, scales.noise.shape) != ((n,), (n,), (q,)):
         raise DimensionError(
             f"Re-lift scales of observer {observer.name}: needs {n} errors, {n} residuals and {q} noises, found {scales.error.shape}, "
             f"{scales.residual.shape}, {scales.noise.shape}."
         )
-    lags = [(name, delay) for name, delay in lifting.window.quantities if name in lifting.states]
-    names = [delayed_name(name, d) for name, d in lags]
+    lags = [(name, lag) for name, lag in lifting.window.quantities if name in lifting.states]
+    names = [delayed_name(name, lag) for name, lag in lags]
     lower, upper = slope_box(observer, names, box, parameters, clipped=clipped)
     columns = np.hstack([observer.A[:n, n:], observer.B[:n, len(observer.inputs) :]])
     functions = lifting.functions + lifting.input_functions
     middle, half = (lower + upper) / 2, (upper - lower) / 2 * _WIDER
-
-    h, order = len(names), K.n_states
-    selector = np.eye(n, h)[list(observer.measured)]
-    into = observer.into[:n]
-    A = np.zeros((h + order, h + order))
-    A[:n, :n] = observer.A[:n, :n]
-    A[:n, :h] += columns @ middle - into @ K.D @ selector
-    for row, (name, d) in enumerate(lags[n:], n):
-        A[row, lags.index((name, d - 1))] = 1.0
-    A[:n, h:], A[h:, :h], A[h:, h:] = -into @ K.C, K.B @ selector, K.A
-    B = np.zeros((h + order, n + q))
-    B[:n, :n], B[:n, n:], B[h:, n:] = np.diag(scales.residual), -into @ K.D * scales.noise, K.B * scales.noise
     moving = np.argwhere((half > _CONSTANT * np.abs(middle)) & np.any(columns, axis=0)[:, None])
-    L, M = np.zeros((h + order, len(moving))), np.zeros((len(moving), h + order))
-    for channel, (i, j) in enumerate(moving):
-        L[:n, channel], M[channel, j] = columns[:, i], half[i, j]
-    C = np.zeros((n, h + order))
-    C[:, :n] = np.diag(1 / scales.error)
-    channels = tuple(f"{functions[i]} by {names[j]}" for i, j in moving)
-    return ErrorSystem(A, L, B, M, np.zeros((len(moving), n + q)), C, observer.sample_period_s, channels)
+    clips, cuts, into = limits.clipped_states(n), limits.limited_corrections(observer.into[:n]), observer.into[:n]
+
+    h, order, link = len(names), K.n_states, len(clips) + len(moving)
+    slots = _driven(observer, scales, h)
+    width, own = len(slots), sum(i < n for i in slots)
+    n_xi, n_p = h + order + (delay * width + n if delay else 0), link * (delay + 1) + len(cuts)
+    of = _Signals(n_xi, n_p, n + q)
+    q_rows, channels = np.zeros((n_p, sum(of.sizes))), [""] * n_p
+    rest = np.zeros(n_p)
+
+    following = np.zeros((h, h))
+    following[:n] = np.hstack([observer.A[:n, :n], np.zeros((n, h - n))]) + columns @ middle
+    for row, (name, lag) in enumerate(lags[n:], n):
+        following[row, lags.index((name, lag - 1))] = 1.0
+
+    def predicted(e: Array, at: int) -> tuple[Array, Array]:
+        """Errors (h) that act where some are estimated, and what becomes of them without correction; its channels begin at `at`."""
+        e, late = e.copy(), f", {at // link} samples on" if link and at else ""
+        for k, i in enumerate(clips, at):
+            q_rows[k], channels[k], rest[k] = _WIDER / 2 * e[i], f"limits of {names[i]}{late}", 1.0
+            e[i] = e[i] / 2 + of.p(k, 1)[0]
+        after = following @ e
+        for k, (i, j) in enumerate(moving, at + len(clips)):
+            q_rows[k], channels[k] = half[i, j] * e[j], f"{functions[i]} by {names[j]}{late}"
+            after[:n] += np.outer(columns[:, i], of.p(k, 1)[0])
+        return e, after
+
+    e, after = predicted(of.xi(0, h), 0)
+    nu = e[list(observer.measured)] + of.w(n, q, scales.noise)
+    nu[~np.broadcast_to(np.asarray(arrives, dtype=bool), (q,))] = 0.0
+    v = K.C @ of.xi(h, order) + K.D @ nu
+    for k, i in enumerate(cuts, n_p - len(cuts)):
+        q_rows[k], channels[k], rest[k] = _WIDER / 2 * v[i], f"limit of correction {i}", 1.0
+        v[i] = v[i] / 2 + of.p(k, 1)[0]
+    after[:n] -= into @ v * applied
+    omega = of.w(0, n, scales.residual)
+    held = [of.xi(h + order + i * width, width) for i in range(delay)]  # residuals, the latest first
+    enters = np.zeros((h, width))
+    enters[slots, range(width)] = 1.0
+    arriving = np.zeros((width, sum(of.sizes)))
+    arriving[:own] = omega[slots[:own]]
+    new = [after + enters @ held[-1] if delay else np.vstack([after[:n] + omega, after[n:]]), K.A @ of.xi(h, order) + K.B @ nu]
+    if delay:
+        ahead = new[0]
+        for i in range(1, delay + 1):
+            ahead = predicted(ahead, i * link)[1] + enters @ (held[delay - 1 - i] if i < delay else arriving)
+        new += [arriving, *held[:-1], ahead[:n]]
+    A, L, B = of.split(np.vstack(new))
+    M, E, D = of.split(q_rows)
+    C = np.zeros((n, n_xi))
+    C[:, n_xi - n if delay else 0 :][:, :n] = np.diag(1 / scales.error)
+    start = np.eye(n_xi, h)
+    if delay:
+        start = np.zeros((n_xi, h))
+        start[h + order : h + order + width] = enters.T
+        start[n_xi - n :, :n] = np.eye(n)
+    return ErrorSystem(A, L, B, M, D, C, observer.sample_period_s, tuple(channels), E if E.any() else None, rest, start)
 
 
-def require_covered(observer: ObserverData) -> None:
-    """Refuse an observer whose `runtime` changes what runs: the error then obeys other equations than those that are certified."""
-    if declared := observer.runtime.changes:
-        raise UncoveredRuntimeError(
-            f"observer {observer.name} runs with {', '.join(declared)}, which the error equations do not cover; "
-            "certify it without, and do not take that certificate for one of the observer as declared"
-        )
+def _driven(observer: ObserverData, scales: ReliftScales, h: int) -> list[int]:
+    """Return the errors, of h with the earlier ones, that a residual or a start drives: those of internal states start at zero."""
+    n = observer.lifting.n_states
+    return [i for i in range(h) if i < n - observer.internal or i >= n or scales.residual[i] > 0]
+
+
+def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> Array:
+    """Return the sizes of all of xi, shape (n_xi,), from those of the errors with the earlier ones, shape (n_window,)."""
+    delay, n = observer.runtime.delay, observer.lifting.n_states
+    late = [*[errors[_driven(observer, scales, len(errors))]] * delay, errors[:n]] if delay else []
+    return np.concatenate([errors, np.ones(observer.controller.n_states), *late])
 
 
 def slope_box(
@@ -243,16 +343,8 @@ def slope_box(
     return (np.minimum(lower, 0.0), np.maximum(upper, 0.0)) if clipped else (lower, upper)
 
 
-def without_measurement(observer: ObserverData, system: ErrorSystem, dropped: Dropped) -> list[ErrorSystem]:
-    """Return the dynamics of a step whose measurement is missing, one system for each thing that the observer may do then."""
-    K, n, q = observer.controller, observer.lifting.n_states, len(observer.measured)
-    h = len(system.A) - K.n_states
-    into = observer.into[:n]
-    A, B = system.A.copy(), system.B.copy()
-    A[:n, list(observer.measured)] += into @ K.D
-    A[h:, :h] = 0.0
-    B[:, -q:] = 0.0
-    withheld = A.copy()
-    withheld[:n, h:] = 0.0
-    steps = {Dropped.NEVER: [], Dropped.INNOVATION: [A], Dropped.CORRECTION: [withheld], Dropped.EITHER: [A, withheld]}
-    return [replace(system, A=step, B=B) for step in steps[dropped]]
+def without_measurement(dropped: Dropped) -> list[dict[str, bool]]:
+    """Return what may happen at a step whose measurement is missing, as arguments of `error_system`."""
+    runs_on, withheld = {"arrives": False}, {"arrives": False, "applied": False}
+    steps: dict[Dropped, list[dict[str, bool]]] = {Dropped.NEVER: [], Dropped.INNOVATION: [runs_on], Dropped.CORRECTION: [withheld]}
+    return steps.get(dropped, [runs_on, withheld])

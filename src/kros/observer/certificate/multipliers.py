@@ -64,21 +64,32 @@ def _stabilising(G: Array) -> Array | None:
     rows = np.einsum("fja,fjb->fjab", G.conj(), G)
     units = np.zeros((width, width, width))
     units[range(width), range(width), range(width)] = 1.0
-    t = np.ones(width)
+    t = min((np.ones(width), _balanced(np.abs(G).max(axis=0))), key=lambda t: _needed(G, t))
     level = _needed(G, t)
-    for _ in range(_CENTRES):
-        if level < _WELL_INSIDE:
+    for centred in range(_CENTRES):
+        if level < _WELL_INSIDE and centred:
             break
-        looser = level * 1.05 + 1e-12
+        looser = max(level * 1.05 + 1e-12, _WELL_INSIDE)
         # One number of the t is free: their sum stays below the number of slopes.
         rest = np.zeros((len(G) + 1, width, width), complex)
         slopes = np.concatenate([looser * units - rows, -np.broadcast_to(np.eye(width), (1, width, width, width))], axis=0)
         rest[-1] = 2 * width * np.eye(width)
         t = _newton(rest, slopes, np.zeros(width), t * width / t.sum())
         before, level = level, _needed(G, t)
-        if level > 0.999 * before:
+        if level > 0.999 * before and before >= _WELL_INSIDE:
             break
     return t if level < 1 else None
+
+
+def _balanced(size: Array) -> Array:
+    """Return multipliers that balance a matrix of sizes, by its Perron vectors; channels may act one way only."""
+    size = size + 1e-3 * size.max(initial=1e-300)
+    right = left = np.ones(len(size))
+    for _ in range(_NEWTON):
+        right, left = size @ right, left @ size
+        right, left = right / right.sum(), left / left.sum()
+    t = left / right
+    return np.asarray(t * len(t) / t.sum())
 
 
 def _needed(G: Array, t: Array) -> float:

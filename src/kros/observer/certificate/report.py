@@ -84,10 +84,9 @@ def relift_report(
     if estimates is None:
         estimates = run_observer(observer, states[..., list(observer.measured)], inputs, values)
     scales, omega = certificate.scales, held_residual(observer, states, inputs, values)
-    states = with_internal(observer, states, inputs, values)
+    states = with_internal(observer, states, observer.runtime.clip_inputs(inputs), values)
     system = certificate.system(observer)
-    first = first_error(observer, states[0] - estimates[0], len(system.A) - observer.controller.n_states)
-    n = observer.lifting.n_states
+    first = first_error(observer, states[0] - estimates[0])
     with np.errstate(divide="ignore", invalid="ignore"):
         w = np.where(omega == 0, 0.0, omega / scales.residual)
     inside = np.arange(n_samples)[:, None] < lengths
@@ -96,7 +95,7 @@ def relift_report(
         "w": np.sum(np.where(inside[:-1, :, None], w, 0.0) ** 2, axis=(0, 2)),
         "z": np.sum(np.where(inside[..., None], z, 0.0) ** 2, axis=(0, 2)),
         "q": np.sum(np.where(inside[..., None], q, 0.0) ** 2, axis=(0, 2)),
-        "e": np.sum(np.where(inside[..., None], (states - estimates[..., :n]) / scales.error, 0.0) ** 2, axis=(0, 2)),
+        "e": np.sum(np.where(inside[..., None], (states - estimates) / scales.error, 0.0) ** 2, axis=(0, 2)),
     }
     by_gain = np.sqrt(certificate.gain**2 * energy["w"] + certificate.initial_energy(first))
     by_frozen = np.sqrt(energy["z"]) + (
@@ -110,9 +109,9 @@ def relift_report(
 def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
     """Return the one-step residual from the first sample on, shape (n_samples - 1, batch, n); earlier values equal the first ones, as in the observer.
 
-    That of internal states is zero: recorded states drive it through the observer's own rows.
+    That of internal states is zero: recorded states drive it through the observer's own rows. Inputs count as the observer takes them, within limits.
     """
-    h = observer.lifting.history
+    h, inputs = observer.lifting.history, observer.runtime.clip_inputs(inputs)
     if h:
         states, inputs = (np.concatenate([np.repeat(v[:1], h, axis=0), v]) for v in (states, inputs))
     residual = one_step_residual(
@@ -122,23 +121,26 @@ def held_residual(observer: ObserverData, states: Array, inputs: Array, paramete
     return residual
 
 
-def first_error(observer: ObserverData, error: Array, width: int) -> Array:
-    """Return the first error with the earlier ones that the lifting reads behind it, which equal it; shape (batch, width)."""
+def first_error(observer: ObserverData, error: Array) -> Array:
+    """Return the first error with the earlier ones that the lifting reads behind it, which equal it; shape (batch, n_window)."""
     states = observer.lifting.states
     earlier = [states.index(name) for name, delay in observer.lifting.window.quantities if delay and name in states]
-    return np.concatenate([error, error[:, earlier]], axis=1)[:, :width]
+    return np.concatenate([error, error[:, earlier]], axis=1)
 
 
 def frozen_response(system: ErrorSystem, w: Array, first: Array) -> tuple[Array, Array]:
-    """Return the scaled error with slopes in the middle, and the movement of the lifted functions it can cause.
+    """Return the scaled error with slopes at rest, and what the channels act on then.
 
     `w` is the scaled residual, shape (n_samples - 1, batch, k), with noise where k is as wide as the system's input; `first` has shape (batch, n_window).
     """
-    xi = np.zeros((len(w) + 1, w.shape[1], len(system.A)))
-    xi[0, :, : first.shape[1]] = first
-    drive = w @ system.B[:, : w.shape[2]].T
-    step = np.ascontiguousarray(system.A.T)
+    plant = system.moved()
+    xi = np.zeros((len(w) + 1, w.shape[1], len(plant.A)))
+    xi[0] = first @ (np.eye(len(plant.A), first.shape[1]) if system.start is None else system.start).T
+    drive = w @ plant.B[:, : w.shape[2]].T
+    step = np.ascontiguousarray(plant.A.T)
     for k in range(len(w)):
         np.matmul(xi[k], step, out=xi[k + 1])
         xi[k + 1] += drive[k]
-    return xi @ system.C.T, xi @ system.M.T
+    moved = xi @ plant.C.T
+    moved[:-1] += w @ plant.D[:, : w.shape[2]].T
+    return xi @ system.C.T, moved

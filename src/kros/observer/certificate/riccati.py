@@ -86,7 +86,7 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
     inputs = np.hstack([system.L / root, system.B / gain])
     outputs = np.vstack([root[:, None] * system.M, system.C])
     feed = np.zeros((len(outputs), inputs.shape[1]))
-    feed[:width, width:] = root[:, None] * system.D / gain
+    feed[:width, :width], feed[:width, width:] = root[:, None] * system.nested / root, root[:, None] * system.D / gain
     T, back = _reachable_coordinates(system.A, inputs, system.dt)
     n = len(T)
     A, inputs, outputs = np.eye(n) + back @ (system.A - np.eye(n)) @ T, back @ inputs, outputs @ T
@@ -140,15 +140,9 @@ def _plain(system: ErrorSystem) -> StateSpace:
 
 def _responses(system: ErrorSystem) -> Array:
     """H at many frequencies: those of the poles and a logarithmic grid; shape (f, n_p + n_z, n_p + n_w)."""
-    plant = StateSpace(
-        system.A,
-        np.hstack([system.L, system.B]),
-        np.vstack([system.M, system.C]),
-        np.block(
-            [[np.zeros((len(system.M), system.L.shape[1])), system.D], [np.zeros((len(system.C), system.L.shape[1] + system.B.shape[1]))]]
-        ),
-        system.dt,
-    )
+    C, D = np.vstack([system.M, system.C]), np.hstack([system.nested, system.D])
+    D = np.vstack([D, np.zeros((len(system.C), D.shape[1]))])
+    plant = StateSpace(system.A, np.hstack([system.L, system.B]), C, D, system.dt)
     poles = np.log(plant.poles().astype(complex) + 1e-300)
     nyquist = 0.5 / system.dt
     marks = np.concatenate([np.abs(poles.imag), np.abs(poles.real), np.abs(poles)]) / (2 * np.pi * system.dt)

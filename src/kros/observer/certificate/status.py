@@ -18,8 +18,8 @@ class ReliftStatus(str, Enum):
     NOT_FOUND
         Neither a proof nor a counterexample was found. Allow a longer lookahead or more time, or take a smaller box.
     NOT_COVERED
-        The observer runs with a delay or limits, which the equations of the error do not know. Certify it without, and do not take the certificate
-        for one of the observer with them.
+        The observer runs in a way that the equations of the error do not know. No observer of this version does; it is kept for the reading of
+        earlier certificates.
     """
 
     CERTIFIED = "certified"

@@ -1,0 +1,97 @@
+"""Certificates of observers with a delay and limits, against the code that runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from adversary import attack, attack_running
+from batches import batch_of
+
+from kros.core.lti import StateSpace, gain
+from kros.lifting import Lifting
+from kros.observer import Observer, ReliftScales, Runtime, relift_certificate, relift_report, run_observer
+from kros.synthesis import Injection
+
+DT = 0.01
+
+
+def observer(functions: tuple[str, ...] = (), order: int = 2, injection: Injection = Injection.STATE, **runtime: object) -> Observer:
+    """Three states, stable without correction too, so that a certificate exists whatever limits do."""
+    rng = np.random.default_rng(11)
+    lifting, n, p = Lifting(("a", "b", "c"), functions, inputs=("u",)), 3, len(functions)
+    A = np.vstack(
+        [np.hstack([0.85 * np.linalg.qr(rng.standard_normal((n, n)))[0], 0.03 * rng.standard_normal((n, p))]), np.zeros((p, n + p))]
+    )
+    width = 1 if injection is Injection.INPUT else n + p
+    C, D = 0.05 * rng.standard_normal((width, order)), 0.1 * rng.standard_normal((width, 1))
+    K = StateSpace(np.diag(np.linspace(0.2, 0.6, order)), rng.standard_normal((order, 1)), C, D, DT)
+    B = np.vstack([rng.standard_normal((n, 1)), np.zeros((p, 1))])
+    return Observer("o", lifting, A, B, (0,), ("u",), K, injection, DT, runtime=Runtime(**runtime))  # type: ignore[arg-type]
+
+
+def recordings(observer: Observer, seed: int = 0, size: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
+    """A machine that is none of the models, inside the limits."""
+    rng = np.random.default_rng(seed)
+    x = np.cumsum(0.1 * rng.standard_normal((300, 6, 3)), axis=0) + rng.standard_normal((6, 3))
+    return np.tanh(x) * size, rng.standard_normal((300, 6, 1))
+
+
+def late(states: np.ndarray, delay: int) -> np.ndarray:
+    return states[np.maximum(np.arange(len(states)) - delay, 0)][..., :1]
+
+
+@pytest.mark.parametrize("functions", [(), ("b[-2]", "a[-1]")])
+@pytest.mark.parametrize("delay", [1, 4])
+def test_without_slopes_the_frozen_response_is_the_error_of_a_late_observer(delay: int, functions: tuple[str, ...]) -> None:
+    """Start, chain of predictions and correction filter: the equations are the code, to rounding."""
+    late_one = observer(functions, delay=delay, upper=np.array([np.inf, 9.0, np.inf]) if delay == 1 else None)
+    found = relift_certificate(late_one, mismatch=False)
+    x, u = recordings(late_one)
+    estimates = run_observer(late_one, late(x, delay), u)
+    rows = relift_report(found, late_one, batch_of(x, u, DT), estimates)
+    assert [row.frozen for row in rows] == pytest.approx([row.error for row in rows], rel=1e-9)
+    assert all(row.holds for row in rows)
+
+
+RUNTIMES = {
+    "delay": {"delay": 3},
+    "limits": {"lower": np.full(3, -0.35), "upper": np.full(3, 0.35)},
+    "correction": {"correction": np.full(5, 2e-3)},
+    "all": {"delay": 1, "upper": np.array([0.35, np.inf, np.inf]), "correction": np.full(4, 5e-3), "input_upper": np.array([0.5])},
+}
+
+
+@pytest.mark.parametrize("what", RUNTIMES)
+def test_bounds_hold_for_the_observer_as_it_runs(what: str) -> None:
+    """Recordings of another machine, random and worst disturbances at many amplitudes; limits bind, and that is seen."""
+    o = observer(("0.3*sin(3*a)", "0.2*cos(2*b)")[: 1 if what == "all" else 2], **RUNTIMES[what])
+    scales = ReliftScales(np.ones(3), np.array([0.1, 0.2, 0.1]), np.array([0.05]))
+    found = relift_certificate(o, scales=scales, time_limit_s=5)
+    assert found.certified, found.reason
+    x, u = recordings(o)
+    estimates = run_observer(o, late(x, o.runtime.delay), u)
+    rows = relift_report(found, o, batch_of(x, u, DT), estimates)
+    assert all(row.holds for row in rows)
+    free = run_observer(replace(o, runtime=Runtime(delay=o.runtime.delay)), late(x, o.runtime.delay), u)
+    assert (what == "delay") == np.array_equal(free, estimates)
+    worst = attack(found, o, steps=20000)
+    assert worst.share <= 1
+    rng = np.random.default_rng(5)
+    for disturbance in (worst.disturbance, rng.standard_normal((400, 4))):
+        start = 0.2 * rng.uniform(-1, 1, (40, 3))
+        share, steps = attack_running(
+            found, o, disturbance, start, 0.1 * rng.standard_normal((len(disturbance) + 1, 40, 1)), amplitudes=(1e-3, 10.0)
+        )
+        assert 0.05 < share <= 1
+        assert steps > 500
+
+
+def test_a_limit_that_leaves_an_unstable_model_uncorrected_is_refused() -> None:
+    lifting, A = Lifting(("x",)), np.array([[1.02]])
+    unstable = Observer("u", lifting, A, np.ones((1, 1)), (0,), ("u",), gain([[0.4]], 1.0), Injection.STATE, 1.0)
+    assert relift_certificate(unstable).certified
+    limited = relift_certificate(replace(unstable, runtime=Runtime(correction=np.array([0.1]))))
+    assert not limited.certified
+    assert "grows" in limited.reason

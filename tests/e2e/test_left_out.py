@@ -155,7 +155,7 @@ def test_a_unit_that_is_left_out_is_calibrated_as_a_new_one(kros, tmp_path):
     run_study(config, fold, until=Stage.CALIBRATE)
     run_study(load_config(study(tmp_path, tmp_path / "drives")), whole, until=Stage.CALIBRATE)
     contexts = [Context(config, Store(folder), Work()) for folder in (whole, fold)]
-    phases = held_parameters(contexts[0], ["001003"], contexts[1])
+    phases = held_parameters(contexts[1], contexts[0].population.select(["001003"]), contexts[0].facts)
     assert phases == unit_parameters(
         contexts[0].population.select(["001003"]), load_calibration(Store(fold)), contexts[1].facts.identify_on
     )
@@ -188,3 +188,53 @@ def test_the_table_holds_means_intervals_worst_units_and_powers():
     assert cell.band_db == pytest.approx(10 * np.log10(3 / 10))
     assert table.cells[PAPER]["velocity"].band_db == pytest.approx(0)
     assert table.cells["learned"]["velocity"].mean is None
+
+
+def test_units_in_reserve_take_part_in_nothing_and_bound_the_next(pendulums, run, tmp_path):
+    """With two in reserve the study is that on the other two alone, to the last digit; it meets them with its deployed observer."""
+    folder = tmp_path / "run"
+    settings = ["evaluate.reserve=2", "evaluate.confidence=0.6"]
+    made = run_study(load_config(study(tmp_path, pendulums), settings), folder, until=Stage.LEFT_OUT)
+    found, condition = made.metrics["next_unit"], made.metrics["study"]["identify_on"]
+    reserve, others = found["units"], [row["unit"] for row in made.metrics["units"]]
+    assert sorted([*reserve, *others]) == list(UNITS)
+    assert len(reserve) == found["reserve"] == made.metrics["study"]["units"] == 2
+    excluded = "data.exclude=" + json.dumps(reserve)
+    run_study(load_config(study(tmp_path, pendulums), [excluded]), tmp_path / "alone", until=Stage.EVALUATE)
+    for part in ("models", "uncertainty", "observers", "evaluation"):
+        files = [p.relative_to(folder) for p in (folder / part).rglob("*.json") if p.name != "relift.json"]  # that one holds seconds
+        assert files
+        assert all((folder / p).read_bytes() == (tmp_path / "alone" / p).read_bytes() for p in files)
+
+    population = read_parquet(pendulums)
+    observer = Observer.load(folder / "observers" / "deployed.json")
+    velocity = population.states.index("velocity")
+    errors = {}
+    for unit in reserve:
+        (key,) = split_episodes(population)[unit, condition].test
+        states, inputs = population.read_parts(key)
+        estimate = run_observer(observer, states[:, None, list(observer.measured)], inputs[:, None])[:, 0]
+        errors[unit] = np.sqrt(np.mean((estimate - states)[:, velocity] ** 2))
+    rows = {r["unit"]: r for r in found["rows"] if r["channel"] == "velocity"}
+    assert {u: r["rms"] for u, r in rows.items()} == pytest.approx(errors)
+    bound = found["bounds"]["velocity"]
+    assert found["reason"] is None
+    assert [m for m in bound if bound[m] == pytest.approx(max(r[m] for r in rows.values()))]  # the second of two: one measure decides
+    assert all(bound[m] >= 0.999999 * r[m] for m in bound for r in rows.values())
+
+
+def test_too_small_a_reserve_says_what_is_needed(kros, pendulums, tmp_path):
+    path = study(tmp_path, pendulums)
+    config = load_config(path, ["evaluate.reserve=1", 'uncertainty.nominal="001"'])
+    found = run_study(config, tmp_path / "run", until=Stage.LEFT_OUT).metrics
+    assert found["next_unit"]["units"] != ["001"]
+    assert found["next_unit"]["bounds"] is None
+    assert found["next_unit"]["reason"] == "1 units in reserve, and a confidence of 0.95 needs 19"
+    assert "left_out" not in found
+    fold = without(Context(config, Store(tmp_path / "run"), Work()), ["003"])
+    assert fold.data.exclude == (*found["next_unit"]["units"], "003")
+    assert fold.evaluate.reserve == 0
+    refused = kros("run", path, "--out", tmp_path / "none", "--set", "evaluate.reserve=3")
+    assert refused.exit_code == 2
+    assert "evaluate.reserve = 3: there are 4 units" in refused.stderr
+    assert not (tmp_path / "none").exists()

@@ -117,6 +117,17 @@ def test_verdict_tells_of_units_that_were_left_out() -> None:
     assert "Designed without" not in " ".join(verdict(METRICS, ("position",)))
 
 
+def test_verdict_bounds_the_next_unit_or_says_why_not() -> None:
+    bounds = {"velocity": {"error_percent": 0.04, "rms": 0.1}, "current": {"error_percent": 12.0, "rms": None}}
+    found = {"reserve": 19, "confidence": 0.95, "condition": "noload", "bounds": bounds, "reason": None}
+    told = (
+        "With 95 % confidence it estimates velocity to 0.0400 % and current to 12.0 % or better on the next unit of the batch (no load): "
+    )
+    assert told + "19 units took part in nothing." in verdict({**METRICS, "next_unit": found})
+    found |= {"bounds": None, "reason": "5 units in reserve, and a confidence of 0.95 needs 19"}
+    assert f"Nothing is known with confidence about the next unit: {found['reason']}." in verdict({**METRICS, "next_unit": found})
+
+
 @pytest.mark.parametrize("absent", ["evaluation", "observers", "outliers"])
 def test_verdict_without_a_part(absent: str) -> None:
     text = " ".join(verdict({k: v for k, v in METRICS.items() if k != absent}))

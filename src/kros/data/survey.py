@@ -44,6 +44,8 @@ class RecordingFacts:
         Episodes that were left out, with the reason.
     alerts : tuple of str
         What looks wrong in the recordings without making them unusable.
+    reserve : tuple of str
+        Units that were recorded and take part in nothing: none of the above speaks of them but `dropped` and `alerts`.
     """
 
     identify_on: str
@@ -53,6 +55,7 @@ class RecordingFacts:
     resolution: dict[str, float]
     dropped: tuple[str, ...] = ()
     alerts: tuple[str, ...] = ()
+    reserve: tuple[str, ...] = ()
 
     @property
     def pooled(self) -> tuple[str, ...]:
@@ -74,7 +77,7 @@ class RecordingFacts:
         """Read what a study's stage `read`, or a saved result, keeps in its folder ``population``."""
         content, _ = load_artifact(folder, "facts")
         train, test = (tuple(EpisodeKey(*row) for row in content[part]) for part in ("train", "test"))
-        texts = {name: tuple(content.get(name, ())) for name in ("dropped", "alerts")}
+        texts = {name: tuple(content.get(name, ())) for name in ("dropped", "alerts", "reserve")}
         return cls(content["identify_on"], content["groups"], train, test, content["resolution"], **texts)
 
 
@@ -107,6 +110,7 @@ def survey(
     on_nan: str = "error",
     folder: Path | None = None,
     work: Work | None = None,
+    reserve: Sequence[str] = (),
 ) -> tuple[Population, RecordingFacts]:
     """Read all recordings once.
 
@@ -122,6 +126,8 @@ def survey(
         Where the recordings are written as Parquet on the way; default nowhere.
     work : Work, optional
         Where it runs.
+    reserve : sequence of str
+        Units that are read, checked and written, and of which the facts say nothing else.
 
     Returns
     -------
@@ -139,15 +145,18 @@ def survey(
     tasks = [_Group(population.select([u], [c]), u, c, folder, on_nan) for u, c, _ in population.groups()]
     found = list((work or Work()).map("read", _read_group, tasks))
     kept = _kept(population, found, folder)
-    splits = split_episodes(kept, test)
+    taking_part = [u for u in kept.unit_ids if u not in reserve]
+    own = [f for task, f in zip(tasks, found, strict=True) if task.unit not in reserve]
+    splits = split_episodes(kept.select(taking_part), test)
     facts = RecordingFacts(
-        identify_on=condition_of(population, identify_on),
-        groups={u.id: u.group for u in kept.units},
+        identify_on=condition_of(population.select(taking_part), identify_on),
+        groups={unit: kept.unit(unit).group for unit in taking_part},
         train=tuple(k for s in splits.values() for k in s.train),
         test=tuple(k for s in splits.values() for k in s.test),
-        resolution={m: min(f.resolution[m] for f in found) for m in kept.measured},
+        resolution={m: min(f.resolution[m] for f in own) for m in kept.measured},
         dropped=tuple(str(k) for k in population.episodes if k not in set(kept.episodes)),
         alerts=tuple(dict.fromkeys(alert for f in found for alert in f.alerts)),
+        reserve=tuple(reserve),
     )
     for alert in facts.alerts:
         log.warning("%s", alert)

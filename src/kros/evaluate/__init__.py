@@ -5,6 +5,7 @@ from .disturb import SEVERITIES, Disturbance, Kind, Measured, hold_missing, stan
 from .errors import ErrorSummary, error_percent, error_rms, error_spectrum, summarise
 from .intervals import draw_interval, interval_rows, mean_intervals, unit_interval
 from .monte_carlo import MonteCarlo, sample_errors
+from .next_unit import draw_reserve, fewest_units, next_unit_bound
 from .robustness import DisturbedEpisodes, robustness_rows, severity_of_growth
 from .sensor import as_shown
 
@@ -19,12 +20,15 @@ __all__ = [
     "MonteCarlo",
     "as_shown",
     "draw_interval",
+    "draw_reserve",
     "error_percent",
     "error_rms",
     "error_spectrum",
+    "fewest_units",
     "hold_missing",
     "interval_rows",
     "mean_intervals",
+    "next_unit_bound",
     "robustness_rows",
     "sample_errors",
     "severity_of_growth",

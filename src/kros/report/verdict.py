@@ -21,7 +21,7 @@ def verdict(metrics: Metrics, measured: tuple[str, ...] = ()) -> list[str]:
 
 def findings(metrics: Metrics, measured: tuple[str, ...] = ()) -> list[str]:
     """Return what was recorded, what is deployed and how well it works, and which units are flagged."""
-    return [*_recorded(metrics), *_deployed(metrics, measured), *_left_out(metrics, measured), *_flagged(metrics)]
+    return [*_recorded(metrics), *_deployed(metrics, measured), *_left_out(metrics, measured), *_next_unit(metrics), *_flagged(metrics)]
 
 
 def trust(metrics: Metrics) -> list[str]:
@@ -71,7 +71,28 @@ def _left_out(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
     parts = [
         f"{c.replace('_', ' ')} to {number(v.mean)} % ({number(v.worst)} % on the worst unit, {v.worst_unit})" for c, v in cells.items()
     ]
-    return [f"Designed without the unit it runs on, the same kind of observer estimates {_join(parts)}, in the mean."] if parts else []
+    return (
+        [f"Designed without the unit it runs on, the same kind of observer estimates {_join(parts)}, in the mean (empirical)."]
+        if parts
+        else []
+    )
+
+
+def _next_unit(metrics: Metrics) -> list[str]:
+    """What units that took part in nothing say about the next one."""
+    found = metrics.get("next_unit")
+    if not found:
+        return []
+    if found["bounds"] is None:
+        return [f"Nothing is known with confidence about the next unit: {found['reason']}."]
+    parts = [
+        f"{c.replace('_', ' ')} to {number(b['error_percent'])} %" for c, b in found["bounds"].items() if b["error_percent"] is not None
+    ]
+    home = "" if found["condition"] == DEFAULT_CONDITION else f" ({condition_label(found['condition'])})"
+    level, n = f"{100 * found['confidence']:g}", found["reserve"]
+    return [
+        f"With {level} % confidence it estimates {_join(parts)} or better on the next unit of the batch{home}: {n} units took part in nothing."
+    ]
 
 
 def _better(table: ErrorTable, name: str, channels: list[str]) -> list[str]:

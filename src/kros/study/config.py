@@ -63,11 +63,14 @@ class EvaluateConfig(Settings):
     """Evaluation on units that took no part, on disturbed measurements, and on machines that might be.
 
     With `folds` the pooled units are parted into so many folds, and for each the study is made once more on all other units; 0 leaves that out.
+    With `reserve` so many units take part in nothing, and their errors bound those of the next unit with this `confidence`.
     With `robustness` observers of the deployed kind of model run on disturbed measurements of a few units, with "all" every observer on all
     units in all conditions. `monte_carlo` is the number of random members of the certified set that observers are computed for; 0 leaves that out.
     """
 
     folds: int = Field(0, ge=0)
+    reserve: int = Field(0, ge=0)
+    confidence: float = Field(0.95, gt=0, lt=1)
     robustness: bool | Literal["all"] = True
     monte_carlo: int = Field(100, ge=0)
 

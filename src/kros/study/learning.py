@@ -7,7 +7,7 @@ from .engine.steps import Step
 from .stages import calibrate, identify, quantify, read, synthesize
 
 LEARNING = (
-    Step(Stage.READ, read.run, ("data", "split")),
+    Step(Stage.READ, read.run, ("data", "split", "evaluate.reserve")),
     Step(Stage.CALIBRATE, calibrate.run, ("calibrate", "lifting")),
     Step(Stage.IDENTIFY, identify.run, ("identify", "lifting")),
     Step(Stage.QUANTIFY, quantify.run, ("uncertainty",)),

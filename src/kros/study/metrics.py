@@ -28,8 +28,8 @@ def collect_metrics(context: Context, until: Stage, total_s: float | None) -> di
     for stage, name, collect in _SECTIONS:
         if stage in done:
             metrics[name] = collect(context)
-    if Stage.LEFT_OUT in done and left_out.wanted(context.config):
-        metrics["left_out"] = load_artifact(context.store.path(left_out.FOLDER), left_out.KIND)[0]
+    if Stage.LEFT_OUT in done:
+        metrics |= left_out.results(context)
     if Stage.EVALUATE in done:
         metrics |= _disturbed(context) | load_metrics(context)
     clean: dict[str, Any] = plain(metrics)

@@ -147,7 +147,7 @@ def require_usable(config: StudyConfig, until: Stage, population: Population | N
     population = read.open_source(config, population)
     read.check_source(config, population, single_allowed=list(Stage).index(until) <= list(Stage).index(Stage.IDENTIFY))
     if left_out.wanted(config):
-        left_out.check_folds(config, population)
+        left_out.check_folds(config, read.taking_part(config, population))
 
 
 def run_in(

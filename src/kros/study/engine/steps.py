@@ -26,7 +26,7 @@ def always(config: StudyConfig) -> bool:
 
 @dataclass(frozen=True)
 class Step:
-    """One stage: what it does, which sections of the study it depends on beside the stages before it, and which studies have it."""
+    """One stage: what it does, which sections of the study, or ``section.key``, it depends on beside the stages before it, and which studies have it."""
 
     stage: Stage
     run: Callable[[Context], None]
@@ -94,6 +94,7 @@ def _outdate(context: Context, steps: Sequence[Step]) -> None:
 
 def _key(context: Context, step: Step, upstream: str) -> str:
     dumped = context.config.dump()
+    dumped |= {f"{section}.{key}": value for section, table in dumped.items() if isinstance(table, dict) for key, value in table.items()}
     inputs = _inputs_key(context) if step.stage is Stage.READ else ""
     return hash_of([upstream, inputs, {name: dumped[name] for name in step.sections}])
 

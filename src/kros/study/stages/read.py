@@ -5,15 +5,18 @@ from __future__ import annotations
 from ...core.artifacts import save_artifact
 from ...core.errors import ConfigError, DataError
 from ...data import Population, read
+from ...data.population import OUTLIERS
 from ...data.prepare import prepare
 from ...data.steps import parse_steps
 from ...data.survey import check_usable, survey
+from ...evaluate import draw_reserve
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...observer.sensor import require_measured
 from ..config import StudyConfig
 from ..engine.context import Context
 
 PARQUET, ARRAYS = "parquet", "arrays"
+FEWEST = 2  # units that a population is learned from
 
 
 def open_source(config: StudyConfig, given: Population | None = None) -> Population:
@@ -33,9 +36,35 @@ def open_source(config: StudyConfig, given: Population | None = None) -> Populat
     return population.select([u for u in population.unit_ids if u not in data.exclude])
 
 
+def draw(config: StudyConfig, population: Population) -> tuple[str, ...]:
+    """Return the units in reserve: drawn from those of the population that the study does not name, by their places alone.
+
+    Raises
+    ------
+    ConfigError
+        When fewer than two units are left to learn from.
+    """
+    n, named = config.evaluate.reserve, {config.uncertainty.nominal, *config.load.units}
+    pooled = [u.id for u in population.units if u.group != OUTLIERS]
+    free = [u for u in pooled if u not in named]
+    if n and (n > len(free) or len(pooled) - n < FEWEST):
+        raise ConfigError(
+            f"evaluate.reserve = {n}: there are {len(pooled)} units, {len(pooled) - len(free)} of them named by the study, and a population is learned from at "
+            f"least {FEWEST}; reserve fewer, or record more units."
+        )
+    return draw_reserve(free, n)
+
+
+def taking_part(config: StudyConfig, population: Population) -> Population:
+    """Return a population without the units in reserve."""
+    reserve = draw(config, population)
+    return population.select([u for u in population.unit_ids if u not in reserve])
+
+
 def check_source(config: StudyConfig, population: Population, single_allowed: bool) -> None:
     """Refuse what can be refused from names alone, before anything is written."""
     check_usable(population, config.split.test, config.data.identify_on, single_allowed)
+    population = taking_part(config, population)
     resolve_phase(config.calibrate, population, resolve_lifting(config.lifting, config.calibrate, population, config.split.test))
     config.predictor.require_hidden(population.states, population.measured)
     require_measured(config.sensor, population.measured)
@@ -46,9 +75,8 @@ def run(context: Context) -> None:
     config = context.config
     in_place = config.data.reader == PARQUET and not config.data.prepare
     folder = None if in_place else context.store.draft("recordings")
-    _, facts = survey(
-        open_source(config, context.given), config.split.test, config.data.identify_on, config.data.on_nan, folder, context.work
-    )
+    population, data = open_source(config, context.given), config.data
+    _, facts = survey(population, config.split.test, data.identify_on, data.on_nan, folder, context.work, draw(config, population))
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them first with on_nan = 'drop_episode'.")
     content = {"recordings": config.data.source if in_place else "recordings", **facts.content()}

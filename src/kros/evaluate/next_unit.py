@@ -1,0 +1,69 @@
+"""What the errors of units that took part in nothing say about the next one: split conformal prediction.
+
+Of ``n`` units that nothing was made from, and one more that is exchangeable with them, every order of their errors is equally likely. So the
+error of the next unit is at most the ``ceil(confidence (n + 1))``-th smallest of theirs with a probability of at least ``confidence``, whatever
+their distribution, the observer or the plant. Several errors are bounded together by the largest one relative to a scale that was fixed before.
+
+Source: V. Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a Random World, Springer 2005, section 4.2; H. Papadopoulos et al., Inductive
+Confidence Machines for Regression, ECML 2002.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import ceil
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError
+
+Array = npt.NDArray[np.float64]
+_ROUNDING = 1e-9  # 0.9 / (1 - 0.9) is a little more than 9
+
+
+def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> tuple[str, ...]:
+    """Draw units that take part in nothing, by place alone, in the order of `units`; more of them include those that fewer would be."""
+    drawn = np.random.default_rng(seed).permutation(len(units))[:n]
+    return tuple(units[i] for i in sorted(drawn))
+
+
+def fewest_units(confidence: float) -> int:
+    """Return how many units bound the next one at all with some confidence: ``1 / (1 - confidence) - 1``, rounded up."""
+    return ceil(confidence / (1 - confidence) - _ROUNDING)
+
+
+def next_unit_bound(errors: npt.ArrayLike, scale: npt.ArrayLike, confidence: float = 0.95) -> Array | None:
+    """Bound the errors of the next unit, all of them together.
+
+    Parameters
+    ----------
+    errors : array_like, shape (unit, k)
+        Of units that nothing was made from, exchangeable with each other and with the next; what is not finite counts as infinite.
+    scale : array_like, shape (k,)
+        Positive, and fixed without a look at these units: errors divided by it are compared with each other.
+    confidence : float
+        In (0, 1).
+
+    Returns
+    -------
+    ndarray, shape (k,), or None
+        None where the units are fewer than `fewest_units`; infinite where too many errors are.
+
+    Raises
+    ------
+    DataError
+        When the scale is not positive and finite, shapes differ or the confidence is none.
+    """
+    errors, scale = np.asarray(errors, dtype=float), np.asarray(scale, dtype=float)
+    if not 0 < confidence < 1:
+        raise DataError(f"Bound of the next unit: the confidence is between 0 and 1, found {confidence:g}.")
+    if errors.ndim != 2 or scale.shape != errors.shape[1:] or not scale.size:
+        raise DataError(f"Bound of the next unit: needs errors (unit, k) and a scale (k,), found {errors.shape} and {scale.shape}.")
+    if not (np.isfinite(scale) & (scale > 0)).all():
+        raise DataError(f"Bound of the next unit: a scale is positive and finite, found {scale.tolist()}.")
+    if len(errors) < fewest_units(confidence):
+        return None
+    scores = np.max(np.where(np.isfinite(errors), errors, np.inf) / scale, axis=1)
+    rank = ceil(confidence * (len(errors) + 1) - _ROUNDING)
+    return np.sort(scores)[rank - 1] * scale

@@ -191,7 +191,7 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
     rows: Rows = []
     if keys:
         observer = Observer.load(context.store.path("observers", "deployed.json"))
-        summary = evaluate_observers([observer], whole, keys, known, ())[0].summary
+        summary = evaluate_observers([observer], whole, keys, known, (), context.config.sensor)[0].summary
         rows = error_rows(deployed, summary, keys, roles, whole.states, band_hz(context))
     lost = dict.fromkeys((k.unit, k.condition) for k in test if k.unit in failed)
     base = {"observer": deployed, "role": "reserve"} | dict.fromkeys(_MEASURES, float("inf"))

@@ -196,8 +196,23 @@ def export_c(
     """Write an observer as C99 source with a self-test."""
     from .study.commands.export import export_run
 
-    path = export_run(run_folder, out, name, precision, observer)
+    path = export_run(run_folder, out, name, observer, precision=precision)
     _say(f"C source in {path}; start with {path / 'README.md'}")
+
+
+@export.command("fmu")
+def export_fmu(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.fmu", help="New file.")],
+    fmi: Annotated[int, typer.Option(help="Version of the standard, 2 or 3")] = 2,
+    name: Annotated[str | None, typer.Option(help="Name of the model, a C identifier; default: the study's name.")] = None,
+    precision: Annotated[str, typer.Option(help="double or float")] = "double",
+    observer: Annotated[str, typer.Option(help="Observer of the run; default: the one that is deployed.")] = "deployed",
+) -> None:
+    """Write an observer as a functional mock-up unit for co-simulation."""
+    from .study.commands.export import export_run
+
+    _say(f"FMU in {export_run(run_folder, out, name, observer, fmi=fmi, precision=precision)}")
 
 
 @app.command()

@@ -2,5 +2,6 @@
 
 from .c99.compiled import CompiledObserver, find_compiler
 from .c99.write import export_c
+from .fmu.write import export_fmu
 
-__all__ = ["CompiledObserver", "export_c", "find_compiler"]
+__all__ = ["CompiledObserver", "export_c", "export_fmu", "find_compiler"]

@@ -1,4 +1,4 @@
-"""A run's observer as C99 source."""
+"""A run's observer as C99 source, or as a functional mock-up unit."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ...core.artifacts import load_artifact
 from ...core.errors import ConfigError
-from ...export import export_c
+from ...export import export_c, export_fmu
 from ...observer import Observer
 from ..config import Stage
 from ..engine.run_folder import open_finished
@@ -14,8 +14,10 @@ from ..engine.run_folder import open_finished
 DEPLOYED = "deployed"
 
 
-def export_run(run: Path, out: Path, name: str | None, precision: str, observer: str = DEPLOYED) -> Path:
-    """Write one of a run's observers as C source; `name` is the study's by default.
+def export_run(
+    run: Path, out: Path, name: str | None, observer: str = DEPLOYED, *, fmi: int | None = None, precision: str = "double"
+) -> Path:
+    """Write one of a run's observers as C source, or as an FMU of a version; `name` is the study's by default.
 
     Raises
     ------
@@ -26,8 +28,10 @@ def export_run(run: Path, out: Path, name: str | None, precision: str, observer:
         names = load_artifact(store.path("observers"), "observers")[0]["names"]
         if observer not in (DEPLOYED, *names):
             raise ConfigError(f"Run {run}: has no observer {observer!r}; known are {', '.join((DEPLOYED, *names))}.")
-        chosen = Observer.load(store.path("observers", f"{observer}.json"))
-        return export_c(chosen, out, name or identifier(config.name), precision, study=config.dump())
+        chosen, name = Observer.load(store.path("observers", f"{observer}.json")), name or identifier(config.name)
+        if fmi is not None:
+            return export_fmu(chosen, out, fmi, name, precision)
+        return export_c(chosen, out, name, precision, study=config.dump())
 
 
 def identifier(text: str) -> str:

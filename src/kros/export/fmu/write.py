@@ -1,0 +1,147 @@
+"""An FMU: sources, their description, and a binary for this machine where there is a compiler, in one archive."""
+
+from __future__ import annotations
+
+import io
+import platform
+import subprocess
+import sys
+import tempfile
+import uuid
+import zipfile
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from ...core.artifacts import write_bytes
+from ...core.errors import ConfigError
+from ...observer import Observer
+from ..c99.compiled import FLAGS, find_compiler
+from ..c99.numbers import Source
+from ..c99.write import c_files, require_identifier
+
+_KROS = uuid.UUID("4b0a3f5e-7f2c-5d0e-9a61-6b726f733939")
+_FIXED = (1980, 1, 1, 0, 0, 0)  # the same bytes from the same observer
+
+
+def export_fmu(
+    observer: Observer,
+    out: Path | str,
+    fmi: int = 2,
+    name: str = "observer",
+    precision: str = "double",
+    *,
+    units: Mapping[str, str] | None = None,
+) -> Path:
+    """Write an observer as an FMU for co-simulation.
+
+    Measurements, inputs and parameters are variables of their own names, estimates end in ``_hat``, ``status`` holds the bits of `SampleStatus`. A
+    communication step of one sampling period takes one sample and gives the estimate for its end.
+
+    Parameters
+    ----------
+    observer : Observer
+    out : path
+        A file that does not exist, ``NAME.fmu``.
+    fmi : int
+        2 or 3.
+    name : str
+        A C identifier.
+    precision : str
+        ``double`` or ``float``.
+    units : mapping of str to str, optional
+        Units of measure by channel.
+
+    Raises
+    ------
+    ConfigError
+        When the file exists or ends differently, the version or the name is none, or a lifted function has no expression in C.
+    """
+    out, known = Path(out), {k: v for k, v in (units or {}).items() if v}
+    require_identifier(name)
+    if fmi not in (2, 3):
+        raise ConfigError(f"Export of an FMU: fmi should be 2 or 3, found {fmi!r}.")
+    if out.suffix != ".fmu" or out.exists():
+        raise ConfigError(f"Export of an FMU: {out} should be a new file that ends in .fmu.")
+    files = c_files(observer, name, precision, known)
+    sources = {f"sources/{file}": files[file] for file in (f"{name}.h", f"{name}.c")}
+    guid = str(uuid.uuid5(_KROS, sources[f"sources/{name}.c"] + files["manifest.json"]))
+    texts = rendered(observer, name, precision, fmi, guid, known)
+    packed: dict[str, bytes] = {
+        file: text.encode() for file, text in {**texts, **sources, "documentation/README.md": files["README.md"]}.items()
+    }
+    write_bytes(out, _archive(packed | compiled(packed, name, fmi)))
+    return out
+
+
+def rendered(observer: Observer, name: str, precision: str, fmi: int, guid: str, units: Mapping[str, str]) -> dict[str, str]:
+    """Return the files that make C source an FMU."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    context = Source.of(observer, name, precision).context()
+    context |= {"version": version("kros"), "fmi": fmi, "guid": guid, "units": units, "variables": variables(observer, units)}
+    context["wide_parameters"] = [f"{observer.parameters.get(p, 0.0):.17g}" for p in observer.lifting.parameters]
+    environment = Environment(loader=PackageLoader("kros.export.fmu"), undefined=StrictUndefined, keep_trailing_newline=True)
+    chosen = {f"sources/{name}_fmu.c": "machine.c", "modelDescription.xml": f"model{fmi}.xml"}
+    if fmi == 3:
+        chosen["sources/buildDescription.xml"] = "build.xml"
+    return {file: environment.get_template(f"{template}.jinja").render(context) for file, template in chosen.items()}
+
+
+def variables(observer: Observer, units: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return the variables in the order of their references: measurements, inputs, parameters, estimates, status."""
+    measured = [observer.lifting.states[i] for i in observer.measured]
+
+    def rows(names: Any, causality: str, variability: str, description: str, start: Any, suffix: str = "") -> list[dict[str, Any]]:
+        return [
+            {
+                "name": n + suffix,
+                "causality": causality,
+                "variability": variability,
+                "description": description.format(n),
+                "unit": units.get(n, ""),
+            }
+            | {"start": start(n), "real": True}
+            for n in names
+        ]
+
+    found = rows(measured, "input", "discrete", "measured {}", lambda _: "0.0")
+    found += rows(observer.inputs, "input", "discrete", "input {}", lambda _: "0.0")
+    found += rows(
+        observer.lifting.parameters, "parameter", "tunable", "this machine's {}", lambda n: f"{observer.parameters.get(n, 0.0):.17g}"
+    )
+    found += rows(observer.recorded, "output", "discrete", "estimate of {} at the end of the step", lambda _: None, "_hat")
+    bits = "1 missing measurement, 2 invalid input, 4 limit, 8 outside the certificate"
+    found.append(
+        {"name": "status", "causality": "output", "variability": "discrete", "description": bits, "unit": "", "start": None, "real": False}
+    )
+    return [{**variable, "index": i} for i, variable in enumerate(found)]
+
+
+def compiled(files: Mapping[str, bytes], name: str, fmi: int) -> dict[str, bytes]:
+    """Return the shared library for this machine, by its place in the archive; nothing where there is no compiler."""
+    compiler = find_compiler()
+    if compiler is None or sys.platform not in ("linux", "darwin"):
+        return {}
+    machine = platform.machine().lower().replace("amd64", "x86_64").replace("arm64", "aarch64")
+    system, ending = ("linux", "so") if sys.platform == "linux" else ("darwin", "dylib")
+    place = f"{machine}-{system}" if fmi == 3 else {"linux": "linux64", "darwin": "darwin64"}[system]
+    with tempfile.TemporaryDirectory() as folder:
+        for file, content in files.items():
+            if file.startswith("sources/") and not file.endswith(".xml"):
+                (Path(folder) / Path(file).name).write_bytes(content)
+        library = Path(folder) / f"{name}_fmu.{ending}"
+        sources = [str(Path(folder) / f"{part}.c") for part in (name, f"{name}_fmu")]
+        done = subprocess.run([compiler, *FLAGS, *sources, "-o", str(library), "-lm"], capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise ConfigError(f"Export of an FMU: {compiler} refused the source: {done.stderr.strip()[:500]}")
+        return {f"binaries/{place}/{library.name}": library.read_bytes()}
+
+
+def _archive(files: Mapping[str, bytes]) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in sorted(files):
+            archive.writestr(zipfile.ZipInfo(file, _FIXED), files[file], zipfile.ZIP_DEFLATED)
+    return packed.getvalue()

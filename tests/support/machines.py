@@ -1,0 +1,94 @@
+"""Machines with observers of every kind, samples with faults, and what the observer in Python makes of them."""
+
+import numpy as np
+
+from kros.core.lti import StateSpace
+from kros.lifting import Lifting
+from kros.observer import Observer, Runtime, Seen
+from kros.synthesis import Injection
+
+STATES, DT = ("position", "velocity", "current"), 1e-3
+GEAR = ("sin(100*position + phase)", "cos(100*position + phase)")
+SMOOTH = (
+    "position**2",
+    "tanh(velocity)",
+    "abs(current)*sign(velocity)",
+    "exp(-velocity**2)",
+    "sqrt(1 + position**2)",
+    "(1 + position**2)**1.3/(2 + velocity**2)",
+)
+
+
+def drive(functions=GEAR, order=2, inputs=(), gamma=(), injection=Injection.STATE, **runtime):
+    lifting = Lifting(STATES, functions, tuple(p for p in ("phase",) if any(p in f for f in functions)), inputs, gamma)
+    rng, n, m = np.random.default_rng(5), lifting.n_lifted, 2 + len(gamma)
+    A, B = 0.9 * np.eye(n), np.zeros((n, m))
+    A[:3, :3] = [[0.99, DT, 0], [-0.5, 0.9, 0.01], [0, 0, 0.9]]
+    A[:3, 3:] = 1e-3 * rng.normal(size=(3, n - 3))
+    B[:3, :2], B[2, 2:] = [[0.01, 0], [0.5, 0.02], [0.01, 0]], 1e-3
+    width = m if injection is Injection.INPUT else n
+    K = StateSpace(
+        0.9 * np.eye(order),
+        0.1 * rng.normal(size=(order, 1)),
+        0.01 * rng.normal(size=(width, order)),
+        0.01 * rng.normal(size=(width, 1)),
+        DT,
+    )
+    parameters = {"phase": 0.3} if lifting.parameters else {}
+    seen = Seen(np.array([1.5]), np.array([2.0, 9.0]))
+    return Observer("drive", lifting, A, B, (0,), ("target", "rate"), K, injection, DT, parameters, Runtime(**runtime), seen)
+
+
+LIMITS = {"lower": [-np.inf, -2, -0.3], "upper": [np.inf, 2, 0.3]}
+MACHINES = {
+    "lifted": lambda: drive(),
+    "gain": lambda: drive(order=0),
+    "linear": lambda: drive(()),
+    "delay": lambda: drive(delay=3),
+    "limits": lambda: drive(correction=np.full(5, 0.004), **LIMITS),
+    "delay and limits": lambda: drive(delay=2, correction=np.full(5, 0.004), **LIMITS),
+    "input limits": lambda: drive(input_lower=[-1, -2], input_upper=[1, 2]),
+    "through the input": lambda: drive(injection=Injection.INPUT, correction=np.full(2, 0.01)),
+    "every function": lambda: drive(SMOOTH),
+    "earlier values": lambda: drive(("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate")),
+    "earlier values and delay": lambda: drive(("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate"), delay=3),
+    "input functions": lambda: drive(inputs=("target", "rate"), gamma=("rate*velocity",)),
+    "replaced": lambda: replaced(),
+}
+
+
+def replaced():
+    """A measurement takes the place of the estimate; two internal states."""
+    lifting = Lifting((*STATES, "memory_1", "memory_2"), GEAR, ("phase",))
+    rng = np.random.default_rng(3)
+    A = np.zeros((7, 7))
+    A[:5, :5] = 0.9 * np.eye(5) + 0.01 * rng.normal(size=(5, 5))
+    A[:5, 5:] = 1e-3 * rng.normal(size=(5, 2))
+    A[0, 0] = 1.0
+    B = np.vstack([0.01 * rng.normal(size=(5, 2)), np.zeros((2, 2))])
+    gain = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((7, 0)), A[:, :1], DT)
+    seen = Seen(np.array([1.5]), np.array([2.0, 9.0]))
+    return Observer(
+        "r", lifting, A, B, (0,), ("target", "rate"), gain, Injection.STATE, DT, {"phase": 0.3}, seen=seen, replaces=True, internal=2
+    )
+
+
+def samples(count, turns=0.0, faults=True):
+    rng, t = np.random.default_rng(1), np.arange(count) * DT
+    y = (np.sin(3 * t - 0.05) + 1e-4 * rng.normal(size=count) + 2 * np.pi * turns)[:, None]
+    u = np.stack([np.sin(3 * t) + 2 * np.pi * turns, 3 * np.cos(3 * t)], axis=1)
+    if faults:
+        y[rng.integers(0, count, count // 50)], y[rng.integers(0, count, 20)] = np.nan, 50
+        u[rng.integers(0, count, count // 80), 0], u[count // 2 : count // 2 + 20] = np.inf, np.nan
+        y[0] = np.nan
+    return y, u
+
+
+def in_python(observer, y, u):
+    running = observer.start(y[0])
+    found = [(np.asarray(running.step(*sample)), int(running.status)) for sample in zip(y, u, strict=True)]
+    return np.array([x for x, _ in found])[:, : len(observer.recorded)], np.array([status for _, status in found])
+
+
+def apart(found, wanted):
+    return (np.sqrt(np.mean((found - wanted) ** 2, axis=0)) / np.sqrt(np.mean((wanted - wanted.mean(axis=0)) ** 2, axis=0))).max()

@@ -10,6 +10,7 @@ import pytest
 from kros.core.work import Work
 from kros.identify import ModelSet
 from kros.identify.refine import RefinedModels
+from kros.plants.harmonic_drive.control import VELOCITY_POLE
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.pipeline import load_run
@@ -68,6 +69,17 @@ def test_every_unit_is_evaluated_in_every_condition_with_every_observer(metrics)
     assert {(name, channel) for name, _, _, channel in rows} == {(name, c) for name, channels in estimated.items() for c in channels}
     assert {r["role"] for r in metrics["evaluation"]} == {"nominal", "off_nominal", "outlier"}
     assert all(r["gearbox_band_power"] >= 0 for r in metrics["evaluation"] if r["error_percent"] is not None)
+
+
+def test_estimates_and_recordings_are_judged_against_the_true_velocity_too(demo, metrics):
+    """The drive's own velocity is a difference, half a sample late, behind a low-pass at 150 Hz, `pole / (1 - pole)` samples late."""
+    late = 1e-3 * (0.5 + VELOCITY_POLE / (1 - VELOCITY_POLE))
+    assert {(r["channel"], r["condition"]) for r in metrics["recorded"]} == {("velocity", "noload"), ("velocity", "load")}
+    assert all(r["true_lag_s"] == pytest.approx(late, abs=0.1e-3) for r in metrics["recorded"])
+    assert len(metrics["recorded"]) == 6 * 2
+    assert "lag (ms)" in (demo / "report.html").read_text()
+    rows = [r for r in metrics["evaluation"] if r["error_percent"] is not None]
+    assert all(("true_error_percent" in r) == (r["channel"] == "velocity") for r in rows)
 
 
 def test_the_models_on_disk_are_what_the_design_promises(demo, metrics, recorded):

@@ -214,7 +214,10 @@ def test_another_rate(folder: Path) -> None:
     [
         ({"file": "x"}, "unknown key 'file'; known keys are files, channel, time"),
         ({"channel": [{"name": "x", "role": "state", "column": "pos", "measurd": True}]}, r"channel\[0\]: unknown key 'measurd'"),
-        ({"channel": [{"name": "x", "role": "output", "column": "pos"}]}, r"role: should be one of \['state', 'input'\], found 'output'"),
+        (
+            {"channel": [{"name": "x", "role": "output", "column": "pos"}]},
+            r"role: should be one of \['state', 'input', 'truth'\], found 'output'",
+        ),
         ({"channel": [{"name": "x", "role": "state"}]}, "channel 'x' has no column"),
         ({"channel": []}, r"there is no \[\[channel\]\]"),
         ({"files": "("}, r"files = '\(' is not a regular expression"),

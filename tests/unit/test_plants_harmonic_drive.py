@@ -83,7 +83,7 @@ def test_reading_twice_gives_independent_equal_arrays(small):
 def test_sources_travel_between_processes(small):
     part = small.population.select(units=["001002"], conditions=["load"])
     content = pickle.dumps(part)
-    assert len(content) < 2 * 4001 * 8 * 5 * 1.1 + 10_000  # two of sixteen episodes
+    assert len(content) < 2 * 4001 * 8 * 6 * 1.1 + 10_000  # two of sixteen episodes
     np.testing.assert_array_equal(pickle.loads(content).read(LOADED), small.population.read(LOADED))
     with pytest.raises(DataError):
         part.source(EpisodeKey("001001", "load", "1"))

@@ -6,7 +6,7 @@ folder or arrays ── reader ── Population ── prepare ── check ─
 from . import steps
 from .batch import EpisodeBatch
 from .checks import check_episode, check_population, scan_population
-from .population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Role, Split, Unit, split_episodes
+from .population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Role, Split, TrueChannel, Unit, split_episodes
 from .prepare import prepare
 from .readers import (
     READERS,
@@ -35,6 +35,7 @@ __all__ = [
     "Population",
     "Role",
     "Split",
+    "TrueChannel",
     "Unit",
     "check_episode",
     "check_population",

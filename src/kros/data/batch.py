@@ -31,6 +31,8 @@ class EpisodeBatch:
         The states as a sensor shows them to an observer; as recorded by default.
     lost : ndarray of bool, shape (n_samples, batch, n), optional
         Samples that do not arrive.
+    truths : ndarray, shape (n_samples, batch, n_truths)
+        What states really were, where the population has it and it was asked for; None otherwise.
     """
 
     keys: tuple[EpisodeKey, ...]
@@ -41,6 +43,7 @@ class EpisodeBatch:
     parameters: dict[str, Array] = field(default_factory=dict)
     shown: Array | None = None
     lost: npt.NDArray[np.bool_] | None = None
+    truths: Array | None = None
 
     @classmethod
     def read(
@@ -49,20 +52,24 @@ class EpisodeBatch:
         keys: Sequence[EpisodeKey],
         max_samples: int | None = None,
         parameters: Mapping[str, Mapping[str, float]] | None = None,
+        truths: bool = False,
     ) -> EpisodeBatch:
-        """Read episodes, each cut to at most `max_samples`; `parameters` are lifting parameters by unit and name, kept where all units have them."""
+        """Read episodes, each cut to at most `max_samples`; `parameters` are lifting parameters by unit and name, kept where all units have them.
+
+        With `truths` also what states really were, for judging.
+        """
         if not keys:
             raise DataError("Reading a batch of episodes: no episodes were named; check the split.")
-        episodes = [population.read(key)[:max_samples] for key in keys]
-        lengths = np.array([len(e) for e in episodes])
+        pairs = [population.read_with_truths(key) for key in keys]
+        lengths = np.array([len(e[:max_samples]) for e, _ in pairs])
         n = len(population.states)
-        values = np.empty((lengths.max(), len(keys), len(population.channels)))
-        for i, episode in enumerate(episodes):
-            values[: len(episode), i] = episode
-            values[len(episode) :, i] = episode[-1]
+        values = _side_by_side([e[:max_samples] for e, _ in pairs], lengths)
+        true = _side_by_side([t[:max_samples] for _, t in pairs], lengths) if truths and population.truths else None
         rows = [(parameters or {}).get(k.unit, {}) for k in keys]
         own = {name: np.array([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
-        return cls(tuple(keys), lengths, values[..., :n], np.ascontiguousarray(values[..., n:]), population.sample_period_s, own)
+        return cls(
+            tuple(keys), lengths, values[..., :n], np.ascontiguousarray(values[..., n:]), population.sample_period_s, own, truths=true
+        )
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -82,7 +89,8 @@ class EpisodeBatch:
         """Return the same episodes, cut to so many samples."""
         lengths, inputs = np.minimum(self.lengths, n_samples), np.ascontiguousarray(self.inputs[:n_samples])
         shown, lost = None if self.shown is None else self.shown[:n_samples], None if self.lost is None else self.lost[:n_samples]
-        return replace(self, lengths=lengths, states=self.states[:n_samples], inputs=inputs, shown=shown, lost=lost)
+        truths = None if self.truths is None else self.truths[:n_samples]
+        return replace(self, lengths=lengths, states=self.states[:n_samples], inputs=inputs, shown=shown, lost=lost, truths=truths)
 
     def take(self, rows: Sequence[int]) -> EpisodeBatch:
         """Return some of the episodes."""
@@ -96,6 +104,7 @@ class EpisodeBatch:
             parameters={name: values[rows] for name, values in self.parameters.items()},
             shown=None if self.shown is None else self.shown[:, rows],
             lost=None if self.lost is None else self.lost[:, rows],
+            truths=None if self.truths is None else self.truths[:, rows],
         )
 
     def first_states(self, history: int = 0) -> Array:
@@ -131,3 +140,12 @@ def hold_missing(y: Array) -> Array:
     shape = (-1, *[1] * (y.ndim - 1))
     last = np.maximum.accumulate(np.where(there, np.arange(len(y)).reshape(shape), 0), axis=0)
     return np.take_along_axis(np.where(there, y, 0.0), last, axis=0)
+
+
+def _side_by_side(episodes: Sequence[Array], lengths: npt.NDArray[np.int64]) -> Array:
+    """Return episodes as one array, shape (n_samples, batch, n_columns), shorter ones held at their last sample."""
+    values = np.empty((lengths.max(), len(episodes), episodes[0].shape[1]))
+    for i, episode in enumerate(episodes):
+        values[: len(episode), i] = episode
+        values[len(episode) :, i] = episode[-1]
+    return values

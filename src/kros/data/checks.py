@@ -18,7 +18,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DataError
 from ..core.files import shortened
 from .copies import Print, print_of, refuse_copies
-from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
+from .population import OUTLIERS, Channel, EpisodeKey, Population, Role, TrueChannel
 from .recording import title
 
 logger = logging.getLogger(__name__)
@@ -213,6 +213,7 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
         raise DataError(
             f"A population needs at least one channel with role 'state', found {[(c.name, c.role.value) for c in channels]}; declare one."
         )
+    _check_truths(channels)
     if not episodes:
         raise DataError("The population is empty: no episode was found; check the source and the reader.")
     doubled = [key for key, count in Counter(episodes).items() if count > 1]
@@ -221,6 +222,21 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
             f"Duplicate episodes: {doubled[0]} occurs {episodes.count(doubled[0])} times ({len(doubled)} such episodes); "
             "rename or remove the copies."
         )
+
+
+def _check_truths(channels: Sequence[Channel]) -> None:
+    """Refuse truths of what is no state, and two of the same."""
+    states, owners = [c.name for c in channels if c.role is Role.STATE], [getattr(c, "of", "") for c in channels if c.role is Role.TRUTH]
+    if (
+        set(owners) <= set(states)
+        and len(set(owners)) == len(owners)
+        and all(isinstance(c, TrueChannel) == (c.role is Role.TRUTH) for c in channels)
+    ):
+        return
+    raise DataError(
+        f"A channel with role 'truth' says with `of` which state it is the truth of, each of another one of {states}, found "
+        f"{[(c.name, getattr(c, 'of', '')) for c in channels if isinstance(c, TrueChannel) or c.role is Role.TRUTH]}; correct them."
+    )
 
 
 def check_population(population: Population, allow_single: bool = False) -> None:
@@ -236,7 +252,7 @@ def check_population(population: Population, allow_single: bool = False) -> None
     ------
     DataError
     """
-    check_structure(population.channels, population.episodes)
+    check_structure(population.columns, population.episodes)
     if not population.measured:
         raise DataError(
             f"No state of {list(population.states)} is measured, so an observer would have nothing to correct with; "
@@ -286,22 +302,23 @@ def scan_prints(population: Population, on_nan: OnNan | str = OnNan.ERROR) -> li
 def usable_episodes(
     population: Population, keys: Iterable[EpisodeKey], on_nan: OnNan | str
 ) -> Iterator[tuple[EpisodeKey, npt.NDArray[np.float64], Print]]:
-    """Yield the episodes of one unit and condition that pass all checks, their samples and what they are recognised by.
+    """Yield the episodes of one unit and condition that pass all checks, all columns of their samples and what they are recognised by.
 
     After the last one, what never moved in any of them is refused.
     """
-    policy, watch = parse_on_nan(on_nan), RestWatch(population.channels)
+    policy, columns = parse_on_nan(on_nan), population.columns
+    watch = RestWatch(columns)
     key = None
     for key in keys:
         try:
-            values = population.read(key)
-            check_episode(values, key, population.channels)
+            values = population.source(key)
+            check_episode(values, key, columns)
         except NonFiniteError as error:
             if policy is OnNan.ERROR:
                 raise
             logger.warning("Dropped, as data.on_nan asks: %s", error)
             continue
         watch.add(values)
-        yield key, values, print_of(values, population.channels)
+        yield key, values, print_of(values, columns)
     if key is not None:
         watch.check(key.unit, key.condition)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property, lru_cache
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ DEFAULT_CONDITION = "default"
 OUTLIERS = "outliers"  # units of this group are scored, but take no part in pooled results
 EpisodeSource = Callable[["EpisodeKey"], npt.NDArray[np.float64]]
 Source = TypeVar("Source")
+AnyChannel = TypeVar("AnyChannel", bound="HasRole")
 
 
 class Role(str, Enum):
@@ -30,6 +31,15 @@ class Role(str, Enum):
 
     STATE = "state"
     INPUT = "input"
+    TRUTH = "truth"  # what a state really was: for judging only
+
+
+class HasRole(Protocol):
+    """A channel, or what describes one."""
+
+    @property
+    def role(self) -> Role:
+        """What the channel is to the model."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +60,19 @@ class Channel:
     role: Role
     unit: str = ""
     measured: bool = False
+
+
+@dataclass(frozen=True)
+class TrueChannel(Channel):
+    """What a recorded state really was, from a simulator or a better sensor; it judges estimates and enters nothing else.
+
+    Parameters
+    ----------
+    of : str
+        The state that it is the truth of, in the same unit of measure.
+    """
+
+    of: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,6 +108,18 @@ def restrict(source: Source, keys: Iterable[EpisodeKey]) -> Source:
     return source if restricted is None else restricted(keys)
 
 
+def columns_in_order(channels: Iterable[AnyChannel]) -> tuple[AnyChannel, ...]:
+    """Return channels, or what describes them, in the order of a source's columns: states, inputs, truths."""
+    roles = list(Role)
+    return tuple(sorted(channels, key=lambda c: roles.index(c.role)))
+
+
+def part_columns(columns: Iterable[Channel]) -> dict[str, Any]:
+    """Return the columns of a source as the ``channels`` and the ``truths`` of a population."""
+    columns = tuple(columns)
+    return {"channels": tuple(c for c in columns if c.role is not Role.TRUTH), "truths": tuple(c for c in columns if c.role is Role.TRUTH)}
+
+
 @dataclass(frozen=True)
 class Split:
     """Training and test episodes, in natural order."""
@@ -100,15 +135,17 @@ class Population:
     Parameters
     ----------
     channels : tuple of Channel
-        Column order of every episode: states first, inputs after them.
+        Columns of every episode: states first, inputs after them.
     sample_period_s : float
     units : tuple of Unit
     episodes : tuple of EpisodeKey
         In natural order of unit, condition and episode.
     source : callable
-        Returns an episode's samples, float64, shape (n_samples, n_channels).
+        Returns an episode's samples, float64, shape (n_samples, n_channels + n_truths).
     metadata : mapping
         Facts about the batch, for example ``{"plant": "harmonic-drive", "gear_ratio": 100}``.
+    truths : tuple of TrueChannel
+        Further columns of the source, behind the inputs: what some states really were. No model and no observer sees them.
     """
 
     channels: tuple[Channel, ...]
@@ -117,13 +154,20 @@ class Population:
     episodes: tuple[EpisodeKey, ...]
     source: EpisodeSource
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    truths: tuple[TrueChannel, ...] = ()
 
     def __repr__(self) -> str:
         """Say how much was recorded of what."""
         counts = {"unit": len(self.units), "condition": len(self.conditions), "episode": len(self.episodes)}
         sizes = ", ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items())
         states = ", ".join(f"{s} (measured)" if s in self.measured else s for s in self.states)
-        return f"Population({sizes} every {self.sample_period_s:g} s; states {states}; inputs {', '.join(self.inputs) or 'none'})"
+        true = f"; true {', '.join(t.of for t in self.truths)}" if self.truths else ""
+        return f"Population({sizes} every {self.sample_period_s:g} s; states {states}; inputs {', '.join(self.inputs) or 'none'}{true})"
+
+    @property
+    def columns(self) -> tuple[Channel, ...]:
+        """All columns of the source: channels, then truths."""
+        return self.channels + self.truths
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -139,6 +183,11 @@ class Population:
     def measured(self) -> tuple[str, ...]:
         """Names of the states that are available at run time."""
         return tuple(c.name for c in self.channels if c.role is Role.STATE and c.measured)
+
+    @property
+    def true_states(self) -> tuple[int, ...]:
+        """Columns of the states that the truths are the truths of, in the order of the truths."""
+        return tuple(self.states.index(t.of) for t in self.truths)
 
     @property
     def unit_ids(self) -> tuple[str, ...]:
@@ -166,7 +215,12 @@ class Population:
 
     def read(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
         """Read one episode, shape (n_samples, n_channels)."""
-        return self.source(key)
+        return self.read_with_truths(key)[0]
+
+    def read_with_truths(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Read one episode, shape (n_samples, n_channels), and what its states really were, shape (n_samples, n_truths)."""
+        values, n = self.source(key), len(self.channels)
+        return np.ascontiguousarray(values[:, :n]) if self.truths else values, values[:, n:]
 
     def read_parts(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Read one episode as states (n_samples, n) and inputs (n_samples, m)."""

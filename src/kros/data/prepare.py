@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ..core.errors import DataError
 from .checks import check_episode, check_period, check_structure
-from .population import Channel, EpisodeKey, EpisodeSource, Population, Role, Unit, natural_key, restrict
+from .population import Channel, EpisodeKey, EpisodeSource, Population, Unit, columns_in_order, natural_key, part_columns, restrict
 from .recording import TIME_TOLERANCE, Recording, Recordings, check_even, estimate_period
 from .steps import Step
 
@@ -40,7 +40,7 @@ class PreparedSource:
     recordings : callable
         Returns a `Recording` for an `EpisodeKey`.
     channels : tuple of Channel
-        As recorded.
+        As recorded: states, inputs, truths.
     period_s : float
         As recorded, found in the episode `reference`.
     reference : EpisodeKey
@@ -98,16 +98,21 @@ def assemble(
         Empty, duplicate episodes or channels, no state, inputs before states.
     """
     check_structure(channels, list(recordings.places))
-    roles = [c.role for c in channels]
-    if roles != sorted(roles, key=lambda role: role is Role.INPUT):
-        raise DataError(f"Channels should list states before inputs, found {[(c.name, c.role.value) for c in channels]}; reorder them.")
+    if channels != columns_in_order(channels):
+        raise DataError(
+            f"Channels should list states before inputs, and truths last, found {[(c.name, c.role.value) for c in channels]}; reorder them."
+        )
     episodes = tuple(sorted(recordings.places, key=episode_order))
     facts = {unit.id: unit for unit in units}
     found = [facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes)]
     first = episodes[0]
     period = check_period(sample_period_s if sample_period_s is not None else estimate_period(recordings(first)), "Population")
     source = PreparedSource(recordings, channels, period, first, tolerance=tolerance)
-    return prepare(Population(channels, period, tuple(found), episodes, source, dict(metadata or {})), steps)
+    parts = part_columns(channels)
+    return prepare(
+        Population(sample_period_s=period, units=tuple(found), episodes=episodes, source=source, metadata=dict(metadata or {}), **parts),
+        steps,
+    )
 
 
 def prepare(population: Population, steps: Iterable[Step]) -> Population:
@@ -139,7 +144,7 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     added = tuple(steps)
     if not added:
         return population
-    channels, period = population.channels, population.sample_period_s
+    channels, period = population.columns, population.sample_period_s
     for step in added:
         channels, period = step.channels_after(channels), step.period_after(period)
     check_structure(channels, population.episodes)
@@ -147,5 +152,5 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     if isinstance(source, PreparedSource):
         source = replace(source, steps=source.steps + added)
     else:
-        source = PreparedSource(EvenRecordings(source), population.channels, population.sample_period_s, population.episodes[0], added)
-    return replace(population, channels=channels, sample_period_s=period, source=source)
+        source = PreparedSource(EvenRecordings(source), population.columns, population.sample_period_s, population.episodes[0], added)
+    return replace(population, sample_period_s=period, source=source, **part_columns(channels))

@@ -8,20 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from .population import EpisodeKey, EpisodeSource, Population, restrict
+from .population import EpisodeKey, EpisodeSource, Population, TrueChannel, part_columns, restrict
 
 Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """A source whose channels are divided by sizes, shape (n_channels,)."""
+    """A source whose columns are divided by sizes, shape (n_columns,)."""
 
     source: EpisodeSource
     sizes: Array
 
     def __call__(self, key: EpisodeKey) -> Array:
-        """Return the samples of an episode, shape (n_samples, n_channels)."""
+        """Return the samples of an episode, shape (n_samples, n_columns)."""
         return np.asarray(self.source(key) / self.sizes)
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> Scaled:
@@ -36,8 +36,9 @@ def scale_population(population: Population, sizes: Mapping[str, float]) -> Popu
     ----------
     population : Population
     sizes : mapping of str to float
-        By name of a channel; one that is not named stays as it is.
+        By name of a channel; one that is not named stays as it is, and what is true of a state is divided by the state's size.
     """
-    factors = np.array([float(sizes.get(c.name, 1.0)) for c in population.channels])
-    channels = tuple(replace(c, unit="") if c.name in sizes else c for c in population.channels)
-    return replace(population, channels=channels, source=Scaled(population.source, factors))
+    owners = [c.of if isinstance(c, TrueChannel) else c.name for c in population.columns]
+    factors = np.array([float(sizes.get(name, 1.0)) for name in owners])
+    columns = [replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True)]
+    return replace(population, source=Scaled(population.source, factors), **part_columns(columns))

@@ -8,6 +8,7 @@ from .monte_carlo import MonteCarlo, sample_errors
 from .next_unit import draw_reserve, fewest_units, next_unit_bound
 from .robustness import DisturbedEpisodes, robustness_rows, severity_of_growth
 from .sensor import as_shown
+from .truth import TrueErrors, delay_samples, true_errors
 
 __all__ = [
     "SEVERITIES",
@@ -18,7 +19,9 @@ __all__ = [
     "Kind",
     "Measured",
     "MonteCarlo",
+    "TrueErrors",
     "as_shown",
+    "delay_samples",
     "draw_interval",
     "draw_reserve",
     "error_percent",
@@ -34,5 +37,6 @@ __all__ = [
     "severity_of_growth",
     "standard_disturbances",
     "summarise",
+    "true_errors",
     "unit_interval",
 ]

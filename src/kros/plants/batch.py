@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
-from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Unit
+from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, TrueChannel, Unit
 from .recordings import Recordings
 from .simulated import SimulatedPopulation, T
 
@@ -58,6 +58,7 @@ class Batch(ABC, Generic[T]):
 
     plant: ClassVar[str]
     channels: ClassVar[tuple[Channel, ...]]
+    truths: ClassVar[tuple[TrueChannel, ...]] = ()
     sample_period_s: ClassVar[float]
     noise: ClassVar[tuple[float, ...]]  # standard deviations of the sensors behind the encoder
     nominal: ClassVar[Mapping[str, float]]
@@ -87,6 +88,8 @@ class Batch(ABC, Generic[T]):
         n_samples = round(self.seconds / self.sample_period_s)
         inputs = np.stack([self.reference(self._rng(INPUT_STREAM, e), n_samples) for e in range(self.n_episodes)])
         states = self.respond(truth, inputs)
+        names = [c.name for c in self.channels]
+        true = states[[names.index(t.of) for t in self.truths]]
         for u, unit in enumerate(units):
             for e in range(self.n_episodes):
                 noise = self._rng(NOISE_STREAM, int(unit.id), e).standard_normal((len(self.noise), n_samples))
@@ -94,9 +97,12 @@ class Batch(ABC, Generic[T]):
         states[0] = np.rint(states[0] / COUNT_RAD) * COUNT_RAD
         keys = tuple(EpisodeKey(unit.id, DEFAULT_CONDITION, str(e)) for unit in units for e in range(self.n_episodes))
         source = Recordings(
-            {key: (states[:, i // self.n_episodes, i % self.n_episodes], inputs[i % self.n_episodes, None]) for i, key in enumerate(keys)}
+            {
+                key: (states[:, u, e], inputs[e, None], true[:, u, e])
+                for key, (u, e) in zip(keys, np.ndindex(len(units), self.n_episodes), strict=True)
+            }
         )
-        population = Population(self.channels, self.sample_period_s, units, keys, source, {"plant": self.plant})
+        population = Population(self.channels, self.sample_period_s, units, keys, source, {"plant": self.plant}, self.truths)
         return SimulatedPopulation(population, population, truth)
 
     def _units(self) -> tuple[tuple[Unit, ...], T]:

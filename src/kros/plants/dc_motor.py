@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..data.population import Channel, Role
+from ..data.population import Channel, Role, TrueChannel
 from .batch import Batch, runge_kutta
 
 Array = npt.NDArray[np.float64]
@@ -38,6 +38,7 @@ CHANNELS = (
     Channel("current", Role.STATE, "A"),
     Channel("voltage", Role.INPUT, "V"),
 )
+TRUTHS = tuple(TrueChannel(f"{c.name}_true", Role.TRUTH, c.unit, of=c.name) for c in CHANNELS[1:3])  # what the noisy sensors see
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +103,7 @@ class DcMotorPopulation(Batch[DcMotorTruth]):
     """Settings of a simulated batch of DC motors, see `Batch`; a spread of 1 means 5 to 15 percent, the outlier has a tired magnet and a dry bearing."""
 
     plant = "dc-motor"
-    channels, sample_period_s, noise = CHANNELS, SAMPLE_PERIOD_S, (VELOCITY_NOISE, CURRENT_NOISE)
+    channels, truths, sample_period_s, noise = CHANNELS, TRUTHS, SAMPLE_PERIOD_S, (VELOCITY_NOISE, CURRENT_NOISE)
     nominal, deviation, outlier_log_factors = NOMINAL, DEVIATION, OUTLIER_LOG_FACTORS
 
     def truth(self, unit_ids: tuple[str, ...], values: Mapping[str, Array]) -> DcMotorTruth:

@@ -22,14 +22,14 @@ class Recordings:
     Parameters
     ----------
     parts : mapping
-        States, shape (n_states, n_samples), and inputs, shape (n_inputs, n_samples), of each episode.
+        States, shape (n_states, n_samples), inputs, shape (n_inputs, n_samples), and truths, shape (n_truths, n_samples), of each episode.
         Episodes that follow the same reference share one array of inputs.
     """
 
-    parts: Mapping[EpisodeKey, tuple[Array, Array]]
+    parts: Mapping[EpisodeKey, tuple[Array, ...]]
 
     def __call__(self, key: EpisodeKey) -> Array:
-        """Return the samples of an episode, shape (n_samples, n_states + n_inputs)."""
+        """Return the samples of an episode, shape (n_samples, n_states + n_inputs + n_truths)."""
         if key not in self.parts:
             first = next(iter(self.parts), None)
             raise DataError(

@@ -31,7 +31,7 @@ def collect_metrics(context: Context, until: Stage, total_s: float | None) -> di
     if Stage.LEFT_OUT in done:
         metrics |= left_out.results(context)
     if Stage.EVALUATE in done:
-        metrics |= _disturbed(context) | load_metrics(context)
+        metrics |= _disturbed(context) | load_metrics(context) | _recorded(context)
     clean: dict[str, Any] = plain(metrics)
     return clean
 
@@ -174,6 +174,12 @@ def _disturbed(context: Context) -> dict[str, Any]:
         return {}
     content = load_artifact(context.store.path("disturbed"), "disturbed")[0]
     return {key: content[key] for key in ("robustness", "monte_carlo") if key in content}
+
+
+def _recorded(context: Context) -> dict[str, Any]:
+    """Errors of recorded states against what they really were; only where the recordings say so."""
+    found = _evaluation_record(context)
+    return {"recorded": found["recorded"]} if "recorded" in found else {}
 
 
 def _outliers(context: Context) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ...core.errors import DataError
 from ...core.files import shortened
 from ..checks import check_period
-from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit
+from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, title
 
@@ -80,7 +80,7 @@ def from_arrays(
         (n_samples, n_channels) with states, then inputs, as columns; a pair (states, inputs); or a mapping from the name of a channel to its
         samples, shape (n_samples,).
     channels : sequence of Channel, optional
-        In place of `states`, `inputs` and `measured`, with units of measure, in the order of the columns; states are moved before inputs.
+        In place of `states`, `inputs` and `measured`, with units of measure, in the order of the columns; states are moved before inputs, truths behind both.
     sample_period_s : float, s
     states, inputs : sequence of str
         Names of the columns.
@@ -111,11 +111,12 @@ def from_arrays(
     """
     check_period(sample_period_s, "from_arrays")
     declared = declare_channels(channels, states, inputs, measured, "from_arrays")
-    order = sorted(range(len(declared)), key=lambda i: declared[i].role is Role.INPUT)
+    columns = columns_in_order(declared)
+    order = [declared.index(c) for c in columns]
     found = {
         key: (np.ascontiguousarray(_samples(key, e, declared)[:, order]), None) for key, e in _episodes(data, {c.name for c in declared})
     }
-    return assemble(ArrayRecordings(found), tuple(declared[i] for i in order), units, sample_period_s, metadata)
+    return assemble(ArrayRecordings(found), columns, units, sample_period_s, metadata)
 
 
 def as_numbers(values: Any) -> npt.NDArray[np.float64]:

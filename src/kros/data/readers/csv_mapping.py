@@ -11,7 +11,7 @@ from typing import Any
 
 from ...core.errors import ConfigError
 from ...core.files import read_toml
-from ..population import Channel, Role
+from ..population import Channel, Role, TrueChannel, columns_in_order
 from ..recording import TIME_TOLERANCE
 from ..steps import Scale, Step, parse_steps
 from ..tables import build
@@ -35,6 +35,8 @@ class ChannelMapping:
         Unit of measure after scaling.
     scale : float
         Factor from the column to the channel.
+    of : str
+        For the role ``truth``: the state that it is the truth of.
     """
 
     name: str
@@ -43,6 +45,14 @@ class ChannelMapping:
     measured: bool = False
     unit: str = ""
     scale: float = 1.0
+    of: str = ""
+
+    @property
+    def declared(self) -> Channel:
+        """The channel of the population."""
+        if self.role is not Role.TRUTH and not self.of:
+            return Channel(self.name, self.role, self.unit, self.measured)
+        return TrueChannel(self.name, self.role, self.unit, self.measured, self.of)
 
 
 @dataclass(frozen=True)
@@ -181,13 +191,13 @@ class CsvMapping:
 
     @property
     def ordered(self) -> tuple[ChannelMapping, ...]:
-        """Channels, states before inputs."""
-        return tuple(sorted(self.channel, key=lambda c: c.role is Role.INPUT))
+        """Channels: states, inputs, truths."""
+        return columns_in_order(self.channel)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
         """The population's channels."""
-        return tuple(Channel(c.name, c.role, c.unit, c.measured) for c in self.ordered)
+        return tuple(c.declared for c in self.ordered)
 
     @property
     def steps(self) -> tuple[Step, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError, MissingDependencyError
-from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit
+from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Unit, columns_in_order
 from ..prepare import assemble
 from .arrays import ArrayRecordings, as_numbers, declare_channels
 
@@ -65,7 +65,7 @@ def from_frame(
     _require_frame(frame)
     if (time is None) == (sample_period_s is None):
         raise DataError(f"from_frame needs one of time and sample_period_s, found time = {time!r}, sample_period_s = {sample_period_s!r}.")
-    ordered = tuple(sorted(declare_channels(channels, states, inputs, measured, "from_frame"), key=lambda c: c.role is Role.INPUT))
+    ordered = columns_in_order(declare_channels(channels, states, inputs, measured, "from_frame"))
     required = [unit, *([] if time is None else [time]), *(c.name for c in ordered)]
     columns = list(frame.columns)
     missing = [name for name in required if name not in columns]

@@ -16,7 +16,7 @@ from ...core.errors import DataError
 from ...core.files import require_regular, shortened
 from ..arrow import fill
 from ..checks import check_period
-from ..population import Channel, EpisodeKey, Population, Role, Unit
+from ..population import Channel, EpisodeKey, Population, Role, TrueChannel, Unit
 from ..prepare import assemble
 from ..recording import Recording, Recordings
 
@@ -103,6 +103,7 @@ def read_parquet(folder: Path | str) -> Population:
     content, _ = load_artifact(Path(folder), INDEX)
     try:
         channels = tuple(Channel(c["name"], Role(c["role"]), _text(c["unit"]), c["measured"] is True) for c in content["channels"])
+        channels += tuple(TrueChannel(t["name"], Role.TRUTH, _text(t["unit"]), of=_text(t["of"])) for t in content.get("truths", ()))
         units = [Unit(_text(u["id"]), _text(u["group"]), dict(u["metadata"])) for u in content["units"]]
         places = _places(content["groups"])
         period = check_period(content["sample_period_s"], f"Reading {Path(folder) / 'population.json'}")

@@ -1,7 +1,7 @@
 """Write a population in kros's native format.
 
     <out>/population.json                    channels, period, units, episodes with their lengths
-    <out>/<unit>@<condition>.parquet         one row group an episode: unit, condition, episode, k, then the channels
+    <out>/<unit>@<condition>.parquet         one row group an episode: unit, condition, episode, k, then the channels, then truths
 
 Names of files are percent-encoded, so any id works. A study writes groups from several processes (`write_group`), then the index.
 """
@@ -130,13 +130,14 @@ def write_index(population: Population, records: Iterable[GroupRecord], folder: 
     """
     groups = [g for g in records if g.episodes]
     written = {g.unit for g in groups}
-    check_structure(population.channels, [EpisodeKey(g.unit, g.condition, e) for g in groups for e in g.episodes])
+    check_structure(population.columns, [EpisodeKey(g.unit, g.condition, e) for g in groups for e in g.episodes])
     refuse_copies(pair for g in groups for pair in g.recognised)
     content = {
         "sample_period_s": population.sample_period_s,
         "channels": population.channels,
         "units": [u for u in population.units if u.id in written],
         "metadata": population.metadata,
+        **({"truths": population.truths} if population.truths else {}),
         "groups": [{name: getattr(g, name) for name in _INDEXED} for g in groups],
     }
     save_artifact(Path(folder), INDEX, content)
@@ -168,7 +169,7 @@ def write_parquet(population: Population, out: Path | str, *, on_nan: str = "err
 def _write_episodes(population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: str) -> Iterable[tuple[str, int, Print]]:
     from pyarrow import parquet
 
-    names = [c.name for c in population.channels]
+    names = [c.name for c in population.columns]
     schema = _schema(names)
     encoding = {"k": COUNTER, **dict.fromkeys(names, SIGNALS)}
     options: dict[str, Any] = {

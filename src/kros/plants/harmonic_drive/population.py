@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ...core.errors import ConfigError
 from ...data import prepare
-from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
+from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, TrueChannel, Unit
 from ...data.steps import Offset, Trim
 from ..recordings import Recordings
 from ..simulated import SimulatedPopulation
@@ -30,6 +30,7 @@ CHANNELS = (
     Channel("target_position", Role.INPUT, "rad"),
     Channel("target_velocity", Role.INPUT, "rad/s"),
 )
+TRUTHS = (TrueChannel("velocity_true", Role.TRUTH, "rad/s", of="velocity"),)
 REST_SAMPLES = 1000
 # As a reader of raw recordings prepares them: offset found at rest, rest dropped; undoing the lag of the targets costs it the last sample.
 PREPARATION = (Offset("position", "target_position", 500, 1000), Trim(start=REST_SAMPLES, tail=1))
@@ -120,8 +121,8 @@ class HarmonicDrivePopulation:
         signals = simulate(parameters.take(rows), loaded, episode, (targets[0], targets[1]), GAINS[loop])
         self._disturb(signals.states, keys)
         inputs = [np.ascontiguousarray(targets[:, e]) for e in range(self.n_episodes)]
-        recordings = Recordings({key: (signals.states[i], inputs[episode[i]]) for i, key in enumerate(keys)})
-        raw = Population(CHANNELS, SAMPLE_PERIOD_S, units, keys, recordings, {"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO})
+        recordings = Recordings({key: (signals.states[i], inputs[episode[i]], signals.velocity[i]) for i, key in enumerate(keys)})
+        raw = Population(CHANNELS, SAMPLE_PERIOD_S, units, keys, recordings, {"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO}, TRUTHS)
         load_rows = {key: i for i, key in enumerate(k for k in keys if k.condition == "load")}
         truth = Truth(tuple(u.id for u in units), parameters, loop, GAINS[loop], load_rows, signals.load_torque[:, REST_SAMPLES:-1])
         return SimulatedPopulation(prepare(raw, PREPARATION), raw, truth)

@@ -17,14 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from .control import COUNT_RAD, SAMPLE_PERIOD_S, VELOCITY_POLE, Gains
-from .dynamics import COMMAND, CURRENT, Physics
+from .dynamics import COMMAND, CURRENT, Physics, W
 from .parameters import DriveParameters
 
 Array = npt.NDArray[Any]
 
 BLOCK_SAMPLES = 256
 CHUNK_TRAJECTORIES = 800  # keeps the working set of a step in cache
-RECORDED = 4  # position, velocity, current, load torque
+SIGNALS = 4  # position, velocity, current, true velocity; the load torque after them
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +35,14 @@ class Signals:
     ----------
     states : ndarray, shape (n, 3, n_samples), rad, rad/s and fraction of full scale
         Position as the encoder quantises it, velocity as filtered difference of it, current without measurement noise.
+    velocity : ndarray, shape (n, 1, n_samples), rad/s
+        True velocity of the motor.
     load_torque : ndarray of float32, shape (n_loaded, n_samples), fraction of full-scale current
         Torque that the load takes from the flange, for the loaded trajectories, in their order.
     """
 
     states: Array
+    velocity: Array
     load_torque: Array
 
 
@@ -61,7 +64,7 @@ def simulate(p: DriveParameters, loaded: Array, reference: Array, targets: tuple
     n, n_samples = len(p), targets[0].shape[1]
     n_loaded = int(np.count_nonzero(loaded))
     rows = np.cumsum(loaded > 0) - 1
-    out = Signals(np.empty((n, RECORDED - 1, n_samples)), np.empty((n_loaded, n_samples), np.float32))
+    out = Signals(np.empty((n, SIGNALS - 1, n_samples)), np.empty((n, 1, n_samples)), np.empty((n_loaded, n_samples), np.float32))
     for start in range(0, n, CHUNK_TRAJECTORIES):
         part = slice(start, start + CHUNK_TRAJECTORIES)
         _simulate_chunk(p.take(part), loaded[part], reference[part], targets, gains, out, part, rows[part])
@@ -78,20 +81,21 @@ def _simulate_chunk(
     load_inertia = loaded * p.load_inertia
     is_loaded = loaded > 0
     any_loaded = bool(is_loaded.any())
-    block = np.empty((RECORDED, BLOCK_SAMPLES, n))
+    block = np.empty((SIGNALS + 1, BLOCK_SAMPLES, n))
     for first in range(0, n_samples, BLOCK_SAMPLES):
         stop = min(first + BLOCK_SAMPLES, n_samples)
         rp, rv = (np.ascontiguousarray(t[:, first:stop].T)[:, reference] for t in targets)
         for k in range(stop - first):
             drive.sample(rp[k], rv[k])
-            block[0, k], block[1, k], block[2, k] = drive.p, drive.v, physics.z[CURRENT]
+            block[0, k], block[1, k], block[2, k], block[3, k] = drive.p, drive.v, physics.z[CURRENT], physics.z[W]
             if any_loaded:
-                block[3, k] = physics.load_torque(load_inertia, total_inertia)
+                block[SIGNALS, k] = physics.load_torque(load_inertia, total_inertia)
             physics.advance()
         length = stop - first
         out.states[part, :, first:stop] = block[:3, :length].transpose(2, 0, 1)
+        out.velocity[part, 0, first:stop] = block[3, :length].T
         if any_loaded:
-            out.load_torque[rows[is_loaded], first:stop] = (block[3, :length] / p.torque_constant).T[is_loaded]
+            out.load_torque[rows[is_loaded], first:stop] = (block[SIGNALS, :length] / p.torque_constant).T[is_loaded]
 
 
 class _Controller:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..content import Cell, Section, Table, where
 from ..error_tables import ErrorCell, ErrorTable, error_table
 from ..names import axis_label, channel_units, in_condition, number, observer_label
 from ..run_folder import RunFolder
+
+_RECORDED = "as recorded"
 
 
 def result(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
@@ -22,7 +24,7 @@ def result(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "channel's own unit of measure. Best of each column in bold; the deployed observer is set off."
     )
     shown = [_errors(t, metrics["study"].get("deployed"), run.measured_states, channel_units(metrics)) for t in tables]
-    return Section("results", "Results", [text], shown, ["errors"])
+    return Section("results", "Results", [text], [*shown, *_against_truth(metrics)], ["errors"])
 
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
@@ -49,6 +51,35 @@ def _errors(table: ErrorTable, deployed: str | None, measured: tuple[str, ...], 
     if len(table.ranked) < len(table.channels):
         caption += " The current's error under load is the load's torque itself: reported, not ranked."
     return Table(head, rows, caption, groups, emphasised=where(table.cells, deployed))
+
+
+def _against_truth(metrics: Mapping[str, Any]) -> list[Table]:
+    """Errors and lag against what the states really were, of the recording itself and of all observers; none where the recordings do not say."""
+    recorded = [{"observer": _RECORDED, **r} for r in metrics.get("recorded", [])]
+    rows = [r for r in [*recorded, *metrics["evaluation"]] if "true_rms" in r and r["role"] != "outlier"]
+    places, observers = dict.fromkeys((r["channel"], r["condition"]) for r in rows), tuple(dict.fromkeys(r["observer"] for r in rows))
+    if not rows:
+        return []
+    found: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
+    for r in rows:
+        found.setdefault((r["observer"], r["channel"], r["condition"]), []).append(r)
+    body = [[observer_label(o), *(cell for place in places for cell in _true_cells(found.get((o, *place), [])))] for o in observers]
+    groups = [("", 1), *((f"{channel.replace('_', ' ')}{in_condition(condition)}", 3) for channel, condition in places)]
+    caption = (
+        "Against what the states really were, which the simulation or a better sensor knows: RMS error in percent of the largest true value, mean over the "
+        "units and worst unit, and how late the signal is in the mean, by the delay that fits best. An observer made to agree with a recording that trails "
+        "trails as well."
+    )
+    deployed = where(observers, metrics["study"].get("deployed"))
+    return [Table(["observer", *("mean", "worst", "lag (ms)") * len(places)], body, caption, groups, folded=True, emphasised=deployed)]
+
+
+def _true_cells(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    errors, lags = ([r[f"true_{what}"] for r in rows] for what in ("error_percent", "lag_s"))
+    if not rows or None in errors:
+        return ["–" if not rows else "diverged", "–", "–"]
+    lag = None if None in lags else 1e3 * sum(lags) / len(lags)
+    return [number(sum(errors) / len(errors)), number(max(errors)), number(lag)]
 
 
 def _cells(table: ErrorTable, channel: str, cell: ErrorCell | None, with_interval: bool) -> list[Cell | str]:

@@ -103,13 +103,13 @@ def _inputs_key(context: Context) -> str:
     given = context.given
     if given is None:
         return source_key(context.config.data.source)
-    declared = repr((given.channels, given.sample_period_s, given.units, sorted(given.metadata.items())))
+    declared = repr((given.columns, given.sample_period_s, given.units, sorted(given.metadata.items())))
     return hash_of([declared, [[str(k), _digest(given, k)] for k in given.episodes]])
 
 
 def _digest(given: Population, key: EpisodeKey) -> str:
     """Return a digest of an episode; of one that is not finite, what is said of it: it is dropped, or an error."""
     try:
-        return sha256(np.ascontiguousarray(given.read(key)).tobytes()).hexdigest()
+        return sha256(np.ascontiguousarray(given.source(key)).tobytes()).hexdigest()
     except NonFiniteError as error:
         return str(error)

@@ -18,7 +18,7 @@ from ...data.population import EpisodeKey, Population
 from ...design.estimators import Baseline, make_difference, make_extended, make_learned
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
-from ...evaluate import ErrorSummary, as_shown, summarise
+from ...evaluate import ErrorSummary, TrueErrors, as_shown, summarise, true_errors
 from ...identify import ModelSet, free_run
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer, Sensors, run_observers
@@ -38,7 +38,7 @@ class Outcome:
     """What one model or observer did on the test episodes: errors, and trajectories of the episodes that are shown.
 
     A baseline that is made here leaves its `facts`, and its errors on disturbed measurements where these are asked for; `estimated` are the states
-    that it estimates, all where it is None.
+    that it estimates, all where it is None, and `true` its errors against what states really were, where the recordings say so.
     """
 
     summary: ErrorSummary
@@ -46,6 +46,7 @@ class Outcome:
     facts: dict[str, Any] | None = None
     estimated: tuple[int, ...] | None = None
     disturbed: Array | None = None
+    true: TrueErrors | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,13 +66,13 @@ def evaluate_observers(
     sensor: Sensors,
 ) -> list[Outcome]:
     """Run observers that `alike` puts together on test episodes as the sensor shows them, as many at a time as fit into memory."""
-    batch, first = as_shown(EpisodeBatch.read(population, keys, parameters=units), sensor, population.states), observers[0]
+    batch, first = as_shown(EpisodeBatch.read(population, keys, parameters=units, truths=True), sensor, population.states), observers[0]
     y, parameters = batch.measurements(first.measured), batch.parameters if first.lifting.parameters else None
     together = max(1, _SAMPLES_AT_ONCE // batch.states.size)
     found = []
     for start in range(0, len(observers), together):
         estimates = run_observers(observers[start : start + together], y, batch.inputs, parameters)
-        found += [_outcome(e[..., : len(population.states)], batch, population.sample_period_s, shown) for e in estimates]
+        found += [_outcome(e[..., : len(population.states)], batch, population, shown) for e in estimates]
     return found
 
 
@@ -89,8 +90,8 @@ def evaluate_baseline(
         baseline = make()
     except KrosError as error:
         return str(error)
-    batch = as_shown(EpisodeBatch.read(population, keys, parameters=units), sensor, population.states)
-    outcome = _outcome(baseline.run(batch, batch.parameters), batch, population.sample_period_s, shown)
+    batch = as_shown(EpisodeBatch.read(population, keys, parameters=units, truths=True), sensor, population.states)
+    outcome = _outcome(baseline.run(batch, batch.parameters), batch, population, shown)
     disturbed = None if trial is None else trial.errors_of_baseline(baseline)
     return replace(outcome, facts=baseline.facts, estimated=baseline.estimated, disturbed=disturbed)
 
@@ -110,11 +111,18 @@ def evaluate_model(
         batch.first_states(models.lifting.history),
         np.swapaxes(batch.inputs, 0, 1),
     )
-    return _outcome(np.swapaxes(states, 0, 1), batch, population.sample_period_s, shown)
+    return _outcome(np.swapaxes(states, 0, 1), batch, population, shown)
 
 
-def _outcome(estimate: Array, batch: EpisodeBatch, dt: float, shown: tuple[int, ...]) -> Outcome:
-    return Outcome(summarise(estimate, batch.states, batch.lengths, dt), [estimate[: batch.lengths[i], i] for i in shown])
+def _outcome(estimate: Array, batch: EpisodeBatch, population: Population, shown: tuple[int, ...]) -> Outcome:
+    dt, pieces = population.sample_period_s, [estimate[: batch.lengths[i], i] for i in shown]
+    return Outcome(summarise(estimate, batch.states, batch.lengths, dt), pieces, true=_true(estimate, batch, population))
+
+
+def _true(signals: Array, batch: EpisodeBatch, population: Population) -> TrueErrors | None:
+    if batch.truths is None:
+        return None
+    return true_errors(signals, batch.truths, population.true_states, batch.lengths, population.sample_period_s)
 
 
 def run(context: Context) -> None:
@@ -139,7 +147,7 @@ def run(context: Context) -> None:
     band = band_hz(context)
     rows = []
     for name, outcome in estimates.items():
-        rows += error_rows(name, outcome.summary, keys, roles, population.states, band, outcome.estimated)
+        rows += error_rows(name, outcome, keys, roles, population.states, band)
     free = {name: free_run_percent(o.summary, on, facts.pooled, population.states) for name, o in free_runs.items()}
     content: dict[str, Any] = {
         "rows": rows,
@@ -148,6 +156,7 @@ def run(context: Context) -> None:
         "roles": roles,
         "shown": [[k.unit, k.condition, k.episode] for k in (keys[i] for i in shown)],
         "baselines": {name: facts_of(name, outcome) for name, outcome in results.items() if name not in observers},
+        **recorded_rows(population, keys, roles),
     }
     content |= {"observers": list(estimates), "models": list(models), "states": population.states}
     arrays = _arrays(population, keys, on, shown, shown_on, roles, estimates, free_runs)
@@ -246,14 +255,14 @@ def showcase(context: Context, keys: tuple[EpisodeKey, ...], roles: dict[str, st
 
 def error_rows(
     name: str,
-    summary: ErrorSummary,
+    outcome: Outcome,
     keys: tuple[EpisodeKey, ...],
     roles: dict[str, str],
     channels: tuple[str, ...],
     band: tuple[float, float] | None,
-    estimated: tuple[int, ...] | None = None,
 ) -> list[dict[str, Any]]:
     """Return a row for every unit, condition and channel that is estimated: the mean over the unit's test episodes."""
+    summary, estimated = outcome.summary, outcome.estimated
     power = None if band is None else summary.band_power(band)
     rows = []
     for unit, condition in dict.fromkeys((k.unit, k.condition) for k in keys):
@@ -263,8 +272,29 @@ def error_rows(
                 continue
             row = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition, "channel": channel}
             row |= {"rms": summary.rms[chosen, j].mean(), "error_percent": summary.percent[chosen, j].mean()}
-            rows.append(row | ({} if power is None else {"gearbox_band_power": power[chosen, j].mean()}))
+            row |= {} if power is None else {"gearbox_band_power": power[chosen, j].mean()}
+            rows.append(row | true_entry(outcome.true, chosen, j))
     return rows
+
+
+def true_entry(true: TrueErrors | None, episodes: Sequence[int], state: int) -> dict[str, float]:
+    """Return errors and lag against what a state really was, mean over episodes; empty where the recordings do not say."""
+    if true is None or state not in true.states:
+        return {}
+    at = true.states.index(state)
+    return {f"true_{what}": float(values[episodes, at].mean()) for what, values in vars(true).items() if what != "states"}
+
+
+def recorded_rows(population: Population, keys: tuple[EpisodeKey, ...], roles: dict[str, str]) -> dict[str, list[dict[str, Any]]]:
+    """Return the errors of the recorded states themselves against what they really were, where the recordings say so."""
+    rows: list[dict[str, Any]] = []
+    for unit, condition in dict.fromkeys((k.unit, k.condition) for k in keys if population.truths):
+        batch = EpisodeBatch.read(population, [k for k in keys if (k.unit, k.condition) == (unit, condition)], truths=True)
+        true = _true(batch.states, batch, population)
+        for state in population.true_states:
+            row = {"unit": unit, "role": roles[unit], "condition": condition, "channel": population.states[state]}
+            rows.append(row | true_entry(true, range(len(batch.keys)), state))
+    return {"recorded": rows} if rows else {}
 
 
 def free_run_percent(

@@ -143,7 +143,7 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
     band, rows = band_hz(whole), []
     for name, outcome in results.items():
         if isinstance(outcome, Outcome):
-            rows += error_rows(name, outcome.summary, keys, dict.fromkeys(held, "left_out"), population.states, band, outcome.estimated)
+            rows += error_rows(name, outcome, keys, dict.fromkeys(held, "left_out"), population.states, band)
     others = {name: facts_of(name, outcome) for name, outcome in results.items() if name not in record["facts"]}
     parameters = {unit: values for unit, values in units.items() if values}
     content = {"units": held, "parameters": parameters, "rows": rows, "observers": {**record["facts"], **others}}
@@ -191,8 +191,8 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
     rows: Rows = []
     if keys:
         observer = Observer.load(context.store.path("observers", "deployed.json"))
-        summary = evaluate_observers([observer], whole, keys, known, (), context.config.sensor)[0].summary
-        rows = error_rows(deployed, summary, keys, roles, whole.states, band_hz(context))
+        (outcome,) = evaluate_observers([observer], whole, keys, known, (), context.config.sensor)
+        rows = error_rows(deployed, outcome, keys, roles, whole.states, band_hz(context))
     lost = dict.fromkeys((k.unit, k.condition) for k in test if k.unit in failed)
     base = {"observer": deployed, "role": "reserve"} | dict.fromkeys(_MEASURES, float("inf"))
     return rows + [{**base, "unit": u, "condition": c, "channel": s} for u, c in lost for s in whole.states], failed

@@ -171,14 +171,23 @@ def check(
 @app.command()
 def estimate(
     run_folder: Annotated[Path, typer.Argument(metavar="RUN")],
-    data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder in the run's own reader, or a TOML with [data].")],
-    out: Annotated[Path, typer.Argument(help="Parquet file to write.")],
+    data: Annotated[
+        Path,
+        typer.Argument(metavar="DATA", help="Folder in the run's reader, or a TOML with [data]; no hidden channels needed."),
+    ],
+    out: Annotated[Path, typer.Argument(help="New file, .parquet or .csv")],
+    parameter: Annotated[
+        list[str] | None, typer.Option(metavar="UNIT.NAME=VALUE", help="A unit's lifting parameter, such as its phase.")
+    ] = None,
+    track: Annotated[str | None, typer.Option(metavar="NAME", help="Parameter that a phase-locked loop follows.")] = None,
 ) -> None:
     """Write the deployed observer's estimates on recordings."""
     from .study.commands.estimate import estimate_recordings
 
-    count = estimate_recordings(run_folder, data, out)
-    _say(f"estimates of {count} episodes in {out}")
+    found = estimate_recordings(run_folder, data, out, parameter or (), track)
+    _say(f"estimates of {found.episodes} episodes in {out}")
+    for unit, source in found.parameters.items():
+        _say(f"  unit {unit}: parameters {source}")
 
 
 export = typer.Typer(help="An observer for machines: source code.", no_args_is_help=True)

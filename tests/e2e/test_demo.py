@@ -140,6 +140,55 @@ def test_estimates_are_written_one_row_group_an_episode(kros, demo, tmp_path, me
     assert kros("estimate", demo, recorded, out).exit_code == 2
 
 
+def test_in_the_field_measured_channels_and_inputs_are_enough(kros, demo, recorded, tmp_path):
+    from kros.data import read_parquet
+
+    population = read_parquet(recorded)
+    seen = ["position", "target_position", "target_velocity"]
+    columns = [[c.name for c in population.channels].index(name) for name in seen]
+    keys = [k for k in population.episodes if (k.unit, k.condition) == ("001002", "noload")]
+    (tmp_path / "field").mkdir()
+    for key in keys:
+        table = population.read(key)[:, columns]
+        rows = [",".join(["t", *seen]), *(",".join(map(repr, [0.001 * i, *row])) for i, row in enumerate(table.tolist()))]
+        (tmp_path / "field" / f"fresh_{key.episode}.csv").write_text("\n".join(rows))
+    channels = ", ".join(
+        f'{{name = "{name}", column = "{name}", role = "{"input" if "target" in name else "state"}", measured = {str(name == "position").lower()}}}'
+        for name in [c.name for c in population.channels]
+    )
+    files = "files = '(?P<unit>[a-z]+)_(?P<episode>[0-9]+)[.]csv'"
+    (tmp_path / "field.toml").write_text(
+        f'[data]\nsource = "field"\nreader = "csv"\n[data.csv]\n{files}\ntime = "t"\nchannel = [{channels}]\n'
+    )
+    whole, field = tmp_path / "whole.parquet", tmp_path / "field.csv"
+    assert kros("estimate", demo, recorded, whole).exit_code == 0
+    result = kros("estimate", demo, tmp_path / "field.toml", field)
+    assert result.exit_code == 0, result.output
+    assert "unit fresh: parameters calibrated on the derivative of position" in result.output
+    rows = pq.read_table(whole).to_pandas()
+    wanted = rows[(rows.unit == "001002") & (rows.condition == "noload") & (rows.episode == keys[0].episode)]["velocity_hat"].to_numpy()
+    lines = [line.split(",") for line in field.read_text().splitlines()]
+    at = lines[0].index("velocity_hat")
+    found = np.array([float(line[at]) for line in lines[1:] if line[2] == keys[0].episode])
+    assert np.sqrt(np.mean((found - wanted) ** 2)) < 1e-3 * np.sqrt(
+        np.mean(wanted**2)
+    )  # of phases that differ by the little that the rate differs
+    given = kros("estimate", demo, tmp_path / "field.toml", tmp_path / "given.csv", "--parameter", "fresh.phase=1.2")
+    assert "unit fresh: parameters given" in given.output
+    assert kros("estimate", demo, tmp_path / "field.toml", tmp_path / "x.csv", "--parameter", "fresh.phi=1").exit_code == 2
+    assert kros("estimate", demo, tmp_path / "field.toml", tmp_path / "x.txt").exit_code == 2
+
+
+@pytest.mark.parametrize("command", ["c", "fmu"])
+def test_the_deployed_observer_is_exported(kros, demo, tmp_path, command):
+    out = tmp_path / "out.fmu"
+    result = kros("export", command, demo, out)
+    assert result.exit_code == 0, result.output
+    assert out.exists()
+    assert kros("export", command, demo, tmp_path / "other.fmu", "--observer", "nobody").exit_code == 2
+    assert not (tmp_path / "other.fmu").exists()
+
+
 def test_new_units_are_scored(kros, demo, tmp_path):
     fresh = tmp_path / "new"
     assert kros("simulate", fresh, "--units", 2, "--episodes", 4, "--seconds", 12, "--seed", 77, "--outlier").exit_code == 0

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 
+import numpy as np
+
 from ..core.errors import IdentificationError
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
@@ -39,14 +41,19 @@ def calibrate(population: Population, facts: RecordingFacts, spec: PhaseSpec, wo
 
 
 def segments_of(task: Task) -> list[Segment]:
-    """Find the constant-velocity segments of some episodes."""
+    """Find the constant-velocity segments of some episodes.
+
+    Where the measured rate is not recorded, as in the field, the derivative of the angle stands for it. It may lag otherwise than the rate did: the
+    phase is the half sum of both directions, which a lag leaves as it is.
+    """
     population, keys, spec = task
     names = population.states + population.inputs
-    angle, reference, measured = (names.index(n) for n in (spec.angle, spec.reference, spec.measured))
-    segments = []
+    angle, reference = (names.index(n) for n in (spec.angle, spec.reference))
+    segments, dt = [], population.sample_period_s
     for key in keys:
         values = population.read(key)
-        segments += find_segments(values[:, angle], values[:, reference], values[:, measured], population.sample_period_s, spec)
+        rate = values[:, names.index(spec.measured)] if spec.measured in names else np.gradient(values[:, angle], dt)
+        segments += find_segments(values[:, angle], values[:, reference], rate, dt, spec)
     return segments
 
 

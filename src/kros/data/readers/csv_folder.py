@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,7 @@ class CsvRecordings(Recordings):
         return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0] * self.time_scale)
 
 
-def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str) -> Population:
+def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str, optional: Collection[str] = ()) -> Population:
     """Read a folder of CSV files (also gzip-compressed).
 
     Parameters
@@ -56,6 +56,8 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
     source : Path
     mapping : CsvMapping, mapping or Path
         See `CsvMapping`; a path names a TOML file.
+    optional : collection of str
+        Channels that are left out where the first file has no column for them.
 
     Returns
     -------
@@ -75,6 +77,8 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
     groups: dict[str, str] = {}
     for path, match in _matches(source, chosen):
         fields = first_fields(path, dialect)
+        if optional and not places:
+            chosen = chosen.without(_absent(chosen, fields, optional))
         found = match.groupdict()
         for unit in chosen.units:
             key = EpisodeKey(
@@ -97,6 +101,11 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
     units = [Unit(unit, group) for unit, group in groups.items()]
     period, tolerance = chosen.sample_period_s, chosen.time_tolerance
     return assemble(recordings, chosen.channels, units, period, chosen.metadata, steps=chosen.steps, tolerance=tolerance)
+
+
+def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:
+    columns = {(c.name, mapping.column(c, unit)) for c in mapping.channel if c.name in optional for unit in mapping.units}
+    return {name for name, column in columns if (column > len(fields) if isinstance(column, int) else column not in fields)}
 
 
 def csv_files(source: Path) -> Iterator[tuple[Path, str]]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +118,7 @@ class CsvMapping:
     header: bool = True
     skip: int = 0
     decimal: str = "."
-    prepare: tuple[Mapping[str, Any], ...] = ()
+    prepare: tuple[Mapping[str, Any] | Step, ...] = ()
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -203,6 +203,12 @@ class CsvMapping:
     def steps(self) -> tuple[Step, ...]:
         """Scaling as declared per channel, then the mapping's own steps."""
         return (*(Scale((c.name,), c.scale) for c in self.ordered if c.scale != 1), *parse_steps(self.prepare, "CSV mapping: prepare"))
+
+    def without(self, names: Collection[str]) -> CsvMapping:
+        """Return the mapping without some channels."""
+        units = tuple(replace(u, columns={k: v for k, v in u.columns.items() if k not in names}) for u in self.unit)
+        steps = tuple(step for s in parse_steps(self.prepare, "CSV mapping: prepare") if (step := s.without(names)) is not None)
+        return replace(self, channel=tuple(c for c in self.channel if c.name not in names), unit=units, prepare=steps)
 
     def column(self, channel: ChannelMapping, unit: UnitMapping) -> Column | None:
         """Return where a channel of a unit is read from."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ def read(
     prepare: Iterable[Step | Mapping[str, Any]] = (),
     *,
     on_nan: str = "error",
+    optional: Collection[str] = (),
 ) -> Population:
     """Open a folder of recordings; episodes are read on demand.
 
@@ -61,6 +62,8 @@ def read(
     on_nan : {"error", "drop_episode"}
         With ``drop_episode`` every episode is read once here, and those with NaN or infinity are left out and logged. To save that pass
         keep ``error`` here and give the option to `write_parquet`.
+    optional : collection of str
+        Channels that recordings may lack, such as states that only a test bench measures; steps that need them are left out with them.
 
     Returns
     -------
@@ -82,7 +85,7 @@ def read(
             raise ConfigError(
                 f"Reading {source} as csv needs a mapping of columns; give mapping=, --mapping FILE or the table [data.csv] (kros init writes one)."
             )
-        population = read_csv_folder(source, mapping)
+        population = read_csv_folder(source, mapping, optional)
     elif mapping is not None:
         raise ConfigError(
             f"Reading {source} as {chosen}: a CSV mapping is given, which only the reader 'csv' uses; remove it or set "
@@ -90,7 +93,8 @@ def read(
         )
     else:
         population = read_parquet(source) if chosen == "parquet" else read_motor_drive_raw(source)
-    population = prepared(population, steps)
+    absent = set(optional) - set(population.states) - set(population.inputs)
+    population = prepared(population, [step for s in steps if (step := s.without(absent)) is not None] if absent else steps)
     return population if policy is OnNan.ERROR else scan_population(population, on_nan=policy)
 
 

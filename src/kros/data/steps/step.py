@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from ...core.errors import ConfigError
@@ -29,6 +29,14 @@ class Step:
     def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
         """Return the prepared recording; `channels` and `period_s` describe the one given."""
         raise NotImplementedError
+
+    def without(self, names: Collection[str]) -> Step | None:
+        """Return the step where some channels are absent: for those that are left, or None where it has nothing to do."""
+        wanted = getattr(self, "channels", None)
+        if wanted is not None:
+            left = tuple(name for name in wanted if name not in names)
+            return replace(self, channels=left) if left else None  # type: ignore[call-arg]
+        return None if {getattr(self, "channel", None), getattr(self, "reference", None)} & set(names) else self
 
     def columns(self, names: Sequence[str], channels: tuple[Channel, ...]) -> list[int]:
         """Return the columns of named channels, or say which name is unknown."""

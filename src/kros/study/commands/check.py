@@ -21,7 +21,7 @@ from ..config import Stage, StudyConfig
 from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
-from .estimate import check_channels, identify_on, load_calibration, open_data, training_keys, unit_parameters
+from .recordings import check_channels, identify_on, load_calibration, open_data, training_keys, unit_parameters
 
 
 def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]:

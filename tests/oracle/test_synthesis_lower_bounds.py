@@ -17,6 +17,7 @@ from kros.synthesis.worst_case.certificate import certify
 from kros.synthesis.worst_case.disturbance import Channels, Shaping, design_grid
 from kros.synthesis.worst_case.everywhere import Everywhere
 from kros.synthesis.worst_case.robust_gain import robust_gain
+from kros.synthesis.worst_case.worst_case_hinf import lower_bound
 
 DT = 1.0
 FULL = StateSpace([[0.6]], [[1.0, 0.3]], [[0.1], [0.05]], [[0.2, 0.1], [0.0, 0.2]], DT)
@@ -262,6 +263,69 @@ def test_bound_in_the_other_norm():
     assert found.lower_bound is not None
     for K in others(case, found, np.random.default_rng(1)):
         assert robust_gain(case, K).value >= found.lower_bound
+
+
+def prediction_level(F, G, H, L):
+    """Least H-infinity norm of one-step predictions of ``L x`` from ``y = H x + n``, by iterating the filter's Riccati recursion.
+
+    B. Hassibi, A. H. Sayed and T. Kailath, Indefinite-Quadratic Estimation and Control, SIAM 1999, theorem 4.3.1 (a priori filters).
+    """
+
+    def exists(level):
+        P, both = G @ G.T, np.vstack([H, L])
+        weights = np.diag(np.r_[np.ones(len(H)), -np.full(len(L), level**2)])
+        for _ in range(3000):
+            if np.linalg.eigvalsh(L @ P @ L.T).max() >= level**2:
+                return False
+            step = F @ P @ F.T + G @ G.T - F @ P @ both.T @ np.linalg.solve(weights + both @ P @ both.T, both @ P @ F.T)
+            if np.abs(step - P).max() < 1e-12 * np.abs(P).max():
+                return True
+            P = (step + step.T) / 2
+        return False
+
+    low, high = 0.0, 100.0
+    while high - low > 1e-4 * high:
+        low, high = ((low + high) / 2, high) if not exists((low + high) / 2) else (low, (low + high) / 2)
+    return high
+
+
+@pytest.mark.parametrize("form", ["inverse_input_multiplicative", "additive"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_bound_in_the_other_norm_is_that_of_prediction(form, seed):
+    """Constant filters: nothing is lost, so the bound is what the filter's own recursion says; two measurements, one state without process noise."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((3, 3))
+    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
+    B, level, outer = rng.standard_normal((3, 2)), np.array([0.3, 0.0, 0.2]), form == "additive"
+    case = ObserverProblem(
+        StateSpace(A, B, np.eye(3), np.zeros((3, 2)), DT),
+        rng.standard_normal((2, 3)),
+        gain(0.1 * np.eye(3 if outer else 2), DT),
+        gain(0.1 * np.eye(2), DT),
+        np.ones(2),
+        np.ones(3),
+        np.array([0.5, 0.8]),
+        form=form,
+        process_noise=level,
+    )
+    size = np.diag(rng.uniform(0.2, 0.6, 3 if outer else 2))
+    _, _, C, W = case.scaled
+    V = np.diag(level)
+    if outer:  # e = x + size w with a w of its own at every sample, which is a state here
+        F, G = np.block([[A, np.zeros((3, 3))], [np.zeros((3, 6))]]), np.block([[V, np.zeros((3, 3))], [np.zeros((3, 3)), np.eye(3)]])
+        truth = prediction_level(F, G, C @ np.hstack([np.eye(3), size]), W @ np.hstack([np.eye(3), size]))
+    else:
+        truth = prediction_level(A, np.hstack([B @ size, V]), C, W)
+    found = lower_bound(case, Shaping(gain(size, DT), None, None), 1e-3)
+    assert 0.997 * truth <= found <= 1.0002 * truth
+
+
+def test_a_set_of_one_model_without_noise_has_no_error():
+    """Nothing disturbs the error of the open loop: both bounds are zero, and no gap is told."""
+    found = worst_case_hinf(small_problem(W_L=gain([[0.0]], DT)))
+    assert (found.worst_case_hinf, found.lower_bound, found.gap_percent) == (0.0, 0.0, None)
+    assert found.status is Status.CERTIFIED
+    assert not found.controller.D.any()
 
 
 # --- what is handed on

@@ -30,6 +30,7 @@ from ..observer import (
     start_covariance,
 )
 from ..observer.baselines.restarts import restarted
+from ..observer.residual.one_step import one_step_covariance, one_step_residual
 from ..observer.screen import Screen
 from .methods.gains import EQUAL, RESIDUAL
 from .validation import TrainingSet, rank
@@ -109,7 +110,10 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
     """
     data, lifting, n = training.read(), models.lifting, models.lifting.n_states
     row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
-    shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2), RESIDUAL: models.residual_covariance.mean(axis=0)[:n, :n]}
+    batch = data.batch
+    residual = one_step_residual(lifting, models.A[row], models.B[row], batch.states, batch.inputs, batch.parameters)
+    pooled = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
+    shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2), RESIDUAL: pooled}
     sized = {name: shape * like_measurement_noise(shape[np.ix_(C, C)], R) for name, shape in shapes.items()}
     tried = [(name, level, 10**level * shape) for name, shape in sized.items() for level in _LEVELS]
     start = start_covariance(models.output_scale[:n], R, models.measured)

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ...core.errors import SynthesisError
 from ...core.lti import gain
-from ...observer import kalman_candidates, luenberger_candidates, noise_covariances
+from ...observer import kalman_candidates, luenberger_candidates, mean_error_dynamics, noise_covariances
+from ...observer.residual.models import Refitted, refitted_models
+from ...observer.residual.one_step import one_step_covariance
 from ...synthesis import Synthesis, kalman
-from ..task import DesignResult, DesignTask, first_of, without_correction
+from ..task import DesignResult, DesignTask, without_correction
+from ..validation import ValidationSet, hidden_mean
+from .residual_shaped import FITTED
 
-T = TypeVar("T")
 EQUAL, RESIDUAL = "equal share of every range", "one-step residuals"
 
 
@@ -32,17 +35,23 @@ def design_kalman_white(task: DesignTask) -> DesignResult:
 def design_kalman_tuned(task: DesignTask) -> DesignResult:
     """Kalman gains for the white process noise that does best on training episodes.
 
-    Its size is swept over sixteen decades, its shape is that of the one-step residuals or the same share of every state's largest value.
+    Its shape is the full covariance of the one-step residuals that the model leaves on the episodes of all units, or the same share of every state's
+    largest value; its size is swept over sixteen decades. The model is the nominal unit's, or that with rows fitted to single steps of all units.
     """
-    shapes = {EQUAL: task.models.output_scale, RESIDUAL: task.models.residual_covariance.mean(axis=0)}
-    R, dt = np.diag(task.noise**2), task.models.sample_period_s
-    tried = [
-        ((name, level), synthesis)
-        for name, shape in shapes.items()
-        for level, synthesis in kalman_candidates(task.dynamics, task.selector, shape, R, dt)
-    ]
-    (shape_name, level), best, share = best_of(task, tried, "Tuned Kalman filter")
-    return task.designed(best, process_noise_level=level, process_noise_shape=shape_name, training_error_to_open_loop=share)
+    models, data, n = task.models, task.training.read(), task.models.lifting.n_states
+    lifting, batch, R = models.lifting, data.batch, np.diag(task.noise**2)
+    nominal = models.index(task.unit)
+    refitted, residual = refitted_models(lifting, models.A[nominal], models.B[nominal], models.measured, batch)
+    covariance = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
+    tried = []
+    for model in refitted:
+        dynamics = mean_error_dynamics(lifting, model.A, batch.states, batch.inputs, batch.parameters)
+        shapes = {RESIDUAL: covariance[np.ix_(model.columns, model.columns)]} | ({} if model.rows else {EQUAL: models.output_scale[:n]})
+        for name, shape in shapes.items():
+            for level, found in kalman_candidates(dynamics, task.selector[:, :n], shape, R, models.sample_period_s):
+                facts = {"process_noise_level": level, "process_noise_shape": name}
+                tried.append(Tried(_padded(found, lifting.n_lifted), facts, model if model.rows else None))
+    return best_of(task, tried, data, process_noise_level=0.0)
 
 
 def design_luenberger(task: DesignTask) -> DesignResult:
@@ -51,29 +60,38 @@ def design_luenberger(task: DesignTask) -> DesignResult:
     Rows of lifted functions are computed anew at every step and need no correction.
     """
     n = task.models.lifting.n_states
-    tried = list(luenberger_candidates(task.dynamics[:n, :n], task.selector[:, :n], task.models.sample_period_s))
-    if not tried:
-        raise SynthesisError(
-            "Luenberger observer: the poles cannot be placed; the measurement hardly sees some state, measure another one."
-        )
-    padded = [(factor, _padded(synthesis, task.models.lifting.n_lifted)) for factor, synthesis in tried]
-    factor, best, share = best_of(task, padded, "Luenberger observer")
-    return task.designed(best, poles_faster_by=factor, training_error_to_open_loop=share)
+    candidates = luenberger_candidates(task.dynamics[:n, :n], task.selector[:, :n], task.models.sample_period_s)
+    tried = [Tried(_padded(found, task.models.lifting.n_lifted), {"poles_faster_by": factor}) for factor, found in candidates]
+    return best_of(task, tried, task.training.read(), poles_faster_by=1.0)
 
 
-def best_of(task: DesignTask, tried: Sequence[tuple[T, Synthesis]], what: str) -> tuple[T, Synthesis, float]:
-    """Return the setting and synthesis that rank first on the training episodes, with their error relative to the open loop's.
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A candidate: gains, the settings behind them, and the model where it is not the nominal unit's."""
 
-    Raises
-    ------
-    SynthesisError
-        When all diverge.
+    synthesis: Synthesis
+    facts: dict[str, Any]
+    model: Refitted | None = None
+
+
+def best_of(task: DesignTask, tried: Sequence[Tried], data: ValidationSet, **off: float) -> DesignResult:
+    """Return the candidate with the least error of the hidden states on training episodes, the geometric mean over them; the model alone where none is better.
+
+    What is handed out is so never worse than the model alone, in that mean; facts say where correction is off.
     """
-    ranks = task.ranked([task.observer(synthesis) for _, synthesis in tried])
-    first = first_of(ranks)
-    if not np.isfinite(ranks[first][1]):
-        raise SynthesisError(f"{what}: every candidate diverges on the training episodes.")
-    return *tried[first], ranks[first][1]
+    candidates = [Tried(without_correction(task), off), *tried]
+    models = [(None, None) if t.model is None else (t.model.A, t.model.B) for t in candidates]
+    observers = [task.observer(t.synthesis, *model) for t, model in zip(candidates, models, strict=True)]
+    errors = hidden_mean(data.percent_of_all(observers), task.models.measured)
+    first = int(np.argmin(errors))
+    if not np.isfinite(errors[first]):
+        raise SynthesisError("Every candidate diverges on the training episodes, and so does the model alone; look at Models first.")
+    best = candidates[first]
+    rows = best.model.rows if best.model else ()
+    facts = {**best.facts, "rows_fitted_to_single_steps": [task.models.lifting.states[i] for i in rows], "correction_off": first == 0}
+    if np.isfinite(errors[0]):
+        facts["training_error_to_open_loop"] = float(errors[first] / errors[0])
+    return DesignResult(task.name, observers[first], best.synthesis, facts, task.problem, FITTED if rows else "")
 
 
 def _padded(synthesis: Synthesis, n_lifted: int) -> Synthesis:

@@ -13,8 +13,8 @@ from ...synthesis.result import Synthesis
 
 Array = npt.NDArray[np.float64]
 _SWEEP_DECADES = (-6, 10)
-_PER_DECADE = 1
-_FASTER = (1.25, 1.6, 2.0, 3.2, 5.0, 8.0, 13.0, 20.0)
+_DECADES_APART = 2
+_FASTER = (1.02, 1.1, 1.25, 1.6, 2.0, 3.2, 5.0, 8.0, 13.0, 20.0)
 
 
 def noise_covariances(residual_covariance: Array, resolution: Array) -> tuple[Array, Array]:
@@ -35,14 +35,16 @@ def noise_covariances(residual_covariance: Array, resolution: Array) -> tuple[Ar
 
 
 def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:
-    """Sweep the size of white process noise over sixteen decades.
+    """Sweep the size of white process noise over sixteen decades; the covariance as it is, the textbook's choice, is among them.
+
+    Sizes for which there is no stable filter are left out.
 
     Parameters
     ----------
     A : ndarray, shape (n, n)
     C : ndarray, shape (q, n)
     shape : ndarray, shape (n, n) or (n,)
-        Covariance of the process noise up to its size; or the range of every state, for noise of equal relative size.
+        Covariance of the process noise; or the range of every state, for noise of equal relative size.
     R : ndarray, shape (q, q)
     dt : float, s
 
@@ -55,8 +57,11 @@ def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> 
     shape = np.diag(shape**2) if shape.ndim == 1 else shape
     base = like_measurement_noise(C @ shape @ C.T, R)
     start, stop = _SWEEP_DECADES
-    for level in np.logspace(start, stop, _PER_DECADE * (stop - start) + 1):
-        yield float(level), kalman(A, C, level * base * shape, R, dt)
+    for level in sorted((1 / base, *np.logspace(start, stop, (stop - start) // _DECADES_APART + 1).tolist())):
+        try:
+            yield level, kalman(A, C, level * base * shape, R, dt)
+        except SynthesisError:
+            continue
 
 
 def like_measurement_noise(covariance: Array, R: Array) -> float:
@@ -69,7 +74,7 @@ def luenberger_candidates(A: Array, C: Array, dt: float) -> Iterator[tuple[float
     """Place the poles of the error dynamics at those of the model, made faster by growing factors.
 
     A pole ``z`` becomes ``z**factor``: the decay rate and the frequency of its continuous counterpart grow alike; a negative one, which has none,
-    keeps its sign. Factors whose poles cannot be placed are left out.
+    keeps its sign. Factors whose poles cannot be placed are left out. One would be the model alone.
 
     Parameters
     ----------

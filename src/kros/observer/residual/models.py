@@ -90,6 +90,49 @@ def one_step_rows(lifting: Lifting, batch: EpisodeBatch) -> tuple[Array, Array]:
     return W[:, : lifting.n_lifted], W[:, lifting.n_lifted :]
 
 
+@dataclass(frozen=True, eq=False)
+class Refitted:
+    """A model of which some rows were fitted to single steps.
+
+    Parameters
+    ----------
+    rows : tuple of int
+        None for the model as identified.
+    A : ndarray, shape (n_lifted, n_lifted)
+    B : ndarray, shape (n_lifted, m)
+    columns : tuple of int
+        Which residuals, of those of all rows as identified and of all rows fitted, are this model's.
+    """
+
+    rows: tuple[int, ...]
+    A: Array
+    B: Array
+    columns: tuple[int, ...]
+
+
+def refitted_models(lifting: Lifting, A: Array, B: Array, measured: Sequence[int], batch: EpisodeBatch) -> tuple[list[Refitted], Array]:
+    """Return the model as identified and with rows fitted to single steps; measured rows with every choice of hidden ones.
+
+    Returns
+    -------
+    list of Refitted
+    ndarray, shape (n_samples - 1 - history, batch, 2 n)
+        One-step residuals of all rows as identified, and of all fitted ones.
+    """
+    n = lifting.n_states
+    hidden = [i for i in range(n) if i not in measured] or list(range(n))
+    fitted, x, u, values = one_step_rows(lifting, batch), batch.states, batch.inputs, batch.parameters
+    both = [(A, B), (np.vstack([fitted[0], A[n:]]), np.vstack([fitted[1], B[n:]]))]
+    residual = np.concatenate([one_step_residual(lifting, *model, x, u, values) for model in both], axis=-1)
+    models = []
+    for rows in _choices(tuple(measured), hidden):
+        own = [M.copy() for M in both[0]]
+        for matrix, other in zip(own, both[1], strict=True):
+            matrix[list(rows)] = other[list(rows)]
+        models.append(Refitted(rows, own[0], own[1], tuple(i + n * (i in rows) for i in range(n))))
+    return models, residual
+
+
 def residual_models(
     lifting: Lifting,
     A: Array,
@@ -117,20 +160,15 @@ def residual_models(
     """
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(range(n))
-    fitted, x, u, values = one_step_rows(lifting, batch), batch.states, batch.inputs, batch.parameters
-    both = [(A, B), (np.vstack([fitted[0], A[n:]]), np.vstack([fitted[1], B[n:]]))]
-    residual = np.concatenate([one_step_residual(lifting, *model, x, u, values) for model in both], axis=-1)
+    x, u, values = batch.states, batch.inputs, batch.parameters
+    refitted, residual = refitted_models(lifting, A, B, measured, batch)
     spectra = residual_spectra(residual, batch.lengths - 1 - lifting.history, batch.units)
     models = []
-    for rows in _choices(tuple(measured), hidden):
-        picked = [i + n * (i in rows) for i in range(n)]
-        own = [M.copy() for M in both[0]]
-        for matrix, other in zip(own, both[1], strict=True):
-            matrix[list(rows)] = other[list(rows)]
-        dynamics = mean_error_dynamics(lifting, own[0], x, u, values)
-        chosen = spectra[..., picked, :][..., picked]
+    for model in refitted:
+        dynamics = mean_error_dynamics(lifting, model.A, x, u, values)
+        chosen = spectra[..., model.columns, :][..., model.columns]
         promised = promised_errors(ResidualProblem(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, batch.sample_period_s))
-        models.append(ResidualModel(rows, own[0], own[1], dynamics, chosen, promised))
+        models.append(ResidualModel(model.rows, model.A, model.B, dynamics, chosen, promised))
     return sorted(models, key=lambda m: float(np.sum(np.log(np.maximum(m.promised[hidden], np.finfo(float).tiny)))))
 
 

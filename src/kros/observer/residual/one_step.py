@@ -73,6 +73,19 @@ def mean_error_dynamics(
     return A[:n, :n] + A[:n, n:] @ slopes.mean(axis=(0, 1))
 
 
+def one_step_covariance(residual: Array, lengths: npt.ArrayLike) -> Array:
+    """Return the mean product of residuals over all episodes, shape (n, n): what white process noise of the same size would have, means included.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n_samples, batch, n)
+    lengths : array_like of int, shape (batch,)
+        Samples of every episode that count.
+    """
+    counted = residual[np.arange(len(residual))[:, None] < np.asarray(lengths)]
+    return np.asarray(counted.T @ counted / len(counted))
+
+
 def residual_spectra(residual: Array, lengths: npt.ArrayLike, units: Sequence[str], segment: int = SEGMENT) -> Array:
     """Return every unit's cross spectral density of the residual by Welch's method; means are kept, since a bias is an error too.
 

@@ -27,13 +27,13 @@ class Multiplied:
     factors: tuple[float, ...]
 
     def __call__(self, key):
-        return self.source(key) * np.array(self.factors)
+        return self.source(key)[:, : len(self.factors)] * np.array(self.factors)
 
 
 @pytest.fixture(scope="module")
 def motors():
     population = DcMotorPopulation(n_units=3, n_episodes=3, seconds=1.4, seed=2).simulate().population
-    return replace(population, metadata={})
+    return replace(population, metadata={}, truths=())
 
 
 def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
@@ -48,7 +48,8 @@ def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
         "lifting": {"functions": [f"tanh({1 / factors[1]!r}*velocity)"]},
         "identify": {"refine": False, "alpha": alpha},
         "uncertainty": {"n_freqs": 50, "max_order": 1, "structure": "scalar"},
-        "synthesis": {"input_weight": 3.0, "methods": ["worst_case_h2", "residual_h2", "memory"], "noise": {"position": 4e-4 * factors[0]}},
+        "synthesis": {"input_weight": 3.0, "methods": ["worst_case_h2", "residual_h2", "memory"]},
+        "sensor": {"position": {"noise": 4e-4 * factors[0]}},
         "predictor": {"states": 2, "steps": 1},
         "evaluate": {"robustness": False, "monte_carlo": 0},
     }

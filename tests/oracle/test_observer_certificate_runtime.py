@@ -10,8 +10,9 @@ from adversary import attack, attack_running
 from batches import batch_of
 
 from kros.core.lti import StateSpace, gain
+from kros.evaluate import as_shown
 from kros.lifting import Lifting
-from kros.observer import Observer, ReliftScales, Runtime, relift_certificate, relift_report, run_observer
+from kros.observer import Observer, ReliftScales, Runtime, Sensor, relift_certificate, relift_report, run_observer
 from kros.synthesis import Injection
 
 DT = 0.01
@@ -53,6 +54,20 @@ def test_without_slopes_the_frozen_response_is_the_error_of_a_late_observer(dela
     rows = relift_report(found, late_one, batch_of(x, u, DT), estimates)
     assert [row.frozen for row in rows] == pytest.approx([row.error for row in rows], rel=1e-9)
     assert all(row.holds for row in rows)
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_what_a_sensor_shows_beside_the_states_drives_the_frozen_response(delay: int) -> None:
+    noisy = observer(delay=delay)
+    found = relift_certificate(noisy, mismatch=False)
+    x, u = recordings(noisy)
+    sensor = {"a": Sensor(noise=5.0, bias=2.0, resolution=0.1, delay_samples=delay)}
+    batch = as_shown(batch_of(x, u, DT), sensor, ("a", "b", "c"))
+    rows = relift_report(found, noisy, batch)
+    assert [row.frozen for row in rows] == pytest.approx([row.error for row in rows], rel=1e-9)
+    assert all(row.holds for row in rows)
+    without = relift_report(found, noisy, batch_of(x, u, DT), run_observer(noisy, batch.measurements((0,)), u))
+    assert not all(row.frozen == pytest.approx(row.error, rel=1e-3) for row in without)
 
 
 RUNTIMES = {

@@ -86,7 +86,11 @@ def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignT
     scales = scales_of(observers, data, task)
     certificates = [certify(observer, own, task) for observer, own in zip(observers, scales, strict=True)]
     estimates = run_observers(observers, data.measurements(first.measured), batch.inputs, first.own(batch.parameters))
-    rows = [relift_report(c, o, batch, x) if c.certified else [] for o, c, x in zip(observers, certificates, estimates, strict=True)]
+    arrived = estimates
+    if batch.lost is not None:  # bounds are for measurements that arrive
+        y = batch.measurements(first.measured, arrived=False)
+        arrived = run_observers(observers, y, batch.inputs, first.own(batch.parameters))
+    rows = [relift_report(c, o, batch, x) if c.certified else [] for o, c, x in zip(observers, certificates, arrived, strict=True)]
     hidden = hidden_mean(data.compare(estimates), first.measured)
     dropout = dropout_error_percent(observers, data, task.models.sample_period_s)
     certificates = [c.in_sizes(o, {}) for o, c in zip(observers, certificates, strict=True)]

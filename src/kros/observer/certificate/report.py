@@ -67,6 +67,8 @@ def relift_report(
 ) -> list[ReliftRow]:
     """Compare bounds and errors, episode by episode; recorded states stand for the true ones, so their noise is part of the residual.
 
+    Where the batch holds what a sensor shows, what it shows beside the states is the noise that drives the error, and all of it arrives.
+
     Parameters
     ----------
     certificate : ReliftCertificate
@@ -82,16 +84,22 @@ def relift_report(
     states, inputs, lengths, n_samples = batch.states, batch.inputs, batch.lengths, len(batch.states)
     values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
     if estimates is None:
-        estimates = run_observer(observer, states[..., list(observer.measured)], inputs, values)
+        estimates = run_observer(observer, batch.measurements(observer.measured, arrived=False), inputs, values)
     scales, omega = certificate.scales, held_residual(observer, states, inputs, values)
     states = with_internal(observer, states, observer.runtime.clip_inputs(inputs), values)
     system = certificate.system(observer)
     first = first_error(observer, states[0] - estimates[0])
     with np.errstate(divide="ignore", invalid="ignore"):
         w = np.where(omega == 0, 0.0, omega / scales.residual)
+    residual = w
+    if batch.shown is not None:
+        noise = shown_beside(observer, batch)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            w = np.concatenate([w, np.where(noise == 0, 0.0, noise / scales.noise)[:-1]], axis=-1)
     inside = np.arange(n_samples)[:, None] < lengths
     z, q = frozen_response(system, w, first)
     energy = {
+        "r": np.sum(np.where(inside[:-1, :, None], residual, 0.0) ** 2, axis=(0, 2)),
         "w": np.sum(np.where(inside[:-1, :, None], w, 0.0) ** 2, axis=(0, 2)),
         "z": np.sum(np.where(inside[..., None], z, 0.0) ** 2, axis=(0, 2)),
         "q": np.sum(np.where(inside[..., None], q, 0.0) ** 2, axis=(0, 2)),
@@ -102,8 +110,17 @@ def relift_report(
         certificate.mismatch_gain * np.sqrt(energy["q"]) if certificate.mismatch_gain is not None else np.inf
     )
     root = np.sqrt(lengths)
-    columns = (np.sqrt(energy["w"]), by_gain, np.sqrt(energy["z"]), np.minimum(by_gain, by_frozen), np.sqrt(energy["e"]))
+    columns = (np.sqrt(energy["r"]), by_gain, np.sqrt(energy["z"]), np.minimum(by_gain, by_frozen), np.sqrt(energy["e"]))
     return [ReliftRow(unit, *(float(c[i] / root[i]) for c in columns)) for i, unit in enumerate(batch.units)]
+
+
+def shown_beside(observer: ObserverData, batch: EpisodeBatch) -> Array:
+    """Return what a sensor shows beside the measured states of its time, shape (n_samples, batch, q); nothing before the first that counts."""
+    delay, y = observer.runtime.delay, batch.measurements(observer.measured, arrived=False)
+    truth = batch.states[..., list(observer.measured)]
+    noise = y - truth[np.maximum(np.arange(len(y)) - delay, 0)]
+    noise[:delay] = 0.0
+    return np.asarray(noise)
 
 
 def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:

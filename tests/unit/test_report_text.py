@@ -117,6 +117,22 @@ def test_verdict_tells_of_units_that_were_left_out() -> None:
     assert "Designed without" not in " ".join(verdict(METRICS, ("position",)))
 
 
+def disturbed(kind: str, severity: float, mean: float | None) -> dict[str, object]:
+    found = {"observer": "koopman/worst_case_h2", "disturbance": kind, "severity": severity, "condition": "noload", "channel": "velocity"}
+    return {**found, "error_percent": {"mean": mean, "worst": mean}}
+
+
+def test_verdict_says_what_sensor_is_needed() -> None:
+    rows = [disturbed("none", 0.0, 1.0), disturbed("noise", 1e-4, 1.5), disturbed("noise", 1e-3, 2.0), disturbed("delay", 1, 40.0)]
+    rows += [disturbed("bias", 1e-4, 1.0), disturbed("dropped", 0.1, 1.5), disturbed("dropped", 0.2, None)]
+    text = "its error doubles with noise of 0.10 % of the largest value, a delay of less than 1 sample that it is not told of or 20 % of the samples lost"
+    assert f"Beyond the recordings' own sensor, {text}" in " ".join(verdict({**METRICS, "robustness": rows}, ("position",)))
+    declared = {**METRICS, "study": {**METRICS["study"], "sensor": {"position": {"noise": 1.0}}}}  # type: ignore[dict-item]
+    assert "Beyond the sensor that is declared" in " ".join(verdict({**declared, "robustness": rows}, ("position",)))
+    assert "No noise, resolution" in " ".join(verdict({**METRICS, "robustness": [rows[0], rows[4]]}, ("position",)))
+    assert "doubles" not in " ".join(verdict(METRICS, ("position",)))
+
+
 def test_verdict_bounds_the_next_unit_or_says_why_not() -> None:
     bounds = {"velocity": {"error_percent": 0.04, "rms": 0.1}, "current": {"error_percent": 12.0, "rms": None}}
     found = {"reserve": 19, "confidence": 0.95, "condition": "noload", "bounds": bounds, "reason": None}

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..evaluate import Kind
+from ..evaluate import Kind, severity_of_growth
 from .names import Look, number, split_observer
 from .theme import Tone
 
@@ -98,3 +98,46 @@ def severity_text(kind: Kind, severity: float, smallest: float) -> str:
     """Return a severity for people, in the unit of its axis; "<" the smallest one that was tried, a dash where there is none."""
     text = number(max(severity, smallest) * AXES[kind].factor, 2)
     return f"< {text}" if severity < smallest else text
+
+
+def doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str]) -> tuple[float, float] | None:
+    """Return the severity at which the error doubles, a geometric mean over the states that are not measured, and the smallest severity that was tried.
+
+    None where there is no curve; infinite where it does not double.
+    """
+    hidden = [curve for c, curve in by_channel.items() if c not in measured] or list(by_channel.values())
+    if not hidden:
+        return None
+    with np.errstate(divide="ignore"):
+        errors = np.exp(np.mean([np.log(curve.errors) for curve in hidden], axis=0))
+    return severity_of_growth(hidden[0].severities, errors), float(hidden[0].severities[1])
+
+
+def needed_sensor(metrics: Mapping[str, Any], measured: Sequence[str]) -> list[str]:
+    """Return the sentence that says what sensor and timing the deployed observer needs; none where the study did not try."""
+    study = metrics["study"]
+    own = curves(metrics.get("robustness", []), study["identify_on"]).get(study.get("deployed"), {})
+    parts = []
+    for kind, words in _NEEDS.items():
+        found = doubling(kind, own.get(kind, {}), measured)
+        if found is not None and np.isfinite(found[0]):
+            at = max(found)
+            value = f"{at:.2g}" if kind is Kind.DELAY else number(at * AXES[kind].factor, 2)
+            text = f"less than {value}" if found[0] < found[1] else value
+            parts.append(words.format(text, "" if at == 1 else "s"))
+    if not own:
+        return []
+    sensor = "sensor that is declared" if study.get("sensor") else "recordings' own sensor"
+    if not parts:
+        return [f"No noise, resolution, bias, delay or loss of samples that was tried beyond the {sensor} doubles its error."]
+    listed = f"{', '.join(parts[:-1])} or {parts[-1]}" if parts[1:] else parts[0]
+    return [f"Beyond the {sensor}, its error doubles with {listed}: this is the encoder and timing it needs."]
+
+
+_NEEDS = {
+    Kind.NOISE: "noise of {} % of the largest value",
+    Kind.QUANTISATION: "a resolution of {} %",
+    Kind.BIAS: "a bias of {} %",
+    Kind.DELAY: "a delay of {} sample{} that it is not told of",
+    Kind.DROPPED: "{} % of the samples lost",
+}

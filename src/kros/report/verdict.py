@@ -7,6 +7,7 @@ from typing import Any
 
 from ..data.population import DEFAULT_CONDITION
 from .caveats import conditions_apart, confounded_text
+from .disturbances import needed_sensor
 from .error_tables import ErrorTable, error_table, left_out_tables
 from .names import BASELINES, channel_units, condition_label, form_label, minus, number, observer_label, split_observer
 from .sections.outliers import flagged_text, undecided_text
@@ -21,7 +22,14 @@ def verdict(metrics: Metrics, measured: tuple[str, ...] = ()) -> list[str]:
 
 def findings(metrics: Metrics, measured: tuple[str, ...] = ()) -> list[str]:
     """Return what was recorded, what is deployed and how well it works, and which units are flagged."""
-    return [*_recorded(metrics), *_deployed(metrics, measured), *_left_out(metrics, measured), *_next_unit(metrics), *_flagged(metrics)]
+    return [
+        *_recorded(metrics),
+        *_deployed(metrics, measured),
+        *needed_sensor(metrics, measured),
+        *_left_out(metrics, measured),
+        *_next_unit(metrics),
+        *_flagged(metrics),
+    ]
 
 
 def trust(metrics: Metrics) -> list[str]:

@@ -45,6 +45,8 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
         "sample_period_s": context.population.sample_period_s,
         "channels": {c.name: c.unit for c in context.population.channels},
     }
+    if context.config.sensor:
+        study["sensor"] = {name: own.model_dump(exclude_none=True) for name, own in context.config.sensor.items()}
     if facts.alerts:
         study["alerts"] = facts.alerts
     if Stage.IDENTIFY in done:

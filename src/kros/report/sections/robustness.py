@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from ...evaluate import Kind, severity_of_growth
+from ...evaluate import Kind
 from ..content import Cell, Cells, Section, Table, where
-from ..disturbances import AXES, Curve, curves, severity_text
+from ..disturbances import AXES, Curve, curves, doubling, severity_text
 from ..names import in_condition, number, observer_label
 from ..run_folder import RunFolder
 
 Rows = Sequence[Mapping[str, Any]]
 _TEXT = (
     "Recordings are made with care; machines in the field lose samples, are badly calibrated, or have a cheaper encoder. Here the measurements of "
-    "held-out episodes are disturbed in one way at a time, and the observers are not informed."
+    "held-out episodes are disturbed in one way at a time, beyond the sensor that is declared, and the observers are not informed."
 )
 _MEMBERS = (
     "A worst case is a bound. Random members of the set show what is typical in it, and how close the bound is: they enter at the uncertainty location of the "
@@ -55,13 +53,8 @@ def _doubling(rows: Rows, condition: str, measured: Sequence[str], deployed: str
 
 
 def _doubled(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str]) -> str:
-    hidden = [curve for c, curve in by_channel.items() if c not in measured] or list(by_channel.values())
-    if not hidden:
-        return "–"
-    with np.errstate(divide="ignore"):
-        errors = np.exp(np.mean([np.log(curve.errors) for curve in hidden], axis=0))
-    severities = hidden[0].severities
-    return severity_text(kind, severity_of_growth(severities, errors), float(severities[1]))
+    found = doubling(kind, by_channel, measured)
+    return "–" if found is None else severity_text(kind, *found)
 
 
 def _sets(sets: Rows, deployed: str | None) -> Table:

@@ -2,6 +2,7 @@
 
 import shutil
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,8 +21,9 @@ def test_two_instances_at_once_and_after_a_reset(fmi, from_source, tmp_path):
     from fmpy.build import build_platform_binary
     from fmpy.validation import validate_fmu
 
-    observer, (y, u) = drive(delay=2), samples(120, faults=False)
-    path = export_fmu(observer, tmp_path / "drive.fmu", fmi, "drive", units={"position": "rad", "velocity": "rad/s"})
+    units = {"units_of_measure": {"position": "rad", "velocity": "rad/s"}}
+    observer, (y, u) = replace(drive(delay=2), about=units), samples(120, faults=False)
+    path = export_fmu(observer, tmp_path / "drive.fmu", fmi, "drive")
     assert validate_fmu(str(path)) == []
     folder, model = fmpy.extract(str(path), tmp_path / "unpacked"), fmpy.read_model_description(str(path))
     if from_source:

@@ -28,6 +28,7 @@ from ..observer import Observer, ReliftCertificate, Sensor, Sensors, in_sizes
 from ..observer.sensor import require_measured
 from ..synthesis import ObserverProblem, Synthesis
 from ..uncertainty.quantify import UncertainModels
+from .about import about
 from .certificates import DIVERGED, Running, certify_running
 from .methods.table import BY_NAME, preferred, slowest_first, suitable
 from .settings import BASELINES, ObserverSettings, PredictorSettings, SynthesisSettings
@@ -173,7 +174,7 @@ def synthesize(
     failed = {found.name: found.facts["reason"] for found in results if found.observer is None}
     if name in failed:
         raise SynthesisError(f"{name} could not be made: {failed[name]}")
-    return certified(tasks, results, work or Work())[0][name]
+    return certified(tasks, results, uncertain.models, work or Work())[0][name]
 
 
 def synthesize_all(
@@ -205,7 +206,7 @@ def synthesize_all(
     for task, found in zip(tasks, results, strict=True):
         if found.observer is None and found.facts["reason"] != task.refusal:
             log.warning("%s could not be made: %s", task.name, found.facts["reason"])
-    designs, running = certified(tasks, results, work)
+    designs, running = certified(tasks, results, uncertain.models, work)
     facts = {found.name: dict(designs[found.name].facts) if found.name in designs else dict(found.facts) for found in results}
     eligible = robust_of(running, facts) if robust else running
     return Designs(designs, choose_deployed(observer.deployed, list(designs), eligible), facts, tuple(running))
@@ -272,7 +273,9 @@ def designed(tasks: list[DesignTask], work: Work) -> list[DesignResult]:
     return [made[i] for i in range(len(tasks))]
 
 
-def certified(tasks: list[DesignTask], results: list[DesignResult], work: Work) -> tuple[dict[str, Design], list[Running]]:
+def certified(
+    tasks: list[DesignTask], results: list[DesignResult], identified: IdentifiedModels, work: Work
+) -> tuple[dict[str, Design], list[Running]]:
     """Certify the observers that were made: on every member of the uncertain set, and as they run."""
     from .uncertain_set import certificate
 
@@ -283,12 +286,13 @@ def certified(tasks: list[DesignTask], results: list[DesignResult], work: Work) 
     running = [one for of_kind in work.run("certify as it runs", as_they_run) for one in of_kind]
     by_name = {one.name: one for one in running}
     designs = {}
-    for (_, found), holds in zip(pairs, on_the_set, strict=True):
+    for (task, found), holds in zip(pairs, on_the_set, strict=True):
         assert found.observer is not None
         assert found.synthesis is not None
-        observer, one = in_sizes(found.observer, {}), by_name[found.name]
+        one, facts = by_name[found.name], {**found.facts, **holds, **by_name[found.name].facts()}
+        observer = replace(in_sizes(found.observer, {}), about=about(task, identified, one.certificate, facts))
         synthesis = replace(found.synthesis, controller=observer.controller)
-        designs[found.name] = Design(found.name, observer, synthesis, one.certificate, {**found.facts, **holds, **one.facts()})
+        designs[found.name] = Design(found.name, observer, synthesis, one.certificate, facts)
     return designs, running
 
 

@@ -63,6 +63,8 @@ class ObserverData:
         So many states at the end are the observer's own (`predictor`): recordings do not hold them.
     sensor : mapping of str to Sensor
         What it was told of the sensors of measured states, by name. What arrives late is corrected by `runtime`.
+    about : mapping of str to JSON values
+        What people should know of it: units of measure, ranges, certificates. It is part of the file; nothing computes with it.
 
     Raises
     ------
@@ -87,6 +89,7 @@ class ObserverData:
     replaces: bool = False
     internal: int = 0
     sensor: Sensors = field(default_factory=dict)
+    about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "injection", Injection(self.injection))

@@ -130,7 +130,10 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
         _seen(content.get("seen"), q, len(content["inputs"]), where),
         sensor=_sensor(content.get("sensor", {}), where),
     )
-    _known(content, [*observer_content(observer), "runtime", "sensor", "lifting_inputs", "input_functions", CHECKSUM], where)
+    _known(content, [*observer_content(observer), "runtime", "sensor", "lifting_inputs", "input_functions", "about", CHECKSUM], where)
+    about = content.get("about", {})
+    _require(isinstance(about, dict), f"{where}: about should be an object", about)
+    observer = replace(observer, about=dict(about))
     if content["schema"] == _FIRST:
         return replace(observer, replaces=measurement_replaces(observer), internal=_named_memories(lifting.states))
     replaces, internal = content["measurement_replaces_estimate"], content["internal_states"]

@@ -31,8 +31,6 @@ def export_c(
     out: Path | str,
     name: str = "observer",
     precision: str = "double",
-    *,
-    units: Mapping[str, str] | None = None,
     study: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write an observer as C99 source with a self-test, a project and a description.
@@ -46,8 +44,6 @@ def export_c(
         Prefix of all public names, a C identifier.
     precision : str
         ``double`` or ``float``.
-    units : mapping of str to str, optional
-        Units of measure by channel, for the description.
     study : mapping, optional
         The resolved study, written beside the source.
 
@@ -64,7 +60,7 @@ def export_c(
     require_identifier(name)
     if precision not in _TOLERANCE:
         raise ConfigError(f"Export to C: precision should be 'double' or 'float', found {precision!r}.")
-    files = c_files(observer, name, precision, units or {})
+    files = c_files(observer, name, precision)
     if study is not None:
         files["study.json"] = json_bytes(study).decode()
     with whole_folder(Path(out)) as folder:
@@ -81,7 +77,7 @@ def require_identifier(name: str) -> None:
         )
 
 
-def c_files(observer: Observer, name: str, precision: str, units: Mapping[str, str]) -> dict[str, str]:
+def c_files(observer: Observer, name: str, precision: str) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -108,7 +104,7 @@ def c_files(observer: Observer, name: str, precision: str, units: Mapping[str, s
         "largest_angle": largest,
         "tolerance": tolerance,
         "library": " and ".join(f"`{f}`" for f in functions) or "nothing",
-        "units": ", ".join(f"{k} {v}" for k, v in units.items() if v),
+        "units": ", ".join(f"{k} {v}" for k, v in units_of_measure(observer).items()),
     }
     environment = Environment(loader=PackageLoader("kros.export.c99"), undefined=StrictUndefined, keep_trailing_newline=True)
     texts = {
@@ -135,6 +131,11 @@ def c_files(observer: Observer, name: str, precision: str, units: Mapping[str, s
         "source": "sha256:" + hashlib.sha256(deployed).hexdigest(),
     }
     return files | {"manifest.json": json_bytes(manifest).decode()}
+
+
+def units_of_measure(observer: Observer) -> dict[str, str]:
+    """Return the units of measure that an observer's file names, by channel."""
+    return {name: unit for name, unit in observer.about.get("units_of_measure", {}).items() if unit}
 
 
 def _sample(value: float) -> str:

@@ -19,7 +19,7 @@ from ...core.errors import ConfigError
 from ...observer import Observer
 from ..c99.compiled import FLAGS, find_compiler
 from ..c99.numbers import Source
-from ..c99.write import c_files, require_identifier
+from ..c99.write import c_files, require_identifier, units_of_measure
 
 _KROS = uuid.UUID("4b0a3f5e-7f2c-5d0e-9a61-6b726f733939")
 _FIXED = (1980, 1, 1, 0, 0, 0)  # the same bytes from the same observer
@@ -50,21 +50,19 @@ def export_fmu(
         A C identifier.
     precision : str
         ``double`` or ``float``.
-    units : mapping of str to str, optional
-        Units of measure by channel.
 
     Raises
     ------
     ConfigError
         When the file exists or ends differently, the version or the name is none, or a lifted function has no expression in C.
     """
-    out, known = Path(out), {k: v for k, v in (units or {}).items() if v}
+    out, known = Path(out), units_of_measure(observer)
     require_identifier(name)
     if fmi not in (2, 3):
         raise ConfigError(f"Export of an FMU: fmi should be 2 or 3, found {fmi!r}.")
     if out.suffix != ".fmu" or out.exists():
         raise ConfigError(f"Export of an FMU: {out} should be a new file that ends in .fmu.")
-    files = c_files(observer, name, precision, known)
+    files = c_files(observer, name, precision)
     sources = {f"sources/{file}": files[file] for file in (f"{name}.h", f"{name}.c")}
     guid = str(uuid.uuid5(_KROS, sources[f"sources/{name}.c"] + files["manifest.json"]))
     texts = rendered(observer, name, precision, fmi, guid, known)

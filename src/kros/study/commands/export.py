@@ -31,7 +31,7 @@ def export_run(
         chosen, name = Observer.load(store.path("observers", f"{observer}.json")), name or identifier(config.name)
         if fmi is not None:
             return export_fmu(chosen, out, fmi, name, precision)
-        return export_c(chosen, out, name, precision, study=config.dump())
+        return export_c(chosen, out, name, precision, config.dump())
 
 
 def identifier(text: str) -> str:

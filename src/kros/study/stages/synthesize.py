@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from shutil import copyfile
+
 from ...core.artifacts import save_artifact
 from ...design.certificates import save_running
 from ...design.synthesize import synthesize_all
@@ -21,8 +24,8 @@ def run(context: Context) -> None:
         work=context.work,
     )
     for name, design in found.designs.items():
-        design.observer.save(draft("observers", f"{name}.json"))
+        replace(design.observer, about={**design.observer.about, "study": config.name}).save(draft("observers", f"{name}.json"))
         design.synthesis.save(draft("synthesis", name))
-    found.designs[found.deployed].observer.save(draft("observers", "deployed.json"))
+    copyfile(draft("observers", f"{found.deployed}.json"), draft("observers", "deployed.json"))
     save_running(draft("observers"), found.running)
     save_artifact(draft("observers"), "observers", {"names": list(found.designs), "deployed": found.deployed, "facts": found.facts})

@@ -25,9 +25,10 @@ from ...core.errors import DimensionError
 from ...core.linalg import adjoint
 
 Array = npt.NDArray[Any]
-BANDS = 48
+BANDS = 96
 _ROUNDING = 1e-13  # of a channel's energy: correlations by FFT and their sums with weights below 2 / lag
 _ITERATIONS = 60
+_REGULAR = 1e-14  # of the largest eigenvalue: what is smaller is rounding
 _RIDGE = 1e-6  # of the largest energy, in every direction: where all lie in fewer of them, the iteration needs its square above rounding
 
 
@@ -144,13 +145,12 @@ def cover(energies: Array, weight: Array | None = None) -> Array:
        Physical Review A 65 (2002) 060301.
     """
     n = energies.shape[-1]
-    if weight is None:
-        size = np.einsum("kbii->bi", energies).real / len(energies)
-        size[size <= 0] = 1.0
-        weight = np.eye(n) / size[:, None, :]
-    half = _power(weight, 0.5)
-    back = _power(weight, -0.5)
-    E = half @ energies @ half
+    mean = np.sqrt(np.einsum("kbii->bi", energies).real / len(energies))
+    mean[mean <= 0] = 1.0
+    outer = mean[:, :, None] * mean[:, None, :]
+    half = np.eye(n)[None] if weight is None else _power(weight * outer, 0.5)
+    back = np.linalg.inv(half)
+    E = half @ (energies / outer) @ half
     size = np.maximum(np.einsum("kbii->kb", E).real.max(axis=0), np.finfo(float).tiny)[:, None, None]
     E = E / size + _RIDGE * np.eye(n)
     Y = np.broadcast_to(np.eye(n) / len(E), E.shape).astype(complex)
@@ -160,19 +160,25 @@ def cover(energies: Array, weight: Array | None = None) -> Array:
         Y = root @ EYE @ root
     M = (E @ Y).sum(axis=0)
     M = (M + adjoint(M)) / 2
-    lacking = np.maximum(np.linalg.eigvalsh(E - M)[..., -1].max(axis=0), 0.0) + 1e-12
-    added = M + lacking[:, None, None] * np.eye(n)
-    root = _power(M, -0.5)
-    grown = M * np.maximum(np.linalg.eigvalsh(root @ E @ root)[..., -1].max(axis=0) * (1 + 1e-12), 1.0)[:, None, None]
+    total = E.sum(axis=0)  # covers in any case
+    M = np.where((np.einsum("bii->b", total - M).real >= 0)[:, None, None], M, total)
+    lacking = np.maximum(np.linalg.eigvalsh(E - M)[..., -1].max(axis=0), 0.0)
+    grown, added = _touching(M, E), _touching(M + lacking[:, None, None] * np.eye(n), E)
     smaller = np.einsum("bii->b", grown - added).real < 0
     found = back @ (np.where(smaller[:, None, None], grown, added) * size) @ back
-    return np.asarray((found + adjoint(found)) / 2)
+    return np.asarray((found + adjoint(found)) / 2 * outer)
+
+
+def _touching(M: Array, E: Array) -> Array:
+    """Multiples of M that are just above all E."""
+    root = _power(M, -0.5)
+    return np.asarray(M * np.linalg.eigvalsh(root @ E @ root)[..., -1].max(axis=0)[:, None, None] * (1 + 1e-12))
 
 
 def _power(matrices: Array, exponent: float) -> Array:
     """Powers of positive definite matrices."""
     values, vectors = np.linalg.eigh((matrices + adjoint(matrices)) / 2)
-    values = np.maximum(values, np.finfo(float).eps ** 2 * np.maximum(values[..., -1:], np.finfo(float).tiny))
+    values = np.maximum(values, _REGULAR * np.maximum(values[..., -1:], np.finfo(float).tiny))
     return np.asarray((vectors * (values**exponent)[..., None, :]) @ adjoint(vectors))
 
 

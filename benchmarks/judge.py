@@ -1,0 +1,461 @@
+"""The judge: observers against their rivals on units that took no part in anything, over populations that nothing was designed on.
+
+    python benchmarks/judge.py OUT                                   everything
+    python benchmarks/judge.py OUT --populations stiff:3:401 --folds 0 --parts accuracy
+    python benchmarks/judge.py OUT --table                           only print what is there
+
+A population is ``kind:spread:seed[:variant]``: `stiff` and `soft` drives of the project's simulator, `compliant` ones of another (`judging/`), `dc`
+motors with Coulomb friction; variant `limit` has a current limit that the motion reaches, `cut` has episodes of 0.7 s. Its units are parted into three
+folds, and for each everything is made from the other units with defaults. Parts: `accuracy`, errors of all observers on the test episodes of the
+units left out, of their first 50 samples and of the rest, against the recording and the truth; `sensor`, the same where the position's sensor is
+worse, of observers that were told of it and of those that were not. A result is a JSON file for each population, fold and part, and one that is
+there is not made again.
+
+The table gives, for each population: the deployed observers and their certificates; ratios to the learned estimator, mean over the units, its upper
+95 % limit (bootstrap over the units, paired) and the worst unit; worst-case designs over the open loop of the same model; bounds over errors; and at
+the limit the worst unit's current.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+import traceback
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, is_dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+sys.path.insert(0, str(Path(__file__).parent / "judging"))
+
+import compliant_drive  # noqa: E402
+import numpy as np  # noqa: E402
+
+import kros  # noqa: E402
+from kros.core.artifacts import read_json, write_json  # noqa: E402
+from kros.data import EpisodeBatch, EpisodeKey, Population, from_arrays, split_episodes  # noqa: E402
+from kros.design.estimators import make_learned  # noqa: E402
+from kros.design.settings import ObserverSettings, PredictorSettings, SynthesisSettings  # noqa: E402
+from kros.design.synthesize import Designs, synthesize_all  # noqa: E402
+from kros.design.validation import TrainingSet  # noqa: E402
+from kros.evaluate import as_shown, true_errors  # noqa: E402
+from kros.identify.calibrate import segments_of  # noqa: E402
+from kros.observer import Sensor, run_observer  # noqa: E402
+from kros.plants import PLANTS  # noqa: E402
+from kros.uncertainty.quantify import UncertainModels  # noqa: E402
+
+HOME, LEARNED, START = "noload", "learned", 50  # samples of the start
+UNITS, EPISODES, SECONDS, FOLDS = 12, 6, 10.0, 3
+CUT_S, LIMIT = 0.7, 0.4
+DRAWS = 4000
+EVERYTHING = (
+    *(f"{loop}:{spread}:{seed}" for seed in (401, 402) for spread in (1, 3) for loop in ("stiff", "soft")),
+    *(f"compliant:1:{seed}" for seed in (401, 402)),
+    *("dc:1:401", "dc:1:402", "compliant:1:403:limit", "stiff:1:403:cut", "dc:1:403:cut"),
+)
+SENSED = ("stiff:1:401", "compliant:1:401")  # populations and
+SENSED_FOLDS = (0,)  # folds that the sensor is made worse for
+LIFTINGS = {"compliant": (compliant_drive.LIFTING,), "dc": ("tanh(velocity)",)}
+
+
+def sensors(size: float, step: float) -> dict[str, Sensor]:
+    """Return the worse sensors of a position, by name, for its range and its resolution."""
+    return {
+        "noise": Sensor(noise=1e-5 * size),
+        "late": Sensor(delay_samples=1),
+        "dropout": Sensor(dropout=0.05),
+        "coarse": Sensor(resolution=10 * step),
+    }
+
+
+@dataclass(frozen=True)
+class Task:
+    """One fold of one population, and the parts to make."""
+
+    out: Path
+    name: str
+    fold: int
+    parts: tuple[str, ...]
+    units: int
+    seconds: float
+
+    @property
+    def kind(self) -> str:
+        """The simulator."""
+        return self.name.split(":")[0]
+
+    @property
+    def variant(self) -> str:
+        """What is special about the population; empty where nothing is."""
+        return (*self.name.split(":"), "")[3]
+
+    def place(self, part: str) -> Path:
+        """Return where a part's result is kept."""
+        return self.out / self.name.replace(":", "-") / f"{part}-{self.fold}.json"
+
+
+def population_of(task: Task) -> Population:
+    """Simulate a population."""
+    kind, spread, seed = task.name.split(":")[:3]
+    settings: dict[str, Any] = {
+        "n_units": task.units,
+        "n_episodes": EPISODES,
+        "seconds": task.seconds,
+        "seed": int(seed),
+        "spread": float(spread),
+    }
+    if kind == "compliant":
+        found, _ = compliant_drive.simulate(**settings, limit=LIMIT if task.variant == "limit" else 1.0)
+    elif kind == "dc":
+        found = PLANTS["dc-motor"](**settings).simulate().population
+    else:
+        found = PLANTS["harmonic-drive"](**settings, loop=kind).simulate().population
+    return cut(found) if task.variant == "cut" else found
+
+
+def cut(population: Population) -> Population:
+    """Return a population with every episode cut into short ones, every other one left out but of the last episode, whose pieces are for testing."""
+    length = round(CUT_S / population.sample_period_s)
+    last = max(int(k.episode) for k in population.episodes)
+    pieces = {}
+    for key in population.episodes:
+        values = population.read(key)
+        for p in range(0, len(values) // length, 1 if int(key.episode) == last else 2):
+            pieces[EpisodeKey(key.unit, key.condition, f"{key.episode}-{p}")] = values[p * length : (p + 1) * length]
+    return from_arrays(pieces, population.channels, population.sample_period_s, units=population.units, metadata=population.metadata)
+
+
+def held_out(task: Task, population: Population) -> tuple[str, ...] | None:
+    """Return the names of the test episodes; None for the default."""
+    if task.variant != "cut":
+        return None
+    last = population.episodes[-1].episode.split("-")[0]
+    return tuple(dict.fromkeys(k.episode for k in population.episodes if k.episode.split("-")[0] == last))
+
+
+class Fold:
+    """What is made from the units that are not left out, once for all parts."""
+
+    def __init__(self, task: Task) -> None:
+        self.task, self.seconds = task, dict[str, float]()
+        population = population_of(task)
+        self.held = population.unit_ids[task.fold :: FOLDS]
+        self.test = held_out(task, population)
+        began = time.perf_counter()
+        lifting = LIFTINGS.get(task.kind)
+        models = kros.identify(population.select([u for u in population.unit_ids if u not in self.held]), lifting, test=self.test)
+        self.seconds["identify"] = time.perf_counter() - began
+        found = kros.quantify(models)
+        self.seconds["quantify"] = time.perf_counter() - began - self.seconds["identify"]
+        refined = tuple(kind for kind in models.kinds if not kind.endswith("edmd"))
+        self.uncertain: UncertainModels = replace(found, models=replace(models, kinds=refined))
+        self.population = population.select(self.held)
+        self._designs: Designs | None = None
+
+    @property
+    def designs(self) -> Designs:
+        """Observers made with defaults."""
+        if self._designs is None:
+            self._designs = self.design({})
+        return self._designs
+
+    def design(self, sensor: Mapping[str, Sensor]) -> Designs:
+        """Design all observers for a sensor."""
+        began = time.perf_counter()
+        methods = tuple(m for m in SynthesisSettings().methods if m != "mixed")
+        baselines = ObserverSettings(baselines=("open_loop", "kalman_tuned"))
+        found = synthesize_all(self.uncertain, SynthesisSettings(methods=methods), baselines, PredictorSettings(), sensor)
+        self.seconds["synthesize"] = time.perf_counter() - began
+        return found
+
+    def learned(self, sensor: Mapping[str, Sensor]) -> Any:
+        """Train the learned estimator for a sensor."""
+        models = self.uncertain.models
+        first = models.models(models.kinds[0])
+        return make_learned(TrainingSet.whole(models, first, sensor), models.lifting, first.measured)
+
+    def batch(self, sensor: Mapping[str, Sensor]) -> EpisodeBatch:
+        """Read the test episodes of the units left out, as a sensor shows them."""
+        models, splits = self.uncertain.models, split_episodes(self.population, self.test)
+        known: dict[str, dict[str, float]] = {}
+        for unit in self.held if models.calibration is not None else ():
+            assert models.calibration is not None
+            on = splits.get((unit, models.facts.identify_on)) or next(s for (u, _), s in splits.items() if u == unit)
+            spec = models.calibration.spec
+            known[unit] = {spec.parameter: models.calibration.calibrate(segments_of((self.population, on.train, spec)), unit).phase_rad}
+        keys = [k for split in splits.values() for k in split.test]
+        return as_shown(EpisodeBatch.read(self.population, keys, parameters=known, truths=True), sensor, self.population.states)
+
+    def estimates(self, designs: Designs, batch: EpisodeBatch, learned: Any) -> Iterable[tuple[str, np.ndarray]]:
+        """Run all observers and the learned estimator."""
+        for name, design in designs.designs.items():
+            observer = design.observer
+            values = batch.parameters if observer.lifting.parameters else None
+            yield name, run_observer(observer, batch.measurements(observer.measured), batch.inputs, values)[..., : batch.states.shape[-1]]
+        yield LEARNED, learned.run(batch, batch.parameters)
+
+    def rows(self, designs: Designs, batch: EpisodeBatch, learned: Any, **case: Any) -> list[dict[str, Any]]:
+        """Return errors in percent of the largest value, mean over the test episodes of every unit and condition."""
+        states, found = self.population.states, []
+        size = np.abs(batch.states).max(axis=0)
+        groups = dict.fromkeys((k.unit, k.condition) for k in batch.keys)
+        for name, estimate in self.estimates(designs, batch, learned):
+            with np.errstate(over="ignore", invalid="ignore"):
+                square = (estimate - batch.states) ** 2
+                parts = {"error_percent": square, "start_percent": square[:START], "rest_percent": square[START:]}
+                percents = {what: 100 * np.sqrt(part.mean(axis=0)) / size for what, part in parts.items()}
+            for unit, condition in groups:
+                chosen = [i for i, k in enumerate(batch.keys) if (k.unit, k.condition) == (unit, condition)]
+                for j, channel in enumerate(states):
+                    row = {"observer": name, "unit": unit, "condition": condition, "channel": channel, **case}
+                    found.append(row | {what: float(values[chosen, j].mean()) for what, values in percents.items()})
+                    found[-1] |= true_row(self.population, estimate, batch, chosen, j)
+        return found
+
+
+def true_row(population: Population, estimate: np.ndarray, batch: EpisodeBatch, chosen: Sequence[int], state: int) -> dict[str, float]:
+    """Return error and lag against what a state really was."""
+    if batch.truths is None or state not in population.true_states:
+        return {}
+    at, rows = population.true_states.index(state), list(chosen)
+    dt = population.sample_period_s
+    own = true_errors(estimate[:, rows], batch.truths[:, rows][..., [at]], (state,), batch.lengths[rows], dt)
+    recorded = true_errors(batch.states[:, rows], batch.truths[:, rows][..., [at]], (state,), batch.lengths[rows], dt)
+    found = {"true_error_percent": own.error_percent, "true_lag_s": own.lag_s}
+    found |= {"recorded_true_error_percent": recorded.error_percent, "recorded_true_lag_s": recorded.lag_s}
+    return {what: float(values.mean()) for what, values in found.items()}
+
+
+def make(task: Task) -> dict[str, float]:
+    """Make the missing parts of a fold; return the seconds that its steps took."""
+    fold, seconds = Fold(task), dict[str, float]()
+    for part in task.parts:
+        began = time.perf_counter()
+        content = {"accuracy": accuracy, "sensor": sensor}[part](fold)
+        seconds[part] = time.perf_counter() - began
+        write_json(
+            task.place(part), {"population": task.name, "fold": task.fold, "held": fold.held, **content, "seconds": fold.seconds | seconds}
+        )
+    return fold.seconds | seconds
+
+
+def accuracy(fold: Fold) -> dict[str, Any]:
+    """Errors of everything on the units left out, as recorded, with what is known about every observer."""
+    designs = fold.designs
+    batch, learned = fold.batch({}), fold.learned({})
+    own = (
+        batch.states[..., fold.population.states.index("current")]
+        if "current" in fold.population.states
+        else np.zeros((1, len(batch.keys)))
+    )
+    limit = {"limit": LIMIT, "at_limit": {str(k): float(np.mean(np.abs(own[:, i]) > 0.97 * LIMIT)) for i, k in enumerate(batch.keys)}}
+    return {
+        "deployed": designs.deployed,
+        "facts": designs.facts,
+        "running": {r.name: [plain_row(row) for row in r.rows] for r in designs.running},
+        "rows": fold.rows(designs, batch, learned),
+        "learned": learned.facts,
+        **(limit if fold.task.variant == "limit" else {}),
+    }
+
+
+def plain_row(row: Any) -> Any:
+    """Return a row of a certificate's report as a mapping."""
+    return row.as_dict() if hasattr(row, "as_dict") else asdict(row) if is_dataclass(row) else row
+
+
+def sensor(fold: Fold) -> dict[str, Any]:
+    """Errors with worse sensors, of observers that were told and of those that were not."""
+    models, untold = fold.uncertain.models, fold.designs
+    (measured,) = models.population.measured
+    never_told, rows, deployed = fold.learned({}), [], {"": untold.deployed}
+    for case, own in sensors(models.sizes[measured], models.facts.resolution[measured]).items():
+        worse, told = {measured: own}, fold.design({measured: own})
+        batch = fold.batch(worse)
+        rows += fold.rows(untold, batch, never_told, case=case, told=False) + fold.rows(
+            told, batch, fold.learned(worse), case=case, told=True
+        )
+        deployed[case] = told.deployed
+    return {"deployed": deployed, "rows": rows}
+
+
+# What is printed
+
+
+def read_parts(out: Path, name: str, part: str) -> list[dict[str, Any]]:
+    """Return the results of a population's folds that are there."""
+    return [read_json(path) for path in sorted((out / name.replace(":", "-")).glob(f"{part}-*.json"))]
+
+
+def errors(
+    parts: Sequence[Mapping[str, Any]], observer: str, condition: str, channel: str, what: str = "error_percent", **case: Any
+) -> dict[str, float]:
+    """Return an observer's error of every unit; `deployed` is every fold's own. Infinite where it diverged, absent where it was not made."""
+    found = {}
+    for part in parts:
+        wanted = part["deployed"] if observer == "deployed" else observer
+        if isinstance(wanted, Mapping):
+            wanted = wanted[case["case"] if case["told"] else ""]
+        for r in part["rows"]:
+            if (r["observer"], r["condition"], r["channel"]) == (wanted, condition, channel) and all(r[k] == v for k, v in case.items()):
+                found[f"{part['fold']}/{r['unit']}"] = np.inf if r[what] is None else float(r[what])
+    return found
+
+
+def paired(own: Mapping[str, float], other: Mapping[str, float]) -> np.ndarray:
+    """Return ratios over the units that both have."""
+    return np.array([own[u] / other[u] for u in own if u in other and np.isfinite(other[u]) and other[u] > 0])
+
+
+def upper(values: np.ndarray, text: str) -> float:
+    """Return the upper 95 % limit of a mean by bootstrap over units."""
+    rows = np.random.default_rng(zlib.crc32(text.encode())).integers(len(values), size=(DRAWS, len(values)))
+    return float(np.quantile(values[rows].mean(axis=1), 0.95))
+
+
+def ratio(own: Mapping[str, float], other: Mapping[str, float], text: str) -> str:
+    """Return mean, upper limit and worst unit of a ratio."""
+    values = paired(own, other)
+    if not len(values):
+        return f"{text:58s} not there"
+    return f"{text:58s} {values.mean():7.3f} {upper(values, text):7.3f} {values.max():7.3f}   ({len(values)} units)"
+
+
+def table(out: Path, names: Iterable[str]) -> None:
+    """Print everything that is there."""
+    for name in names:
+        if parts := read_parts(out, name, "accuracy"):
+            say(f"\n== {name}: {len(parts)} of {FOLDS} folds, {sum(p['seconds'].get('accuracy', 0) for p in parts):.0f} s")
+            show_accuracy(parts, limited=":limit" in name)
+        if parts := read_parts(out, name, "sensor"):
+            show_sensor(parts)
+
+
+def show_accuracy(parts: Sequence[Mapping[str, Any]], limited: bool) -> None:
+    """Print one population."""
+    for part in parts:
+        facts = part["facts"][part["deployed"]]
+        known = {k: v for k, v in facts.items() if k in _PROOFS}
+        say(f"fold {part['fold']}: deployed {part['deployed']}, " + ", ".join(f"{k} {_short(v)}" for k, v in known.items()))
+    conditions = sorted({r["condition"] for p in parts for r in p["rows"]}, key=lambda c: c != HOME)
+    hidden = [c for c in dict.fromkeys(r["channel"] for r in parts[0]["rows"]) if c != "position"]
+    say(f"{'deployed over learned':58s} {'mean':>7s} {'95 %':>7s} {'worst':>7s}")
+    for condition in conditions:
+        for channel in hidden:
+            for what in ("error_percent", "start_percent", "rest_percent"):
+                own, other = (errors(parts, o, condition, channel, what) for o in ("deployed", LEARNED))
+                text = f"  {condition}, {channel}{'' if what == 'error_percent' else ', ' + what.split('_')[0]}"
+                say(ratio(own, other, text) + f"   {np.mean([*own.values()]):.4g} / {np.mean([*other.values()]):.4g} %")
+    observers = list(dict.fromkeys(r["observer"] for p in parts for r in p["rows"]))
+    say("over the open loop of the same model, or over learned (mean, 95 %, worst)")
+    for observer in observers:
+        open_loop = f"{observer.split('/')[0]}/open_loop"
+        if observer in (open_loop, LEARNED):
+            continue
+        for condition in conditions[:1]:
+            for channel in hidden:
+                own = errors(parts, observer, condition, channel)
+                say(ratio(own, errors(parts, open_loop, condition, channel), f"  {observer}, {channel} / open loop"))
+                say(ratio(own, errors(parts, LEARNED, condition, channel), f"  {observer}, {channel} / learned"))
+    for observer in observers:
+        bounds = [r for p in parts for r in p["running"].get(observer, [])]
+        pairs = [(r["bound"], r["error"]) for r in bounds if "bound" in r and "error" in r]
+        if pairs:
+            values = [b / e for b, e in pairs if e]
+            say(f"  {observer}: bound over error of units in the set {min(values):.3g} to {max(values):.3g}")
+    true = (
+        {o: errors(parts, o, conditions[0], "velocity", "true_error_percent") for o in ("deployed", LEARNED)} if _has_truth(parts) else {}
+    )
+    for o, own in true.items():
+        lag = errors(parts, o, conditions[0], "velocity", "true_lag_s")
+        say(f"  true velocity, {o}: error {np.mean([*own.values()]):.4g} %, lag {1e3 * np.mean([*lag.values()]):.3f} ms")
+    if true:
+        own, lag = (errors(parts, LEARNED, conditions[0], "velocity", f"recorded_true_{what}") for what in ("error_percent", "lag_s"))
+        say(f"  true velocity, as recorded: error {np.mean([*own.values()]):.4g} %, lag {1e3 * np.mean([*lag.values()]):.3f} ms")
+    if limited:
+        for condition in conditions:
+            values = paired(*(errors(parts, o, condition, "current") for o in ("deployed", LEARNED)))
+            at = [v for p in parts for k, v in p["at_limit"].items() if condition in k]
+            say(
+                f"  at the limit, {condition}: {100 * np.mean(at):.1f} % of samples; worst unit's current over learned {values.max():.3f}, asked 1.5"
+            )
+
+
+def show_sensor(parts: Sequence[Mapping[str, Any]]) -> None:
+    """Print told over untold, and told over the best told rival."""
+    say("worse sensors: told over untold; told over the best of open loop, told tuned Kalman and told learned (means over units)")
+    for case in dict.fromkeys(r["case"] for p in parts for r in p["rows"]):
+        for channel in ("velocity", "current"):
+            told, untold = (np.array([*errors(parts, "deployed", HOME, channel, case=case, told=t).values()]) for t in (True, False))
+            rivals = dict.fromkeys(
+                r["observer"] for p in parts for r in p["rows"] if r["observer"].endswith(("open_loop", "kalman_tuned", LEARNED))
+            )
+            means = {o: float(np.mean([*errors(parts, o, HOME, channel, case=case, told=True).values()])) for o in rivals}
+            best = min(means, key=lambda o: means[o])
+            say(
+                f"  {case:8s} {channel:9s} {told.mean():9.4g} / {untold.mean():9.4g} = {told.mean() / untold.mean():6.3f}"
+                f"   / {means[best]:9.4g} ({best}) = {told.mean() / means[best]:6.3f}   {parts[0]['deployed'][case]}"
+            )
+
+
+_PROOFS = ("relift_certified", "worst_case_h2", "relift_gain", "relift_bound_worst", "hidden_error_percent")
+
+
+def _has_truth(parts: Sequence[Mapping[str, Any]]) -> bool:
+    return any("true_error_percent" in r for r in parts[0]["rows"])
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def say(text: str) -> None:
+    """Print at once."""
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    """Make what is missing, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--populations", nargs="+", default=list(EVERYTHING))
+    parser.add_argument("--folds", type=int, nargs="+", default=list(range(FOLDS)))
+    parser.add_argument("--parts", nargs="+", choices=("accuracy", "sensor"), default=["accuracy", "sensor"])
+    parser.add_argument("--sensed", nargs="+", default=list(SENSED), help="populations that the sensor is made worse for")
+    parser.add_argument("--sensed-folds", type=int, nargs="+", default=list(SENSED_FOLDS))
+    parser.add_argument("--units", type=int, default=UNITS)
+    parser.add_argument("--seconds", type=float, default=SECONDS)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--again", action="store_true", help="make again what is there")
+    parser.add_argument("--table", action="store_true")
+    o = parser.parse_args()
+    tasks = []
+    for name in [] if o.table else o.populations:
+        for fold in o.folds:
+            wanted = [p for p in o.parts if p == "accuracy" or (name in o.sensed and fold in o.sensed_folds)]
+            task = Task(o.out, name, fold, (), o.units, o.seconds)
+            missing = tuple(p for p in wanted if o.again or not task.place(p).exists())
+            tasks += [replace(task, parts=missing)] if missing else []
+    tasks.sort(key=lambda task: -len(task.parts))  # the longest first
+    with ProcessPoolExecutor(o.workers, get_context("spawn")) as pool:
+        futures = {pool.submit(make, task): task for task in tasks}
+        for future in as_completed(futures):
+            task = futures[future]
+            try:
+                seconds = ", ".join(f"{k} {v:.0f}" for k, v in future.result().items())
+                say(f"{task.name}, fold {task.fold}: {seconds} s")
+            except Exception as error:  # whatever it is: the others are made all the same
+                say(f"{task.name}, fold {task.fold} FAILED: {error}\n{''.join(traceback.format_exception(error)[-6:])}")
+    table(o.out, o.populations)
+
+
+if __name__ == "__main__":
+    main()

@@ -20,13 +20,14 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import time
 import traceback
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, is_dataclass, replace
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,7 @@ HOME, LEARNED, START = "noload", "learned", 50  # samples of the start
 UNITS, EPISODES, SECONDS, FOLDS = 12, 6, 10.0, 3
 CUT_S, LIMIT = 0.7, 0.4
 DRAWS = 4000
+PROOFS = r"certified|robust|worst_case|bound|gain$|hidden_error"  # facts of the deployed observer that are printed
 EVERYTHING = (
     *(f"{loop}:{spread}:{seed}" for seed in (401, 402) for spread in (1, 3) for loop in ("stiff", "soft")),
     *(f"compliant:1:{seed}" for seed in (401, 402)),
@@ -314,9 +316,9 @@ def paired(own: Mapping[str, float], other: Mapping[str, float]) -> np.ndarray:
     return np.array([own[u] / other[u] for u in own if u in other and np.isfinite(other[u]) and other[u] > 0])
 
 
-def upper(values: np.ndarray, text: str) -> float:
+def upper(values: np.ndarray) -> float:
     """Return the upper 95 % limit of a mean by bootstrap over units."""
-    rows = np.random.default_rng(zlib.crc32(text.encode())).integers(len(values), size=(DRAWS, len(values)))
+    rows = np.random.default_rng(0).integers(len(values), size=(DRAWS, len(values)))
     return float(np.quantile(values[rows].mean(axis=1), 0.95))
 
 
@@ -325,10 +327,10 @@ def ratio(own: Mapping[str, float], other: Mapping[str, float], text: str) -> st
     values = paired(own, other)
     if not len(values):
         return f"{text:58s} not there"
-    return f"{text:58s} {values.mean():7.3f} {upper(values, text):7.3f} {values.max():7.3f}   ({len(values)} units)"
+    return f"{text:58s} {values.mean():7.3f} {upper(values):7.3f} {values.max():7.3f}   ({len(values)} units)"
 
 
-def table(out: Path, names: Iterable[str]) -> None:
+def table(out: Path, names: Sequence[str]) -> None:
     """Print everything that is there."""
     for name in names:
         if parts := read_parts(out, name, "accuracy"):
@@ -336,56 +338,99 @@ def table(out: Path, names: Iterable[str]) -> None:
             show_accuracy(parts, limited=":limit" in name)
         if parts := read_parts(out, name, "sensor"):
             show_sensor(parts)
+    say("\n== In short (deployed over learned, units left out)")
+    for name in names:
+        if parts := read_parts(out, name, "accuracy"):
+            verdict(name, parts)
 
 
 def show_accuracy(parts: Sequence[Mapping[str, Any]], limited: bool) -> None:
     """Print one population."""
     for part in parts:
         facts = part["facts"][part["deployed"]]
-        known = {k: v for k, v in facts.items() if k in _PROOFS}
-        say(f"fold {part['fold']}: deployed {part['deployed']}, " + ", ".join(f"{k} {_short(v)}" for k, v in known.items()))
-    conditions = sorted({r["condition"] for p in parts for r in p["rows"]}, key=lambda c: c != HOME)
-    hidden = [c for c in dict.fromkeys(r["channel"] for r in parts[0]["rows"]) if c != "position"]
+        known = [f"{k} {_short(v)}" for k, v in facts.items() if re.search(PROOFS, k) and not isinstance(v, (Mapping, list))]
+        say(f"fold {part['fold']}: deployed {part['deployed']}, {', '.join(known)}")
+    conditions, hidden = conditions_of(parts), hidden_of(parts)
     say(f"{'deployed over learned':58s} {'mean':>7s} {'95 %':>7s} {'worst':>7s}")
-    for condition in conditions:
+    for condition, channel in product(conditions, hidden):
+        for what in ("error_percent", "start_percent", "rest_percent"):
+            own, other = (errors(parts, o, condition, channel, what) for o in ("deployed", LEARNED))
+            text = f"  {condition}, {channel}{'' if what == 'error_percent' else ', ' + what.split('_')[0]}"
+            say(ratio(own, other, text) + f"   {np.mean([*own.values()]):.4g} / {np.mean([*other.values()]):.4g} %")
+    say(f"{f'{conditions[0]}, mean over units (worst)':28s}" + "".join(f"{f'{c}: % / open loop / learned':>46s}" for c in hidden))
+    for observer in dict.fromkeys(r["observer"] for p in parts for r in p["rows"]):
+        cells = []
         for channel in hidden:
-            for what in ("error_percent", "start_percent", "rest_percent"):
-                own, other = (errors(parts, o, condition, channel, what) for o in ("deployed", LEARNED))
-                text = f"  {condition}, {channel}{'' if what == 'error_percent' else ', ' + what.split('_')[0]}"
-                say(ratio(own, other, text) + f"   {np.mean([*own.values()]):.4g} / {np.mean([*other.values()]):.4g} %")
-    observers = list(dict.fromkeys(r["observer"] for p in parts for r in p["rows"]))
-    say("over the open loop of the same model, or over learned (mean, 95 %, worst)")
-    for observer in observers:
-        open_loop = f"{observer.split('/')[0]}/open_loop"
-        if observer in (open_loop, LEARNED):
-            continue
-        for condition in conditions[:1]:
-            for channel in hidden:
-                own = errors(parts, observer, condition, channel)
-                say(ratio(own, errors(parts, open_loop, condition, channel), f"  {observer}, {channel} / open loop"))
-                say(ratio(own, errors(parts, LEARNED, condition, channel), f"  {observer}, {channel} / learned"))
-    for observer in observers:
-        bounds = [r for p in parts for r in p["running"].get(observer, [])]
-        pairs = [(r["bound"], r["error"]) for r in bounds if "bound" in r and "error" in r]
-        if pairs:
-            values = [b / e for b, e in pairs if e]
-            say(f"  {observer}: bound over error of units in the set {min(values):.3g} to {max(values):.3g}")
-    true = (
-        {o: errors(parts, o, conditions[0], "velocity", "true_error_percent") for o in ("deployed", LEARNED)} if _has_truth(parts) else {}
-    )
-    for o, own in true.items():
-        lag = errors(parts, o, conditions[0], "velocity", "true_lag_s")
-        say(f"  true velocity, {o}: error {np.mean([*own.values()]):.4g} %, lag {1e3 * np.mean([*lag.values()]):.3f} ms")
-    if true:
-        own, lag = (errors(parts, LEARNED, conditions[0], "velocity", f"recorded_true_{what}") for what in ("error_percent", "lag_s"))
-        say(f"  true velocity, as recorded: error {np.mean([*own.values()]):.4g} %, lag {1e3 * np.mean([*lag.values()]):.3f} ms")
+            own = errors(parts, observer, conditions[0], channel)
+            others = [errors(parts, o, conditions[0], channel) for o in (open_loop_of(observer), LEARNED)]
+            found = [paired(own, other) for other in others]
+            ratios = [f"{v.mean():7.3f} ({v.max():6.3f})" if len(v) else f"{'-':>16s}" for v in found]
+            cells.append(f"{np.mean([*own.values()]):10.4g}  " + " ".join(ratios))
+        say(f"  {observer:26s}" + "  ".join(cells))
+    if _has_truth(parts):
+        for observer in ("deployed", LEARNED):
+            show_truth(parts, conditions[0], observer, "true_", observer)
+        show_truth(parts, conditions[0], LEARNED, "recorded_true_", "as recorded")
     if limited:
         for condition in conditions:
-            values = paired(*(errors(parts, o, condition, "current") for o in ("deployed", LEARNED)))
-            at = [v for p in parts for k, v in p["at_limit"].items() if condition in k]
-            say(
-                f"  at the limit, {condition}: {100 * np.mean(at):.1f} % of samples; worst unit's current over learned {values.max():.3f}, asked 1.5"
-            )
+            at = [v for p in parts for k, v in p["at_limit"].items() if f"({condition})" in k]
+            say(f"  at the limit, {condition}: {100 * np.mean(at):.1f} % of samples, {100 * max(at):.1f} % of the worst episode")
+
+
+def show_truth(parts: Sequence[Mapping[str, Any]], condition: str, observer: str, prefix: str, title: str) -> None:
+    """Print error and lag against the true velocity."""
+    error, lag = (
+        np.mean([*errors(parts, observer, condition, "velocity", f"{prefix}{what}").values()]) for what in ("error_percent", "lag_s")
+    )
+    say(f"  true velocity, {title}: error {error:.4g} %, lag {1e3 * lag:.3f} ms")
+
+
+def conditions_of(parts: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the conditions, the one that was identified on first."""
+    return sorted({r["condition"] for p in parts for r in p["rows"]}, key=lambda c: c != HOME)
+
+
+def hidden_of(parts: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the states that are not measured."""
+    return [c for c in dict.fromkeys(r["channel"] for r in parts[0]["rows"]) if c != "position"]
+
+
+def open_loop_of(observer: str) -> str:
+    """Return the open loop of the same model."""
+    return f"{observer.split('/')[0]}/open_loop"
+
+
+def verdict(name: str, parts: Sequence[Mapping[str, Any]]) -> None:
+    """Print what is asked of a population, what was found, and whether it is met."""
+    conditions, hidden, short = conditions_of(parts), hidden_of(parts), ":cut" in name
+
+    def line(what: str, found: float, most: float, note: str = "") -> None:
+        say(f"  {name:24s} {what:52s} {found:8.3f}   asked {most:g} [{'met' if found <= most else 'MISSED'}] {note}")
+
+    deployed = [p["facts"][p["deployed"]] for p in parts]
+    made = ", ".join(dict.fromkeys(p["deployed"] for p in parts))
+    say(f"  {name:24s} deployed {made}; certified as it runs {sum(f['relift_certified'] is True for f in deployed)} of {len(parts)}")
+    for condition, channel in product(conditions, hidden):
+        values = paired(*(errors(parts, o, condition, channel) for o in ("deployed", LEARNED)))
+        what = f"{channel}, {condition}"
+        if not len(values):
+            continue
+        if ":limit" in name:
+            if channel == "current":
+                line(f"{what}: worst unit over learned", values.max(), 1.5)
+        elif short:
+            line(f"{what}: mean over learned", values.mean(), 1.05, f"worst {values.max():.3f}")
+        elif channel == "velocity":
+            line(f"{what}: upper limit of the mean ratio", upper(values), 1.03, f"mean {values.mean():.3f}")
+            line(f"{what}: worst unit", values.max(), 1.1)
+        elif condition == conditions[0]:
+            line(f"{what}: mean ratio", values.mean(), 0.85, f"upper limit {upper(values):.3f}, worst {values.max():.3f}")
+    robust = [o for o in dict.fromkeys(r["observer"] for p in parts for r in p["rows"]) if "worst_case_h2" in o]
+    for channel, most in (("velocity", 0.35), ("current", 0.85)) if not short and ":limit" not in name else ():
+        found = {o: paired(*(errors(parts, x, conditions[0], channel) for x in (o, open_loop_of(o)))).mean() for o in robust}
+        if found:
+            best = min(found, key=lambda o: found[o])
+            line(f"{channel}: best worst-case H2 over open loop", found[best], most, best)
 
 
 def show_sensor(parts: Sequence[Mapping[str, Any]]) -> None:
@@ -403,9 +448,6 @@ def show_sensor(parts: Sequence[Mapping[str, Any]]) -> None:
                 f"  {case:8s} {channel:9s} {told.mean():9.4g} / {untold.mean():9.4g} = {told.mean() / untold.mean():6.3f}"
                 f"   / {means[best]:9.4g} ({best}) = {told.mean() / means[best]:6.3f}   {parts[0]['deployed'][case]}"
             )
-
-
-_PROOFS = ("relift_certified", "worst_case_h2", "relift_gain", "relift_bound_worst", "hidden_error_percent")
 
 
 def _has_truth(parts: Sequence[Mapping[str, Any]]) -> bool:

@@ -204,17 +204,21 @@ class Fold:
         yield LEARNED, learned.run(batch, batch.parameters)
 
     def rows(self, designs: Designs, batch: EpisodeBatch, learned: Any, **case: Any) -> list[dict[str, Any]]:
-        """Return errors in percent of the largest value, mean over the test episodes of every unit and condition."""
+        """Return errors in percent of the largest value of a unit in a condition, mean over its test episodes."""
         states, found = self.population.states, []
-        size = np.abs(batch.states).max(axis=0)
-        groups = dict.fromkeys((k.unit, k.condition) for k in batch.keys)
+        groups = {
+            g: [i for i, k in enumerate(batch.keys) if (k.unit, k.condition) == g]
+            for g in dict.fromkeys((k.unit, k.condition) for k in batch.keys)
+        }
+        size = np.empty(batch.states.shape[1:])
+        for chosen in groups.values():  # pieces in which the machine rests have no size of their own
+            size[chosen] = np.abs(batch.states[:, chosen]).max(axis=(0, 1))
         for name, estimate in self.estimates(designs, batch, learned):
             with np.errstate(over="ignore", invalid="ignore"):
                 square = (estimate - batch.states) ** 2
                 parts = {"error_percent": square, "start_percent": square[:START], "rest_percent": square[START:]}
                 percents = {what: 100 * np.sqrt(part.mean(axis=0)) / size for what, part in parts.items()}
-            for unit, condition in groups:
-                chosen = [i for i, k in enumerate(batch.keys) if (k.unit, k.condition) == (unit, condition)]
+            for (unit, condition), chosen in groups.items():
                 for j, channel in enumerate(states):
                     row = {"observer": name, "unit": unit, "condition": condition, "channel": channel, **case}
                     found.append(row | {what: float(values[chosen, j].mean()) for what, values in percents.items()})

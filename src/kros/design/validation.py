@@ -15,7 +15,7 @@ from ..data.scaled import scale_population
 from ..evaluate import as_shown, error_percent
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
-from ..observer import Observer, Seen, Sensors, run_observer, run_observers
+from ..observer import Observer, Seen, Sensor, Sensors, run_observer, run_observers
 from ..observer.sensor import in_units
 
 Array = npt.NDArray[np.float64]
@@ -74,8 +74,9 @@ class TrainingSet:
         return self._shown(self.keys, round(TUNING_S / self.population.sample_period_s))
 
     def one_by_one(self) -> Iterator[ValidationSet]:
-        """Read every episode by itself, whole."""
-        return (self._shown([key]) for key in self.keys)
+        """Read every episode by itself, whole, without the bias: its size is declared, and its sign nobody can learn."""
+        unbiased = replace(self, sensor=_without(self.sensor, "bias"))
+        return (unbiased._shown([key]) for key in self.keys)
 
     def _shown(self, keys: Sequence[EpisodeKey], limit: int | None = None) -> ValidationSet:
         batch, states = EpisodeBatch.read(self.population, keys, limit, self.parameters), self.population.states
@@ -100,8 +101,8 @@ class ValidationSet:
 
     @property
     def on_time(self) -> ValidationSet:
-        """The same with measurements that are not late: what observers that know of a delay are identified and tuned on."""
-        sensor = {name: own.model_copy(update={"delay_samples": 0}) for name, own in self.sensor.items()}
+        """The same with measurements that are neither late, which observers know of, nor biased, which none can learn: what they are fitted to."""
+        sensor = _without(self.sensor, "delay_samples", "bias")
         return replace(self, batch=as_shown(replace(self.batch, shown=None, lost=None), sensor, self.states), sensor=sensor)
 
     @property
@@ -145,6 +146,10 @@ class ValidationSet:
         n = self.batch.states.shape[-1]
         found = [error_percent(estimate[..., :n], self.batch.states, self.batch.lengths).mean(axis=0) for estimate in estimates]
         return np.where(np.isfinite(found), found, np.inf)
+
+
+def _without(sensor: Sensors, *what: str) -> dict[str, Sensor]:
+    return {name: own.model_copy(update=dict.fromkeys(what, 0)) for name, own in sensor.items()}
 
 
 def seen_by(identified: IdentifiedModels, measured: Sequence[int]) -> Seen:

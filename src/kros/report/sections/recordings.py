@@ -24,7 +24,10 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section:
     if filed:
         text += f"In the group of outliers, and kept out of everything pooled: {', '.join(filed)}. "
     if facts.get("dropped"):
-        text += f"Left out for bad samples: {', '.join(facts['dropped'])}."
+        text += f"Left out for bad samples: {', '.join(facts['dropped'])}. "
+    told = [f"{c.replace('_', ' ')}: {', '.join(f'{k} {v:g}' for k, v in own.items() if v)}" for c, own in study.get("sensor", {}).items()]
+    if told:
+        text += f"Declared of the sensor beyond the recordings, and told to all: {'; '.join(told)}. "
     alerts = [f"Look at this first: {alert}" for alert in facts.get("alerts", ())]
     return Section("recordings", "Recordings", [*alerts, text], _channels(run), ["signals", "tracking_spectrum"])
 

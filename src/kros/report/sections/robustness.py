@@ -80,8 +80,8 @@ def _noise(rows: Rows, deployed: str | None) -> Table:
         for row in rows
     ]
     caption = (
-        f"Mean error in percent of the largest value over {rows[0]['units']} units with fresh measurement noise of the assumed level, on top of the "
-        "recordings' own, and its 95 % intervals: over the noise alone, over the units alone, over both."
+        f"Mean error in percent of the largest value over {rows[0]['units']} units with fresh measurement noise of the assumed level, on top of what "
+        "the sensor shows, and its 95 % intervals: over the noise alone, over the units alone, over both."
     )
     head = ["observer", "channel", "error", "over noise", "over units", "over both"]
     return Table(head, cells, caption, folded=True, emphasised=where((row["observer"] for row in rows), deployed))

@@ -121,7 +121,7 @@ def errors_on(context: Context, population: Population, condition: str) -> dict[
         y, values = batch.states[..., list(group[0].measured)], parameters if group[0].lifting.parameters else None
         for observer, estimate in zip(group, run_observers(group, y, batch.inputs, values), strict=True):
             note(observer.name, estimate)
-    for name, make in baseline_makers(context).items():
+    for name, make in baseline_makers(context, population, tuple(last.values())).items():
         try:
             note(name, make().run(batch, parameters))
         except KrosError as error:

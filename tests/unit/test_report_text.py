@@ -11,6 +11,7 @@ from kros.report.canvas import decibel, log_ticks, power_of_ten, spread, thin, t
 from kros.report.error_tables import error_table
 from kros.report.figures.rows import best_last
 from kros.report.names import best_models, deployed_pair, model_label, number, observer_label, observer_look, paper_pair
+from kros.report.sections.observers import baseline_notes
 from kros.report.theme import Tone
 from kros.report.verdict import verdict
 
@@ -99,10 +100,46 @@ def test_verdict_tells_the_numbers() -> None:
     text = " ".join(verdict({**METRICS, "study": told, "evaluation": rows}, ("position",)))
     assert "velocity to 0.300 % of the largest value (RMS 0.0200 rad/s; 0.400 % on the worst unit, c)" in text
     assert "Open loop, the nominal model alone, gives velocity 0.600 % (2.0 times as much)." in text
-    assert "The tuned Kalman filter diverges on some units." in text
+    assert "The best baseline is for velocity “Koopman, open loop”, 0.600 % (2.0 times as much)." in text
     assert "at most 12.0 % above" in text
     assert "No certificate could be found for it as it runs" in text
     assert "Flagged as not belonging to the batch: z (loaded)." in text
+
+
+def test_verdict_compares_with_the_best_baseline_of_every_channel_by_name() -> None:
+    errors = {
+        "koopman/worst_case_h2": (0.2, 5.0),
+        "linear/mixed": (0.1, 5.1),
+        "learned": (0.19, None),
+        "linear/kalman_tuned": (0.3, 4.0),
+        "koopman/kalman_tuned": (0.4, 7.0),
+        "filtered_difference": (0.25,),
+        "mean_profile": (9.0, 4.5),
+    }
+    rows = [row(o, "b", c, e) for o, own in errors.items() for c, e in zip(("velocity", "current"), own, strict=False)]
+    text = " ".join(verdict({**METRICS, "evaluation": rows}, ("position",)))
+    told = "The best baseline is for velocity “learned”, 0.190 % (5 % less) and current “linear, tuned Kalman”, 4.00 % (20 % less)."
+    assert told in text
+    assert "Better in the mean: “linear, mixed H2-H∞” in velocity (0.100 %)." in text
+    same = " ".join(verdict({**METRICS, "evaluation": rows, "left_out": {"rows": rows}}, ("position",)))
+    assert same.count(told) == 2
+
+
+def test_results_tell_what_baselines_are_not() -> None:
+    facts = {
+        "linear/luenberger": {"status": "optimal", "correction_off": True},
+        "linear/kalman_tuned": {"status": "optimal", "correction_off": False},
+        "learned": {"episodes": 30, "episodes_recorded": 47},
+        "mean_profile": {"status": "failed", "reason": "Mean profile: no motion is repeated."},
+    }
+    off, learned, missing = baseline_notes(facts)
+    assert off.endswith("training episodes: linear, Luenberger.")
+    assert learned == "The learned estimator was trained on 30 of 47 training episodes, from their first sample on."
+    assert missing == "Mean profile: no motion is repeated."
+    assert baseline_notes({"learned": {"episodes": 47, "episodes_recorded": 47}})[0].startswith(
+        "The learned estimator was trained on all 47"
+    )
+    assert baseline_notes({}) == []
 
 
 def test_verdict_tells_of_units_that_were_left_out() -> None:

@@ -66,6 +66,8 @@ class Baseline:
         For the records.
     takes_missing : bool
         Whether it knows what to do where a measurement is missing; others get the last one that arrived.
+    restarts : bool
+        Whether it starts again where an observer would.
     seen : Seen, optional
         Largest sizes in training: samples are screened as those of an observer are.
     """
@@ -75,6 +77,7 @@ class Baseline:
     estimated: tuple[int, ...]
     facts: dict[str, Any]
     takes_missing: bool = False
+    restarts: bool = True
     seen: Seen | None = None
 
     def run(self, batch: EpisodeBatch, parameters: Parameters) -> Array:
@@ -90,7 +93,8 @@ class Baseline:
         found: Array | None = None
         for name, rows in pieces.items():
             own = {k: v[rows] for k, v in parameters.items()}
-            part = restarted(partial(self._piece, self.by_unit[name]), samples.of(rows), own)
+            run, mine = partial(self._piece, self.by_unit[name]), samples.of(rows)
+            part = restarted(run, mine, own) if self.restarts else run(mine.y, mine.u, own)
             found = np.empty((*y.shape[:2], part.shape[-1])) if found is None else found
             found[:, rows] = part
         assert found is not None

@@ -11,7 +11,7 @@ from ..core.errors import ConfigError
 from ..core.settings import Settings
 
 METHODS = Literal["mixed", "paper", "worst_case_h2", "worst_case_hinf", "residual_h2", "memory"]
-BASELINES = Literal["open_loop", "kalman_white", "kalman_tuned", "luenberger", "ekf", "filtered_difference", "learned"]
+BASELINES = Literal["open_loop", "kalman_white", "kalman_tuned", "luenberger", "ekf", "filtered_difference", "learned", "mean_profile"]
 
 
 class SynthesisSettings(Settings):
@@ -67,8 +67,8 @@ class PredictorSettings(Settings):
 class ObserverSettings(Settings):
     """Which observers are compared, and which one is deployed.
 
-    The extended Kalman filter runs on the first lifted model (on a linear one it is the tuned Kalman filter); ``filtered_difference`` and
-    ``learned`` need no model.
+    The extended Kalman filter runs on the first lifted model (on a linear one it is the tuned Kalman filter); ``filtered_difference``,
+    ``learned`` and ``mean_profile`` need no model.
     """
 
     baselines: tuple[BASELINES, ...] = get_args(BASELINES)

@@ -46,6 +46,7 @@ _LOOKS = {
     "ekf": Look(Tone.PURPLE.light),
     "filtered_difference": Look(Tone.GOLD.light),
     "learned": Look(Tone.GREEN.light),
+    "mean_profile": Look(Tone.GREEN.light, ":"),
 }
 
 

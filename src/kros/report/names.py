@@ -26,6 +26,7 @@ _METHODS = {
     "memory": "subspace predictor",
     "filtered_difference": "filtered difference",
     "learned": "learned",
+    "mean_profile": "mean profile",
 }
 _METHOD_TONES = {
     "open_loop": Tone.GREY,
@@ -35,6 +36,7 @@ _METHOD_TONES = {
     "ekf": Tone.PURPLE,
     "filtered_difference": Tone.GOLD,
     "learned": Tone.GREEN,
+    "mean_profile": Tone.GREEN,
 }
 BASELINES = tuple(_METHOD_TONES)
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

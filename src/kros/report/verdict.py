@@ -62,16 +62,15 @@ def _deployed(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
     units = channel_units(metrics)
     parts = [_channel(table, name, c, units.get(c, "")) for c in known]
     sentences.append(f"{source} estimates {_join(parts)} on held-out episodes of units that are not the nominal one, in the mean.")
-    for method, label in (("open_loop", "Open loop, the nominal model alone,"), ("kalman_tuned", "The tuned Kalman filter")):
-        sentences += _comparison(table, name, method, label, known)
+    sentences += [*_open_loop(table, name, known), *_rivals(table, name, known)]
     return sentences + _better(table, name, known)
 
 
 def _left_out(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
     """What the same method does on units that took no part."""
     name, rows = metrics["study"].get("deployed"), metrics.get("left_out", {}).get("rows", [])
-    tables = left_out_tables([r for r in rows if r["observer"] == name], metrics["study"]["identify_on"])
-    if not tables:
+    tables = left_out_tables(rows, metrics["study"]["identify_on"])
+    if not tables or name not in tables[0].cells:
         return []
     cells = {c: cell for c, cell in tables[0].cells[name].items() if c not in measured}
     if any(cell.mean is None for cell in cells.values()):
@@ -79,11 +78,10 @@ def _left_out(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
     parts = [
         f"{c.replace('_', ' ')} to {number(v.mean)} % ({number(v.worst)} % on the worst unit, {v.worst_unit})" for c, v in cells.items()
     ]
-    return (
-        [f"Designed without the unit it runs on, the same kind of observer estimates {_join(parts)}, in the mean (empirical)."]
-        if parts
-        else []
-    )
+    if not parts:
+        return []
+    text = f"Designed without the unit it runs on, the same kind of observer estimates {_join(parts)}, in the mean (empirical)."
+    return [text, *_rivals(tables[0], name, list(cells))]
 
 
 def _next_unit(metrics: Metrics) -> list[str]:
@@ -104,13 +102,15 @@ def _next_unit(metrics: Metrics) -> list[str]:
 
 
 def _better(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
-    """Observers that do clearly better in some channel, by name."""
+    """Observers other than baselines that do clearly better in some channel, by name."""
     parts = []
     for channel in channels:
-        own, best = table.cells[name][channel].mean, table.best(channel, "mean")
-        if own is not None and best is not None and best < 0.95 * own:
-            other = next(o for o in table.cells if channel in table.cells[o] and table.cells[o][channel].mean == best)
-            parts.append(f"“{observer_label(other)}” in {channel.replace('_', ' ')} ({number(best)} %)")
+        own = table.cells[name][channel].mean
+        means = {o: cells[channel].mean for o, cells in table.cells.items() if channel in cells and split_observer(o)[1] not in BASELINES}
+        known = {o: mean for o, mean in means.items() if mean is not None}
+        best = min(known, key=lambda o: known[o], default=None)
+        if own is not None and best is not None and known[best] < 0.95 * own and channel in table.ranked:
+            parts.append(f"“{observer_label(best)}” in {channel.replace('_', ' ')} ({number(known[best])} %)")
     return [f"Better in the mean: {_join(parts)}."] if parts else []
 
 
@@ -121,17 +121,29 @@ def _channel(table: ErrorTable, name: str, channel: str, unit: str) -> str:
     return f"{channel.replace('_', ' ')} to {number(cell.mean)} % of the largest value" + (f" ({'; '.join(more)})" if more else "")
 
 
-def _comparison(table: ErrorTable, name: str, method: str, label: str, channels: list[str]) -> list[str]:
-    model = split_observer(name)[0]
-    same = f"{model}/{method}"
-    other = same if same in table.cells else next((o for o in table.cells if split_observer(o)[1] == method), None)
+def _open_loop(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
+    same = f"{split_observer(name)[0]}/open_loop"
+    other = same if same in table.cells else next((o for o in table.cells if split_observer(o)[1] == "open_loop"), None)
     if other is None or other == name:
         return []
     theirs = {c: table.cells[other][c].mean for c in channels if c in table.cells[other]}
     if any(value is None for value in theirs.values()):
-        return [f"{label} diverges on some units."]
+        return ["Open loop, the nominal model alone, diverges on some units."]
     parts = [f"{c.replace('_', ' ')} {number(v)} %{_ratio(table.cells[name][c].mean, v)}" for c, v in theirs.items() if v is not None]
-    return [f"{label} gives {_join(parts)}."]
+    return [f"Open loop, the nominal model alone, gives {_join(parts)}."]
+
+
+def _rivals(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
+    """The best of all baselines in every channel, whichever it is, with its name."""
+    parts = []
+    for channel in channels:
+        means = {o: cells[channel].mean for o, cells in table.cells.items() if channel in cells and split_observer(o)[1] in BASELINES}
+        theirs = {o: mean for o, mean in means.items() if mean is not None and o != name}
+        if theirs and channel in table.ranked:
+            best = min(theirs, key=lambda o: theirs[o])
+            ratio = _ratio(table.cells[name][channel].mean, theirs[best])
+            parts.append(f"{channel.replace('_', ' ')} “{observer_label(best)}”, {number(theirs[best])} %{ratio}")
+    return [f"The best baseline is for {_join(parts)}."] if parts else []
 
 
 def _ratio(own: float | None, theirs: float) -> str:

@@ -23,8 +23,9 @@ def result(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "over the units other than the nominal one, with its 95 % interval by a bootstrap over these units, and the worst of them; RMS: the same mean in the "
         "channel's own unit of measure. Best of each column in bold; the deployed observer is set off."
     )
+    notes = baseline_notes(metrics.get("observers", {}))
     shown = [_errors(t, metrics["study"].get("deployed"), run.measured_states, channel_units(metrics)) for t in tables]
-    return Section("results", "Results", [text], [*shown, *_against_truth(metrics)], ["errors"])
+    return Section("results", "Results", [text, *([" ".join(notes)] if notes else [])], [*shown, *_against_truth(metrics)], ["errors"])
 
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
@@ -36,6 +37,24 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "for the next sample uses data up to this one."
     )
     return Section("observers", "Estimates", [text], [], ["observers_in_time", "observers_in_time_paper", "observer_spectra"])
+
+
+def baseline_notes(observers: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return what has to be known of baselines to compare with them: which correct nothing, what was trained on how much, what there is none of."""
+    off = [observer_label(name) for name, facts in observers.items() if facts.get("correction_off")]
+    notes = (
+        [f"Tuning switched the correction off, no gain was better than the model alone on training episodes: {', '.join(off)}."]
+        if off
+        else []
+    )
+    learned = observers.get("learned", {})
+    if "episodes_recorded" in learned:
+        part = "all" if learned["episodes"] == learned["episodes_recorded"] else f"{learned['episodes']} of"
+        notes.append(
+            f"The learned estimator was trained on {part} {learned['episodes_recorded']} training episodes, from their first sample on."
+        )
+    missing = [facts["reason"] for name, facts in observers.items() if name == "mean_profile" and facts.get("status") == "failed"]
+    return [*notes, *missing]
 
 
 def _errors(table: ErrorTable, deployed: str | None, measured: tuple[str, ...], channel_units: Mapping[str, str]) -> Table:

@@ -16,6 +16,7 @@ from ...core.errors import KrosError
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
 from ...design.estimators import Baseline, make_difference, make_extended, make_learned
+from ...design.mean_profile import make_mean_profile
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
 from ...evaluate import ErrorSummary, TrueErrors, as_shown, summarise, true_errors
@@ -175,7 +176,7 @@ def estimation(
     trial: Trial | None = None,
 ) -> list[Piece]:
     """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
-    makers, sensor = baseline_makers(context), context.config.sensor
+    makers, sensor = baseline_makers(context, population, keys), context.config.sensor
     work = [
         Piece((name,), partial(evaluate_baseline, make, population, keys, units, shown, sensor, trial)) for name, make in makers.items()
     ]
@@ -193,8 +194,11 @@ def outcomes(context: Context, work: Sequence[Piece]) -> dict[str, Outcome | str
     return {name: found[name] for name in dict.fromkeys((*load_observers(context), *found))}
 
 
-def baseline_makers(context: Context) -> dict[str, Callable[[], Baseline]]:
-    """Return what makes every baseline that is no correction of a model: the extended filter of the first lifted model, and those without a model."""
+def baseline_makers(context: Context, population: Population, keys: tuple[EpisodeKey, ...]) -> dict[str, Callable[[], Baseline]]:
+    """Return what makes every baseline that is no correction of a model: the extended filter of the first lifted model, and those without a model.
+
+    `keys` are the episodes of a population that will be estimated: the mean profile has to know their motions.
+    """
     models = {name: context.identified.models(name) for name in context.identified.kinds}
     asked, first = context.config.observer.baselines, next(iter(models.values()))
     nominal, training = context.uncertain.nominal, TrainingSet.of(context.identified, first, context.config.sensor)
@@ -206,8 +210,10 @@ def baseline_makers(context: Context) -> dict[str, Callable[[], Baseline]]:
             makers[f"{name}/ekf"] = partial(make_extended, training, models[name], nominal, noise)
     if "filtered_difference" in asked:
         makers["filtered_difference"] = partial(make_difference, training, first.measured)
+    whole = TrainingSet.whole(context.identified, first, context.config.sensor)
+    if "mean_profile" in asked:
+        makers["mean_profile"] = partial(make_mean_profile, whole, first.measured, population, keys)
     if "learned" in asked:
-        whole = TrainingSet.whole(context.identified, first, context.config.sensor)
         makers["learned"] = partial(make_learned, whole, context.lifting, first.measured)
     return makers
 

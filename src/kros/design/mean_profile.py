@@ -1,0 +1,83 @@
+"""The baseline for machines that repeat a motion: made from training episodes whose inputs are those of the episodes it is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError
+from ..data.population import EpisodeKey, Population
+from ..observer.baselines.profile import SAME, MeanProfile, difference, held, sizes_of
+from .estimators import Baseline
+from .validation import TrainingSet
+
+Array = npt.NDArray[np.float64]
+_SAMPLES = 5_000_000  # read at most, once every unit and condition has been read
+
+
+def make_mean_profile(training: TrainingSet, measured: tuple[int, ...], population: Population, keys: Iterable[EpisodeKey]) -> Baseline:
+    """Average the states of training episodes that are the same motions as some episodes, over units, once for every unit without it.
+
+    Parameters
+    ----------
+    training : TrainingSet
+        Of all episodes (`TrainingSet.whole`).
+    measured : tuple of int
+    population : Population
+    keys : iterable of EpisodeKey
+        Episodes that will be estimated; of these the inputs are read, nothing else.
+
+    Raises
+    ------
+    DataError
+        When there are no inputs, every state is measured, or an episode's inputs are not those of training episodes of two units.
+    """
+    n = len(population.states)
+    estimated = [i for i in range(n) if i not in measured]
+    if not population.inputs or not estimated:
+        raise DataError("Mean profile: it needs inputs that tell a motion, and a state that is not measured.")
+    motions: list[Array] = []
+    named: list[EpisodeKey] = []
+    for key in keys:
+        u = population.read_parts(key)[1]
+        if not motions or min(difference(u, motion, sizes_of([*motions, u])) for motion in motions) > SAME:
+            motions.append(u)
+            named.append(key)
+    sums: list[dict[str, Array]] = [{} for _ in motions]
+    counts: list[dict[str, int]] = [{} for _ in motions]
+    closest = np.full(len(motions), np.inf)
+    total, read, groups = 0, 0, len({(key.unit, key.condition) for key in training.keys})
+    for part in training.one_by_one():
+        (unit,), states, u = part.batch.units, part.batch.states[:, 0, estimated], part.batch.inputs[:, 0]
+        apart = np.array([difference(motion, u, sizes_of(motions)) for motion in motions])
+        closest = np.minimum(closest, apart)
+        if apart.min() <= SAME:
+            at = int(apart.argmin())
+            profile = held(states, len(motions[at]))
+            sums[at][unit] = sums[at].get(unit, 0.0) + profile
+            counts[at][unit] = counts[at].get(unit, 0) + 1
+        read, total = read + 1, total + len(states)
+        if read >= groups and total > _SAMPLES:
+            break
+    for key, found, apart_by in zip(named, sums, closest, strict=True):
+        if len(found) < 2:
+            raise DataError(
+                f"Mean profile: held-out episode {key} is no motion that training episodes of two units repeat; the nearest inputs differ by "
+                f"{100 * apart_by:.3g} % of the largest (RMS), {100 * SAME:g} % counts as the same."
+            )
+    profiles = [{unit: total / counts[at][unit] for unit, total in found.items()} for at, found in enumerate(sums)]
+
+    def without(left_out: str) -> MeanProfile:
+        means = [np.mean([p for unit, p in found.items() if unit != left_out], axis=0) for found in profiles]
+        return MeanProfile(n, tuple(estimated), motions, means)
+
+    by_unit = {unit: without(unit) for unit in dict.fromkeys(unit for found in profiles for unit in found)}
+    facts = {
+        "status": "averaged",
+        "motions": len(motions),
+        "episodes": sum(sum(c.values()) for c in counts),
+        "left_out": "the unit under test",
+    }
+    return Baseline(by_unit | {"": without("")}, measured, tuple(estimated), facts, takes_missing=True, restarts=False, seen=training.seen)

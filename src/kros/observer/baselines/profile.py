@@ -1,0 +1,62 @@
+"""The mean motion: what other units did at the same sample of the same motion, for machines that repeat themselves. It looks at no measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+SAME = 0.01  # of the largest input: RMS difference of inputs that are the same motion
+
+
+@dataclass(frozen=True, eq=False)
+class MeanProfile:
+    """Mean states of motions that are known by their inputs.
+
+    Parameters
+    ----------
+    n_states : int
+    estimated : tuple of int
+        Indices of the estimated states.
+    inputs : sequence of ndarray, shape (n_samples, m)
+        Of every motion.
+    states : sequence of ndarray, shape (n_samples, h)
+        Mean of the estimated states, sample by sample.
+    """
+
+    n_states: int
+    estimated: tuple[int, ...]
+    inputs: Sequence[Array]
+    states: Sequence[Array]
+
+    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+        """Estimate a batch from its first sample on, each member by the motion whose inputs are nearest to its own; shape (n_samples, batch, n).
+
+        NaN for states that are not estimated. A motion that goes on for longer than it was recorded is held. Measurements and parameters play no part.
+        """
+        del parameters
+        estimate = np.full((*y.shape[:2], self.n_states), np.nan)
+        sizes = sizes_of(self.inputs)
+        for i in range(y.shape[1]):
+            distance = [difference(u[:, i], motion, sizes) for motion in self.inputs]
+            estimate[:, i, list(self.estimated)] = held(self.states[int(np.argmin(distance))], len(y))
+        return estimate
+
+
+def held(signal: Array, n_samples: int) -> Array:
+    """Return a signal, shape (n, ...), of so many samples: cut, or held at its last one."""
+    return np.asarray(signal[np.minimum(np.arange(n_samples), len(signal) - 1)])
+
+
+def sizes_of(inputs: Sequence[Array]) -> Array:
+    """Return the largest absolute value of every input over motions, one where it is always zero."""
+    largest = np.max([np.abs(motion).max(axis=0) for motion in inputs], axis=0)
+    return np.asarray(np.where(largest > 0, largest, 1.0))
+
+
+def difference(u: Array, motion: Array, sizes: Array) -> float:
+    """Return the RMS difference of inputs, shape (n_samples, m), as a share of `sizes`; the largest of all inputs."""
+    return float(np.sqrt(np.mean(((u - held(motion, len(u))) / sizes) ** 2, axis=0)).max())

@@ -292,6 +292,24 @@ def test_units_that_make_the_weights_are_below_the_bounds(form):
     assert not check_units(small, K, units).holds  # the check can fail
 
 
+def test_the_error_of_a_unit_is_that_of_the_two_recursions_in_units_of_measure():
+    """Machine and observer written down in the recordings' units; only what goes in and comes out is divided by ranges."""
+    rng = np.random.default_rng(4)
+    A, B, C = 0.3 * rng.standard_normal((2, 2)), rng.standard_normal((2, 2)), rng.standard_normal((1, 2))
+    A_p, B_p, K = A + 0.05 * rng.standard_normal((2, 2)), B + 0.1 * rng.standard_normal((2, 2)), 0.2 * rng.standard_normal((2, 1))
+    u_size, x_size = np.array([2.0, 50.0]), np.array([0.3, 7.0])
+    nominal = StateSpace(A, B, np.eye(2), np.zeros((2, 2)), DT)
+    case = ObserverProblem(nominal, C, gain(0.1 * np.eye(2), DT), gain(np.eye(2), DT), u_size, x_size, [0.02])
+    freqs = np.array([0.0, 0.07, 0.31]) / DT
+    error = []
+    for z in np.exp(2j * np.pi * freqs * DT):
+        x = np.linalg.solve(z * np.eye(2) - A_p, B_p @ np.diag(u_size))
+        estimate = np.linalg.solve(z * np.eye(2) - A + K @ C, B @ np.diag(u_size) + K @ C @ x)
+        error.append((x - estimate) / x_size[:, None])
+    found = unit_error(case, gain(K, DT), A_p, B_p).frequency_response(freqs)
+    assert found == pytest.approx(np.array(error), rel=1e-9, abs=1e-12)
+
+
 def drives(spread, n_units=6):
     """Position, velocity and current of drives under a cascaded loop, from targets of position and velocity; at spread 1 by 5-15 %."""
     rng = np.random.default_rng(0)

@@ -16,7 +16,7 @@ from kros.synthesis.worst_case.arcs import Enclosure, least_ratio
 from kros.synthesis.worst_case.certificate import certify
 from kros.synthesis.worst_case.disturbance import Channels, Shaping, design_grid
 from kros.synthesis.worst_case.everywhere import Everywhere
-from kros.synthesis.worst_case.robust_gain import robust_gain
+from kros.synthesis.worst_case.robust_gain import RobustGain, robust_gain
 from kros.synthesis.worst_case.worst_case_hinf import lower_bound
 
 DT = 1.0
@@ -326,6 +326,7 @@ def test_a_set_of_one_model_without_noise_has_no_error():
     assert (found.worst_case_hinf, found.lower_bound, found.gap_percent) == (0.0, 0.0, None)
     assert found.status is Status.CERTIFIED
     assert not found.controller.D.any()
+    assert robust_gain(small_problem(W_L=gain([[0.0]], DT)), found.controller) == RobustGain(0.0, 0.0, 0.0)
 
 
 # --- what is handed on

@@ -18,6 +18,7 @@ from kros.design.synthesize import choose_deployed, robust_of
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certificate, relift_report
+from kros.observer.certificate.report import ReliftRow
 from kros.report.run_folder import RunFolder
 from kros.report.sections.relift import section
 from kros.synthesis import Injection
@@ -81,6 +82,11 @@ def test_an_observer_without_certificate_has_no_report() -> None:
     square = observer("square", "x**2", 0.1)
     with pytest.raises(DimensionError, match="certify it first"):
         relift_report(relift_certificate(square), square, batch_of(np.zeros((5, 1, 1)), np.zeros((5, 1, 1)), 1.0))
+
+
+def test_an_error_is_within_its_bound_but_for_rounding() -> None:
+    rows = [ReliftRow("a", 0.1, 2.0, 1.0, 1.0, error) for error in (0.5, 1 + 1e-7, 1 + 1e-5, 2.0)]
+    assert [row.holds for row in rows] == [True, True, False, False]
 
 
 def test_wrong_scales_are_refused() -> None:

@@ -295,6 +295,19 @@ def test_the_residual_bound_of_a_recording_holds_sample_by_sample() -> None:
     assert e[2:] == pytest.approx((0.6 - 0.2 + 0.3 * slope) * e[1:-1] + omega[1:], abs=1e-12)
 
 
+@pytest.mark.parametrize("at", [0, 77, 200, 399])
+def test_multipliers_know_of_a_resonance_at_one_of_many_frequencies(at: int) -> None:
+    """Two channels that feed each other at one frequency, where multipliers in ratios between 16 and 25 alone show that this stays small."""
+    H = 0.02 * np.random.default_rng(0).standard_normal((400, 3, 3)) + 0j
+    H[at, :2, :2] = [[0.0, 4.0j], [0.2, 0.0]]
+    found = best_multipliers(H, 2)
+    assert found is not None
+    root = np.sqrt(found)
+    assert np.linalg.norm(root[:, None] * H[:, :2, :2] / root, 2, axis=(1, 2)).max() < 1
+    H[at, 0, 1] = 5.1j
+    assert best_multipliers(H, 2) is None
+
+
 def test_a_certificate_survives_saving(tmp_path) -> None:  # type: ignore[no-untyped-def]
     found = relift_certificate(scalar(0.5, 0.2), box={"x": (-1, 2)})
     found.save(tmp_path)

@@ -13,6 +13,8 @@ from kros.core.lti import StateSpace, gain
 from kros.evaluate import as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, Runtime, Sensor, relift_certificate, relift_report, run_observer
+from kros.observer.certificate.error import error_system
+from kros.observer.certificate.report import frozen_response
 from kros.synthesis import Injection
 
 DT = 0.01
@@ -68,6 +70,41 @@ def test_what_a_sensor_shows_beside_the_states_drives_the_frozen_response(delay:
     assert all(row.holds for row in rows)
     without = relift_report(found, noisy, batch_of(x, u, DT), run_observer(noisy, batch.measurements((0,)), u))
     assert not all(row.frozen == pytest.approx(row.error, rel=1e-3) for row in without)
+
+
+@pytest.mark.parametrize("injection", list(Injection)[:2])
+def test_limits_that_bind_wholly_or_not_at_all_are_corners(injection: Injection) -> None:
+    """``sat(v) = d v``: with every channel at its end the error is that of the observer without limits, at the other that of one without correction."""
+    free = observer((), injection=injection)
+    width = len(free.controller.C)
+    limited = error_system(replace(free, runtime=Runtime(correction=np.full(width, 0.1))))
+    assert limited.L.shape[1] == width
+    A, B = limited.corner(np.ones(width))
+    np.testing.assert_allclose(A, error_system(free).A, atol=1e-12)
+    np.testing.assert_allclose(B, error_system(free).B, atol=1e-12)
+    np.testing.assert_allclose(limited.corner(-np.ones(width))[0], error_system(free, applied=False).A, atol=1e-12)
+    np.testing.assert_allclose(limited.frozen().A, error_system(free).A, atol=1e-12)  # where no limit binds
+
+    kept = error_system(replace(free, runtime=Runtime(lower=np.full(3, -1.0), upper=np.full(3, 1.0))))
+    A, B = kept.corner(np.ones(3))
+    np.testing.assert_allclose(A, error_system(free).A, atol=1e-12)
+    gone = kept.corner(-np.ones(3))[0]  # clipped to the true states: the error of the estimate is gone, the filter's state acts
+    np.testing.assert_allclose(gone[:, :3], 0.0, atol=1e-12)
+    np.testing.assert_allclose(gone[:, 3:], error_system(free).A[:, 3:], atol=1e-12)
+
+
+def test_a_frozen_response_starts_at_the_first_error() -> None:
+    """Recursion by hand; the first states are where it starts unless a system says otherwise."""
+    system = error_system(observer(("0.3*sin(3*a)",)))
+    rng = np.random.default_rng(3)
+    w, first = rng.standard_normal((6, 2, 3)), rng.standard_normal((2, 3))
+    xi = np.concatenate([first, np.zeros((2, len(system.A) - 3))], axis=1)
+    expected = [xi @ system.C.T]
+    for k in range(6):
+        xi = xi @ system.A.T + w[k] @ system.B[:, :3].T
+        expected.append(xi @ system.C.T)
+    for one in (system, replace(system, start=None)):
+        np.testing.assert_allclose(frozen_response(one, w, first)[0], expected, rtol=1e-12, atol=1e-14)
 
 
 RUNTIMES = {

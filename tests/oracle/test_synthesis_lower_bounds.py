@@ -399,6 +399,28 @@ def test_a_perturbation_that_is_held_keeps_what_is_proven(form):
     assert finer == pytest.approx(seen, rel=2e-3)
 
 
+@pytest.mark.parametrize("size", [1e-4, 0.01, 0.3])
+def test_what_the_ball_holds_around_its_centre_is_not_less_on_an_arc_than_is_proven(size):
+    case = looped()
+    channels = Channels(case, design_grid(case), apart=True)
+    proofs, rng = Everywhere(channels), np.random.default_rng(1)
+    theta = rng.uniform(0.35, 2.8, 80)
+    half = size * rng.uniform(0.3, 1.0, 80)
+    proven, seen = proofs.symmetric_part(theta, half)
+
+    def truth(there):
+        f = there / (2 * np.pi)
+        M, nu = case.M.frequency_response(f), np.abs(case.N.frequency_response(f)[:, 0, 0])
+        return np.linalg.norm(M, axis=(-2, -1)) / (1 - nu**2)  # R_l and R_r are 1 / sqrt(1 - nu^2)
+
+    assert seen[:, 0] == pytest.approx(truth(theta), rel=1e-9)
+    shares = np.linspace(-1, 1, 21)
+    lowest = np.min([truth(theta + share * half) for share in shares], axis=0)
+    assert np.all(proven[:, 0] <= lowest)
+    if size < 1e-3:
+        assert np.all(proven[:, 0] >= 0.98 * lowest)
+
+
 def least_on_a_fine_grid(filters, power_of):
     theta = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 20000), np.linspace(1e-3, np.pi, 20000)]))
     magnitude = np.linalg.norm(filters.frequency_response(theta / (2 * np.pi)), axis=-1)

@@ -176,7 +176,9 @@ def test_every_structure_has_a_matrix_that_bounds_entries(structure: str) -> Non
 def test_identical_units_and_single_frequencies_get_weights() -> None:
     units = [single(0.9, 0.5)] * 3
     for structure in Structure:
-        assert quantify_systems(units, "additive", GRID, structure=structure).cover_max == 0
+        found = quantify_systems(units, "additive", GRID, structure=structure)
+        assert found.cover_max == 0
+        assert found.weight.remaining_margin == 1 or structure is Structure.ENTRYWISE
     pair = [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 1.1)]
     for freqs in ([0.1], [0.0, 0.5], [0.5]):
         assert quantify_systems(pair, "additive", freqs, max_order=2).cover_max <= 1
@@ -188,4 +190,6 @@ def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
     E = np.array([response(u, GRID) - response(found.nominal_system, GRID) for u in units])
     excess = (found.weight.magnitudes(GRID).cost_db() - optimal_cover(E).cost_db()).max()
     assert found.overbound_db_max == pytest.approx(excess, abs=1e-6)
+    used, best = found.weight.magnitudes(GRID).entries(), optimal_cover(E).entries()
+    assert found.weight.overbound_entry_db == pytest.approx(20 * np.log10((used / best).max()), abs=1e-6)
     assert not found.weight.within_tolerance

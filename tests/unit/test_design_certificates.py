@@ -89,6 +89,15 @@ def test_an_error_is_within_its_bound_but_for_rounding() -> None:
     assert [row.holds for row in rows] == [True, True, False, False]
 
 
+def test_typical_scales_give_the_residual_of_a_population_unit_power() -> None:
+    residual = np.array([[[3.0, 0.1], [-4.0, 0.1]], [[0.0, -0.1], [0.0, 0.1]]])  # unit, sample, state
+    found = ReliftScales.typical([2.0, 5.0], residual, [0.3, 0.4, 0.5])
+    np.testing.assert_allclose(found.residual, [np.sqrt(25 / 4 * 2), np.sqrt(0.01 * 2)])
+    assert np.mean(np.sum((residual / found.residual) ** 2, axis=-1)) == pytest.approx(1)
+    np.testing.assert_allclose(found.noise, np.sqrt(3) * np.array([0.3, 0.4, 0.5]))
+    np.testing.assert_array_equal(found.error, [2.0, 5.0])
+
+
 def test_wrong_scales_are_refused() -> None:
     with pytest.raises(DimensionError, match="needs 1 errors"):
         relift_certificate(observer("sine", "sin(x)", 0.1), scales=ReliftScales(np.ones(2), np.ones(1), np.ones(1)))

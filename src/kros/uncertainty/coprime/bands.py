@@ -158,6 +158,9 @@ def cover(energies: Array, weight: Array | None = None) -> Array:
         EYE = E @ Y @ E
         root = _power(EYE.sum(axis=0), -0.5)
         Y = root @ EYE @ root
+        Y = (Y + adjoint(Y)) / 2
+        half_sum = _power(Y.sum(axis=0), -0.5)  # the identity but for rounding, which would grow
+        Y = half_sum @ Y @ half_sum
     M = (E @ Y).sum(axis=0)
     M = (M + adjoint(M)) / 2
     total = E.sum(axis=0)  # covers in any case

@@ -81,18 +81,18 @@ class Disturbance:
 
 
 SEVERITIES: dict[Kind, tuple[float, ...]] = {
-    Kind.DROPPED: (0.05, 0.1, 0.2, 0.3, 0.5),
+    Kind.DROPPED: (0.02, 0.05, 0.1, 0.2, 0.3, 0.5),
     Kind.GAP: (0.01, 0.03, 0.1, 0.3, 1.0),
     Kind.BIAS: (1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
-    Kind.QUANTISATION: (1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
-    Kind.NOISE: (1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
+    Kind.QUANTISATION: (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
+    Kind.NOISE: (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
     Kind.PHASE: (np.pi / 16, np.pi / 8, np.pi / 4, np.pi / 2, np.pi),
-    Kind.DELAY: (1, 2, 4, 8, 16),
+    Kind.DELAY: (1, 2, 3, 4, 8, 16),
 }
 
 
 def standard_disturbances(kinds: Sequence[Kind] = tuple(Kind)) -> list[Disturbance]:
-    """Return the disturbances of a study: five severities of every kind."""
+    """Return the disturbances of a study: five or six severities of every kind."""
     return [Disturbance(kind, severity) for kind in kinds for severity in SEVERITIES[kind]]
 
 

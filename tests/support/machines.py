@@ -47,6 +47,7 @@ MACHINES = {
     "delay": lambda: drive(delay=3),
     "limits": lambda: drive(correction=np.full(5, 0.004), **LIMITS),
     "delay and limits": lambda: drive(delay=2, correction=np.full(5, 0.004), **LIMITS),
+    "cut off": lambda: drive(relift=False, delay=2, **LIMITS),
     "input limits": lambda: drive(input_lower=[-1, -2], input_upper=[1, 2]),
     "through the input": lambda: drive(injection=Injection.INPUT, correction=np.full(2, 0.01)),
     "every function": lambda: drive(SMOOTH),

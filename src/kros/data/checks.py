@@ -6,7 +6,7 @@ import logging
 import math
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from enum import Enum
 from numbers import Real
@@ -22,6 +22,7 @@ from .population import OUTLIERS, Channel, EpisodeKey, Population, Role, TrueCha
 from .recording import title
 
 logger = logging.getLogger(__name__)
+Look = Callable[[EpisodeKey, npt.NDArray[np.float64]], None]
 
 MIN_SAMPLES = 3  # two consecutive states and one more
 _ROUNDING = 1e-12  # of the largest value: what filters and scales make of a constant
@@ -292,15 +293,15 @@ def scan_population(population: Population, on_nan: OnNan | str = OnNan.ERROR) -
     return replace(population, episodes=tuple(kept), units=tuple(u for u in population.units if u.id in left))
 
 
-def scan_prints(population: Population, on_nan: OnNan | str = OnNan.ERROR) -> list[tuple[EpisodeKey, Print]]:
-    """Do the same, and return the episodes that are left with what they are recognised by."""
-    kept = [(key, mark) for _, _, keys in population.groups() for key, _, mark in usable_episodes(population, keys, on_nan)]
+def scan_prints(population: Population, on_nan: OnNan | str = OnNan.ERROR, look: Look | None = None) -> list[tuple[EpisodeKey, Print]]:
+    """Do the same, and return the episodes that are left with what they are recognised by; `look` is shown the samples of each."""
+    kept = [(key, mark) for _, _, keys in population.groups() for key, _, mark in usable_episodes(population, keys, on_nan, look)]
     refuse_copies(kept)
     return kept
 
 
 def usable_episodes(
-    population: Population, keys: Iterable[EpisodeKey], on_nan: OnNan | str
+    population: Population, keys: Iterable[EpisodeKey], on_nan: OnNan | str, look: Look | None = None
 ) -> Iterator[tuple[EpisodeKey, npt.NDArray[np.float64], Print]]:
     """Yield the episodes of one unit and condition that pass all checks, all columns of their samples and what they are recognised by.
 
@@ -319,6 +320,8 @@ def usable_episodes(
             logger.warning("Dropped, as data.on_nan asks: %s", error)
             continue
         watch.add(values)
+        if look is not None:
+            look(key, values)
         yield key, values, print_of(values, columns)
     if key is not None:
         watch.check(key.unit, key.condition)

@@ -6,8 +6,8 @@ Population --survey--> Population that can be used, RecordingFacts
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from ..core.work import Work
 from .alerts import period_alerts
 from .checks import check_population, scan_prints
 from .copies import Print, refuse_copies
+from .flat_tops import Ends, FoundLimit, ends_of, found_limit
 from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
 from .writers import GroupRecord, write_group, write_index
 
@@ -44,6 +45,8 @@ class RecordingFacts:
         Episodes that were left out, with the reason.
     alerts : tuple of str
         What looks wrong in the recordings without making them unusable.
+    limits : mapping of state to FoundLimit
+        Limits that states which are not measured were seen at.
     reserve : tuple of str
         Units that were recorded and take part in nothing: none of the above speaks of them but `dropped` and `alerts`.
     """
@@ -56,6 +59,7 @@ class RecordingFacts:
     dropped: tuple[str, ...] = ()
     alerts: tuple[str, ...] = ()
     reserve: tuple[str, ...] = ()
+    limits: Mapping[str, FoundLimit] = field(default_factory=dict)
 
     @property
     def pooled(self) -> tuple[str, ...]:
@@ -78,7 +82,8 @@ class RecordingFacts:
         content, _ = load_artifact(folder, "facts")
         train, test = (tuple(EpisodeKey(*row) for row in content[part]) for part in ("train", "test"))
         texts = {name: tuple(content.get(name, ())) for name in ("dropped", "alerts", "reserve")}
-        return cls(content["identify_on"], content["groups"], train, test, content["resolution"], **texts)
+        limits = {name: FoundLimit(**{**own, "units": tuple(own["units"])}) for name, own in content.get("limits", {}).items()}
+        return cls(content["identify_on"], content["groups"], train, test, content["resolution"], **texts, limits=limits)
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,8 @@ class _Found:
     resolution: dict[str, float]
     prints: list[tuple[EpisodeKey, Print]]
     alerts: tuple[str, ...]
+    ends: dict[str, list[Ends]]
+    inputs: npt.NDArray[np.float64]
 
 
 def survey(
@@ -157,7 +164,12 @@ def survey(
         dropped=tuple(str(k) for k in population.episodes if k not in set(kept.episodes)),
         alerts=tuple(dict.fromkeys(alert for f in found for alert in f.alerts)),
         reserve=tuple(reserve),
+        limits=_limits(
+            [f for task, f in zip(tasks, found, strict=True) if task.unit in taking_part and kept.unit(task.unit).group != OUTLIERS]
+        ),
     )
+    for name, limit in facts.limits.items():
+        log.info("%s is limited at %s.", name, limit)
     for alert in facts.alerts:
         log.warning("%s", alert)
     return kept, facts
@@ -188,10 +200,22 @@ def condition_of(population: Population, wanted: str | None) -> str:
 def _read_group(task: _Group) -> _Found:
     """Read, check and, where asked, write one unit and condition."""
     population, record = task.population, None
+    own, hidden = (
+        slice(len(population.states), len(population.states) + len(population.inputs)),
+        [name for name in population.states if name not in population.measured],
+    )
+    ends: dict[str, list[Ends]] = {name: [] for name in hidden}
+    reach = np.array([[np.inf], [-np.inf]]) * np.ones(len(population.inputs))
+
+    def look(key: EpisodeKey, values: npt.NDArray[np.float64]) -> None:
+        for name in hidden:
+            ends[name].append(ends_of(key.unit, f"{key.condition}/{key.episode}", values[:, population.states.index(name)], values[:, own]))
+        reach[:] = np.minimum(reach[0], values[:, own].min(axis=0)), np.maximum(reach[1], values[:, own].max(axis=0))
+
     if task.folder is None:
-        prints = scan_prints(population.select([task.unit], [task.condition]), on_nan=task.on_nan)
+        prints = scan_prints(population.select([task.unit], [task.condition]), on_nan=task.on_nan, look=look)
     else:
-        record = write_group(population, task.unit, task.condition, task.folder, task.on_nan)
+        record = write_group(population, task.unit, task.condition, task.folder, task.on_nan, look)
         prints = record.recognised
     episodes = tuple(key for key, _ in prints)
     if not episodes:
@@ -199,7 +223,17 @@ def _read_group(task: _Group) -> _Found:
     first = population.read(episodes[0])
     names = population.states + population.inputs
     steps = {m: resolution(first[:, names.index(m)]) for m in population.measured}
-    return _Found(record, episodes, steps, prints, period_alerts(first, population.channels, population.sample_period_s))
+    alerts = period_alerts(first, population.channels, population.sample_period_s)
+    return _Found(record, episodes, steps, prints, alerts, ends, reach)
+
+
+def _limits(found: Sequence[_Found]) -> dict[str, FoundLimit]:
+    """Return the limits that the states of all units were seen at."""
+    if not found:
+        return {}
+    ranges = np.max([f.inputs[1] for f in found], axis=0) - np.min([f.inputs[0] for f in found], axis=0)
+    limits = {name: found_limit([end for f in found for end in f.ends[name]], ranges) for name in found[0].ends}
+    return {name: limit for name, limit in limits.items() if limit is not None}
 
 
 def _kept(population: Population, found: Sequence[_Found], folder: Path | None) -> Population:

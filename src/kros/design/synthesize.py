@@ -24,7 +24,8 @@ from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..identify.kinds import kind_of
-from ..observer import Observer, ReliftCertificate, Sensor, Sensors, in_sizes
+from ..observer import Limit, Limits, Observer, ReliftCertificate, Sensor, Sensors, in_sizes
+from ..observer.limits import limits_of
 from ..observer.sensor import require_measured
 from ..synthesis import ObserverProblem, Synthesis
 from ..uncertainty.quantify import UncertainModels
@@ -123,6 +124,7 @@ def synthesize(
     observer: Mapping[str, Any] | None = None,
     predictor: Mapping[str, Any] | None = None,
     sensor: Mapping[str, Any] | None = None,
+    limits: Mapping[str, Any] | None = None,
     robust: bool = False,
     work: Work | None = None,
     **settings: Any,
@@ -141,6 +143,9 @@ def synthesize(
     sensor : mapping of str to mapping, optional
         What the sensors of measured states are like, as ``[sensor.<state>]`` of a study: ``{"position": {"noise": 1e-5, "delay_samples": 1}}``, see
         `kros.observer.Sensor`.
+    limits : mapping of str to number, pair or False, optional
+        Limits of states, as ``[limits]`` of a study: ``{"current": (-0.35, 0.35)}``, in the recordings' unit. Where a state is not named, limits that were
+        found in the recordings count; False stands for none.
     robust : bool
         Whether only observers that are certified for the uncertain set are deployed, where there are any.
     work : Work, optional
@@ -163,13 +168,14 @@ def synthesize(
     asked = SynthesisSettings.of(settings, "Synthesize")
     among, of = ObserverSettings.of(observer or {}, "Synthesize, observer"), PredictorSettings.of(predictor or {}, "Synthesize, predictor")
     told = {name: Sensor.of(own, f"Synthesize, sensor.{name}") for name, own in (sensor or {}).items()}
+    kept = {name: Limit.of(own, f"Synthesize, limits.{name}") for name, own in (limits or {}).items()}
     if method is None:
-        found = synthesize_all(uncertain, asked, among, of, told, robust=robust, work=work)
+        found = synthesize_all(uncertain, asked, among, of, told, kept, robust=robust, work=work)
         return found.designs[found.deployed]
     name = named(uncertain, method)
     kind, short = split_name(name)
     with_set = {short, _SURROUNDED} if _SURROUNDED in asked.methods else {short}
-    tasks = tasks_of(uncertain, kind, with_set, asked, of, told)
+    tasks = tasks_of(uncertain, kind, with_set, asked, of, told, kept)
     results = designed(tasks, work or Work())
     failed = {found.name: found.facts["reason"] for found in results if found.observer is None}
     if name in failed:
@@ -183,6 +189,7 @@ def synthesize_all(
     observer: ObserverSettings | None = None,
     predictor: PredictorSettings | None = None,
     sensor: Sensors | None = None,
+    limits: Limits | None = None,
     *,
     robust: bool = False,
     work: Work | None = None,
@@ -201,7 +208,7 @@ def synthesize_all(
         work or Work(),
     )
     wanted = {*observer.baselines, *settings.methods}
-    tasks = [task for kind in uncertain.models.kinds for task in tasks_of(uncertain, kind, wanted, settings, predictor, sensor)]
+    tasks = [task for kind in uncertain.models.kinds for task in tasks_of(uncertain, kind, wanted, settings, predictor, sensor, limits)]
     results = designed(tasks, work)
     for task, found in zip(tasks, results, strict=True):
         if found.observer is None and found.facts["reason"] != task.refusal:
@@ -233,6 +240,7 @@ def tasks_of(
     settings: SynthesisSettings,
     predictor: PredictorSettings,
     sensor: Sensors | None = None,
+    limits: Limits | None = None,
 ) -> list[DesignTask]:
     """Return a task for every observer of one kind of model, in channels divided by their ranges."""
     from .uncertain_set import usable_problem
@@ -247,6 +255,9 @@ def tasks_of(
     shared: dict[str, Any] = {"models": models, "unit": uncertain.nominal, "problem": problem, "refusal": refusal, "noise": noise}
     shared |= {"training": training, "covered": own.unit_ids}
     shared |= {"max_order": uncertain.max_order, "settings": settings, "predictor": predictor}
+    if own_limits := limits_of(limits or {}, identified.facts.limits, identified.population.states):
+        shared["limits"] = {name: limit.in_unit(recorded.sizes[name]) for name, limit in own_limits.items()}
+        shared["at_limits"] = TrainingSet.at_limits(identified, recorded, sensor).normalised(recorded)
     methods = suitable(wanted, kind, kind_of(kind).refined)
     return [DesignTask(f"{kind}/{method.name}", method.name, **shared) for method in methods]
 

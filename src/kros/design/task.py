@@ -13,7 +13,8 @@ from ..core.errors import SynthesisError
 from ..core.lti import gain
 from ..identify import ModelSet
 from ..lifting import Lifting
-from ..observer import Observer, Runtime, Sensors
+from ..observer import Limits, Observer, Runtime, Sensors
+from ..observer.limits import sides
 from ..observer.sensor import delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .settings import PredictorSettings, SynthesisSettings
@@ -46,6 +47,10 @@ class DesignTask:
         Highest order of a weight.
     settings : SynthesisSettings
     predictor : PredictorSettings
+    limits : mapping of str to Limit
+        Of recorded states, by name.
+    at_limits : TrainingSet, optional
+        Episodes among which there are some that meet them.
     """
 
     name: str
@@ -60,6 +65,8 @@ class DesignTask:
     max_order: int = 4
     settings: SynthesisSettings = field(default_factory=SynthesisSettings)
     predictor: PredictorSettings = field(default_factory=PredictorSettings)
+    limits: Limits = field(default_factory=dict)
+    at_limits: TrainingSet | None = None
 
     def observer(self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None, lifting: Lifting | None = None) -> Observer:
         """Return the observer of a synthesis, with the nominal model or another one."""
@@ -91,8 +98,9 @@ class DesignTask:
 
     @property
     def runtime(self) -> Runtime:
-        """What observers have to know of the machine: that measurements arrive late."""
-        return Runtime(delay=delay_of(self.sensor))
+        """What observers have to know of the machine: that measurements arrive late, and its limits, which cut off estimates."""
+        lower, upper = sides(self.limits, self.models.lifting.states) if self.limits else (None, None)
+        return Runtime(delay_of(self.sensor), lower, upper, relift=False)
 
     @property
     def dynamics(self) -> Array:

@@ -22,6 +22,7 @@ Array = npt.NDArray[np.float64]
 TUNING_UNITS = 12
 TUNING_EPISODES = 3
 TUNING_S = 10.0
+TUNING_EPISODES_AT_LIMITS = 72
 SIDE_BY_SIDE = 20  # keeps a study of twelve units below 200 MB
 
 
@@ -55,6 +56,12 @@ class TrainingSet:
         return cls(
             identified.population.select(units), keys, {u: known[u] for u in units}, seen_by(identified, models.measured), sensor or {}
         )
+
+    @classmethod
+    def at_limits(cls, identified: IdentifiedModels, models: ModelSet, sensor: Sensors | None = None) -> TrainingSet:
+        """Take some training episodes of all conditions, first those of units that were seen at a limit."""
+        every, seen = cls.whole(identified, models, sensor), {u for limit in identified.facts.limits.values() for u in limit.units}
+        return replace(every, keys=tuple(sorted(every.keys, key=lambda k: k.unit not in seen))[:TUNING_EPISODES_AT_LIMITS])
 
     def normalised(self, models: ModelSet) -> TrainingSet:
         """Return the same in channels divided by the ranges of models."""

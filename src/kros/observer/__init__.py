@@ -9,8 +9,9 @@ from .certificate.certificate import ReliftCertificate, relift_certificate
 from .certificate.error import ReliftScales
 from .certificate.report import ReliftRow, relift_report
 from .certificate.status import Dropped, ReliftStatus
+from .limits import Limit, Limits
 from .observer import Observer
-from .predictor import PastMoments, driven_coordinates, identify_predictor, with_internal
+from .predictor import PastMoments, conditioned, driven_coordinates, identify_predictor, with_internal, with_limits
 from .residual.models import ResidualModel, one_step_rows, residual_models
 from .residual.one_step import mean_error_dynamics, one_step_residual, residual_spectra
 from .running import Estimate, RunningObserver
@@ -32,6 +33,8 @@ __all__ = [
     "Features",
     "FilteredDifference",
     "Learned",
+    "Limit",
+    "Limits",
     "Moments",
     "Observer",
     "PastMoments",
@@ -47,6 +50,7 @@ __all__ = [
     "Sensor",
     "Sensors",
     "Tracked",
+    "conditioned",
     "cutoffs_hz",
     "driven_coordinates",
     "followed",
@@ -71,4 +75,5 @@ __all__ = [
     "track_parameter",
     "tune_observer",
     "with_internal",
+    "with_limits",
 ]

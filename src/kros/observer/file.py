@@ -214,8 +214,9 @@ def _indices(values: Any, count: int, where: str) -> tuple[int, ...]:
 def _runtime(content: Mapping[str, Any], where: str) -> Runtime:
     found = content.get("runtime", {})
     _known(found, Runtime.__dataclass_fields__, f"{where}: runtime")
+    _require(type(found.get("relift", True)) is bool, f"{where}: runtime.relift should be true or false", found.get("relift"))
     for key, value in found.items():
-        entries = [value]
+        entries = [] if key == "relift" else [value]
         while any(isinstance(entry, list) for entry in entries):
             entries = [e for entry in entries for e in (entry if isinstance(entry, list) else [entry])]
         for entry in entries:

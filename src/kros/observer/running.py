@@ -106,7 +106,7 @@ class RunningObserver:
         if len(self._inputs) < o.runtime.delay:
             return self.estimate
         nu = self._steps.innovation(self._judge(self._measurement(y), np.zeros(len(o.inputs))).y[0])[0, 0]
-        return self._forward(o.runtime.clip_estimate(self._steps.x[0, 0] + o.filter_gain @ nu))
+        return self._forward(o.runtime.relifted(self._steps.x[0, 0] + o.filter_gain @ nu))
 
     def step(self, y: npt.ArrayLike, u: npt.ArrayLike) -> Estimate:
         """Take what arrives and the input at k, return the estimate for k + 1.
@@ -133,7 +133,7 @@ class RunningObserver:
         if len(self._inputs) > self.observer.runtime.delay:
             missing, steps = ~np.isfinite(measurement), self._steps
             steps.step(measurement, self._inputs.popleft(), missing if missing.any() else None)
-            if steps.correction is not None and self.observer.runtime.binds(steps.x[0, 0], steps.correction):
+            if self.observer.runtime.binds(steps.x[0, 0], steps.correction):
                 self._status |= SampleStatus.LIMIT
         return self.estimate
 
@@ -169,12 +169,15 @@ class RunningObserver:
     def _forward(self, x: Array) -> Estimate:
         """Predict through the model over the inputs that no measurement has met yet."""
         if not self._inputs:
-            return Estimate(self._places, x.copy())
+            return self._given(x)
         ahead = self._ahead
         ahead.place(x[None], self._steps.earlier(self._inputs[0])[0])
         for u in self._inputs:
             ahead.step(np.zeros(self._unknown.shape), u, self._unknown)
-        return Estimate(self._places, ahead.x[0, 0].copy())
+        return self._given(ahead.x[0, 0])
+
+    def _given(self, x: Array) -> Estimate:
+        return Estimate(self._places, self.observer.runtime.clip_estimate(x.copy()))
 
 
 class _Checked(MutableMapping[str, float]):

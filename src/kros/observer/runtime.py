@@ -57,6 +57,9 @@ class Runtime:
         predicted forward through the model.
     lower, upper : ndarray, shape (n,), optional
         Limits of the estimate, state by state.
+    relift : bool
+        Whether the observer goes on from its estimate within the limits; otherwise these only cut off what it gives out. A model of a machine under
+        control need not be stable with a state that is stuck: what is cut off is safe for every observer, the other for one that was made for it.
     correction : ndarray, shape (width,), optional
         Largest size of every correction.
     filter_gain : ndarray, shape (n, q), optional
@@ -77,6 +80,7 @@ class Runtime:
     filter_gain: Array | None = None
     input_lower: Array | None = None
     input_upper: Array | None = None
+    relift: bool = True
 
     def __post_init__(self) -> None:
         if int(self.delay) != self.delay or self.delay < 0:
@@ -97,28 +101,42 @@ class Runtime:
 
     @property
     def limited(self) -> bool:
-        """Whether anything is limited."""
-        return any(limit is not None for limit in (self.lower, self.upper, self.correction))
+        """Whether a step meets limits."""
+        return self.correction is not None or (self.relift and any(side is not None for side in (self.lower, self.upper)))
 
-    def clipped_states(self, n: int) -> list[int]:
+    def limited_states(self, n: int) -> list[int]:
         """Return which of n states have limits."""
         sides = [np.isfinite(side) for side in (self.lower, self.upper) if side is not None]
         return [int(i) for i in np.flatnonzero(np.any(sides, axis=0))] if sides else []
+
+    def clipped_states(self, n: int) -> list[int]:
+        """Return which of n states an observer goes on from within their limits."""
+        return self.limited_states(n) if self.relift else []
 
     def limited_corrections(self, into: Array) -> list[int]:
         """Return which corrections have a limit and reach a state; `into`, shape (n, width), is where they enter."""
         return [] if self.correction is None else [int(i) for i in np.flatnonzero(np.isfinite(self.correction) & np.any(into, axis=0))]
 
-    def binds(self, x: Array, y_c: Array) -> bool:
-        """Whether an estimate, shape (n,), meets a limit, or a correction, shape (width,), exceeds one."""
-        sides = ((self.lower, x.__le__), (self.upper, x.__ge__), (self.correction, np.abs(y_c).__gt__))
-        return any(limit is not None and bool(np.any(meets(limit))) for limit, meets in sides)
+    def binds(self, x: Array, y_c: Array | None) -> bool:
+        """Whether an estimate, shape (n,), meets a limit, or a correction, shape (width,), exceeds one; None where corrections have none."""
+        at = [limit is not None and np.any(meets(limit)) for limit, meets in ((self.lower, x.__le__), (self.upper, x.__ge__))]
+        return bool(any(at)) or (self.correction is not None and y_c is not None and bool(np.any(np.abs(y_c) > self.correction)))
+
+    def clips_alike(self, other: Runtime) -> bool:
+        """Whether two observers' estimates have the same limits, and their corrections none."""
+        pairs = ((self.lower, other.lower), (self.upper, other.upper))
+        same = all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
+        return same and self.relift == other.relift and self.correction is None and other.correction is None
 
     def clip_estimate(self, x: Array) -> Array:
         """Return estimates within their limits, shape (..., n)."""
         if self.lower is None and self.upper is None:
             return x
         return np.asarray(np.clip(x, self.lower, self.upper))
+
+    def relifted(self, x: Array) -> Array:
+        """Return the estimates that an observer goes on from, shape (..., n)."""
+        return self.clip_estimate(x) if self.relift else x
 
     def clip_correction(self, y_c: Array) -> Array:
         """Return corrections within their limits, shape (..., width)."""
@@ -139,7 +157,8 @@ class Runtime:
     def content(self) -> dict[str, Any]:
         """Return what an observer's file holds of it: nothing where everything is as by default."""
         arrays = {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
-        found = ({"delay": int(self.delay)} if self.delay else {}) | {k: _finite(v) for k, v in arrays.items()}
+        found: dict[str, Any] = ({"delay": int(self.delay)} if self.delay else {}) | ({} if self.relift else {"relift": False})
+        found |= {k: _finite(v) for k, v in arrays.items()}
         return {"runtime": found} if found else {}
 
     @classmethod

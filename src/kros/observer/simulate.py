@@ -88,7 +88,9 @@ def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, paramet
             f"Running {len(observers)} observers side by side: they differ in lifting, measured states or inputs; run them one by one."
         )
     late = first.runtime.delay
-    alone = any(o.runtime.delay != late or o.runtime.limited or not Screen.of(o).same_as(Screen.of(first)) for o in observers)
+    alone = any(
+        o.runtime.delay != late or not o.runtime.clips_alike(first.runtime) or not Screen.of(o).same_as(Screen.of(first)) for o in observers
+    )
     alone |= bool(late and first.lifting.history)
     if alone and len(observers) > 1:
         return np.stack([_run([o], y, u, parameters, EstimateKind.PREDICT)[0] for o in observers])
@@ -127,6 +129,7 @@ def _run(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Para
         if earlier is not None and pending is not None:
             for own, of_one in zip(observers, found, strict=True):
                 _predict(own, of_one, earlier, samples, pending, values)
+        found[...] = observer.runtime.clip_estimate(found)
     return found
 
 
@@ -141,7 +144,7 @@ def _pending(starts: Flags, delay: int) -> Whole:
 def _filter(observer: ObserverData, x: Array, y: Array, pending: Whole | None, delay: int) -> None:
     """Correct predictions, shape (n_samples, batch, n), by what has arrived."""
     nu = np.where(np.isfinite(y), y - x[..., list(observer.measured)], 0.0)
-    filtered = observer.runtime.clip_estimate(x + nu @ observer.filter_gain.T)
+    filtered = observer.runtime.relifted(x + nu @ observer.filter_gain.T)
     np.copyto(x, filtered, where=True if pending is None else (pending == delay)[..., None])
 
 

@@ -22,7 +22,7 @@ class Steps:
     Parameters
     ----------
     observers : sequence of ObserverData
-        Of the same lifting, measured states and inputs; more than one only without limits of estimates and corrections.
+        Of the same lifting, measured states, inputs and limits; more than one only without limits of corrections.
     batch : int
     values : mapping of str to array_like, shape (batch,)
         Lifting parameters; looked at anew in every step.
@@ -51,7 +51,7 @@ class Steps:
         """Start all machines, or some, at measurements, shape (batch, q)."""
         rows = slice(None) if machines is None else machines
         for own, observer in zip(self.x, self.observers, strict=True):
-            own[rows] = observer.initial(y, self.values)[rows]
+            own[rows] = observer.runtime.relifted(observer.initial(y, self.values))[rows]
         self._x_c[:, rows] = 0.0
         self._fresh[rows] = True
 
@@ -113,9 +113,11 @@ class Steps:
         assert self._limits is not None
         observer, n = self.observers[0], self.x.shape[2]
         K = observer.controller
-        self.correction = self._x_c @ K.C.T + (self._y - self.x[..., self._at]) @ K.D.T
-        clipped = self._limits.clip_correction(self.correction)
-        following[..., :n] = self._limits.clip_estimate(following[..., :n] + (clipped - self.correction) @ observer.into[:n].T)
+        if self._limits.correction is not None:
+            self.correction = self._x_c @ K.C.T + (self._y - self.x[..., self._at]) @ K.D.T
+            clipped = self._limits.clip_correction(self.correction)
+            following[..., :n] += (clipped - self.correction) @ observer.into[:n].T
+        following[..., :n] = self._limits.relifted(following[..., :n])
 
 
 def _padded(observer: ObserverData, order: int) -> Array:

@@ -103,7 +103,7 @@ def track_parameter(
     steps.begin(y[0])
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for k in range(len(y)):
-            estimates[k], followed[k] = steps.x[0], values[name]
+            estimates[k], followed[k] = observer.runtime.clip_estimate(steps.x[0]), values[name]
             if k and starts[k].any():  # the parameter stays
                 steps.begin(y[k], starts[k])
                 s[starts[k]], s_c[starts[k]], power[starts[k]], age[starts[k]] = 0.0, 0.0, 0.0, 0

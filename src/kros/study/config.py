@@ -15,6 +15,7 @@ from ..core.files import parse_toml, read_toml, shortened
 from ..core.settings import Settings
 from ..design.settings import ObserverSettings, PredictorSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
+from ..observer.limits import Limit
 from ..observer.sensor import Sensor
 from ..uncertainty.settings import UncertaintySettings
 
@@ -121,6 +122,7 @@ class StudyConfig(Settings):
     synthesis: SynthesisSettings = SynthesisSettings()
     predictor: PredictorSettings = PredictorSettings()
     sensor: dict[str, Sensor] = Field(default_factory=dict)
+    limits: dict[str, Limit] = Field(default_factory=dict)
     observer: ObserverSettings = ObserverSettings()
     evaluate: EvaluateConfig = EvaluateConfig()
     load: LoadConfig = LoadConfig()

@@ -11,5 +11,5 @@ LEARNING = (
     Step(Stage.CALIBRATE, calibrate.run, ("calibrate", "lifting")),
     Step(Stage.IDENTIFY, identify.run, ("identify", "lifting")),
     Step(Stage.QUANTIFY, quantify.run, ("uncertainty",)),
-    Step(Stage.SYNTHESIZE, synthesize.run, ("synthesis", "predictor", "sensor", "observer", "require")),
+    Step(Stage.SYNTHESIZE, synthesize.run, ("synthesis", "predictor", "sensor", "limits", "observer", "require")),
 )

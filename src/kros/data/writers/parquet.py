@@ -24,7 +24,7 @@ import numpy.typing as npt
 from ...core.artifacts import save_artifact
 from ...core.errors import DataError
 from ..arrow import from_numpy, repeated
-from ..checks import check_structure, usable_episodes
+from ..checks import Look, check_structure, usable_episodes
 from ..copies import Print, refuse_copies
 from ..population import EpisodeKey, Population
 from ..readers.parquet import INDEX, KEYS
@@ -75,7 +75,9 @@ def group_file(unit: str, condition: str) -> str:
     return f"{name}.parquet"
 
 
-def write_group(population: Population, unit: str, condition: str, folder: Path | str, on_nan: str = "error") -> GroupRecord:
+def write_group(
+    population: Population, unit: str, condition: str, folder: Path | str, on_nan: str = "error", look: Look | None = None
+) -> GroupRecord:
     """Read, prepare, check and write all episodes of one unit and condition.
 
     Parameters
@@ -85,6 +87,8 @@ def write_group(population: Population, unit: str, condition: str, folder: Path 
     folder : Path
         Exists; the file appears whole or not at all.
     on_nan : {"error", "drop_episode"}
+    look : callable, optional
+        Is shown every episode's key and samples.
 
     Returns
     -------
@@ -102,7 +106,7 @@ def write_group(population: Population, unit: str, condition: str, folder: Path 
     path = Path(folder) / group_file(unit, condition)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        written = list(_write_episodes(population, keys, temporary, on_nan))
+        written = list(_write_episodes(population, keys, temporary, on_nan, look))
         if not written:
             logger.warning("Unit %s (%s) is left out: no episode of %d is left after dropping those with NaN.", unit, condition, len(keys))
             return GroupRecord(unit, condition, "", (), ())
@@ -166,7 +170,9 @@ def write_parquet(population: Population, out: Path | str, *, on_nan: str = "err
         write_index(population, records, folder)
 
 
-def _write_episodes(population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: str) -> Iterable[tuple[str, int, Print]]:
+def _write_episodes(
+    population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: str, look: Look | None = None
+) -> Iterable[tuple[str, int, Print]]:
     from pyarrow import parquet
 
     names = [c.name for c in population.columns]
@@ -179,7 +185,7 @@ def _write_episodes(population: Population, keys: Sequence[EpisodeKey], path: Pa
         "write_page_checksum": True,
     }
     with parquet.ParquetWriter(path, schema, column_encoding=encoding, **options) as writer:
-        for key, values, mark in usable_episodes(population, keys, on_nan):
+        for key, values, mark in usable_episodes(population, keys, on_nan, look):
             writer.write_table(_table(key, values, schema), row_group_size=len(values))
             yield key.episode, len(values), mark
 

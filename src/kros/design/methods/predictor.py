@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import replace
 from functools import partial
@@ -10,15 +11,20 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import KrosError, SynthesisError
+from ...data import EpisodeBatch
 from ...lifting import Lifting
-from ...observer import Observer, driven_coordinates, identify_predictor
+from ...observer import Observer, Runtime, conditioned, driven_coordinates, identify_predictor, relift_certificate, with_limits
+from ...observer.limits import sides
 from ...synthesis import Status, Synthesis
-from ..certificates import DIVERGED
+from ..certificates import DIVERGED, scales_of
 from ..task import DesignResult, DesignTask
 from ..validation import ValidationSet, hidden_mean
 from .tuned import tuned_where_better
 
 UNCOVERED = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
+log = logging.getLogger(__name__)
+_SAMPLES, _EPISODES = 6000, 12  # that an observer is conditioned on, at most
+_CLOSE, _SHARE = 0.99, 0.001  # what counts as at a limit, and how much of an episode has to be
 _CIRCLE = {"sin": "cos", "cos": "sin"}
 
 
@@ -34,7 +40,7 @@ def design_predictor(task: DesignTask) -> DesignResult:
     recipe = partial(identified, task, on_the_circle(task.models.lifting))
     try:
         kept, facts = tuned_where_better(
-            task, data, recipe(data.on_time, iterations=0), lambda seen, _: recipe(seen.on_time), partial(in_coordinates, task)
+            task, data, recipe(data.on_time, iterations=0), lambda seen, _: recipe(seen.on_time), partial(settled, task, reaching(task))
         )
     except (KrosError, np.linalg.LinAlgError) as error:
         raise SynthesisError(str(error)) from error
@@ -61,10 +67,16 @@ def identified(task: DesignTask, lifting: Lifting, data: ValidationSet, **option
         models.recorded_inputs,
         data.batch,
         task.predictor.states,
-        [task.predictor.importance.get(name, 1.0) for i, name in enumerate(models.lifting.states) if i not in models.measured],
+        importance_of(task),
         **({"episodes": task.predictor.episodes, "iterations": task.predictor.steps} | options),
     )
-    return replace(observer, runtime=task.runtime, sensor=task.sensor)
+    observer = replace(observer, runtime=Runtime(task.runtime.delay), sensor=task.sensor)
+    return with_limits(observer, *sides(task.limits, observer.recorded)) if task.limits else observer
+
+
+def importance_of(task: DesignTask) -> list[float]:
+    """Return the weights of the hidden states' logarithmic errors."""
+    return [task.predictor.importance.get(name, 1.0) for i, name in enumerate(task.models.lifting.states) if i not in task.models.measured]
 
 
 def on_the_circle(lifting: Lifting) -> Lifting:
@@ -77,6 +89,29 @@ def on_the_circle(lifting: Lifting) -> Lifting:
     return replace(lifting, functions=tuple(dict.fromkeys(functions)))
 
 
-def in_coordinates(task: DesignTask, data: ValidationSet, observer: Observer) -> Observer:
-    """Return the observer in coordinates in which recordings drive its internal states."""
-    return driven_coordinates(observer, data.batch, task.models.output_scale[: len(observer.recorded)])
+def settled(task: DesignTask, reached: EpisodeBatch | None, data: ValidationSet, observer: Observer) -> Observer:
+    """Return the observer conditioned on episodes that meet its limits, in coordinates in which recordings drive its internal states."""
+    sizes = task.models.output_scale[: len(observer.recorded)]
+    as_is = driven_coordinates(observer, data.batch, sizes)
+    if reached is None:
+        return as_is
+    found = driven_coordinates(conditioned(observer, reached, importance_of(task)), data.batch, sizes)
+    if relift_certificate(found, scales=scales_of([found], data, task)[0], mismatch=False).certified:
+        return found
+    log.info("%s is cut off at its limits and not conditioned: no certificate covers it otherwise.", task.name)
+    return as_is
+
+
+def reaching(task: DesignTask) -> EpisodeBatch | None:
+    """Return the episodes that are longest at a limit of a hidden state, cut short; None where there are none."""
+    names = task.models.lifting.states
+    lower, upper = sides(task.limits, names)
+    at = [i for i in range(len(names)) if i not in task.models.measured and np.isfinite([lower[i], upper[i]]).any()]
+    if task.at_limits is None or not at:
+        return None
+    batch = task.at_limits.read().on_time.batch
+    batch = batch.head(min(_SAMPLES, int(batch.lengths.min())))
+    x = batch.states[..., at]
+    met = np.mean((x <= _CLOSE * lower[at]) | (x >= _CLOSE * upper[at]), axis=(0, 2))
+    rows = [int(i) for i in np.argsort(-met, kind="stable")[:_EPISODES] if met[i] > _SHARE]
+    return batch.take(rows) if rows else None

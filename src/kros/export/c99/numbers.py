@@ -73,6 +73,7 @@ class Source:
             "longest": LONGEST,
             "limited": limited,
             "clips_estimate": run.lower is not None or run.upper is not None,
+            "relifts": run.relift,
             "clips_correction": run.correction is not None,
             "width": o.into.shape[1],
             "history": len(lifting.window.earlier),

@@ -15,6 +15,9 @@ stably. Let F be the rows of [x_h; m] and P their observability Gramian, ``P = F
 .. math:: P_{mm} = F_{mm}^\top P_{mm} F_{mm} + F_{hm}^\top (\cdot) F_{hm}
 
 with something positive between: the internal dynamics ``F_mm`` is stable wherever F is.
+
+Hidden states with limits (`limited`) are given, as measured ones are: F is then that of the others, the internal states that are these without
+their limits shown in H beside x_h. Their gain is part of the coordinates, and decides what the observer does at its limits.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from ...core.norms import gramian
 from ...data import EpisodeBatch
 from ..data import ObserverData
 from ..observer import Observer
+from .limited import limited_states
 
 Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, npt.ArrayLike]
@@ -89,13 +93,15 @@ def driven_coordinates(observer: Observer, batch: EpisodeBatch, sizes: npt.Array
     recorded, n = len(observer.recorded), observer.lifting.n_states
     if recorded == n or not observer.replaces:
         return observer
-    hidden = [i for i in range(recorded) if i not in observer.measured]
-    place = [*hidden, *range(recorded, n)]
-    F, h = observer.A[np.ix_(place, place)], len(hidden)
+    limited = limited_states(observer)
+    hidden = [i for i in range(recorded) if i not in observer.measured and i not in limited]
+    place, h = [*hidden, *range(recorded, n)], len(hidden)
+    F = observer.A[np.ix_(place, place)]
     if not np.abs(np.linalg.eigvals(F)).max() < 1:
         return observer
-    H = np.zeros((h, len(F)))
-    H[:, :h] = np.diag(1 / np.asarray(sizes, dtype=float)[hidden])
+    shown = [*range(h), *range(len(F) - len(limited), len(F))]
+    H = np.zeros((len(shown), len(F)))
+    H[range(len(shown)), shown] = 1 / np.asarray(sizes, dtype=float)[[*hidden, *limited]]
     P = gramian(F.T, H.T, 1.0)
     turn = np.eye(observer.lifting.n_lifted)
     turn[recorded:n, hidden] = np.linalg.lstsq(P[h:, h:], P[h:, :h], rcond=None)[0]

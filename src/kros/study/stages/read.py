@@ -11,6 +11,7 @@ from ...data.steps import parse_steps
 from ...data.survey import check_usable, survey
 from ...evaluate import draw_reserve
 from ...identify.presets import resolve_lifting, resolve_phase
+from ...observer.limits import limits_of
 from ...observer.sensor import require_measured
 from ..config import StudyConfig
 from ..engine.context import Context
@@ -68,6 +69,7 @@ def check_source(config: StudyConfig, population: Population, single_allowed: bo
     resolve_phase(config.calibrate, population, resolve_lifting(config.lifting, config.calibrate, population, config.split.test))
     config.predictor.require_hidden(population.states, population.measured)
     require_measured(config.sensor, population.measured)
+    limits_of(config.limits, {}, population.states)
 
 
 def run(context: Context) -> None:

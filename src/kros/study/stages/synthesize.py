@@ -20,6 +20,7 @@ def run(context: Context) -> None:
         config.observer,
         config.predictor,
         config.sensor,
+        config.limits,
         robust=config.require.robust,
         work=context.work,
     )

@@ -1,0 +1,190 @@
+r"""Predictors of machines whose hidden states meet limits: estimates within them, and internal states that do not wind up.
+
+A predictor knows the machine within its limits. Where the command meets one, what it has seen keeps pushing the estimate beyond, and its internal
+states follow. Here the estimate as it would be without limits becomes an internal state r of its own, and what all others read of the limited
+state is turned by a gain:
+
+.. math:: r^+ = f(\hat x, m, r, u) + \Gamma_r c, \quad \hat x_l^+ = \operatorname{clip}(r^+), \quad m^+ = \dots + \Gamma_m c, \qquad c = \hat x_l - r .
+
+Within the limits c is zero and nothing changes. The gain is an ordinary column of A, the limit an entry of `Runtime`: the observer that runs,
+in a batch or sample by sample, is one like any other, re-lifted from the clipped estimate. With the gain zero the internal states run on as if there
+were no limits, and the estimate alone is cut off: no worse than before. From there Gauss-Newton steps with the limits in the loop, on recordings that
+meet them, lead to a gain for which r comes back as the machine does (back-calculation, the conditioning of controllers, learned).
+
+References
+----------
+K. J. Astrom and L. Rundqwist, "Integrator windup and how to avoid it", American Control Conference 1989, 1693-1698.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.linalg import least_squares
+from ...core.lti import gain
+from ...data import EpisodeBatch
+from ..observer import Observer
+from ..simulate import run_observer
+from ..tuning.gauss_newton import Damping, mean_log, scaled, search
+
+Array = npt.NDArray[np.float64]
+_DAMPING = Damping(1e-7, 1e-2, 1e6, 6.0)
+_THIN = 4
+_FREQUENCIES = 400
+_MARGIN, _SHORT = 0.25, 0.9  # of the circle criterion, and of the way to it
+
+
+def with_limits(observer: Observer, lower: npt.ArrayLike, upper: npt.ArrayLike) -> Observer:
+    """Return a predictor with limits of its recorded states, shape (n_recorded,), infinite where there is none; its internal states run on.
+
+    Every hidden state with a limit gets an internal state more, behind the others: its estimate without the limit, which all rows read.
+    """
+    n, recorded = observer.lifting.n_states, len(observer.recorded)
+    sides = [np.asarray(side, dtype=float) for side in (lower, upper)]
+    at = [i for i in range(recorded) if i not in observer.measured and any(np.isfinite(side[i]) for side in sides)]
+    place = [*range(n), *at, *range(n, observer.lifting.n_lifted)]  # of the widened states: every raw one begins as a copy
+    A, B, D = observer.A[np.ix_(place, place)], observer.B[place], observer.controller.D[place]
+    A[:, at] = 0.0
+    lifting = replace(observer.lifting, states=(*observer.lifting.states, *(f"memory_{n - recorded + i + 1}" for i in range(len(at)))))
+    none = np.full(len(lifting.states) - recorded, np.inf)
+    runtime = replace(observer.runtime, lower=np.append(sides[0], -none), upper=np.append(sides[1], none), relift=True)
+    controller = gain(D, observer.sample_period_s)
+    return replace(observer, lifting=lifting, A=A, B=B, controller=controller, internal=observer.internal + len(at), runtime=runtime)
+
+
+def limited_states(observer: Observer) -> list[int]:
+    """Return the hidden states with limits of a predictor of `with_limits`; as many internal states at the end are these without them."""
+    n, recorded = observer.lifting.n_states, len(observer.recorded)
+    at = [i for i in observer.runtime.clipped_states(n) if i < recorded and i not in observer.measured]
+    return at if len(at) <= observer.internal and np.array_equal(observer.A[at], observer.A[n - len(at) : n]) else []
+
+
+def conditioned(observer: Observer, batch: EpisodeBatch, importance: npt.ArrayLike = 1.0, iterations: int = 6) -> Observer:
+    """Return a predictor of `with_limits` with the gain that is best on recordings that meet the limits.
+
+    Parameters
+    ----------
+    observer : Observer
+    batch : EpisodeBatch
+    importance : array_like, shape (h,)
+        Weights of the hidden states' logarithmic errors.
+    iterations : int
+        Most steps.
+    """
+    problem = _Conditioning(observer, batch, importance)
+    start = problem.at(np.zeros((len(problem.F), len(problem.raw))))
+    found, _ = search(start, problem.steps, _DAMPING, iterations, 1e-3, patience=2)
+    turned = _turned(observer, problem.rows, found.gain)
+    return _turned(turned, list(observer.measured), _of_measured(turned, batch))
+
+
+def _turned(observer: Observer, rows: list[int], gain: Array) -> Observer:
+    """The observer with a gain, shape (rows, limited), from what limits cut off."""
+    A, at, n = observer.A.copy(), limited_states(observer), observer.lifting.n_states
+    raw = list(range(n - len(at), n))
+    A[np.ix_(rows, at)] += gain
+    A[np.ix_(rows, raw)] -= gain
+    A[at] = A[raw]
+    return replace(observer, A=A)
+
+
+def _of_measured(observer: Observer, batch: EpisodeBatch) -> Array:
+    """The gain of the measured states' rows, shape (q, limited), by least squares: nothing comes back from them."""
+    at, n, y = limited_states(observer), observer.lifting.n_states, batch.measurements(observer.measured, arrived=False)
+    estimates = run_observer(observer, y, batch.inputs, observer.own(batch.parameters))
+    excess = (estimates[..., at] - estimates[..., n - len(at) :])[:-1].reshape(-1, len(at))
+    missed = (y - estimates[..., list(observer.measured)])[1:].reshape(len(excess), -1)
+    return least_squares(excess, missed).T
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A gain, what the estimates miss and how they move with it, and the criterion."""
+
+    gain: Array
+    missed: Array
+    slopes: Array
+    criterion: float
+
+
+class _Conditioning:
+    """Recordings that meet the limits; `rows` are the states beside the measured and the limited ones, whose rows the gain enters."""
+
+    def __init__(self, observer: Observer, batch: EpisodeBatch, importance: npt.ArrayLike) -> None:
+        n, at = observer.lifting.n_states, limited_states(observer)
+        assert observer.runtime.lower is not None
+        assert observer.runtime.upper is not None
+        self.lower, self.upper = observer.runtime.lower[at], observer.runtime.upper[at]
+        self.raw_states = list(range(n - len(at), n))
+        self.rows = [i for i in range(n) if i not in observer.measured and i not in at]
+        self.raw = [self.rows.index(i) for i in self.raw_states]
+        hidden = [i for i in range(len(observer.recorded)) if i not in observer.measured]
+        self.shown = [self.raw[at.index(i)] if i in at else self.rows.index(i) for i in hidden]
+        self.limits = [at.index(i) if i in at else -1 for i in hidden]
+        values = observer.own(batch.parameters)
+        x = np.zeros((*batch.states.shape[:2], n))
+        y = batch.measurements(observer.measured, arrived=False)
+        x[..., list(observer.measured)] = y
+        self.F = observer.A[np.ix_(self.rows, self.rows)]
+        self.drive = observer.lifting.lift(x, values) @ observer.A[self.rows].T + batch.inputs @ observer.B[self.rows].T
+        self.start = observer.initial(y[0], values)[:, self.rows]
+        self.truth = batch.states[..., hidden]
+        share = np.broadcast_to(np.asarray(importance, dtype=float), len(hidden))
+        self.share = np.tile(share / share.sum() / len(batch.keys), (len(batch.keys), 1))
+        around = np.exp(1j * np.concatenate([[0.0], np.geomspace(1e-5, np.pi, _FREQUENCIES)]))
+        self.responses = np.linalg.inv(around[:, None, None] * np.eye(len(self.F)) - self.F)[:, self.raw]
+
+    def at(self, gain: Array) -> _Point:
+        """Run the predictor with a gain."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            estimates, slopes = self._run(gain)
+            missed = self.truth - estimates
+            return _Point(gain, missed, slopes, mean_log(self.share.ravel(), np.mean(missed**2, axis=0).ravel()))
+
+    def steps(self, point: _Point) -> Callable[[float], _Point]:
+        """Gauss-Newton steps."""
+        root = np.sqrt(self.share / np.mean(point.missed**2, axis=0))
+        X = (point.slopes * root[:, None]).transpose(2, 0, 1, 3).reshape(point.gain.size, -1)
+        H, g, size = scaled(X @ X.T, X @ (point.missed[::_THIN] * root).ravel())
+
+        def trial(damping: float) -> _Point:
+            step = (np.linalg.solve(H + damping * np.eye(len(g)), g) / size).reshape(point.gain.shape)
+            return self.at(point.gain + min(1.0, _SHORT * self._room(point.gain, step)) * step)
+
+        return trial
+
+    def _room(self, gain: Array, step: Array) -> float:
+        """By which multiple of a step the gain stays where limits that come and go at will leave the errors stable (circle criterion)."""
+        now, change = (self.responses @ part for part in (gain, step))
+        now, change = ((part + part.conj().swapaxes(-1, -2)) / 2 for part in (now, change))
+        inside = np.linalg.inv(np.linalg.cholesky(now + (1 - _MARGIN) * np.eye(gain.shape[1])))
+        towards = float(np.linalg.eigvalsh(inside @ change @ inside.conj().swapaxes(-1, -2)).min())
+        return np.inf if towards >= 0 else -1 / towards
+
+    def _run(self, gain: Array) -> tuple[Array, Array]:
+        """Return estimates of the hidden states, shape (n_samples, batch, h), and their slopes by the gain, (n_samples / thin, batch, gain.size, h)."""
+        n_samples, batch = self.drive.shape[:2]
+        F, raw, limits = self.F.T, self.raw, np.array(self.limits)
+        h, moved = self.start.copy(), np.zeros((batch, gain.size, len(self.F)))
+        estimates, slopes = np.empty(self.truth.shape), np.empty((-(-n_samples // _THIN), batch, gain.size, len(self.shown)))
+        by_gain = np.eye(gain.size).reshape(gain.size, *gain.shape)  # (parameter, row, limit)
+        for k in range(n_samples):
+            excess = np.clip(h[:, raw], self.lower, self.upper) - h[:, raw]
+            met = excess != 0.0
+            estimates[k] = h[:, self.shown]
+            estimates[k][:, limits >= 0] += excess[:, limits[limits >= 0]]
+            if k % _THIN == 0:
+                slopes[k // _THIN] = moved[..., self.shown]
+                slopes[k // _THIN][..., limits >= 0] *= ~met[:, None, limits[limits >= 0]]
+            following, turned = h @ F + self.drive[k], moved @ F
+            at = np.flatnonzero(met.any(axis=1))
+            if len(at):
+                following[at] += excess[at] @ gain.T
+                turned[at] += np.einsum("bl,pnl->bpn", excess[at], by_gain)
+                turned[at] -= np.where(met[at][:, None], moved[at][..., raw], 0.0) @ gain.T
+            h, moved = following, turned
+        return estimates, slopes

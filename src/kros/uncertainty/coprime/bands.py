@@ -153,15 +153,11 @@ def cover(energies: Array, weight: Array | None = None) -> Array:
     E = half @ (energies / outer) @ half
     size = np.maximum(np.einsum("kbii->kb", E).real.max(axis=0), np.finfo(float).tiny)[:, None, None]
     E = E / size + _RIDGE * np.eye(n)
-    Y = np.broadcast_to(np.eye(n) / len(E), E.shape).astype(complex)
+    F = np.broadcast_to(np.eye(n) / np.sqrt(len(E)), E.shape).astype(complex)  # Y_k = F_k F_k^H
     for _ in range(_ITERATIONS):
-        EYE = E @ Y @ E
-        root = _power(EYE.sum(axis=0), -0.5)
-        Y = root @ EYE @ root
-        Y = (Y + adjoint(Y)) / 2
-        half_sum = _power(Y.sum(axis=0), -0.5)  # the identity but for rounding, which would grow
-        Y = half_sum @ Y @ half_sum
-    M = (E @ Y).sum(axis=0)
+        F = E @ F
+        F = _power((F @ adjoint(F)).sum(axis=0), -0.5) @ F
+    M = (E @ F @ adjoint(F)).sum(axis=0)
     M = (M + adjoint(M)) / 2
     total = E.sum(axis=0)  # covers in any case
     M = np.where((np.einsum("bii->b", total - M).real >= 0)[:, None, None], M, total)

@@ -1,5 +1,7 @@
 """Baselines against what is known without them: textbook recursions, analytic filters, an estimator that is linear in the past."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from batches import batch_of
@@ -61,6 +63,22 @@ def test_extended_filter_of_a_linear_model_settles_at_the_riccati_gain():
     steady = Observer("k", plain, A, B, (0,), ("u",), kalman(A, np.eye(1, 2), Q, R, DT).controller, Injection.STATE, DT)
     extended = ExtendedKalman(plain, A, B, (0,), ("u",), Q, R, start_covariance(np.array([1.0, 5.0]), R, (0,)))
     np.testing.assert_allclose(extended.run(y, u)[500:], run_observer(steady, y, u)[500:], atol=1e-9)
+
+
+def test_extended_filter_of_late_measurements_is_that_of_punctual_ones_predicted_forward():
+    rng, d = np.random.default_rng(1), 2
+    A, B = 0.2 * rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
+    Q, R, P0 = np.diag([1e-3, 1e-2, 1e-1]), np.array([[0.02]]), np.diag([0.02, 1.0, 2.0])
+    y, u, phase = rng.normal(size=(30, 1, 1)), rng.normal(size=(30, 1, 2)), {"phase": np.array([0.4])}
+    punctual = ExtendedKalman(KOOPMAN, A, B, (0,), ("a", "b"), Q, R, P0)
+    arrives = np.concatenate([np.repeat(y[:1], d, axis=0), y[:-d]])
+    found = replace(punctual, delay=d).run(arrives, u, phase)[:, 0]
+    before = punctual.run(y, u, phase)[:, 0]
+    for k in range(30):
+        x = before[max(k - d, 0)]
+        for j in range(max(k - d, 0), k):
+            x = A[:3] @ [*x, np.sin(10 * x[0] + 0.4)] + B[:3] @ u[j, 0]
+        np.testing.assert_allclose(found[k], x, rtol=1e-12, atol=1e-12)
 
 
 def test_extended_filter_with_two_measurements_and_delays_runs_as_a_stack():

@@ -32,6 +32,7 @@ from ..observer import (
 from ..observer.baselines.restarts import restarted
 from ..observer.residual.one_step import one_step_covariance, one_step_residual
 from ..observer.screen import Screen
+from ..observer.sensor import delay_of
 from .methods.gains import EQUAL, RESIDUAL
 from .validation import TrainingSet, rank
 
@@ -123,7 +124,16 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
     start = start_covariance(models.output_scale[:n], R, models.measured)
     values = {name: float(v[row]) for name, v in models.parameters.items()}
     filters = ExtendedKalman(
-        lifting, models.A[row], models.B[row], models.measured, models.recorded_inputs, np.stack([Q for *_, Q in tried]), R, start, values
+        lifting,
+        models.A[row],
+        models.B[row],
+        models.measured,
+        models.recorded_inputs,
+        np.stack([Q for *_, Q in tried]),
+        R,
+        start,
+        values,
+        delay_of(training.sensor),
     )
     short = data.first(_EXTENDED_S / models.sample_period_s)
     percents = [

@@ -16,7 +16,7 @@ B. D. O. Anderson and J. B. Moore, Optimal Filtering, Prentice-Hall 1979, sectio
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +48,8 @@ class ExtendedKalman:
         Covariance of the first estimate, in which measured states have the measurement's noise.
     parameters : mapping of str to float
         Default values of the lifting's parameters, the nominal unit's.
+    delay : int
+        Samples by which measurements arrive late: the filter corrects as of then, and predicts forward through the model.
     """
 
     lifting: Lifting
@@ -59,6 +61,7 @@ class ExtendedKalman:
     R: Array
     P0: Array
     parameters: Mapping[str, float] = field(default_factory=dict)
+    delay: int = 0
 
     def __post_init__(self) -> None:
         n, q = self.lifting.n_states, len(self.measured)
@@ -79,6 +82,8 @@ class ExtendedKalman:
     def run_all(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Run all filters of a stack Q (k, n, n) side by side, shape (k, n_samples, batch, n)."""
         require_samples("the extended Kalman filter", len(self.measured), self.inputs, y, u)
+        if self.delay:
+            return self._late(y, u, parameters)
         lifting, n, C = self.lifting, self.lifting.n_states, list(self.measured)
         Q = self.Q.reshape(-1, 1, n, n)
         k, (n_samples, batch) = len(Q), y.shape[:2]
@@ -119,6 +124,23 @@ class ExtendedKalman:
                 if earlier is not None:
                     earlier = lifting.window.advance(window, held)
         return np.moveaxis(estimates, 0, 1)
+
+    def _late(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
+        """Run on what was measured, with the inputs of its time, and predict each estimate to the row in which it is there."""
+        d, lifting, n = min(self.delay, len(y) - 1), self.lifting, self.lifting.n_states
+        if lifting.history:
+            raise DimensionError(
+                f"Extended Kalman filter: a delay of {d} samples needs a lifting of present values, found {lifting.functions}."
+            )
+        before = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], parameters)
+        values = {**self.parameters, **(parameters or {})}
+        found = np.empty((len(before), len(y), *before.shape[2:]))
+        for step in range(d):
+            found[:, step] = before[:, 0]  # nothing arrived but where to start
+            inputs = np.broadcast_to(u[step : len(u) - d + step], (*before.shape[:-1], u.shape[-1]))
+            before = lifting.lift(before, values) @ self.A[:n].T + lifting.lift_inputs(inputs, before, values) @ self.B[:n].T
+        found[:, d:] = before
+        return found
 
 
 def start_covariance(scale: Array, R: Array, measured: Sequence[int]) -> Array:

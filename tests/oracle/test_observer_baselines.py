@@ -9,6 +9,7 @@ from batches import batch_of
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
 from kros.data import Channel, Role
+from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
 from kros.observer import (
     Choice,
@@ -185,6 +186,17 @@ def test_learned_estimator_chooses_what_does_best_on_units_left_out():
         errors = [runs[unit][:, int(unit), 1] - states[:, int(unit), 1] for unit in batch.units]
         percent[choice] = np.mean([np.sqrt(np.mean(e**2)) / np.abs(states[:, i, 1]).max() for i, e in enumerate(errors)])
     assert percent[chosen] == min(percent.values())
+
+
+def test_a_condition_that_misleads_is_not_trained_on():
+    lifting, states, u, phases = linear_in_the_past(units=6)
+    states[:, 3:, 1] = np.random.default_rng(0).normal(size=(900, 3))  # nothing to learn there, and no unit's own size
+    keys = tuple(EpisodeKey(unit, condition, "0") for condition in ("good", "noise") for unit in "abc")
+    batch = replace(batch_of(states, u, DT, phases), keys=keys)
+    batch.states[:, :3, 1] /= 1 + np.arange(3)
+    moments = Moments.of(Features.of(lifting, (0,), states[..., :1], u, taps=5), [batch])
+    assert moments.units == ("a", "b", "c")
+    assert moments.choose()[0].condition == "good"
 
 
 def test_a_unit_that_is_left_out_leaves_no_trace():

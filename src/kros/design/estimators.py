@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -41,6 +41,7 @@ Parameters = Mapping[str, Array]
 _LEVELS = (-4.0, -2.0, 0.0, 2.0, 4.0)  # decades of process noise that the extended filter tries, for either shape
 _EXTENDED_S = 2.0
 _REGRESSORS = 600  # of the learned estimator, at most
+_MOMENTS = 2.5e7  # numbers that its moments of all units, conditions and states may take, 200 MB
 _LEAST = 0.1  # of a state's largest value: what it hardly moves in counts for no more than this
 _WORK = 2e9  # samples times regressors that it is trained on, some seconds: no clock decides, so that every run finds the same
 
@@ -203,13 +204,15 @@ def make_learned(training: TrainingSet, lifting: Lifting, measured: tuple[int, .
     few = training.first_of_units().read()
     y, u = hold_missing(few.measurements(measured)), few.batch.inputs
     features = Features.of(lifting, measured, y, u)
-    regressors = features.channels(y[:1], u[:1], few.parameters).shape[-1] * features.taps
-    features = replace(features, taps=max(1, features.taps * min(_REGRESSORS, regressors) // regressors))
     groups, lengths = len({(key.unit, key.condition) for key in training.keys}), list[int]()
+    channels = features.channels(y[:1], u[:1], few.parameters).shape[-1]
+    most = min(_REGRESSORS, (_MOMENTS / (groups * max(1, lifting.n_states - len(measured)))) ** 0.5)
+    features = replace(features, taps=max(1, min(features.taps, int(most / channels))))
+    regressors = channels * features.taps
 
     def episodes() -> Iterator[EpisodeBatch]:
         for number, part in enumerate(training.one_by_one()):
-            if number >= groups and sum(lengths) * min(_REGRESSORS, regressors) > _WORK:
+            if number >= groups and sum(lengths) * regressors > _WORK:
                 return
             lengths.append(len(part.batch.states))
             yield part.batch
@@ -218,5 +221,5 @@ def make_learned(training: TrainingSet, lifting: Lifting, measured: tuple[int, .
     choices = moments.choose()
     estimators: dict[str, Learned] = {unit: moments.estimator([unit], choices) for unit in moments.units}
     facts = {"status": "trained", "episodes": len(lengths), "episodes_recorded": len(training.keys), "left_out": "the unit under test"}
-    facts["taps"] = max(choice.taps for choice in choices)
+    facts["chosen"] = {lifting.states[i]: asdict(choice) for i, choice in zip(moments.estimated, choices, strict=True)}
     return Baseline(estimators | {"": moments.estimator((), choices)}, measured, moments.estimated, facts, seen=training.seen)

@@ -1,13 +1,14 @@
 """Training of the learned estimator, from the moments that every unit leaves of all its samples.
 
-An estimator trained without a unit costs one solution of the normal equations. How many samples of the past count and how much weights are penalised
-is chosen for every estimated state, by the errors on units that were left out.
+An estimator trained without a unit costs one solution of the normal equations. How many samples of the past count, how much weights are penalised, and
+whether all conditions are trained on or one alone is chosen for every estimated state, by the errors in all conditions on units that were left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -19,22 +20,33 @@ from .learned import Features, Learned
 
 Array = npt.NDArray[np.float64]
 RIDGE = 1e-5
-_TAPS = (2, 5, 10, 20, 40, 80)
-_RIDGES = tuple(10.0**exponent for exponent in range(-10, 0))
+_TAPS = (5, 10, 20, 40, 80)
+_RIDGES = (1e-10, 1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 _FOLDS = 4
 
 
 @dataclass(frozen=True)
 class Choice:
-    """How one state is estimated: samples of the past, and the penalty of weights relative to the regressors' mean squares."""
+    """How one state is estimated.
+
+    Parameters
+    ----------
+    taps : int
+        Samples of the past.
+    ridge : float
+        Penalty of weights relative to the regressors' mean squares.
+    condition : str or None
+        That is trained on; None for all.
+    """
 
     taps: int
     ridge: float
+    condition: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """What every unit leaves of its training episodes: means of products of regressors and estimated states.
+    """What every unit leaves of its training episodes in every condition: means of products of regressors and estimated states.
 
     Regressors are a constant and, for every channel, its sample at k - 1 and the differences of those before it. For every estimated state, episodes are
     divided by its largest value in them, as errors are.
@@ -44,24 +56,25 @@ class Moments:
     features : Features
     estimated : tuple of int
         Indices of the estimated states.
-    units : tuple of str
-    gram : ndarray, shape (unit, h, 1 + f, 1 + f)
+    groups : tuple of (str, str)
+        Unit and condition.
+    gram : ndarray, shape (group, h, 1 + f, 1 + f)
         Of the regressors, ``f = channels * taps``, for every estimated state.
-    cross : ndarray, shape (unit, h, 1 + f)
-    power : ndarray, shape (unit, h)
+    cross : ndarray, shape (group, h, 1 + f)
+    power : ndarray, shape (group, h)
         Mean squares of the estimated states.
     """
 
     features: Features
     estimated: tuple[int, ...]
-    units: tuple[str, ...]
+    groups: tuple[tuple[str, str], ...]
     gram: Array
     cross: Array
     power: Array
 
     @classmethod
     def of(cls, features: Features, batches: Iterable[EpisodeBatch], least: Array | None = None) -> Moments:
-        """Collect the moments of training episodes, every sample from the first on; all episodes of a unit count the same.
+        """Collect the moments of training episodes, every sample from the first on; all episodes of a unit and condition count the same.
 
         Parameters
         ----------
@@ -80,36 +93,46 @@ class Moments:
         if not estimated:
             raise DataError("Learned estimator: every state is measured, there is nothing to estimate.")
         floor = np.finfo(float).tiny + (np.zeros(n) if least is None else least)[estimated]
-        found: dict[str, list[Array]] = {}
-        counts: dict[str, int] = {}
+        found: dict[tuple[str, str], list[Array]] = {}
+        counts: dict[tuple[str, str], int] = {}
         for batch in batches:
             z = features.channels(hold_missing(batch.measurements(features.measured)), batch.inputs, batch.parameters)
-            for i, (unit, length) in enumerate(zip(batch.units, batch.lengths.tolist(), strict=True)):
+            for i, (key, length) in enumerate(zip(batch.keys, batch.lengths.tolist(), strict=True)):
                 truth = batch.states[:length, i][:, estimated]
                 size = np.maximum(np.abs(truth).max(axis=0), floor)
                 gram, cross, power = episode_moments(z[:length, i], truth / size, features.taps)
                 new = [gram / size[:, None, None] ** 2, cross.T / size[:, None], power]
-                found[unit] = [a + b for a, b in zip(found[unit], new, strict=True)] if unit in found else new
-                counts[unit] = counts.get(unit, 0) + 1
-        gram, cross, power = (np.stack([found[unit][part] / counts[unit] for unit in found]) for part in range(3))
+                group = (key.unit, key.condition)
+                found[group] = [a + b for a, b in zip(found[group], new, strict=True)] if group in found else new
+                counts[group] = counts.get(group, 0) + 1
+        gram, cross, power = (np.stack([found[group][part] / counts[group] for group in found]) for part in range(3))
         return cls(features, tuple(estimated), tuple(found), gram, cross, power)
 
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units in order of appearance."""
+        return tuple(dict.fromkeys(unit for unit, _ in self.groups))
+
     def choose(self) -> tuple[Choice, ...]:
-        """Return for every estimated state the choice with the least mean error on units that were left out, in few folds."""
-        folds = [list(range(fold, len(self.units), _FOLDS)) for fold in range(min(_FOLDS, len(self.units)))]
+        """Return for every estimated state the choice with the least mean error on units left out in folds, the geometric mean over conditions."""
+        folds = [self.units[fold::_FOLDS] for fold in range(min(_FOLDS, len(self.units)))]
         if len(folds) < 2:
             return (Choice(self.features.taps, RIDGE),) * len(self.estimated)
-        tried = [Choice(taps, ridge) for taps in {min(taps, self.features.taps) for taps in _TAPS} for ridge in _RIDGES]
-        errors = np.zeros((len(tried), len(self.estimated)))
-        for held in folds:
-            others = [i for i in range(len(self.units)) if i not in held]
+        conditions = sorted({condition for _, condition in self.groups})
+        taps = sorted({min(taps, self.features.taps) for taps in _TAPS})
+        trained = (None, *conditions) if len(conditions) > 1 else (None,)
+        tried = [Choice(*settings) for settings in product(taps, _RIDGES, trained)]
+        errors = np.zeros((len(self.estimated), len(tried), len(self.groups)))
+        for fold in folds:
+            held = [i for i, (unit, _) in enumerate(self.groups) if unit in fold]
             for state in range(len(self.estimated)):
-                gram, cross = self.gram[others, state].mean(axis=0), self.cross[others, state].mean(axis=0)
-                weights = np.stack([self._weights(gram, cross, choice) for choice in tried])
+                weights = np.stack([self._weights(state, fold, choice) for choice in tried])
                 missed = self.power[held, state] - 2 * weights @ self.cross[held, state].T
                 missed += np.einsum("tf,ufg,tg->tu", weights, self.gram[held, state], weights, optimize=True)
-                errors[:, state] += np.sqrt(np.maximum(missed, 0.0)).sum(axis=1)
-        return tuple(tried[i] for i in errors.argmin(axis=0))
+                errors[state][:, held] = np.sqrt(np.maximum(missed, np.finfo(float).tiny))
+        members = [[i for i, group in enumerate(self.groups) if group[1] == condition] for condition in conditions]
+        scores = sum(np.log(errors[..., rows].mean(axis=-1)) for rows in members)
+        return tuple(tried[i] for i in np.argmin(scores, axis=-1))
 
     def estimator(self, without: Collection[str] = (), choices: Sequence[Choice] | None = None) -> Learned:
         """Train on all units but some; names of units that took no part are ignored.
@@ -125,22 +148,25 @@ class Moments:
         DataError
             When no unit is left.
         """
-        rows = [i for i, unit in enumerate(self.units) if unit not in without]
-        if not rows:
+        if not set(self.units) - set(without):
             raise DataError(f"Learned estimator: no unit is left to train on without {', '.join(sorted(without))}; record more units.")
         taps, h = self.features.taps, len(self.estimated)
-        gram, cross = self.gram[rows].mean(axis=0), self.cross[rows].mean(axis=0)
         chosen = choices or (Choice(taps, RIDGE),) * h
-        weights = np.stack([self._weights(gram[i], cross[i], choice) for i, choice in enumerate(chosen)], axis=1)
+        weights = np.stack([self._weights(state, without, choice) for state, choice in enumerate(chosen)], axis=1)
         response = weights[1:].reshape(-1, taps, h).copy()
         response[:, :-1] -= weights[1:].reshape(-1, taps, h)[:, 1:]
         return Learned(self.features, self.estimated, weights[0], response)
 
-    def _weights(self, gram: Array, cross: Array, choice: Choice) -> Array:
-        """Solve the normal equations, shape (1 + f,); weights of samples that do not count are zero, that of the constant is not penalised."""
-        lags = np.arange(len(gram) - 1) % self.features.taps
+    def _weights(self, state: int, without: Collection[str], choice: Choice) -> Array:
+        """Solve the normal equations, shape (1 + f,); weights of samples that do not count are zero, that of the constant is not penalised.
+
+        Where the other units were not recorded in the condition that was chosen, all conditions are trained on.
+        """
+        others = [i for i, (unit, _) in enumerate(self.groups) if unit not in without]
+        rows = [i for i in others if choice.condition in (None, self.groups[i][1])] or others
+        lags = np.arange(self.gram.shape[-1] - 1) % self.features.taps
         used = np.concatenate([[0], 1 + np.flatnonzero(lags < choice.taps)])
-        gram, cross = gram[np.ix_(used, used)], cross[used]
+        gram, cross = self.gram[rows, state].mean(axis=0)[np.ix_(used, used)], self.cross[rows, state].mean(axis=0)[used]
         size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
         penalty = np.diag([0.0] + [choice.ridge] * (len(size) - 1))
         weights = np.zeros(1 + len(lags))

@@ -1,7 +1,7 @@
 # Everything is built in .venv from the two lock files; nothing outside this folder changes.
 # A Python other than the newest found:  make install PYTHON=/path/to/python3.12
 
-.PHONY: help install demo test coverage check bench docs lock clean
+.PHONY: help install demo test coverage check bench embedded docs lock clean
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 
@@ -46,6 +46,9 @@ check: $(INSTALLED_DEV)  ## lint, formatting, types, import layers and circles
 
 bench: $(INSTALLED_DEV)  ## run the benchmarks
 	$(ONE_THREAD) $(BIN)/python -m pytest benchmarks --benchmark-only
+
+embedded: $(INSTALLED)  ## run an exported observer on a Cortex-M4F under QEMU, where the tools for it are there
+	$(BIN)/python benchmarks/embedded/measure.py
 
 docs: $(INSTALLED_DEV)  ## build the documentation in docs/_build/html
 	$(BIN)/python -m sphinx -W --keep-going -n -q -b html docs docs/_build/html

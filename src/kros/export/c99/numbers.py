@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,13 @@ import numpy.typing as npt
 
 from ...lifting.c_code import Precision, c_code
 from ...observer import Observer
+from ...observer.predictor.driven import in_coordinates
 from ...observer.samples import LONGEST
 from ...observer.screen import Bounds, Screen
 from .shift import Shift, find_shift
 
 Array = npt.NDArray[np.float64]
+_ALIKE = 1e4  # condition of the modes, by which rounding grows
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +41,8 @@ class Source:
     @classmethod
     def of(cls, observer: Observer, name: str, precision: str) -> Source:
         """Look at an observer."""
-        single = precision == "float"
-        return cls(observer, name, Precision(precision), find_shift(observer) if single else None)
+        observer = in_modes(observer)
+        return cls(observer, name, Precision(precision), find_shift(observer) if precision == "float" else None)
 
     def context(self) -> dict[str, Any]:
         """Return everything that the templates name."""
@@ -79,12 +81,11 @@ class Source:
             "history": len(lifting.window.earlier),
             "window_shift": [int(i) for i in lifting.window._shift] if lifting.history else [],
             "window_present": [int(i) for i in lifting.window._present] if lifting.history else [],
-            "model": self.matrix(np.hstack([o.A[:n], o.B[:n]])),
-            "correct": self.matrix(o.into[:n] @ np.hstack([K.C, K.D])) if not limited else None,
-            "correction": self.matrix(np.hstack([K.C, K.D])) if limited else None,
-            "into": self.matrix(o.into[:n]) if limited else None,
-            "controller": self.matrix(np.hstack([K.A, K.B])),
-            "filter_gain": self.matrix(o.filter_gain),
+            "model": self.sums(np.hstack([o.A[:n], o.B[:n]])),
+            "correction": self.sums(np.hstack([K.C, K.D]) if limited else o.into[:n] @ np.hstack([K.C, K.D])),
+            "into": self.sums(o.into[:n]) if limited else [],
+            "controller": self.sums(np.hstack([K.A, K.B])),
+            "filter_gain": self.sums(o.filter_gain),
             "lower": self.numbers(_filled(run.lower, n, -np.inf), wide=True),
             "upper": self.numbers(_filled(run.upper, n, np.inf), wide=True),
             "largest": self.numbers(_filled(run.correction, o.into.shape[1], np.inf)),
@@ -98,6 +99,10 @@ class Source:
             "shift": self.shift,
             "shift_states": None if self.shift is None else self.wide(self.shift.states),
             "shift_inputs": None if self.shift is None else self.wide(self.shift.inputs),
+            "shift_others": []
+            if self.shift is None
+            else [i for i in range(len(o.recorded)) if i != o.measured[0] and self.shift.states[i] != 0],
+            "far": None if self.shift is None else self.precision.literal(8 * self.shift.period),
             "period": None if self.shift is None else Precision().literal(self.shift.period),
             "sample_period_s": Precision().literal(o.sample_period_s),
         }
@@ -122,6 +127,10 @@ class Source:
                 return f"{array}[{names.index(name)}]"
         raise KeyError(name)
 
+    def sums(self, values: Array) -> list[list[tuple[int, str]]]:
+        """Return what is multiplied by which entry of a column, row by row; zeros are left out."""
+        return [[(int(j), self.precision.literal(float(row[j]))) for j in np.flatnonzero(row)] for row in values]
+
     def matrix(self, values: Array) -> list[list[str]]:
         """Return the literals of a matrix, row by row."""
         return [[self.precision.literal(float(v)) for v in row] for row in values]
@@ -137,11 +146,43 @@ class Source:
         return [Precision().literal(float(v)) for v in values]
 
     def bounds(self, bounds: Bounds) -> list[dict[str, str]]:
-        """Return the bounds of every channel in double precision."""
-        rows = zip(bounds.lower, bounds.upper, bounds.least, bounds.most, strict=True)
-        most = float(np.finfo(float).max)
-        keys = ("lower", "upper", "least", "most")
-        return [dict(zip(keys, (Precision().literal(float(np.clip(v, -most, most))) for v in row), strict=True)) for row in rows]
+        """Return the bounds of every channel in double precision, and in single precision between which a sample is good as it is."""
+        rows, most = zip(bounds.lower, bounds.upper, bounds.least, bounds.most, strict=True), float(np.finfo(float).max)
+        found = []
+        for row in rows:
+            lower, upper, least, furthest = (float(np.clip(v, -most, most)) for v in row)
+            wide = {"lower": lower, "upper": upper, "least": least, "most": furthest}
+            inner = np.clip([max(lower, least), min(upper, furthest)], *(np.finfo(np.float32).max * np.array([-1, 1])))
+            texts = {name: Precision().literal(v) for name, v in wide.items()}
+            found.append(texts | {name: Precision("float").literal(v) for name, v in zip(("low", "high"), inner, strict=True)})
+        return found
+
+
+def in_modes(observer: Observer) -> Observer:
+    """Return the observer with its internal states in the coordinates of their modes: two operations a state in place of one for every other state.
+
+    One for real modes, pairs for complex ones; where modes are so alike that rounding would grow, the observer stays as it is.
+    """
+    n, first = observer.lifting.n_states, len(observer.recorded)
+    if first == n:
+        return observer
+    values, vectors = np.linalg.eig(observer.A[first:n, first:n])
+    columns = [
+        part
+        for i, v in enumerate(values)
+        if v.imag >= 0
+        for part in ([vectors[:, i].real, vectors[:, i].imag] if v.imag else [vectors[:, i].real])
+    ]
+    basis = np.array(columns).T
+    if basis.shape != (n - first, n - first) or np.linalg.cond(basis) > _ALIKE:
+        return observer
+    turn = np.eye(observer.lifting.n_lifted)
+    turn[first:n, first:n] = np.linalg.inv(basis)
+    turned = in_coordinates(observer, turn)
+    A = turned.A.copy()
+    block = np.abs(A[first:n, first:n])
+    A[first:n, first:n][block < 1e-12 * block.max()] = 0.0
+    return replace(turned, A=A)
 
 
 def _filled(values: Array | None, count: int, otherwise: float) -> Array:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from ...observer import Observer
 
 Array = npt.NDArray[np.float64]
-_EXACT = 1e-11
+_EXACT, _NOTHING = 1e-11, 1e-13
 _MOST = 64  # periods of the first function until all others repeat
 
 
@@ -58,7 +58,9 @@ def find_shift(observer: Observer) -> Shift | None:
     direction[at], direction[free] = 1.0, found * sizes[free]
     reads = {lifting.states[i] for i in range(n) if direction[i] != 0}
     period = _period(observer, lifting.states[at], reads)
+    plain = np.where(np.abs(direction) < _NOTHING * sizes / sizes[at], 0.0, direction)
     largest = float(np.abs(moving * direction).max(initial=0.0))
+    direction = plain if np.abs(moving @ plain).max() <= _EXACT * max(largest, 1e-300) else direction
     if period is None or np.abs(moving @ direction).max() > _EXACT * max(largest, 1e-300):
         return None
     return Shift(direction[:n], direction[n:], period)

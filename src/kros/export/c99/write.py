@@ -94,13 +94,13 @@ def c_files(observer: Observer, name: str, precision: str) -> dict[str, str]:
         "tolerance": [f"{tolerance * v:.9g}" for v in golden.size],
     }
     state_bytes = _state_bytes(context)
-    numbers = sum(len(row) for key in ("model", "correction", "correct", "into", "controller", "filter_gain") for row in context[key] or ())
+    numbers = sum(len(row) for key in ("model", "correction", "into", "controller", "filter_gain") for row in context[key] or ())
     largest = None if observer.seen is None else f"{1.5 * float(observer.seen.measured.max()):.6g}"
     functions = sorted({f for text in context["sigma"] + context["gamma"] for f in re.findall(r"\b([a-z]+)\(", text)})
     context |= {
         "state_bytes": state_bytes,
         "constant_bytes": numbers * (4 if precision == "float" else 8),
-        "operations": numbers - len(context["filter_gain"]) * context["q"],
+        "operations": numbers - sum(map(len, context["filter_gain"])),
         "largest_angle": largest,
         "tolerance": tolerance,
         "library": " and ".join(f"`{f}`" for f in functions) or "nothing",
@@ -145,7 +145,7 @@ def _sample(value: float) -> str:
 def _state_bytes(context: Mapping[str, Any]) -> int:
     """Return the size of the state: doubles first, then numbers of the build's precision, then words of four bytes."""
     real = 4 if context["single"] else 8
-    doubles = (1 if context["shift"] else 0) + context["m"]
+    doubles = context["m"] + (1 + context["m"] + len(context["shift_others"]) if context["shift"] else 0)
     reals = context["n"] + context["order"] + context["history"] + len(context["parameters"]) + context["delay"] * context["m"]
     words = context["m"] + (1 if context["delay"] else 0) + 1
     size = 8 * doubles + real * reals + 4 * words

@@ -105,15 +105,15 @@ def driven_coordinates(observer: Observer, batch: EpisodeBatch, sizes: npt.Array
     P = gramian(F.T, H.T, 1.0)
     turn = np.eye(observer.lifting.n_lifted)
     turn[recorded:n, hidden] = np.linalg.lstsq(P[h:, h:], P[h:, :h], rcond=None)[0]
-    turned = _in_coordinates(observer, turn)
+    turned = in_coordinates(observer, turn)
     internal = with_internal(turned, batch.states, batch.inputs, turned.own(batch.parameters))[..., recorded:]
     size = np.sqrt(np.mean(internal**2, axis=(0, 1)))
     scale = np.eye(len(turn))
     scale[range(recorded, n), range(recorded, n)] = np.divide(1.0, size, out=np.ones_like(size), where=size > 0)
-    return _in_coordinates(turned, scale)
+    return in_coordinates(turned, scale)
 
 
-def _in_coordinates(observer: Observer, turn: Array) -> Observer:
+def in_coordinates(observer: Observer, turn: Array) -> Observer:
     """The observer in lifted coordinates ``turn @ theta`` that leave the recorded states and the lifted functions alone."""
     A = turn @ observer.A @ np.linalg.inv(turn)
     return replace(observer, A=A, B=turn @ observer.B, controller=replace(observer.controller, D=A[:, list(observer.measured)]))

@@ -31,7 +31,7 @@ class SynthesisSettings(Settings):
     @classmethod
     def _renamed(cls, raw: Any) -> Any:
         if isinstance(raw, Mapping) and "noise" in raw:
-            raise ValueError("noise is declared with the sensor since version 0.3, [sensor.position] noise = 1e-6; move it there")
+            raise ValueError("noise is declared with the sensor since version 0.2, [sensor.position] noise = 1e-6; move it there")
         return raw
 
 

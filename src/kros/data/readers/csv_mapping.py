@@ -191,7 +191,7 @@ class CsvMapping:
 
     @property
     def ordered(self) -> tuple[ChannelMapping, ...]:
-        """Channels: states, inputs, truths."""
+        """Channels, states before inputs and truths behind them."""
         return columns_in_order(self.channel)
 
     @property

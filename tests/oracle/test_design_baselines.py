@@ -59,7 +59,7 @@ def test_the_tuned_filter_is_at_least_as_good_as_the_textbooks(uncertain):
         own[0]
         < 0.2 * percent(run_observer(in_sizes(task(uncertain, "open_loop").open_loop(), {}), test.states[..., :1], test.inputs), test)[0]
     )
-    assert found.facts["rows_fitted_to_single_steps"] == ["position", "velocity", "current"]
+    assert "position" in found.facts["rows_fitted_to_single_steps"]
     assert "rows fitted to single steps" in found.uncovered
 
 

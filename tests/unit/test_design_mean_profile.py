@@ -1,5 +1,7 @@
 """The mean profile against averages written down here, and what it refuses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -49,6 +51,8 @@ def test_it_is_the_mean_of_the_other_units_at_the_same_sample() -> None:
     lost = batch.measurements((0,)).copy()
     lost[10:40] = np.nan  # a gap after which observers start again does not set the motion back
     np.testing.assert_array_equal(made.estimate(batch.keys, lost, batch.inputs, {}), found)
+    within = replace(made, limits=(np.array([-np.inf, -0.5]), np.array([np.inf, 0.25]))).run(batch, {})
+    np.testing.assert_array_equal(within, np.clip(found, [-np.inf, -0.5], [np.inf, 0.25]))
     short = batch.head(25)
     np.testing.assert_array_equal(made.run(short, {}), found[:25])
 

@@ -70,6 +70,8 @@ class Baseline:
         Whether it knows what to do where a measurement is missing; others get the last one that arrived.
     restarts : bool
         Whether it starts again where an observer would.
+    limits : (ndarray, ndarray), optional
+        Lower and upper limits of the states, shape (n,), that cut off estimates as they do those of an observer.
     seen : Seen, optional
         Largest sizes in training: samples are screened as those of an observer are.
     """
@@ -80,6 +82,7 @@ class Baseline:
     facts: dict[str, Any]
     takes_missing: bool = False
     restarts: bool = True
+    limits: tuple[Array, Array] | None = None
     seen: Seen | None = None
 
     def run(self, batch: EpisodeBatch, parameters: Parameters) -> Array:
@@ -100,7 +103,7 @@ class Baseline:
             found = np.empty((*y.shape[:2], part.shape[-1])) if found is None else found
             found[:, rows] = part
         assert found is not None
-        return found
+        return found if self.limits is None else np.clip(found, *self.limits)
 
     def _piece(self, estimator: Estimator, y: Array, u: Array, parameters: Parameters) -> Array:
         return estimator.run(y if self.takes_missing else hold_missing(y), u, parameters)

@@ -23,6 +23,7 @@ from ...evaluate import ErrorSummary, TrueErrors, as_shown, summarise, true_erro
 from ...identify import ModelSet, free_run
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer, Sensors, run_observers
+from ...observer.limits import limits_of, sides
 from ..engine.context import Context
 from .disturbed import Trial, make_trial, run_disturbed
 from .load import run_load
@@ -85,10 +86,14 @@ def evaluate_baseline(
     shown: tuple[int, ...],
     sensor: Sensors,
     trial: Trial | None = None,
+    limits: tuple[Array, Array] | None = None,
 ) -> Outcome | str:
-    """Make a baseline and run it on test episodes as the sensor shows them, and on disturbed ones; the reason where it cannot be made."""
+    """Make a baseline and run it on test episodes as the sensor shows them, and on disturbed ones; the reason where it cannot be made.
+
+    `limits` of the states, lower and upper, cut off its estimates.
+    """
     try:
-        baseline = make()
+        baseline = replace(make(), limits=limits)
     except KrosError as error:
         return str(error)
     batch = as_shown(EpisodeBatch.read(population, keys, parameters=units, truths=True), sensor, population.states)
@@ -177,8 +182,10 @@ def estimation(
 ) -> list[Piece]:
     """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
     makers, sensor = baseline_makers(context, population, keys), context.config.sensor
+    limits = sides(limits_of(context.config.limits, context.facts.limits, population.states), population.states)
     work = [
-        Piece((name,), partial(evaluate_baseline, make, population, keys, units, shown, sensor, trial)) for name, make in makers.items()
+        Piece((name,), partial(evaluate_baseline, make, population, keys, units, shown, sensor, trial, limits))
+        for name, make in makers.items()
     ]
     for group in alike(load_observers(context).values()):
         names = tuple(observer.name for observer in group)

@@ -5,7 +5,8 @@
     python benchmarks/judge.py OUT --table                           only print what is there
 
 A population is ``kind:spread:seed[:variant]``: `stiff` and `soft` drives of the project's simulator, `compliant` ones of another (`judging/`), `dc`
-motors with Coulomb friction; variant `limit` has a current limit that the motion reaches, `cut` has episodes of 0.7 s. Its units are parted into three
+motors with Coulomb friction; variant `limit` has a current limit that
+the motion reaches, in `declared` it is told, `cut` has episodes of 0.7 s. Its units are parted into three
 folds, and for each everything is made from the other units with defaults. Parts: `accuracy`, errors of all observers on the test episodes of the
 units left out, of their first 50 samples and of the rest, against the recording and the truth; `sensor`, the same where the position's sensor is
 worse, of observers that were told of it and of those that were not. A result is a JSON file for each population, fold and part, and one that is
@@ -49,6 +50,7 @@ from kros.design.validation import TrainingSet  # noqa: E402
 from kros.evaluate import as_shown, true_errors  # noqa: E402
 from kros.identify.calibrate import segments_of  # noqa: E402
 from kros.observer import Sensor, run_observer  # noqa: E402
+from kros.observer.limits import Limit  # noqa: E402
 from kros.plants import PLANTS  # noqa: E402
 from kros.uncertainty.quantify import UncertainModels  # noqa: E402
 
@@ -56,11 +58,21 @@ HOME, LEARNED, START = "noload", "learned", 50  # samples of the start
 UNITS, EPISODES, SECONDS, FOLDS = 12, 6, 10.0, 3
 CUT_S, LIMIT = 0.7, 0.33
 LIMITS = {"stiff": 1.0, "soft": 1.0, "compliant": 1.0, "dc": 8.0}  # of the current
+LIMITED = ("limit", "declared")  # variants
 REACHED = 0.005  # share of an episode's samples at the limit from which on it counts
 DRAWS = 4000
 PROOFS = r"certified|robust|worst_case|bound|gain$|hidden_error"  # facts of the deployed observer that are printed
 EVERYTHING = (  # what says most comes first
-    *("stiff:1:401", "compliant:1:401", "soft:3:401", "dc:1:401", "stiff:1:403:cut", "dc:1:403:cut", "compliant:1:403:limit"),
+    *(
+        "stiff:1:401",
+        "compliant:1:401",
+        "soft:3:401",
+        "dc:1:401",
+        "stiff:1:403:cut",
+        "dc:1:403:cut",
+        "compliant:1:403:limit",
+        "compliant:1:403:declared",
+    ),
     *("stiff:3:401", "soft:1:401", "stiff:1:402", "soft:3:402", "compliant:1:402", "dc:1:402", "stiff:3:402", "soft:1:402"),
 )
 SENSED = ("stiff:1:401", "compliant:1:401")  # populations and
@@ -104,6 +116,11 @@ class Task:
         return self.out / self.name.replace(":", "-") / f"{part}-{self.fold}.json"
 
 
+def limit_of(task: Task) -> float:
+    """Return the limit of the current."""
+    return LIMIT if task.variant in LIMITED else LIMITS[task.kind]
+
+
 def population_of(task: Task) -> Population:
     """Simulate a population."""
     kind, spread, seed = task.name.split(":")[:3]
@@ -115,7 +132,7 @@ def population_of(task: Task) -> Population:
         "spread": float(spread),
     }
     if kind == "compliant":
-        found, _ = compliant_drive.simulate(**settings, limit=LIMIT if task.variant == "limit" else 1.0)
+        found, _ = compliant_drive.simulate(**settings, limit=limit_of(task))
     elif kind == "dc":
         found = PLANTS["dc-motor"](**settings).simulate().population
     else:
@@ -174,7 +191,8 @@ class Fold:
         began = time.perf_counter()
         methods = tuple(m for m in SynthesisSettings().methods if m != "mixed")
         baselines = ObserverSettings(baselines=("open_loop", "kalman_tuned"))
-        found = synthesize_all(self.uncertain, SynthesisSettings(methods=methods), baselines, PredictorSettings(), sensor)
+        limits = {"current": Limit.of((-LIMIT, LIMIT), "Judge")} if self.task.variant == "declared" else {}
+        found = synthesize_all(self.uncertain, SynthesisSettings(methods=methods), baselines, PredictorSettings(), sensor, limits)
         self.seconds["synthesize"] = time.perf_counter() - began
         return found
 
@@ -257,10 +275,7 @@ def accuracy(fold: Fold) -> dict[str, Any]:
     """Errors of everything on the units left out, as recorded, with what is known about every observer."""
     designs = fold.designs
     batch, learned = fold.batch({}), fold.learned({})
-    current, limit = (
-        batch.states[..., fold.population.states.index("current")],
-        LIMIT if fold.task.variant == "limit" else LIMITS[fold.task.kind],
-    )
+    current, limit = batch.states[..., fold.population.states.index("current")], limit_of(fold.task)
     at_limit = (np.abs(current) > 0.97 * limit).mean(axis=0)
     return {
         "deployed": designs.deployed,
@@ -340,12 +355,12 @@ def table(out: Path, names: Sequence[str]) -> None:
         if parts := read_parts(out, name, "accuracy"):
             say(f"\n== {name}: {len(parts)} of {FOLDS} folds, {sum(p['seconds'].get('accuracy', 0) for p in parts):.0f} s")
             show_accuracy(parts)
-        if parts := read_parts(out, name, "sensor"):
-            show_sensor(parts)
     say("\n== In short (deployed over learned, units left out)")
     for name in names:
         if parts := read_parts(out, name, "accuracy"):
             verdict(name, parts)
+        if parts := read_parts(out, name, "sensor"):
+            show_sensor(name, parts)
 
 
 def show_accuracy(parts: Sequence[Mapping[str, Any]]) -> None:
@@ -413,10 +428,7 @@ def open_loop_of(observer: str) -> str:
 
 def verdict(name: str, parts: Sequence[Mapping[str, Any]]) -> None:
     """Print what is asked of a population, what was found, and whether it is met."""
-    conditions, hidden, short = conditions_of(parts), hidden_of(parts), ":cut" in name
-
-    def line(what: str, found: float, most: float, note: str = "") -> None:
-        say(f"  {name:24s} {what:52s} {found:8.3f}   asked {most:g} [{'met' if found <= most else 'MISSED'}] {note}")
+    conditions, hidden, short, limited = conditions_of(parts), hidden_of(parts), ":cut" in name, name.endswith(LIMITED)
 
     deployed = [p["facts"][p["deployed"]] for p in parts]
     made = ", ".join(dict.fromkeys(p["deployed"] for p in parts))
@@ -429,39 +441,47 @@ def verdict(name: str, parts: Sequence[Mapping[str, Any]]) -> None:
         if channel == "current" and (reached := at_the_limit(parts, condition)):
             own, other = (errors(parts, o, condition, channel) for o in ("deployed", LEARNED))
             at = paired({u: own[u] for u in own if u in reached}, other)
-            line(f"{what}: worst of the units at the limit over learned", at.max(), 1.5, f"{len(at)} units")
-        if ":limit" in name:
+            line(name, f"{what}: worst of the units at the limit over learned", at.max(), 1.5, f"{len(at)} units")
+        if limited:
             continue
         if short:
-            line(f"{what}: mean over learned", values.mean(), 1.05, f"worst {values.max():.3f}")
+            line(name, f"{what}: mean over learned", values.mean(), 1.05, f"worst {values.max():.3f}")
         elif channel == "velocity":
-            line(f"{what}: upper limit of the mean ratio", upper(values), 1.03, f"mean {values.mean():.3f}")
-            line(f"{what}: worst unit", values.max(), 1.1)
+            line(name, f"{what}: upper limit of the mean ratio", upper(values), 1.03, f"mean {values.mean():.3f}")
+            line(name, f"{what}: worst unit", values.max(), 1.1)
         elif condition == conditions[0]:
-            line(f"{what}: mean ratio", values.mean(), 0.85, f"upper limit {upper(values):.3f}, worst {values.max():.3f}")
+            line(name, f"{what}: mean ratio", values.mean(), 0.85, f"upper limit {upper(values):.3f}, worst {values.max():.3f}")
     robust = [o for o in dict.fromkeys(r["observer"] for p in parts for r in p["rows"]) if "worst_case_h2" in o]
-    for channel, most in (("velocity", 0.35), ("current", 0.85)) if not short and ":limit" not in name else ():
+    for channel, most in (("velocity", 0.35), ("current", 0.85)) if not short and not limited else ():
         found = {o: paired(*(errors(parts, x, conditions[0], channel) for x in (o, open_loop_of(o)))).mean() for o in robust}
         if found:
             best = min(found, key=lambda o: found[o])
-            line(f"{channel}: best worst-case H2 over open loop", found[best], most, best)
+            line(name, f"{channel}: best worst-case H2 over open loop", found[best], most, best)
 
 
-def show_sensor(parts: Sequence[Mapping[str, Any]]) -> None:
-    """Print told over untold, and told over the best told rival."""
-    say("worse sensors: told over untold; told over the best of open loop, told tuned Kalman and told learned (means over units)")
-    for case in dict.fromkeys(r["case"] for p in parts for r in p["rows"]):
-        for channel in ("velocity", "current"):
-            told, untold = (np.array([*errors(parts, "deployed", HOME, channel, case=case, told=t).values()]) for t in (True, False))
-            rivals = dict.fromkeys(
-                r["observer"] for p in parts for r in p["rows"] if r["observer"].endswith(("open_loop", "kalman_tuned", LEARNED))
-            )
-            means = {o: float(np.mean([*errors(parts, o, HOME, channel, case=case, told=True).values()])) for o in rivals}
-            best = min(means, key=lambda o: means[o])
-            say(
-                f"  {case:8s} {channel:9s} {told.mean():9.4g} / {untold.mean():9.4g} = {told.mean() / untold.mean():6.3f}"
-                f"   / {means[best]:9.4g} ({best}) = {told.mean() / means[best]:6.3f}   {parts[0]['deployed'][case]}"
-            )
+def show_sensor(name: str, parts: Sequence[Mapping[str, Any]]) -> None:
+    """Print errors of observers that were told of the sensor over those of observers that were not, and over the best rival that was told."""
+    asked = {"noise": (0.5, 0.8), "late": (0.5, 0.8), "dropout": (1.0, 1.05), "coarse": (1.0, 1.05)}
+    condition = conditions_of(parts)[0]
+    rivals = dict.fromkeys(
+        r["observer"] for p in parts for r in p["rows"] if r["observer"].endswith(("open_loop", "kalman_tuned", LEARNED))
+    )
+    for case, channel in product(dict.fromkeys(r["case"] for p in parts for r in p["rows"]), hidden_of(parts)):
+        told, untold = (mean_error(parts, "deployed", condition, channel, case=case, told=t) for t in (True, False))
+        means = {o: mean_error(parts, o, condition, channel, case=case, told=True) for o in rivals}
+        best, what = min(means, key=lambda o: means[o]), f"{case}, {channel}: told {told:.4g} %"
+        line(name, f"{what} over untold", told / untold, asked[case][0], f"{parts[0]['deployed'][case]}")
+        line(name, f"{what} over best rival", told / means[best], asked[case][1], best)
+
+
+def mean_error(parts: Sequence[Mapping[str, Any]], observer: str, condition: str, channel: str, **case: Any) -> float:
+    """Return an observer's error, mean over the units."""
+    return float(np.mean([*errors(parts, observer, condition, channel, **case).values()]))
+
+
+def line(name: str, what: str, found: float, most: float, note: str = "") -> None:
+    """Print what is asked, what was found, and whether it is met."""
+    say(f"  {name:24s} {what:56s} {found:8.3f}   asked {most:g} [{'met' if found <= most * (1 + 1e-9) else 'MISSED'}] {note}")
 
 
 def _has_truth(parts: Sequence[Mapping[str, Any]]) -> bool:

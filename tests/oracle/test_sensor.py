@@ -1,11 +1,15 @@
 """The declared sensor: what it does to recordings, where it is refused, and that it stays with the observer."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from tests.support.batches import batch_of
 
 from kros.core.errors import ConfigError
 from kros.core.lti import gain
+from kros.design.synthesize import measurement_noise
 from kros.design.validation import ValidationSet
 from kros.evaluate import as_shown
 from kros.lifting import Lifting
@@ -88,6 +92,14 @@ def test_what_is_fitted_knows_neither_the_delay_nor_the_bias_that_candidates_are
     np.testing.assert_array_equal(data.on_time.measurements((0,)), only.measurements((0,)))
     shift = data.measurements((0,))[3:] - only.measurements((0,))[:-3]
     assert np.nanmean(shift) == pytest.approx(0.5, abs=1e-3)
+
+
+def test_what_syntheses_assume_is_the_declared_noise_and_the_coarser_resolution():
+    identified: Any = SimpleNamespace(facts=SimpleNamespace(resolution={"position": 1e-3, "force": 2e-3}))
+    models: Any = SimpleNamespace(measured=(0, 1), lifting=Lifting(("position", "force", "velocity")))
+    told = {"position": Sensor(noise=1e-3, resolution=1e-2, delay_samples=1), "force": Sensor(resolution=1e-3, bias=9.0)}
+    np.testing.assert_allclose(measurement_noise(identified, models, told), [np.sqrt(1e-6 + 1e-4 / 12), 2e-3 / np.sqrt(12)], rtol=1e-12)
+    np.testing.assert_allclose(measurement_noise(identified, models, {}), np.array([1e-3, 2e-3]) / np.sqrt(12), rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from kros.design.task import DesignResult, DesignTask
 from kros.design.uncertain_set import certificate
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
-from kros.observer import identify_predictor, relift_certificate
+from kros.observer import Sensor, identify_predictor, relift_certificate
 from kros.plants import PLANTS
 from kros.report.verdict import verdict
 from kros.synthesis import kalman
@@ -96,6 +96,19 @@ def test_a_study_makes_what_the_recipe_makes(made, tuning):
     )
     np.testing.assert_allclose(judge.percent(observer), judge.percent(expected), rtol=1e-6)
     assert max(judge.percent(observer)) < 20
+
+
+def test_told_of_the_sensor_it_is_better_than_untold_and_certified(made, tuning):
+    own = task(replace(tuning, sensor={"position": Sensor(noise=6e-5, delay_samples=1, dropout=0.05)}))
+    told, untold, data = design(own), made[1].observer, own.training.read()
+    assert told.observer.runtime.delay == 1
+    assert told.observer.sensor == own.sensor
+    better, worse = data.percent(told.observer)[1:], data.percent(untold)[1:]
+    assert (better < 0.5 * worse).all()
+    running = certify_running(own, [told])[0]
+    assert running.certificate.certified
+    assert running.rows
+    assert all(row.holds for row in running.rows)
 
 
 def test_it_is_certified_as_it_runs_and_its_order_counts_the_memory(made):

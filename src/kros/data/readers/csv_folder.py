@@ -13,7 +13,7 @@ import numpy as np
 
 from ...core.errors import DataError
 from ..checks import check_names
-from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Unit
+from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Role, Unit
 from ..prepare import assemble
 from ..recording import Recording, Recordings
 from .csv_mapping import Column, CsvMapping, UnitMapping, load_mapping
@@ -104,8 +104,11 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
 
 
 def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:
-    columns = {(c.name, mapping.column(c, unit)) for c in mapping.channel if c.name in optional for unit in mapping.units}
-    return {name for name, column in columns if (column > len(fields) if isinstance(column, int) else column not in fields)}
+    """Return the channels that are not there and need not be: those that are optional, and truths."""
+    spared = [c for c in mapping.channel if c.name in optional or c.role is Role.TRUTH]
+    columns = {(c.name, mapping.column(c, unit)) for c in spared for unit in mapping.units}
+    absent = {name for name, column in columns if (column > len(fields) if isinstance(column, int) else column not in fields)}
+    return absent | {c.name for c in mapping.channel if c.of in absent}
 
 
 def csv_files(source: Path) -> Iterator[tuple[Path, str]]:

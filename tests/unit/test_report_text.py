@@ -165,7 +165,9 @@ def test_verdict_says_what_sensor_is_needed() -> None:
     text = "its error doubles with noise of 0.10 % of the largest value, a delay of less than 1 sample that it is not told of or 20 % of the samples lost"
     assert f"Beyond the recordings' own sensor, {text}" in " ".join(verdict({**METRICS, "robustness": rows}, ("position",)))
     declared = {**METRICS, "study": {**METRICS["study"], "sensor": {"position": {"noise": 1.0}}}}  # type: ignore[dict-item]
-    assert "Beyond the sensor that is declared" in " ".join(verdict({**declared, "robustness": rows}, ("position",)))
+    told = " ".join(verdict({**declared, "robustness": rows}, ("position",)))
+    assert "Beyond the sensor that is declared" in told
+    assert "on held-out episodes, as the declared sensor shows them, of units" in told
     assert "No noise, resolution" in " ".join(verdict({**METRICS, "robustness": [rows[0], rows[4]]}, ("position",)))
     assert "doubles" not in " ".join(verdict(METRICS, ("position",)))
 

@@ -61,7 +61,8 @@ def _deployed(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
         return [*sentences, "Its estimates diverge on held-out episodes: do not use it."]
     units = channel_units(metrics)
     parts = [_channel(table, name, c, units.get(c, "")) for c in known]
-    sentences.append(f"{source} estimates {_join(parts)} on held-out episodes of units that are not the nominal one, in the mean.")
+    shown = ", as the declared sensor shows them," if metrics["study"].get("sensor") else ""
+    sentences.append(f"{source} estimates {_join(parts)} on held-out episodes{shown} of units that are not the nominal one, in the mean.")
     sentences += [*_open_loop(table, name, known), *_rivals(table, name, known)]
     return sentences + _better(table, name, known)
 

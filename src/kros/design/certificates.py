@@ -19,12 +19,16 @@ from ..observer import (
     ReliftRow,
     ReliftScales,
     ReliftStatus,
+    SignalBound,
     one_step_residual,
     relift_certificate,
     relift_report,
     run_observers,
+    signal_bound,
     with_internal,
 )
+from ..observer.units import factors
+from ..uncertainty.coprime.bands import BandEnergies
 from .task import DesignResult, DesignTask
 from .validation import ValidationSet, hidden_mean
 
@@ -38,7 +42,7 @@ _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has
 
 @dataclass(frozen=True, eq=False)
 class Running:
-    """What is known about one observer as it runs: its certificate, a row for every unit, and the size of its errors.
+    """What is known about one observer as it runs: its certificate, a row for every unit, bounds for recorded signals, and the size of its errors.
 
     `hidden_percent` is the geometric mean over the states that are not measured of the mean error on training episodes, percent of the largest value;
     `dropout_percent` the largest error of a state in a short run in which measurements stop arriving.
@@ -49,6 +53,13 @@ class Running:
     rows: list[ReliftRow]
     hidden_percent: float
     dropout_percent: float
+    signals: SignalBound | None = None
+    measured: tuple[int, ...] = ()
+
+    @property
+    def certified(self) -> bool:
+        """Whether it is certified both as it runs, for any machine, and for the recorded signals of all units."""
+        return self.certificate.certified and (self.signals is None or self.signals.certified)
 
     def facts(self) -> dict[str, Any]:
         """Return what goes into the metrics."""
@@ -59,6 +70,8 @@ class Running:
             "hidden_error_percent": self.hidden_percent,
             "blind_error_percent": self.dropout_percent,
         }
+        if self.signals is not None:
+            facts |= self.signals.facts(self.measured)
         if not found.certified:
             return facts | {"relift_reason": found.reason}
         return facts | {"relift_mismatch_gain": found.mismatch_gain, "relift_bound_worst": max((r.bound for r in self.rows), default=None)}
@@ -93,8 +106,12 @@ def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignT
     rows = [relift_report(c, o, batch, x) if c.certified else [] for o, c, x in zip(observers, certificates, arrived, strict=True)]
     hidden = hidden_mean(data.compare(estimates), first.measured)
     dropout = dropout_error_percent(observers, data, task.models.sample_period_s)
+    known: dict[bytes, BandEnergies] = {}
+    bounds = [signal_bound(c, o, batch, x, known) for o, c, x in zip(observers, certificates, arrived, strict=True)]
+    bounds = [b.in_sizes(factors(o, {})[0][: len(b.states)]) for o, b in zip(observers, bounds, strict=True)]
     certificates = [c.in_sizes(o, {}) for o, c in zip(observers, certificates, strict=True)]
-    return [Running(o.name, c, r, float(h), float(b)) for o, c, r, h, b in zip(observers, certificates, rows, hidden, dropout, strict=True)]
+    found = zip(observers, certificates, rows, hidden, dropout, bounds, strict=True)
+    return [Running(o.name, c, r, float(h), float(d), b, o.measured) for o, c, r, h, d, b in found]
 
 
 def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[ReliftScales]:
@@ -141,6 +158,7 @@ def save_running(folder: Path, found: Sequence[Running]) -> None:
     """Write certificates and rows below the folder of the observers."""
     rows = {r.name: [row.as_dict() for row in r.rows] for r in found}
     notes = {r.name: {"assumptions": r.certificate.assumptions, "method": r.certificate.method} for r in found}
-    save_artifact(folder, "relift", {"rows": rows, "certificates": notes})
+    signals = {r.name: r.signals.as_dict() for r in found if r.signals is not None}
+    save_artifact(folder, "relift", {"rows": rows, "certificates": notes, "signals": signals})
     for running in found:
         running.certificate.save(folder / "relift" / running.name)

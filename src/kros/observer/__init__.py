@@ -8,6 +8,7 @@ from .baselines.learned_moments import Choice, Moments
 from .certificate.certificate import ReliftCertificate, relift_certificate
 from .certificate.error import ReliftScales
 from .certificate.report import ReliftRow, relift_report
+from .certificate.signals import SignalBound, signal_bound
 from .certificate.status import Dropped, ReliftStatus
 from .limits import Limit, Limits
 from .observer import Observer
@@ -49,6 +50,7 @@ __all__ = [
     "Seen",
     "Sensor",
     "Sensors",
+    "SignalBound",
     "Tracked",
     "conditioned",
     "cutoffs_hz",
@@ -71,6 +73,7 @@ __all__ = [
     "run_observer",
     "run_observers",
     "sample_status",
+    "signal_bound",
     "start_covariance",
     "track_parameter",
     "tune_observer",

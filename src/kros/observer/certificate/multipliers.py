@@ -32,8 +32,10 @@ def best_multipliers(H: Array, width: int) -> Array | None:
     """
     largest = np.argsort(-np.linalg.norm(H, axis=(1, 2)))[: _MOST_FREQUENCIES // 2]
     H = H[np.union1d(largest, np.linspace(0, len(H) - 1, _MOST_FREQUENCIES // 2).astype(int))]
-    size = np.linalg.norm(H[:, width:, width:], 2, axis=(1, 2)).max() or 1.0
-    through = np.maximum(np.sqrt(np.max(np.sum(np.abs(H[:, width:, :width]) ** 2, axis=1), axis=0)), 1e-12 * size)
+    through = np.sqrt(np.max(np.sum(np.abs(H[:, width:, :width]) ** 2, axis=1), axis=0))
+    by_slopes = through @ np.sqrt(np.max(np.sum(np.abs(H[:, :width, width:]) ** 2, axis=2), axis=0))
+    size = max(np.linalg.norm(H[:, width:, width:], 2, axis=(1, 2)).max(), by_slopes) or 1.0
+    through = np.maximum(through, 1e-12 * size)
     H = H / np.concatenate([through, np.full(H.shape[2] - width, size)])
     H[:, :width] *= through[:, None]  # now t is measured in units of through^2
     start = _stabilising(H[:, :width, :width])

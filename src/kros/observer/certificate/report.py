@@ -14,6 +14,7 @@ from ...data import EpisodeBatch
 from ..data import ObserverData
 from ..predictor.driven import with_internal
 from ..residual.one_step import one_step_residual
+from ..screen import screened
 from ..simulate import run_observer
 from .certificate import ReliftCertificate
 from .error import ErrorSystem
@@ -81,60 +82,102 @@ def relift_report(
     """
     if certificate.gain is None:
         raise DimensionError(f"Re-lift report of observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")
-    states, inputs, lengths, n_samples = batch.states, batch.inputs, batch.lengths, len(batch.states)
-    values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
-    if estimates is None:
-        estimates = run_observer(observer, batch.measurements(observer.measured, arrived=False), inputs, values)
-    scales, omega = certificate.scales, held_residual(observer, states, inputs, values)
-    states = with_internal(observer, states, observer.runtime.clip_inputs(inputs), values)
-    system = certificate.system(observer)
-    first = first_error(observer, states[0] - estimates[0])
+    seen, lengths, scales = course(observer, batch, estimates), batch.lengths, certificate.scales
     with np.errstate(divide="ignore", invalid="ignore"):
-        w = np.where(omega == 0, 0.0, omega / scales.residual)
-    residual = w
-    if batch.shown is not None:
-        noise = shown_beside(observer, batch)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            w = np.concatenate([w, np.where(noise == 0, 0.0, noise / scales.noise)[:-1]], axis=-1)
-    inside = np.arange(n_samples)[:, None] < lengths
-    z, q = frozen_response(system, w, first)
+        w = np.concatenate([seen.omega / scales.residual, seen.noise / scales.noise], axis=-1)
+    w[np.isnan(w)] = 0.0  # what has no size has no part in the certificate
+    inside = np.arange(len(seen.error))[:, None] < lengths
+    z, q = frozen_response(certificate.system(observer), w, seen.first)
     energy = {
-        "r": np.sum(np.where(inside[:-1, :, None], residual, 0.0) ** 2, axis=(0, 2)),
+        "r": np.sum(np.where(inside[:-1, :, None], w[..., : observer.lifting.n_states], 0.0) ** 2, axis=(0, 2)),
         "w": np.sum(np.where(inside[:-1, :, None], w, 0.0) ** 2, axis=(0, 2)),
         "z": np.sum(np.where(inside[..., None], z, 0.0) ** 2, axis=(0, 2)),
         "q": np.sum(np.where(inside[..., None], q, 0.0) ** 2, axis=(0, 2)),
-        "e": np.sum(np.where(inside[..., None], (states - estimates) / scales.error, 0.0) ** 2, axis=(0, 2)),
+        "e": np.sum(np.where(inside[..., None], seen.error / scales.error, 0.0) ** 2, axis=(0, 2)),
     }
-    by_gain = np.sqrt(certificate.gain**2 * energy["w"] + certificate.initial_energy(first))
+    by_gain = np.sqrt(certificate.gain**2 * energy["w"] + certificate.initial_energy(seen.first))
     by_frozen = np.sqrt(energy["z"]) + (
         certificate.mismatch_gain * np.sqrt(energy["q"]) if certificate.mismatch_gain is not None else np.inf
     )
     root = np.sqrt(lengths)
+    by_frozen = np.where(np.isnan(by_frozen), np.inf, by_frozen)
     columns = (np.sqrt(energy["r"]), by_gain, np.sqrt(energy["z"]), np.minimum(by_gain, by_frozen), np.sqrt(energy["e"]))
     return [ReliftRow(unit, *(float(c[i] / root[i]) for c in columns)) for i, unit in enumerate(batch.units)]
 
 
-def shown_beside(observer: ObserverData, batch: EpisodeBatch) -> Array:
-    """Return what a sensor shows beside the measured states of its time, shape (n_samples, batch, q); nothing before the first that counts."""
-    delay, y = observer.runtime.delay, batch.measurements(observer.measured, arrived=False)
-    truth = batch.states[..., list(observer.measured)]
-    noise = y - truth[np.maximum(np.arange(len(y)) - delay, 0)]
-    noise[:delay] = 0.0
-    return np.asarray(noise)
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What drove the error of an observer along recorded episodes, and the error.
+
+    Parameters
+    ----------
+    omega : ndarray, shape (n_samples - 1, batch, n)
+        One-step residual; zero in internal states.
+    noise : ndarray, shape (n_samples - 1, batch, q)
+        What the sensor shows beside the recording, as it arrives; zero before the first measurement that is used.
+    first : ndarray, shape (batch, n_window)
+        First error, with the earlier ones that the lifting reads.
+    error : ndarray, shape (n_samples, batch, n)
+    lengths : ndarray, shape (batch,)
+    states, inputs, y : ndarray
+        Recorded states and inputs, and the measurements as they arrive.
+    """
+
+    omega: Array
+    noise: Array
+    first: Array
+    error: Array
+    lengths: npt.NDArray[np.int64]
+    states: Array
+    inputs: Array
+    y: Array
+
+    def mean_square(self, signal: Array) -> Array:
+        """Return the mean square of every channel over every episode, shape (batch, k)."""
+        inside = (np.arange(len(signal))[:, None] < self.lengths)[..., None]
+        return np.asarray(np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None])
+
+    def inside(self, observer: ObserverData) -> npt.NDArray[np.bool_]:
+        """Whether the true state keeps declared limits and no sample is refused, shape (batch,)."""
+        taken, limits, n = screened(observer, self.y, self.inputs), observer.runtime, observer.lifting.n_states
+        wide = np.zeros((*self.states.shape[:2], n))
+        wide[..., : self.states.shape[-1]] = self.states
+        low, high = (np.full(n, s) if side is None else side for s, side in ((-np.inf, limits.lower), (np.inf, limits.upper)))
+        own = self.states.shape[-1]
+        good = ((wide >= low) & (wide <= high))[..., :own].all(axis=-1)
+        good &= np.isfinite(taken.y).all(axis=-1) & (taken.u == limits.clip_inputs(self.inputs)).all(axis=-1)
+        return np.asarray((good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0))
+
+
+def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None) -> Course:
+    """Return what drove an observer along recorded episodes; recorded states stand for the true ones, and no sample is lost."""
+    states, inputs, at, late = batch.states, batch.inputs, list(observer.measured), observer.runtime.delay
+    values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
+    due = states[np.maximum(np.arange(len(states)) - late, 0)][..., at]
+    y = due if batch.shown is None else batch.measurements(at, arrived=False)
+    if estimates is None:
+        estimates = run_observer(observer, y, inputs, values)
+    # Measurements beyond the limits of their states are taken at the limit: what is left of their noise is smaller.
+    taken = screened(observer, y, inputs).y
+    start = observer.runtime.relifted(observer.initial(taken[0], values))  # what is given out may be cut off
+    noise = np.where(np.isfinite(taken), taken, y)[:-1] - due[:-1]
+    noise[:late] = 0.0
+    truth = with_internal(observer, states, observer.runtime.clip_inputs(inputs), values, start)
+    omega = held_residual(observer, truth, inputs, values)
+    return Course(omega, noise, first_error(observer, truth[0] - start), truth - estimates, batch.lengths, states, inputs, y)
 
 
 def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
     """Return the one-step residual from the first sample on, shape (n_samples - 1, batch, n); earlier values equal the first ones, as in the observer.
 
-    That of internal states is zero: recorded states drive it through the observer's own rows. Inputs count as the observer takes them, within limits.
+    `states` have the internal ones behind them (`with_internal`), whose residual is zero: recorded states drive them through the observer's own rows.
+    Inputs count as the observer takes them, within limits.
     """
     h, inputs = observer.lifting.history, observer.runtime.clip_inputs(inputs)
     if h:
         states, inputs = (np.concatenate([np.repeat(v[:1], h, axis=0), v]) for v in (states, inputs))
-    residual = one_step_residual(
-        observer.lifting, observer.A, observer.B, with_internal(observer, states, inputs, parameters), inputs, parameters
-    )
-    residual[..., states.shape[-1] :] = 0.0
+    residual = one_step_residual(observer.lifting, observer.A, observer.B, states, inputs, parameters)
+    residual[..., len(observer.recorded) :] = 0.0
     return residual
 
 

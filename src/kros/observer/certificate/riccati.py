@@ -60,9 +60,10 @@ def riccati_proposals(system: ErrorSystem) -> Iterator[Proposal]:
     how = "Riccati equation with a multiplier for every slope" if len(multipliers) else "Riccati equation of the bounded-real lemma"
     least = max(least, np.finfo(float).tiny)
     for factor in _STEPS:
-        R = lyapunov_factor(system, multipliers, least * factor)
+        # Multipliers that grow with the gain leave the error less weight, and the disturbance too: room for what the grid did not see.
+        R = lyapunov_factor(system, multipliers * factor, least * factor)
         if R is not None:
-            yield Proposal(least * factor, R[None], how, multipliers)
+            yield Proposal(least * factor, R[None], how, multipliers * factor)
 
 
 def frequency_bound(system: ErrorSystem) -> tuple[Array, float]:

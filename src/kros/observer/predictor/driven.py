@@ -39,7 +39,9 @@ Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, npt.ArrayLike]
 
 
-def with_internal(observer: ObserverData, states: Array, inputs: Array, parameters: Parameters | None = None) -> Array:
+def with_internal(
+    observer: ObserverData, states: Array, inputs: Array, parameters: Parameters | None = None, start: Array | None = None
+) -> Array:
     """Return recordings with the internal states that they drive behind them, shape (n_samples, batch, n).
 
     Parameters
@@ -49,6 +51,8 @@ def with_internal(observer: ObserverData, states: Array, inputs: Array, paramete
         Returned as they are where the observer has no internal states.
     inputs : ndarray, shape (n_samples, batch, m)
     parameters : mapping of str to array_like, shape (batch,)
+    start : ndarray, shape (batch, n), optional
+        Where the observer starts; as it does from the recorded first measurement by default.
 
     Raises
     ------
@@ -66,7 +70,8 @@ def with_internal(observer: ObserverData, states: Array, inputs: Array, paramete
     rows, into = observer.A[recorded:n].T, observer.B[recorded:n].T
     driven = np.zeros((*states.shape[:2], n))
     driven[..., :recorded] = states
-    driven[0, :, recorded:] = observer.initial(states[0][:, list(observer.measured)], values)[:, recorded:]
+    first = observer.initial(states[0][:, list(observer.measured)], values) if start is None else start
+    driven[0, :, recorded:] = first[:, recorded:]
     constant = observer.lifting.lift(driven, values)
     constant[..., recorded:n] = 0.0
     drive, own = constant @ rows + inputs @ into, np.ascontiguousarray(rows[recorded:n])

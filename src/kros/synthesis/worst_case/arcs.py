@@ -49,20 +49,30 @@ class Enclosure:
 
     def __call__(self, theta: Array, half: Array) -> tuple[Array, Array]:
         """Return the response in the middle, (k, p, m), and the distance of every row from it on the arc, (k, p); infinite where the series ends."""
+        return self._enclosed(theta, half, lambda rows: np.linalg.norm(rows, axis=-1))
+
+    def entries(self, theta: Array, half: Array) -> tuple[Array, Array]:
+        """Return the response in the middle and the distance of every entry from it on the arc, both (k, p, m)."""
+        return self._enclosed(theta, half, np.abs)
+
+    def _enclosed(self, theta: Array, half: Array, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
         response = self.system.frequency_response(theta / (2 * np.pi * self.system.dt))
-        size = np.linalg.norm(response, axis=-1)
-        n = self.system.n_states
+        size, n = measure(response), self.system.n_states
         if not n:
             return response, _ROUNDING * size
+        shape = (-1, *[1] * (size.ndim - 1))
         R = np.linalg.inv(np.expm1(1j * theta)[:, None, None] * np.eye(n) - self._A)
         size_R = np.sqrt(np.linalg.norm(R, 1, axis=(-2, -1)) * np.linalg.norm(R, np.inf, axis=(-2, -1)))
         CR, RB = self._C @ R, R @ self._B
-        slope, twice = np.linalg.norm(CR @ RB, axis=-1), np.linalg.norm(CR @ R, axis=-1)
-        reach = half * size_R
-        tail = twice * (np.linalg.norm(RB, axis=(-2, -1)) / np.where(reach < 1, 1 - reach, 1.0))[:, None]
-        lost = n * _RESOLVENT * np.linalg.norm(CR, axis=-1) * np.linalg.norm(RB, axis=(-2, -1))[:, None]
-        distance = half[:, None] * slope + half[:, None] ** 2 * tail + lost + _ROUNDING * size
-        return response, np.where((reach < 1)[:, None], distance, np.inf)
+        twice, reach = np.linalg.norm(CR @ R, axis=-1), half * size_R
+        # Over the rows' entries: either their norm, or those of single columns.
+        reached = np.linalg.norm(RB, axis=(-2, -1))[:, None] if size.ndim == 2 else np.linalg.norm(RB, axis=-2)[:, None]
+        left, first = (v.reshape(*v.shape, *[1] * (size.ndim - 2)) for v in (twice, np.linalg.norm(CR, axis=-1)))
+        tail = left * reached / np.where(reach < 1, 1 - reach, 1.0).reshape(shape)
+        lost = n * _RESOLVENT * first * reached
+        h = half.reshape(shape)
+        distance = h * measure(CR @ RB) + h**2 * tail + lost + _ROUNDING * size
+        return response, np.where((reach < 1).reshape(shape), distance, np.inf)
 
 
 def _even_coordinates(system: StateSpace) -> Array:

@@ -163,7 +163,8 @@ def cover(energies: Array, weight: Array | None = None) -> Array:
     M = np.where((np.einsum("bii->b", total - M).real >= 0)[:, None, None], M, total)
     lacking = np.maximum(np.linalg.eigvalsh(E - M)[..., -1].max(axis=0), 0.0)
     grown, added = _touching(M, E), _touching(M + lacking[:, None, None] * np.eye(n), E)
-    smaller = np.einsum("bii->b", grown - added).real < 0
+    # Before it converges the symmetric part of M may be indefinite: no multiple of it covers then.
+    smaller = (np.einsum("bii->b", grown - added).real < 0) & (np.linalg.eigvalsh(M)[..., 0] > 0)
     found = back @ (np.where(smaller[:, None, None], grown, added) * size) @ back
     return np.asarray((found + adjoint(found)) / 2 * outer)
 

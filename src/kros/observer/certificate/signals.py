@@ -1,0 +1,249 @@
+r"""A bound on the error of every unit of a set of signals: the residuals of recorded motion, known by their energies in bands of frequency.
+
+Let ``w_k``, k from -1, be the first error followed by the one-step residual and the noise of a recording, and T_j the frozen response from w to the error of
+state j as the observer runs, delay included. Then (`relift` page)
+
+.. math:: \|e_j\| \le \Big(\sum_b \mathrm{tr}(M_{jb} \Phi_b)\Big)^{1/2} + \kappa_j \Big(\sum_l \frac{1}{s_l^2} \sum_b \mathrm{tr}(M_{lb} \Phi_b)\Big)^{1/2},
+
+``M_b`` above ``T^H T`` throughout band b for the error and for what the slopes and limits act on (`majorants`), and ``kappa_j`` the proven gain from the
+latter, divided by sizes s, to what they can add to state j alone. It holds for every signal with energies of at most ``Phi_b``: for those of a unit
+whatever course they take, for the cover of all units whatever unit they come from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.lti import StateSpace
+from ...data import EpisodeBatch
+from ...uncertainty.coprime.bands import BandEnergies, band_edges, cover
+from ..data import ObserverData
+from .certificate import ReliftCertificate
+from .error import ErrorSystem, error_system
+from .majorants import energy, majorants
+from .report import Course, course
+from .search import quick_gain
+
+Array = npt.NDArray[np.float64]
+_BANDS, _BELOW = 96, 10  # bands, the lowest of which ends at a tenth of an episode's lowest frequency
+_RIDGE = 1e-6
+_SPARE = 1e-6
+_OTHERS = (
+    0.0,
+    1e-3,
+    1.0,
+)  # weights of other states' errors beside the one that counts: with them the Riccati equation is better conditioned
+
+
+@dataclass(frozen=True, eq=False)
+class SignalBound:
+    """Bounds on the errors of one observer as it runs.
+
+    Parameters
+    ----------
+    states : tuple of str
+        The recorded ones.
+    units : tuple of str
+    cover : ndarray, shape (n,)
+        Bound on the RMS error of every state for any signal inside the cover of all units; infinite where there is none.
+    bounds : ndarray, shape (units, n)
+        For any signal with the energies of one unit.
+    errors : ndarray, shape (units, n)
+        RMS errors as they were.
+    movement : ndarray, shape (n,)
+        What slopes and limits may add, within `cover`.
+    sizes : ndarray, shape (n,)
+        Ranges of the states; all of the above are in the states' own units of measure.
+    reason : str
+        Why there is no bound; empty where there is one.
+    outside : tuple of str
+        Units whose recordings leave what is assumed: declared limits, or samples that the observer refuses. Their rows are infinite.
+    """
+
+    states: tuple[str, ...]
+    units: tuple[str, ...]
+    cover: Array
+    bounds: Array
+    errors: Array
+    movement: Array
+    sizes: Array
+    reason: str = ""
+    outside: tuple[str, ...] = ()
+
+    @property
+    def certified(self) -> bool:
+        """Whether every state has a bound for all signals inside the cover."""
+        return bool(np.isfinite(self.cover).all())
+
+    @property
+    def ratios(self) -> Array:
+        """Bounds over errors, shape (units, n)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.where(self.errors > 0, self.bounds / self.errors, np.inf))
+
+    def percent(self) -> dict[str, float | None]:
+        """Return the bound of the cover by state, percent of the range; None where there is none."""
+        values = 100 * self.cover / self.sizes
+        return {name: float(v) if np.isfinite(v) else None for name, v in zip(self.states, values, strict=True)}
+
+    def facts(self, measured: Sequence[int] = ()) -> dict[str, Any]:
+        """Return what goes into the metrics; ratios are those of hidden states (of all where none is), over units that keep what is assumed."""
+        if not self.certified:
+            return {"set_certified": False, "set_reason": self.reason}
+        hidden = [j for j in range(len(self.states)) if j not in measured] or list(range(len(self.states)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios, over = self.ratios[:, hidden], (self.cover / self.errors)[:, hidden]
+        ratios, over = (v[np.isfinite(self.bounds[:, hidden]) & np.isfinite(v)] for v in (ratios, over))
+        facts: dict[str, Any] = {"set_certified": True, "set_bound_percent": self.percent()}
+        least, most = (float(ratios.min()), float(ratios.max())) if ratios.size else (None, None)
+        facts |= {"set_bound_to_error_min": least, "set_bound_to_error_max": most}
+        return facts | {"set_cover_to_error_max": float(over.max()) if over.size else None, "set_outside": list(self.outside)}
+
+    def in_sizes(self, factors: npt.ArrayLike) -> SignalBound:
+        """Return the same for states in other units of measure, by their factors, shape (n,)."""
+        by = np.asarray(factors, dtype=float)
+        return replace(self, **{name: getattr(self, name) * by for name in ("cover", "bounds", "errors", "movement", "sizes")})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for a record; what is infinite is None."""
+        arrays = {name: _finite(getattr(self, name)) for name in ("cover", "bounds", "errors", "movement", "sizes")}
+        return {"states": self.states, "units": self.units, **arrays, "reason": self.reason, "outside": self.outside}
+
+
+def signal_bound(
+    certificate: ReliftCertificate,
+    observer: ObserverData,
+    batch: EpisodeBatch,
+    estimates: Array | None = None,
+    known: dict[bytes, BandEnergies] | None = None,
+) -> SignalBound:
+    """Bound the errors of an observer for signals like those of recorded episodes.
+
+    Parameters
+    ----------
+    certificate : ReliftCertificate
+        Of this observer: its box, parameters and sizes of errors are taken.
+    observer : ObserverData
+    batch : EpisodeBatch
+        Training episodes; noise is what its sensor shows beside the recording, and no sample of it is lost.
+    estimates : ndarray, shape (n_samples, batch, n), optional
+        Of `run_observer` for these measurements; it is run where they are missing.
+    known : dict, optional
+        Energies that were found already, for observers of one model: filled here.
+
+    Returns
+    -------
+    SignalBound
+        Also where there is none: `reason` says why.
+    """
+    seen = course(observer, batch, estimates)
+    n = len(observer.recorded)
+    units = list(dict.fromkeys(batch.units))
+    member = np.array([[unit == name for unit in batch.units] for name in units], dtype=float)
+    member /= member.sum(axis=1, keepdims=True)
+    errors = np.sqrt(member @ seen.mean_square(seen.error[..., :n]))
+    nothing = np.full(n, np.inf)
+    found = SignalBound(
+        observer.recorded, tuple(units), nothing, np.full(errors.shape, np.inf), errors, nothing, certificate.scales.error[:n].copy()
+    )
+    if not certificate.certified:
+        return replace(found, reason="it has no certificate as it runs")
+    signal, system = _signals(certificate, observer, seen)
+    frozen = system.moved()
+    if not frozen.is_stable():
+        return replace(found, reason="its error does not settle where slopes and limits rest")
+    energies = _energies(signal, batch, known).of_units(batch.units)
+    first = energies.cover()
+    plant = StateSpace(
+        frozen.A, frozen.B, np.vstack([system.C[:n], frozen.C]), np.vstack([np.zeros((n, frozen.n_inputs)), frozen.D]), system.dt
+    )
+    rough = majorants(plant, energies.edges, first.energy)
+    # The cover is made once more for the states' errors: a matrix that no unit exceeds, where it matters.
+    size = energy(rough[:n], energies.energy).max(axis=0)
+    matter = np.einsum("p,pbij->bij", 1 / np.maximum(size, np.finfo(float).tiny), rough[:n])
+    matter = matter + _RIDGE * np.einsum("bii->b", matter).real[:, None, None] * np.eye(matter.shape[-1])
+    final = cover(energies.energy, matter)
+    M = majorants(plant, energies.edges, final)
+    linear, own = np.sqrt(energy(M, final)), np.sqrt(energy(M, energies.energy))
+    acted = np.maximum(linear[n:], np.finfo(float).tiny)
+    kappa = mismatch_gains(system, acted, n)
+    with np.errstate(invalid="ignore"):
+        movement = np.where(kappa > 0, kappa * np.sqrt(len(acted)), 0.0)
+        each = own[:, :n] + np.where(kappa > 0, kappa * np.linalg.norm(own[:, n:] / acted, axis=1)[:, None], 0.0)
+    inside = seen.inside(observer)
+    left = tuple(unit for unit, rows in zip(units, member > 0, strict=True) if not inside[rows].all())
+    each[[unit in left for unit in units]] = np.inf
+    reason = "" if np.isfinite(kappa).all() else "what slopes and limits can add has no proven gain"
+    by = found.sizes * (1 + _SPARE)
+    return replace(found, cover=(linear[:n] + movement) * by, bounds=each * by, movement=movement * by, reason=reason, outside=left)
+
+
+def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
+    """Return the proven gains from what the channels act on, divided by sizes, to what they add to every one of n errors; infinite where none is."""
+    if not len(acted):
+        return np.zeros(n)
+    rest = system.mismatch()
+    rest = replace(rest, B=rest.B * acted, D=rest.D * acted)
+    found = np.full(n, np.inf)
+    for j in range(n):
+        for others in _OTHERS:
+            weight = np.full((len(rest.C), 1), others)
+            weight[j] = 1.0
+            found[j] = quick_gain(replace(rest, C=weight * rest.C))
+            if np.isfinite(found[j]):
+                break
+    return found
+
+
+def _signals(certificate: ReliftCertificate, observer: ObserverData, seen: Course) -> tuple[Array, ErrorSystem]:
+    """Return the signals, shape (n_samples, batch, m), each of size one, and the system from them to the errors over their ranges.
+
+    Channels are residuals of recorded states, noise where there is some, and, where the lifting reads earlier values, first errors of their own.
+    """
+    n, q = len(observer.recorded), len(observer.measured)
+    start = seen.first[None, :, :n]
+    later = np.concatenate([seen.omega[..., :n], seen.noise], axis=-1)
+    noisy = bool(seen.noise.any())
+    before = np.concatenate([start, np.zeros((1, start.shape[1], q))], axis=-1)
+    if observer.lifting.history:
+        before = np.concatenate([np.zeros_like(before), start], axis=-1)
+        later = np.concatenate([later, np.zeros((*later.shape[:2], n))], axis=-1)
+    signal = np.concatenate([before, later])
+    size = np.sqrt(np.mean(signal**2, axis=(0, 1)))
+    size[size == 0] = 1.0
+    internal = np.zeros(observer.lifting.n_states - n)
+    scales = replace(certificate.scales, residual=np.concatenate([size[:n], internal]), noise=size[n : n + q])
+    system = error_system(observer, scales, certificate.box, certificate.parameters, clipped=certificate.clipped)
+    nw = observer.lifting.n_states
+    columns = [*range(n), *(range(nw, nw + q) if noisy else ())]
+    B, D = system.B[:, columns], system.D[:, columns]
+    keep = [*range(n), *(range(n, n + q) if noisy else ())]
+    if observer.lifting.history:
+        assert system.start is not None
+        earlier = [observer.lifting.states.index(name) for name, _ in observer.lifting.window.quantities if name in observer.lifting.states]
+        spread = np.eye(nw)[earlier][:, :n]  # the first error and the earlier ones that equal it
+        B = np.hstack([B, system.start @ spread * size[n + q :]])
+        D = np.hstack([D, np.zeros((len(D), n))])
+        keep += range(n + q, 2 * n + q)
+    return (signal / size)[..., keep], replace(system, B=B, D=D)
+
+
+def _energies(signal: Array, batch: EpisodeBatch, known: dict[bytes, BandEnergies] | None) -> BandEnergies:
+    key = signal.tobytes()
+    if known is not None and key in known:
+        return known[key]
+    found = BandEnergies.of(signal, batch.lengths, band_edges(_BELOW * int(batch.lengths.max()), _BANDS))
+    if known is not None:
+        known[key] = found
+    return found
+
+
+def _finite(values: Array) -> Any:
+    plain = values.astype(object)
+    plain[~np.isfinite(values)] = None
+    return plain.tolist()

@@ -1,5 +1,7 @@
 """Parts of worst-case synthesis, one by one: multipliers, bounding spectra and quadrature against what each is by definition."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -121,3 +123,20 @@ def test_rounds_after_the_first_make_the_design_for_the_gain_no_worse():
     assert more.hinf_norm == pytest.approx(hinf_norm(StateSpace(loop.A, loop.B[:, 2:], loop.C, loop.D[:, 2:], DT)))  # of the noise alone
     nothing = robust_gain(case, gain([[0.0]], DT))
     assert more.worst_case_hinf < nothing.value
+
+
+def test_a_gain_between_all_points_that_were_looked_at_raises_the_level(monkeypatch):
+    """One point beside a broad resonance is looked at first: the walk meets the top by itself, and claims hardly more than that is attained."""
+    angle, radius = 1.234, 0.8
+    turn = radius * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    nominal = StateSpace(turn, [[0.5], [0.0]], np.eye(2), np.zeros((2, 1)), DT)
+    case = ObserverProblem(nominal, [[1.0, 0.0]], gain([[0.2]], DT), gain([[1.0]], DT), [1.0], [1.0, 1.0], [0.1])
+    nothing = gain(np.zeros((2, 1)), DT)
+    truth = robust_gain(case, nothing)
+    module = import_module("kros.synthesis.worst_case.robust_gain")
+    monkeypatch.setattr(module, "_first_grid", lambda *_: np.array([0.0, 0.7 * angle / (2 * np.pi), 0.5 / DT]))
+    monkeypatch.setattr(module, "_ROUNDS", 0)
+    found = robust_gain(case, nothing)
+    assert found.attained <= truth.value
+    assert truth.attained <= found.value <= 1.06 * truth.attained
+    assert found.value == pytest.approx(found.attained, rel=0.051)

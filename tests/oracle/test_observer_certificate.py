@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import product
 
 import numpy as np
@@ -17,7 +18,7 @@ from kros.observer import Observer, one_step_residual, run_observer
 from kros.observer.certificate.certificate import ReliftCertificate, relift_certificate
 from kros.observer.certificate.error import ErrorSystem, ReliftScales, error_system
 from kros.observer.certificate.multipliers import best_multipliers
-from kros.observer.certificate.proof import margin, proven
+from kros.observer.certificate.proof import _positive, margin, proven
 from kros.observer.certificate.report import relift_report
 from kros.observer.certificate.sdp import sdp_proposal
 from kros.observer.certificate.search import growing_sequence
@@ -264,6 +265,16 @@ def test_the_proof_is_exact_at_the_edge() -> None:
     assert not proven(np.ones((1, 1, 1)), corner, C, float(np.nextafter(up, 2.0)))  # P = C'C
     assert not proven(np.array([[[up]]]), corner, C, float(up))  # gamma^2 = P
     assert not proven(np.array([[[np.nan]]]), corner, C, 2.0)
+
+
+@pytest.mark.parametrize(("share", "positive"), [(0.95, True), (0.9999, True), (1.0, False), (1.0001, False)])
+def test_definiteness_of_large_integers_is_that_of_their_determinant(share: float, positive: bool) -> None:
+    """Diagonal entries of very different size, and a correlation on either side of one."""
+    sizes = [1 << 400, 1 << 201, 3]
+    off = int(share * (1 << 60)) * math.isqrt(sizes[0] * sizes[1]) >> 60
+    F = np.array([[sizes[0], off, 0], [off, sizes[1], 1], [0, 1, sizes[2]]], dtype=object)
+    assert (sizes[0] * sizes[1] > off**2) == (positive or share == 1)  # the root is rounded down, by less than can be told
+    assert _positive(F) == positive
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -13,7 +13,7 @@ from kros.core.lti import StateSpace, gain
 from kros.evaluate import as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, Runtime, Sensor, relift_certificate, relift_report, run_observer
-from kros.observer.certificate.error import error_system
+from kros.observer.certificate.error import error_system, state_sizes
 from kros.observer.certificate.report import frozen_response
 from kros.synthesis import Injection
 
@@ -91,6 +91,17 @@ def test_limits_that_bind_wholly_or_not_at_all_are_corners(injection: Injection)
     gone = kept.corner(-np.ones(3))[0]  # clipped to the true states: the error of the estimate is gone, the filter's state acts
     np.testing.assert_allclose(gone[:, :3], 0.0, atol=1e-12)
     np.testing.assert_allclose(gone[:, 3:], error_system(free).A[:, 3:], atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_sizes_of_the_error_system_are_those_of_what_its_states_are(delay: int) -> None:
+    late = observer(("b[-2]",), delay=delay)
+    system = error_system(late)
+    window = sum(name in late.lifting.states for name, _ in late.lifting.window.quantities)
+    sizes = state_sizes(late, ReliftScales.ones(late), np.arange(1.0, window + 1))
+    filters, behind = np.ones(2), [*np.tile(np.arange(1.0, window + 1), delay), 1.0, 2.0, 3.0] if delay else []
+    np.testing.assert_array_equal(sizes, [*np.arange(1.0, window + 1), *filters, *behind])
+    assert len(sizes) == len(system.A)
 
 
 def test_a_frozen_response_starts_at_the_first_error() -> None:

@@ -42,8 +42,9 @@ PLACES = (
     "src/kros/evaluate/errors.py",
 )
 TESTS = (
-    "synthesis_worst_case synthesis_forms synthesis_lower_bounds synthesis_shaping synthesis_problem uncertainty_weights uncertainty_cover "
-    "uncertainty_entrywise uncertainty_certificate uncertainty_diagonal uncertainty_fit evaluate_errors evaluate_spectra observer_certificate* "
+    "synthesis_worst_case synthesis_forms synthesis_lower_bounds synthesis_shaping synthesis_parts synthesis_problem synthesis_errors "
+    "uncertainty_weights uncertainty_cover uncertainty_entrywise uncertainty_certificate uncertainty_diagonal uncertainty_fit uncertainty_check "
+    "uncertainty_quantify uncertainty_residuals evaluate_errors evaluate_spectra observer_certificate* "
     "design_certificates"
 )
 Mutant = dict[str, Any]

@@ -71,7 +71,7 @@ def drives(unsteady: str, condition: str) -> Population:
     velocity = (whole.states + whole.inputs).index("target_velocity")
 
     def source(key: EpisodeKey) -> np.ndarray:
-        values = whole.read(keys[key]).copy()
+        values = whole.source(keys[key]).copy()
         if key.unit == unsteady:
             values[:, velocity] += np.random.default_rng(int(key.episode)).normal(size=len(values))
         return values

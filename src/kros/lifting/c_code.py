@@ -55,7 +55,8 @@ def c_code(expression: Any, name: Callable[[str], str], precision: Precision | N
     """
     numbers: list[float] = []
     shape = shape_of(expression, numbers)
-    return _Writer(name, precision or Precision(), iter(numbers)).write(shape)
+    text = _Writer(name, precision or Precision(), iter(numbers)).write(shape)
+    return text[1:-1] if shape[0] in ("add", "multiply") else text
 
 
 @dataclass(frozen=True)
@@ -77,12 +78,13 @@ class _Writer:
         if kind == "power":
             return self._power(rest[0], self.write(rest[1]))
         inner, suffix = self.write(rest[0]), self.precision.suffix
+        inner = inner[1:-1] if rest[0][0] in ("add", "multiply") else inner
         if kind in _DIRECT:
             return f"{kind}{suffix}({inner})"
         if kind == "Abs":
             return f"fabs{suffix}({inner})"
         if kind == "sign":
-            return f"({self.precision.type})(({inner} > 0) - ({inner} < 0))"
+            return f"({self.precision.type})((({inner}) > 0) - (({inner}) < 0))"
         raise ConfigError(f"Formula node {kind!r}: it has no expression in C; write the formula with other functions.")
 
     def _power(self, exponent: float, base: str) -> str:

@@ -31,8 +31,6 @@ def export_fmu(
     fmi: int = 2,
     name: str = "observer",
     precision: str = "double",
-    *,
-    units: Mapping[str, str] | None = None,
 ) -> Path:
     """Write an observer as an FMU for co-simulation.
 

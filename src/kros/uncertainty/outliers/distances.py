@@ -141,7 +141,7 @@ def _median(values: Array, own: npt.NDArray[np.bool_]) -> Array:
 
 
 def _smooth(level: Array, freqs: Array) -> Array:
-    """Moving average over log frequency, to a billionth of a dB: equal units in other places of a batch are rounded differently, and no unit is flagged for that."""
+    """Moving average over log frequency, to a billionth of a dB: equal units are rounded differently in other places of a batch, which flags nobody."""
     x = np.log10(freqs)
     near = (np.abs(x[:, None] - x) <= _SMOOTHING_DECADES / 2).astype(float)
     return np.asarray(np.round(level @ (near / near.sum(axis=0)), 9))

@@ -196,11 +196,12 @@ def limit_of(found: Sequence[FlatTops], ranges: Array) -> _Level | None:
     width = max(f.width for f, _ in at)
     varied = np.all(np.ptp(inputs, axis=0) > _VARIED * ranges)
     often = len(lengths) >= _RUNS and len({(f.unit, f.episode) for f, _ in at}) >= _EPISODES
-    if not (often and varied and sides.mean() >= 0.5 and abs(np.average(bend, weights=lengths)) <= _BENT * width):
+    cut_off = np.average(sides.any(axis=1), weights=lengths) >= 0.5 and abs(np.average(bend, weights=lengths)) <= _BENT * width
+    if not (often and varied and cut_off):
         return None
     values = np.concatenate([f.values[rows] for f, rows in at])
     units = tuple(dict.fromkeys(f.unit for f, _ in at))
-    return _Level(float(np.average(values, weights=lengths)), units, int(lengths.sum()))
+    return _Level(float(np.average(values, weights=lengths * sides.any(axis=1))), units, int(lengths.sum()))
 
 
 def _width(signal: Array) -> float:

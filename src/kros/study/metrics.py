@@ -5,12 +5,15 @@ What was not run is absent, what is unknown is null, nothing is invented.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from ..core.artifacts import load_artifact, plain, read_json
+from ..data.flat_tops import FoundLimit
 from ..evaluate import interval_rows
+from ..observer.limits import Limit, limits_of
 from ..synthesis.result import Synthesis
 from ..uncertainty import Tightness, UncertainModel, VariationAndNoise
 from .config import Stage
@@ -47,6 +50,8 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
     }
     if context.config.sensor:
         study["sensor"] = {name: own.model_dump(exclude_none=True) for name, own in context.config.sensor.items()}
+    if limits := limits_of(context.config.limits, facts.limits, context.population.states):
+        study["limits"] = {name: _limit(own, facts.limits.get(name), name in context.config.limits) for name, own in limits.items()}
     if facts.alerts:
         study["alerts"] = facts.alerts
     if Stage.IDENTIFY in done:
@@ -54,6 +59,12 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
     if Stage.SYNTHESIZE in done:
         study["deployed"] = _observers_record(context)["deployed"]
     return study
+
+
+def _limit(limit: Limit, found: FoundLimit | None, declared: bool) -> dict[str, Any]:
+    """Return a limit that counts, and where recordings were seen at one."""
+    entry: dict[str, Any] = limit.model_dump() | {"declared": declared}
+    return entry if found is None else entry | {"seen": asdict(found)}
 
 
 def _timing(context: Context, done: list[Stage], total_s: float | None) -> dict[str, float]:

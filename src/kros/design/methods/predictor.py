@@ -24,6 +24,7 @@ from .tuned import tuned_where_better
 UNCOVERED = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
 log = logging.getLogger(__name__)
 _SAMPLES, _EPISODES = 6000, 12  # that an observer is conditioned on, at most
+_SHARES = (1.0, 0.5)  # of the gain that is best, until a certificate covers it
 _CLOSE, _SHARE = 0.99, 0.001  # what counts as at a limit, and how much of an episode has to be
 _CIRCLE = {"sin": "cos", "cos": "sin"}
 
@@ -95,9 +96,11 @@ def settled(task: DesignTask, reached: EpisodeBatch | None, data: ValidationSet,
     as_is = driven_coordinates(observer, data.batch, sizes)
     if reached is None:
         return as_is
-    found = driven_coordinates(conditioned(observer, reached, importance_of(task)), data.batch, sizes)
-    if relift_certificate(found, scales=scales_of([found], data, task)[0], mismatch=False).certified:
-        return found
+    best = conditioned(observer, reached, importance_of(task))
+    for share in _SHARES:
+        found = driven_coordinates(replace(observer, A=share * best.A + (1 - share) * observer.A), data.batch, sizes)
+        if relift_certificate(found, scales=scales_of([found], data, task)[0], mismatch=False).certified:
+            return found
     log.info("%s is cut off at its limits and not conditioned: no certificate covers it otherwise.", task.name)
     return as_is
 

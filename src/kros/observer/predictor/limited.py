@@ -35,7 +35,7 @@ Array = npt.NDArray[np.float64]
 _DAMPING = Damping(1e-7, 1e-2, 1e6, 6.0)
 _THIN = 4
 _FREQUENCIES = 400
-_MARGIN, _SHORT = 0.25, 0.9  # of the circle criterion, and of the way to it
+_MARGIN, _SHORT, _BARRIER = 0.25, 0.9, 1e-3  # of the circle criterion, of the way to it, and weight of its logarithm
 
 
 def with_limits(observer: Observer, lower: npt.ArrayLike, upper: npt.ArrayLike) -> Observer:
@@ -63,7 +63,7 @@ def limited_states(observer: Observer) -> list[int]:
     return at if len(at) <= observer.internal and np.array_equal(observer.A[at], observer.A[n - len(at) : n]) else []
 
 
-def conditioned(observer: Observer, batch: EpisodeBatch, importance: npt.ArrayLike = 1.0, iterations: int = 6) -> Observer:
+def conditioned(observer: Observer, batch: EpisodeBatch, importance: npt.ArrayLike = 1.0, iterations: int = 8) -> Observer:
     """Return a predictor of `with_limits` with the gain that is best on recordings that meet the limits.
 
     Parameters
@@ -143,27 +143,40 @@ class _Conditioning:
         with np.errstate(over="ignore", invalid="ignore"):
             estimates, slopes = self._run(gain)
             missed = self.truth - estimates
-            return _Point(gain, missed, slopes, mean_log(self.share.ravel(), np.mean(missed**2, axis=0).ravel()))
+            criterion = mean_log(self.share.ravel(), np.mean(missed**2, axis=0).ravel())
+        root = np.linalg.cholesky(self._distance(gain))
+        barrier = -2 * np.mean(np.sum(np.log(np.diagonal(root, axis1=1, axis2=2).real), axis=1))
+        return _Point(gain, missed, slopes, criterion + _BARRIER * float(barrier))
 
     def steps(self, point: _Point) -> Callable[[float], _Point]:
-        """Gauss-Newton steps."""
+        """Gauss-Newton steps, those of the barrier included."""
+        size = point.gain.size
         root = np.sqrt(self.share / np.mean(point.missed**2, axis=0))
-        X = (point.slopes * root[:, None]).transpose(2, 0, 1, 3).reshape(point.gain.size, -1)
-        H, g, size = scaled(X @ X.T, X @ (point.missed[::_THIN] * root).ravel())
+        X = (point.slopes * root[:, None]).transpose(2, 0, 1, 3).reshape(size, -1)
+        missed = (point.missed[::_THIN] * root).ravel()
+        white = np.linalg.inv(np.linalg.cholesky(self._distance(point.gain)))
+        moved = self._moved(np.eye(size).reshape(size, *point.gain.shape))
+        moved = (white @ moved @ white.conj().swapaxes(-1, -2)).reshape(size, -1)
+        traces = np.trace(moved.reshape(size, -1, *white.shape[1:]), axis1=2, axis2=3).real.mean(axis=1)
+        rows, frequencies = len(point.missed[::_THIN]), len(white)
+        H, g, sizes = scaled(X @ X.T / rows + _BARRIER * (moved @ moved.conj().T).real / frequencies, X @ missed / rows + _BARRIER * traces)
 
         def trial(damping: float) -> _Point:
-            step = (np.linalg.solve(H + damping * np.eye(len(g)), g) / size).reshape(point.gain.shape)
-            return self.at(point.gain + min(1.0, _SHORT * self._room(point.gain, step)) * step)
+            step = (np.linalg.solve(H + damping * np.eye(size), g) / sizes).reshape(point.gain.shape)
+            towards = white @ self._moved(step[None])[0] @ white.conj().swapaxes(-1, -2)
+            least = float(np.linalg.eigvalsh(towards).min())
+            return self.at(point.gain + (1.0 if least >= 0 else min(1.0, -_SHORT / least)) * step)
 
         return trial
 
-    def _room(self, gain: Array, step: Array) -> float:
-        """By which multiple of a step the gain stays where limits that come and go at will leave the errors stable (circle criterion)."""
-        now, change = (self.responses @ part for part in (gain, step))
-        now, change = ((part + part.conj().swapaxes(-1, -2)) / 2 for part in (now, change))
-        inside = np.linalg.inv(np.linalg.cholesky(now + (1 - _MARGIN) * np.eye(gain.shape[1])))
-        towards = float(np.linalg.eigvalsh(inside @ change @ inside.conj().swapaxes(-1, -2)).min())
-        return np.inf if towards >= 0 else -1 / towards
+    def _distance(self, gain: Array) -> Array:
+        """How far a gain is from where limits that come and go at will might let errors grow (circle criterion); positive, (frequency, l, l)."""
+        return np.asarray((1 - _MARGIN) * np.eye(gain.shape[1]) + self._moved(gain[None])[0])
+
+    def _moved(self, gains: Array) -> Array:
+        """The real part, in the sense of forms, of the responses from what limits cut off to what they cut it off from; (gain, frequency, l, l)."""
+        responses = self.responses @ gains[:, None]
+        return (responses + responses.conj().swapaxes(-1, -2)) / 2
 
     def _run(self, gain: Array) -> tuple[Array, Array]:
         """Return estimates of the hidden states, shape (n_samples, batch, h), and their slopes by the gain, (n_samples / thin, batch, gain.size, h)."""

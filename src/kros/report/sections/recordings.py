@@ -23,6 +23,8 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section:
         text += f"Models, uncertainty and observers come from “{condition_label(study['identify_on'])}” alone; the rest only tests them. "
     if filed:
         text += f"In the group of outliers, and kept out of everything pooled: {', '.join(filed)}. "
+    for name, own in study.get("limits", {}).items():
+        text += f"{_limited(name, own)} "
     if facts.get("dropped"):
         text += f"Left out for bad samples: {', '.join(facts['dropped'])}. "
     told = [f"{c.replace('_', ' ')}: {', '.join(f'{k} {v:g}' for k, v in own.items() if v)}" for c, own in study.get("sensor", {}).items()]
@@ -30,6 +32,14 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section:
         text += f"Declared of the sensor beyond the recordings, and told to all: {'; '.join(told)}. "
     alerts = [f"Look at this first: {alert}" for alert in facts.get("alerts", ())]
     return Section("recordings", "Recordings", [*alerts, text], _channels(run), ["signals", "tracking_spectrum"])
+
+
+def _limited(name: str, own: Mapping[str, Any]) -> str:
+    """Say what limits a state."""
+    ends = " and ".join(number(own[side]) for side in ("lower", "upper") if own[side] is not None)
+    text = f"{name.replace('_', ' ').capitalize()} is limited at {ends}, {'as declared' if own['declared'] else 'found in the recordings'}"
+    seen = own.get("seen")
+    return f"{text}; seen at a limit: {', '.join(seen['units'])}." if seen else f"{text}; no unit was seen there for certain."
 
 
 def _channels(run: RunFolder) -> list[Table]:

@@ -192,7 +192,9 @@ class Fold:
         methods = tuple(m for m in SynthesisSettings().methods if m != "mixed")
         baselines = ObserverSettings(baselines=("open_loop", "kalman_tuned"))
         limits = {"current": Limit.of((-LIMIT, LIMIT), "Judge")} if self.task.variant == "declared" else {}
-        found = synthesize_all(self.uncertain, SynthesisSettings(methods=methods), baselines, PredictorSettings(), sensor, limits)
+        found = synthesize_all(
+            self.uncertain, SynthesisSettings(methods=methods), baselines, PredictorSettings(), sensor=sensor, limits=limits
+        )
         self.seconds["synthesize"] = time.process_time() - began
         return found
 

@@ -14,12 +14,15 @@ import numpy.typing as npt
 from ..core.artifacts import save_artifact
 from ..lifting import Lifting
 from ..observer import (
+    DropoutBound,
     Observer,
     ReliftCertificate,
     ReliftRow,
     ReliftScales,
     ReliftStatus,
+    Sensor,
     SignalBound,
+    dropout_bound,
     one_step_residual,
     relift_certificate,
     relift_report,
@@ -45,7 +48,8 @@ class Running:
     """What is known about one observer as it runs: its certificate, a row for every unit, bounds for recorded signals, and the size of its errors.
 
     `hidden_percent` is the geometric mean over the states that are not measured of the mean error on training episodes, percent of the largest value;
-    `dropout_percent` the largest error of a state in a short run in which measurements stop arriving.
+    `dropout_percent` the largest error of a state in a short run in which measurements stop arriving, `dropout` what is proven of losses at the rate that is
+    declared of the sensor.
     """
 
     name: str
@@ -55,11 +59,13 @@ class Running:
     dropout_percent: float
     signals: SignalBound | None = None
     measured: tuple[int, ...] = ()
+    dropout: DropoutBound | None = None
 
     @property
     def certified(self) -> bool:
-        """Whether it is certified both as it runs, for any machine, and for the recorded signals of all units."""
-        return self.certificate.certified and (self.signals is None or self.signals.certified)
+        """Whether it is certified as it runs, for any machine, for the recorded signals of all units, and in mean square for losses that are declared."""
+        proven = self.dropout is None or self.dropout.gain is not None
+        return self.certificate.certified and proven and (self.signals is None or self.signals.certified)
 
     def facts(self) -> dict[str, Any]:
         """Return what goes into the metrics."""
@@ -72,6 +78,10 @@ class Running:
         }
         if self.signals is not None:
             facts |= self.signals.facts(self.measured)
+        if self.dropout is not None:
+            lost = self.dropout
+            facts |= {"dropout_rate": lost.rate, "dropout_certified": lost.gain is not None, "dropout_mean_square_gain": lost.gain}
+            facts |= {"dropout_reason": lost.reason} if lost.reason else {}
         if not found.certified:
             return facts | {"relift_reason": found.reason}
         return facts | {"relift_mismatch_gain": found.mismatch_gain, "relift_bound_worst": max((r.bound for r in self.rows), default=None)}
@@ -106,12 +116,14 @@ def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignT
     rows = [relift_report(c, o, batch, x) if c.certified else [] for o, c, x in zip(observers, certificates, arrived, strict=True)]
     hidden = hidden_mean(data.compare(estimates), first.measured)
     dropout = dropout_error_percent(observers, data, task.models.sample_period_s)
+    rates = [task.sensor.get(first.lifting.states[i], Sensor()).dropout for i in first.measured]
+    lost = [dropout_bound(c, o, rates) if any(rates) else None for o, c in zip(observers, certificates, strict=True)]
     known: dict[bytes, BandEnergies] = {}
     bounds = [signal_bound(c, o, batch, x, known) for o, c, x in zip(observers, certificates, arrived, strict=True)]
     bounds = [b.in_sizes(factors(o, {})[0][: len(b.states)]) for o, b in zip(observers, bounds, strict=True)]
     certificates = [c.in_sizes(o, {}) for o, c in zip(observers, certificates, strict=True)]
-    found = zip(observers, certificates, rows, hidden, dropout, bounds, strict=True)
-    return [Running(o.name, c, r, float(h), float(d), b, o.measured) for o, c, r, h, d, b in found]
+    found = zip(observers, certificates, rows, hidden, dropout, bounds, lost, strict=True)
+    return [Running(o.name, c, r, float(h), float(d), b, o.measured, p) for o, c, r, h, d, b, p in found]
 
 
 def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[ReliftScales]:

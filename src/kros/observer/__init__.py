@@ -7,6 +7,7 @@ from .baselines.learned import Features, Learned
 from .baselines.learned_moments import Choice, Moments
 from .certificate.certificate import ReliftCertificate, relift_certificate
 from .certificate.error import ReliftScales
+from .certificate.mean_square import DropoutBound, dropout_bound
 from .certificate.report import ReliftRow, relift_report
 from .certificate.signals import SignalBound, signal_bound
 from .certificate.status import Dropped, ReliftStatus
@@ -27,6 +28,7 @@ from .units import in_sizes
 
 __all__ = [
     "Choice",
+    "DropoutBound",
     "Dropped",
     "Estimate",
     "EstimateKind",
@@ -55,6 +57,7 @@ __all__ = [
     "conditioned",
     "cutoffs_hz",
     "driven_coordinates",
+    "dropout_bound",
     "followed",
     "identify_predictor",
     "in_sizes",

@@ -59,7 +59,10 @@ def margin(roots: Array, corners: Corners, C: Array, gain: float, D: Array | Non
 
 
 def proven(roots: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> bool:
-    """Tell whether the inequalities hold, in exact arithmetic on the numbers as they are stored."""
+    """Tell whether the inequalities hold, in exact arithmetic on the numbers as they are stored.
+
+    A and B may have several steps below one another, shape (k n, n): the squares of what they lead to add up.
+    """
     numbers = [roots, C, np.array(gain), *(matrix for corner in corners for matrix in corner)]
     if not all(np.isfinite(part).all() for part in numbers):
         return False
@@ -68,10 +71,10 @@ def proven(roots: Array, corners: Corners, C: Array, gain: float, D: Array | Non
     held = [_gram(_Exact.of(R)) for R in roots]
     for c, word, following in steps(len(corners), len(roots)):
         A, B = corners[c]
-        n, width = A.shape[0], B.shape[1]
-        moved = _gram(_Exact.of(roots[following]) @ _Exact.of(np.hstack([A, B])))
-        shift = max(part.shift for part in (moved, held[word], out, level))
-        F = -moved.at(shift) - out.at(shift)
+        n, width = A.shape[1], B.shape[1]
+        moved = [_gram(_Exact.of(roots[following]) @ _Exact.of(step)) for step in np.split(np.hstack([A, B]), len(A) // n)]
+        shift = max(part.shift for part in (*moved, held[word], out, level))
+        F = -sum(part.at(shift) for part in moved) - out.at(shift)
         F[:n, :n] += held[word].at(shift)
         F[range(n, n + width), range(n, n + width)] += level.at(shift)[0, 0]
         if not _positive(F):

@@ -88,7 +88,7 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
     outputs = np.vstack([root[:, None] * system.M, system.C])
     feed = np.zeros((len(outputs), inputs.shape[1]))
     feed[:width, :width], feed[:width, width:] = root[:, None] * system.nested / root, root[:, None] * system.D / gain
-    T, back = _reachable_coordinates(system.A, inputs, system.dt)
+    T, back = reachable_coordinates(system.A, inputs, system.dt)
     n = len(T)
     A, inputs, outputs = np.eye(n) + back @ (system.A - np.eye(n)) @ T, back @ inputs, outputs @ T
     room = 1 - (hinf_norm(StateSpace(A, inputs, outputs, feed, system.dt), _TOLERANCE) * (1 + _TOLERANCE)) ** 2
@@ -108,7 +108,7 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
     return np.asarray(np.linalg.qr(R @ back, mode="r"))
 
 
-def _reachable_coordinates(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
+def reachable_coordinates(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
     """Return T and its inverse, for coordinates in which a reachability Gramian is the identity.
 
     A Lyapunov matrix is then at most gamma^2 there, however poorly some states are reached.

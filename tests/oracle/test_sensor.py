@@ -11,7 +11,7 @@ from kros.core.errors import ConfigError
 from kros.core.lti import gain
 from kros.design.synthesize import measurement_noise
 from kros.design.validation import ValidationSet
-from kros.evaluate import as_shown
+from kros.evaluate import as_arriving, as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, Sensor, in_sizes, run_observers
 from kros.observer.sensor import require_measured
@@ -100,6 +100,13 @@ def test_what_syntheses_assume_is_the_declared_noise_and_the_coarser_resolution(
     told = {"position": Sensor(noise=1e-3, resolution=1e-2, delay_samples=1), "force": Sensor(resolution=1e-3, bias=9.0)}
     np.testing.assert_allclose(measurement_noise(identified, models, told), [np.sqrt(1e-6 + 1e-4 / 12), 2e-3 / np.sqrt(12)], rtol=1e-12)
     np.testing.assert_allclose(measurement_noise(identified, models, {}), np.array([1e-3, 2e-3]) / np.sqrt(12), rtol=1e-12)
+
+
+def test_recordings_arrive_late_at_an_observer_that_was_told_so_and_nothing_is_added():
+    batch = recorded(50)
+    y = as_arriving(batch, {"position": Sensor(noise=1.0, bias=3.0, delay_samples=2, dropout=0.5)}, STATES).measurements((0,))
+    np.testing.assert_array_equal(y[2:], batch.measurements((0,))[:-2])
+    assert as_arriving(batch, {"position": Sensor(noise=1.0)}, STATES) is batch
 
 
 @pytest.mark.parametrize(

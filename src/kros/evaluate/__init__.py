@@ -7,7 +7,7 @@ from .intervals import draw_interval, interval_rows, mean_intervals, unit_interv
 from .monte_carlo import MonteCarlo, sample_errors
 from .next_unit import draw_reserve, fewest_units, next_unit_bound
 from .robustness import DisturbedEpisodes, robustness_rows, severity_of_growth
-from .sensor import as_shown
+from .sensor import as_arriving, as_shown
 from .truth import TrueErrors, delay_samples, true_errors
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "Measured",
     "MonteCarlo",
     "TrueErrors",
+    "as_arriving",
     "as_shown",
     "delay_samples",
     "draw_interval",

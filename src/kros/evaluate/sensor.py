@@ -41,6 +41,11 @@ def as_shown(batch: EpisodeBatch, sensor: Sensors, states: Sequence[str], seed: 
     return replace(batch, shown=shown, lost=lost if lost.any() else None)
 
 
+def as_arriving(batch: EpisodeBatch, sensor: Sensors, states: Sequence[str]) -> EpisodeBatch:
+    """Return recordings as they arrive at an observer that was told of a sensor: as late as declared, nothing else added; arguments as in `as_shown`."""
+    return as_shown(batch, {name: Sensor(delay_samples=own.delay_samples) for name, own in sensor.items()}, states)
+
+
 def _draws(keys: Sequence[EpisodeKey], n_samples: int, seed: Sequence[int]) -> tuple[Array, Array, Array]:
     """Draw moments of measurement and noise, both Gaussian, and chances of arrival, shape (n_samples, batch) each: streams that a longer episode goes on."""
     found = np.empty((3, n_samples, len(keys)))

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from ...core.errors import ConfigError, IdentificationError
 from ...data import EpisodeBatch, Population
 from ...data.population import EpisodeKey
+from ...evaluate import as_arriving
 from ...observer import Observer, run_observer, track_parameter
 from ..config import Stage
 from ..engine.run_folder import open_finished
@@ -103,7 +104,8 @@ def settled(units: UnitValues, observer: Observer, track: str | None) -> dict[st
 
 def estimates(observer: Observer, population: Population, batch: EpisodeBatch, track: str | None) -> Array:
     """Return estimates of the recorded states, shape (n_samples, batch, n_recorded), and the parameter that is followed behind them."""
-    y = batch.states[..., [population.states.index(observer.lifting.states[i]) for i in observer.measured]]
+    measured = [population.states.index(observer.lifting.states[i]) for i in observer.measured]
+    y = as_arriving(batch, observer.sensor, population.states).measurements(measured)
     u = batch.inputs[..., [population.inputs.index(name) for name in observer.inputs]]
     values, n = observer.own(batch.parameters) if observer.lifting.parameters else None, len(observer.recorded)
     if track is None:

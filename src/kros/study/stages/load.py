@@ -20,6 +20,7 @@ from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey
 from ...design.validation import seen_by
+from ...evaluate import as_arriving
 from ...lifting import Lifting
 from ...motor_drive import (
     AngleLoad,
@@ -193,7 +194,8 @@ class LoadStudy:
         """The paper's estimate."""
         current, errors = self.places[1], []
         for batch in (self.train, self.test):
-            estimate = run_observer(observer, self.measured(batch), batch.inputs, self.parameters(observer, batch))
+            y = as_arriving(batch, observer.sensor, self.context.population.states).measurements(observer.measured)
+            estimate = run_observer(observer, y, batch.inputs, self.parameters(observer, batch))
             errors.append(batch.states[..., current] - estimate[..., current])
         loaded = [i for i, k in enumerate(self.train.keys) if k.condition == self.config.condition]
         scale = calibrate_torque(errors[0][:, loaded], self.truth[0][:, loaded], self.dt)

@@ -6,6 +6,7 @@ import numpy as np
 
 from ....data import EpisodeBatch
 from ....design import Design
+from ....evaluate import as_shown
 from ....identify.identified import IdentifiedModels
 from ....observer import Observer, run_observer
 from ...canvas import Figure, grid, label_below, legend, note
@@ -31,7 +32,7 @@ def estimate_figure(observer: Observer, models: IdentifiedModels) -> Figure:
     facts = models.facts
     key = next(k for k in facts.keys("test", condition=facts.identify_on) if k.unit in facts.pooled)
     batch = EpisodeBatch.read(models.population, [key], parameters=models.parameters)
-    y = np.ascontiguousarray(batch.states[..., list(observer.measured)])
+    y = as_shown(batch, observer.sensor, models.population.states).measurements(observer.measured)
     estimate = run_observer(observer, y, batch.inputs, batch.parameters or None)[:, 0]
     channels = models.population.channels[: batch.states.shape[-1]]
     figure, axes = grid(len(channels), 1, 1.3, sharex=True)

@@ -62,11 +62,6 @@ def delay_of(sensor: Sensors) -> int:
     return max((own.delay_samples for own in sensor.values()), default=0)
 
 
-def dropout_of(sensor: Sensors) -> float:
-    """Return the largest probability with which a sample is lost."""
-    return max((own.dropout for own in sensor.values()), default=0.0)
-
-
 def in_units(sensor: Sensors, sizes: Mapping[str, float]) -> dict[str, Sensor]:
     """Return sensors of channels that are divided by sizes, by name; one that is not named stays as it is."""
     return {name: own.in_unit(sizes.get(name, 1.0)) for name, own in sensor.items()}

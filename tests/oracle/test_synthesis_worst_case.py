@@ -93,6 +93,22 @@ def contraction(x, m):
     return U @ Vh
 
 
+@pytest.mark.parametrize("shape", [(1, 2), (2, 1), (3, 2), (3, 1)])
+def test_the_set_is_a_matrix_ball_of_any_shape(shape):
+    """Loops with more or fewer rows than columns: members are inside, and what is inside are members."""
+    rng, (a, b) = np.random.default_rng(1), shape
+    for _ in range(10):
+        N = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+        N *= rng.uniform(0.3, 0.9) / np.linalg.norm(N, 2)
+        ball = Ball.of(N[None], np.eye(a)[None])
+        free = rng.standard_normal((b, a)) + 1j * rng.standard_normal((b, a))
+        delta = free / np.linalg.norm(free, 2)
+        X = delta @ np.linalg.inv(np.eye(a) - N @ delta)
+        assert np.linalg.norm(np.linalg.solve(ball.left[0], X - ball.center[0]) @ np.linalg.inv(ball.right[0]), 2) <= 1 + 1e-9
+        X = ball.center[0] + ball.left[0] @ delta @ ball.right[0]
+        assert np.linalg.norm(X @ np.linalg.inv(np.eye(a) + N @ X), 2) <= 1 + 1e-9
+
+
 def test_the_set_is_a_matrix_ball():
     rng = np.random.default_rng(0)
     for _ in range(20):

@@ -11,7 +11,7 @@ from kros.uncertainty import cover_ratio, fit_magnitude, residual
 from kros.uncertainty.fits.magnitude import alternation_db
 from kros.uncertainty.weights.certificate import Method, certify
 from kros.uncertainty.weights.fit import fit_weight
-from kros.uncertainty.weights.pencils import ResidualSystems, ratio_systems
+from kros.uncertainty.weights.pencils import Part, ResidualSystems, ratio_systems
 
 DT = 1e-3
 GRID = np.geomspace(0.1, 500.0, 60)
@@ -44,6 +44,29 @@ def test_realisations_have_the_responses_of_the_residuals(form: str, shape: tupl
         s = 1j * np.tan(np.pi * GRID[:-1] * DT)
         found = [np.linalg.norm(pencil.C @ np.linalg.solve(x * pencil.F - pencil.A, pencil.B) + pencil.D, 2) for x in s]
         np.testing.assert_allclose(found, expected[unit, :-1], rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "form", ["input_multiplicative", "inverse_input_multiplicative", "output_multiplicative", "inverse_output_multiplicative"]
+)
+@pytest.mark.parametrize("states", [1, 2, 3])
+def test_realisations_of_remainders_are_what_the_form_leaves(form: str, states: int) -> None:
+    """By pseudo-inverses at every frequency; an output form is the input form of the transposed systems."""
+    outside = "output" in form
+    nominal, units = population(4, 2, *((2, 3) if outside else (3, 2)), states)
+    G, every = nominal.frequency_response(GRID), units.frequency_response(GRID)
+    if outside:
+        G, every = np.swapaxes(G, -1, -2), np.swapaxes(every, -1, -2)
+    factor = np.linalg.inv(np.linalg.pinv(every) @ G) if form.startswith("inverse") else np.linalg.pinv(G) @ every
+    left_over = every - G @ factor
+    pencils = ratio_systems(
+        ResidualSystems(form, nominal, units, part=Part.REMAINDER), gain(np.eye(nominal.n_outputs), DT), gain(np.eye(nominal.n_inputs), DT)
+    )
+    assert len(pencils) == 2
+    for pencil, expected in zip(pencils, left_over, strict=True):
+        s = 1j * np.tan(np.pi * GRID[:-1] * DT)
+        found = [np.linalg.norm(pencil.C @ np.linalg.solve(x * pencil.F - pencil.A, pencil.B) + pencil.D, 2) for x in s]
+        np.testing.assert_allclose(found, np.linalg.norm(expected[:-1], 2, axis=(-2, -1)), rtol=1e-6, atol=1e-9)
 
 
 def test_a_peak_between_grid_points_is_found_and_is_the_norm() -> None:

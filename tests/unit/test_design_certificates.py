@@ -17,8 +17,9 @@ from kros.design.certificates import Running, certify, save_running
 from kros.design.synthesize import choose_deployed, robust_of
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
-from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certificate, relift_report
+from kros.observer import Observer, ReliftScales, ReliftStatus, dropout_bound, relift_certificate, relift_report, signal_bound
 from kros.observer.certificate.report import ReliftRow
+from kros.report.names import number
 from kros.report.run_folder import RunFolder
 from kros.report.sections.relift import section
 from kros.synthesis import Injection
@@ -110,7 +111,13 @@ def test_the_report_tells_gains_bounds_and_failures(tmp_path: Path) -> None:
     states = np.cumsum(np.random.default_rng(0).standard_normal((50, 2, 1)), axis=0)
     certificate = relift_certificate(good)
     rows = relift_report(certificate, good, batch_of(states, np.zeros((50, 2, 1)), 1.0, units=["a", "b"]))
-    running = [Running(good.name, certificate, rows, 1.0, 5.0), Running(bad.name, relift_certificate(bad), [], 2.0, 5.0)]
+    batch = batch_of(states, np.zeros((50, 2, 1)), 1.0, units=["a", "b"])
+    refused, lost = relift_certificate(bad), dropout_bound(certificate, good, 0.1)
+    running = [
+        Running(good.name, certificate, rows, 1.0, 5.0, signal_bound(certificate, good, batch), (0,), lost),
+        Running(bad.name, refused, [], 2.0, 5.0, signal_bound(refused, bad, batch), (0,)),
+    ]
+    assert [r.certified for r in running] == [True, False]
     assert [r.facts()["relift_certified"] for r in running] == [True, False]
     assert running[0].facts()["relift_bound_worst"] == max(r.bound for r in rows)
     save_running(tmp_path / "observers", running)
@@ -119,7 +126,10 @@ def test_the_report_tells_gains_bounds_and_failures(tmp_path: Path) -> None:
     assert found is not None
     assert any("No certificate was found for" in text and "grows" in text for text in found.paragraphs)
     assert [row[1].text for row in found.tables[0].cells] == ["10.0", "none"]
-    assert [row[0].text for row in found.tables[1].cells] == ["a", "b"]
+    assert [row[0].text for row in found.tables[2].cells] == ["a", "b"]
+    assert [row[1].text for row in found.tables[3].cells] == [number(100 * v) for v in running[0].signals.bounds[:, 0]]  # type: ignore[union-attr]
+    assert [row[-1].text for row in found.tables[1].cells] == [number(lost.gain), "none"]
+    assert metrics["observers"][bad.name]["set_reason"]
     assert section(RunFolder(tmp_path), {"study": {}, "observers": {}}) is None
 
 

@@ -23,6 +23,11 @@ _BOUND = (
     "functions' slopes in the middle of their interval, and, times the mismatch gain, what their movement can add. The bounds below take the smaller of both, "
     "on the first five seconds of a training episode of every unit."
 )
+_SIGNALS = (
+    "Of the recorded signals more is known than their size: how much power they have in every band of frequency. Whatever course signals of these powers take, "
+    "the error of a state stays below the bound of the second table, start included. The first columns are for all signals inside a cover of all units; the "
+    "last two are the bounds for single units, from their own powers, over the errors of the states that are not measured."
+)
 
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
@@ -44,8 +49,9 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     table = Table(head, rows, caption, groups, emphasised=where(observers, deployed))
     assumptions = record["certificates"].get(deployed, {}).get("assumptions", [])
     conditions = [f"Assumed for “{observer_label(deployed)}”: {'; '.join(assumptions)}."] if deployed and assumptions else []
-    tables = [table, *_units(deployed, record["rows"].get(deployed, []))]
-    return Section("relift", "Certified as it runs", [_TEXT, _BOUND, *conditions, *failed], tables)
+    signals = _signals(observers, deployed)
+    tables = [table, *signals, *_units(deployed, record["rows"].get(deployed, []), record.get("signals", {}).get(deployed, {}))]
+    return Section("relift", "Certified as it runs", [_TEXT, _BOUND, *([_SIGNALS] if signals else []), *conditions, *failed], tables)
 
 
 def _row(name: str, entry: Mapping[str, Any], rows: Rows) -> list[Cell | str]:
@@ -57,10 +63,41 @@ def _row(name: str, entry: Mapping[str, Any], rows: Rows) -> list[Cell | str]:
     return [observer_label(name), *gains, *(number(100 * v) for v in values)]
 
 
-def _units(deployed: str | None, rows: Rows) -> list[Table]:
+def _signals(observers: Mapping[str, Mapping[str, Any]], deployed: str | None) -> list[Table]:
+    """Return bounds for recorded signals, and gains with losses where a rate is declared."""
+    states = next((list(e["set_bound_percent"]) for e in observers.values() if "set_bound_percent" in e), None)
+    if states is None:
+        return []
+    lossy = any("dropout_rate" in entry for entry in observers.values())
+    head, rows = ["observer", *states, "least", "most", *(["gain, losses at random"] if lossy else [])], []
+    for name, entry in observers.items():
+        bounds = entry.get("set_bound_percent", {})
+        over = [number(entry.get(f"set_bound_to_error_{which}")) for which in ("min", "max")]
+        lost = number(entry.get("dropout_mean_square_gain")) if entry.get("dropout_certified") else "none"
+        rows.append([observer_label(name), *(number(bounds.get(state)) for state in states), *over, *([lost] if lossy else [])])
+    groups = [
+        ("", 1),
+        ("bound for any unit, % of the largest value", len(states)),
+        ("bound over error, units", 2),
+        *([("", 1)] if lossy else []),
+    ]
+    return [Table(head, rows, "Bounds on RMS errors for signals like those recorded", groups, emphasised=where(observers, deployed))]
+
+
+def _units(deployed: str | None, rows: Rows, signals: Mapping[str, Any]) -> list[Table]:
     if deployed is None or not rows:
         return []
     keys = ("gain_bound", "bound", "error")
     cells = [[row["unit"], number(row["residual"]), *(number(100 * row[key]) for key in keys)] for row in rows]
     head = ["unit", "residual", "bound by the gain (%)", "bound (%)", "error (%)"]
-    return [Table(head, cells, f"Every unit, “{observer_label(deployed)}”; residual relative to the population's.", folded=True)]
+    found = [Table(head, cells, f"Every unit, “{observer_label(deployed)}”; residual relative to the population's.", folded=True)]
+    if signals:
+        sizes, by_unit = signals["sizes"], zip(signals["units"], signals["bounds"], signals["errors"], strict=True)
+        cells = [
+            [unit, *(number(v and 100 * v / size) for j, size in enumerate(sizes) for v in (bounds[j], errors[j]))]
+            for unit, bounds, errors in by_unit
+        ]
+        groups = [("", 1), *((state, 2) for state in signals["states"])]
+        caption = f"Every unit, “{observer_label(deployed)}”: bound for signals of its powers, and error, % of the largest value"
+        found.append(Table(["unit", *["bound", "error"] * len(sizes)], cells, caption, groups, folded=True))
+    return found

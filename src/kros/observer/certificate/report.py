@@ -137,14 +137,24 @@ class Course:
         inside = (np.arange(len(signal))[:, None] < self.lengths)[..., None]
         return np.asarray(np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None])
 
+    def beyond(self, observer: ObserverData) -> Array:
+        """Return the mean square by which recorded states are beyond limits that only cut off what the observer gives out, shape (batch, n).
+
+        Cut off at a limit, an estimate is no further from a state within it than before, and from one beyond it at most as far as that is beyond.
+        """
+        return self.mean_square(np.zeros_like(self.states) if observer.runtime.relift else self._excess(observer))
+
+    def _excess(self, observer: ObserverData) -> Array:
+        own, limits = self.states.shape[-1], observer.runtime
+        low, high = (np.full(own, s) if side is None else side[:own] for s, side in ((-np.inf, limits.lower), (np.inf, limits.upper)))
+        return np.asarray(self.states - np.clip(self.states, low, high))
+
     def inside(self, observer: ObserverData) -> npt.NDArray[np.bool_]:
         """Whether the true state keeps declared limits and no sample is refused, shape (batch,)."""
-        taken, limits, n = screened(observer, self.y, self.inputs), observer.runtime, observer.lifting.n_states
-        wide = np.zeros((*self.states.shape[:2], n))
-        wide[..., : self.states.shape[-1]] = self.states
-        low, high = (np.full(n, s) if side is None else side for s, side in ((-np.inf, limits.lower), (np.inf, limits.upper)))
-        own = self.states.shape[-1]
-        good = ((wide >= low) & (wide <= high))[..., :own].all(axis=-1)
+        taken, limits = screened(observer, self.y, self.inputs), observer.runtime
+        good = np.ones(self.states.shape[:2], dtype=bool)
+        if limits.relift:
+            good = (self._excess(observer) == 0).all(axis=-1)
         good &= np.isfinite(taken.y).all(axis=-1) & (taken.u == limits.clip_inputs(self.inputs)).all(axis=-1)
         return np.asarray((good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0))
 

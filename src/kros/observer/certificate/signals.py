@@ -175,6 +175,7 @@ def signal_bound(
     with np.errstate(invalid="ignore"):
         movement = np.where(kappa > 0, kappa * np.sqrt(len(acted)), 0.0)
         each = own[:, :n] + np.where(kappa > 0, kappa * np.linalg.norm(own[:, n:] / acted, axis=1)[:, None], 0.0)
+    each = np.sqrt(each**2 + member @ seen.beyond(observer) / found.sizes**2)
     inside = seen.inside(observer)
     left = tuple(unit for unit, rows in zip(units, member > 0, strict=True) if not inside[rows].all())
     each[[unit in left for unit in units]] = np.inf

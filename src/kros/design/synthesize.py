@@ -316,16 +316,18 @@ def certified_problem(task: DesignTask, pairs: Sequence[tuple[DesignTask, Design
 
 
 def choose_deployed(wanted: str | None, made: list[str], running: Sequence[Running]) -> str:
-    """Return the observer that is deployed: the one asked for, else the most accurate one that is certified as it runs and tolerates dropouts.
+    """Return the observer that is deployed: the one asked for, else the most accurate one with all certificates that tolerates dropouts.
 
-    Accuracy is that on training episodes, of the states that are not measured. Where no observer tolerates dropouts, those that are certified
-    compete; where there is none either, the best guarantee of the best model decides.
+    Certificates are those as it runs, for the recorded signals of all units and for losses at a declared rate (`Running.certified`). Accuracy is that on
+    training episodes, of the states that are not measured. Where no observer tolerates dropouts, those that are certified compete; where there is none,
+    those that are certified as they run; where there is none either, the best guarantee of the best model decides.
     """
     if wanted is not None:
         if wanted not in made:
             raise SynthesisError(f"observer.deployed = {wanted!r}: there is no such observer, only {', '.join(made)}; name one of them.")
         return wanted
-    safe = [r for r in running if r.certificate.certified and np.isfinite(r.hidden_percent)]
+    bounded = [r for r in running if r.certificate.certified and np.isfinite(r.hidden_percent)]
+    safe = [r for r in bounded if r.certified] or bounded
     candidates = [r for r in safe if r.dropout_percent < DIVERGED] or safe
     least = min((r.hidden_percent for r in candidates), default=np.inf)
     best = preferred([r.name for r in candidates if r.hidden_percent <= _AS_GOOD * least] or made)

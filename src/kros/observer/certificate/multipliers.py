@@ -23,6 +23,7 @@ _CENTRES = 40
 _ACCURACY = 2e-4
 _MOST_FREQUENCIES = 80
 _WELL_INSIDE = 0.25
+_BINDING = 0.1
 
 
 def best_multipliers(H: Array, width: int) -> Array | None:
@@ -66,19 +67,23 @@ def _stabilising(G: Array) -> Array | None:
     rows = np.einsum("fja,fjb->fjab", G.conj(), G)
     units = np.zeros((width, width, width))
     units[range(width), range(width), range(width)] = 1.0
-    t = min((np.ones(width), _balanced(np.abs(G).max(axis=0))), key=lambda t: _needed(G, t))
-    level = _needed(G, t)
+    t = min((np.ones(width), _balanced(np.abs(G).max(axis=0))), key=lambda t: _needed(G, t).max())
+    needed = _needed(G, t)
+    level, binding = needed.max(), np.zeros(len(G), bool)
     for centred in range(_CENTRES):
         if level < _WELL_INSIDE and centred:
             break
         looser = max(level * 1.05 + 1e-12, _WELL_INSIDE)
+        # Frequencies far below the level bind nothing, and as many of them would keep the centre where it is.
+        binding, known = binding | (needed > _BINDING * level), binding
         # One number of the t is free: their sum stays below the number of slopes.
-        rest = np.zeros((len(G) + 1, width, width), complex)
-        slopes = np.concatenate([looser * units - rows, -np.broadcast_to(np.eye(width), (1, width, width, width))], axis=0)
+        rest = np.zeros((binding.sum() + 1, width, width), complex)
+        slopes = np.concatenate([looser * units - rows[binding], -np.broadcast_to(np.eye(width), (1, width, width, width))], axis=0)
         rest[-1] = 2 * width * np.eye(width)
         t = _newton(rest, slopes, np.zeros(width), t * width / t.sum())
-        before, level = level, _needed(G, t)
-        if level > 0.999 * before and before >= _WELL_INSIDE:
+        needed, before = _needed(G, t), level
+        level = needed.max()
+        if level > 0.999 * before and before >= _WELL_INSIDE and np.array_equal(binding, known):
             break
     return t if level < 1 else None
 
@@ -94,10 +99,10 @@ def _balanced(size: Array) -> Array:
     return np.asarray(t * len(t) / t.sum())
 
 
-def _needed(G: Array, t: Array) -> float:
-    """Return the least lambda for given multipliers."""
+def _needed(G: Array, t: Array) -> Array:
+    """Return the least lambda for given multipliers, at every frequency."""
     root = np.sqrt(t)
-    return float(np.linalg.norm(root[:, None] * G / root, 2, axis=(1, 2)).max() ** 2)
+    return np.asarray(np.linalg.norm(root[:, None] * G / root, 2, axis=(1, 2)) ** 2)
 
 
 def _inside(fixed: Array, slopes: Array, x: Array) -> bool:

@@ -54,6 +54,12 @@ def test_metrics_keep_the_contract(metrics):
         assert [len(orders) for orders in uncertain["weight"]["orders"]] == [2, 2]
     for name in (f"{model}/worst_case_h2" for model in metrics["models"]):
         observer = metrics["observers"][name]
+        if observer["set"] == "signals":
+            assert observer["set_certified"]
+            bounds = observer["set_lower_bound_percent"]
+            assert all(bound is None or bound <= observer["set_bound_percent"][state] for state, bound in bounds.items())
+            assert observer["set_bound_to_error_min"] >= 1
+            continue
         assert 0 < observer["lower_bound"] <= observer["worst_case_h2"]
         assert observer["spectral_radius_max"] < 1
     assert len(metrics["outliers"]) == 12

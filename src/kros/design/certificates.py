@@ -90,9 +90,14 @@ class Running:
 def certify_running(task: DesignTask, results: Sequence[DesignResult]) -> list[Running]:
     """Certify observers of one kind of model; `task` is that of any of them, and what could not be made is left out."""
     observers = [found.observer for found in results if found.observer is not None]
-    data = task.training.first_of_units().read().first(_EPISODE_S / task.models.sample_period_s)
+    data = certified_on(task)
     found = {r.name: r for group in by_lifting(observers) for r in running_of(group, data, task)}
     return [found[observer.name] for observer in observers]
+
+
+def certified_on(task: DesignTask) -> ValidationSet:
+    """Return the episodes whose signals make the set that observers are certified for: the beginning of the first one of every unit."""
+    return task.training.first_of_units().read().first(_EPISODE_S / task.models.sample_period_s)
 
 
 def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:

@@ -18,6 +18,10 @@ class SynthesisSettings(Settings):
     """Observer synthesis."""
 
     methods: tuple[METHODS, ...] = ("mixed", "worst_case_h2", "residual_h2", "memory")
+    set: Literal["auto", "signals", "models", "form"] = Field(
+        "auto",
+        description="set that worst-case synthesis is for; auto: of signals or of the form, whichever does better on held-out episodes",
+    )
     injection: Literal["state", "input"] = "state"
     input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
     penalty: float = Field(1e-3, gt=0)

@@ -10,7 +10,8 @@ from .gains import design_kalman_tuned, design_kalman_white, design_luenberger, 
 from .predictor import design_predictor
 from .published import design_published
 from .residual_shaped import design_residual_h2
-from .robust import design_mixed, design_worst_case_h2, design_worst_case_hinf
+from .robust import design_mixed
+from .sets import design_worst_case
 
 DESIGNS: dict[str, Callable[[DesignTask], DesignResult]] = {
     "open_loop": design_open_loop,
@@ -19,8 +20,8 @@ DESIGNS: dict[str, Callable[[DesignTask], DesignResult]] = {
     "luenberger": design_luenberger,
     "mixed": design_mixed,
     "paper": design_published,
-    "worst_case_h2": design_worst_case_h2,
-    "worst_case_hinf": design_worst_case_hinf,
+    "worst_case_h2": design_worst_case,
+    "worst_case_hinf": design_worst_case,
     "residual_h2": design_residual_h2,
     "memory": design_predictor,
 }

@@ -1,0 +1,249 @@
+"""Observers for the set of signals: a nominal whose certified errors are small, and the Kalman predictor for its residuals.
+
+The worst member of the set is its cover, and what an observer is certified to stay below is a sum over bands (`kros.observer.certificate.signals`). Rows of
+a nominal need not be those of a unit, nor of free runs: models that are refined for long free runs miss single steps by residuals that nearly cancel in
+the error, and the cancelling is lost where signals are covered. So nominals compete by certified cost: the unit, the population's mean, rows fitted to
+single steps, and rows fitted to the errors of the observer that runs them, in turn with its gains. Among those that cost hardly more than the least, the
+most accurate one on episodes that nothing was fitted to is taken: the cost is that of the worst signal of the set.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import KrosError, SynthesisError
+from ...core.lti import StateSpace, block_diagonal, gain
+from ...core.norms import hinf_norm
+from ...observer import (
+    Observer,
+    Runtime,
+    mean_error_dynamics,
+    one_step_residual,
+    relift_certificate,
+    residual_spectra,
+    tune_observer,
+)
+from ...observer.certificate.signals import SignalBound, signal_bound
+from ...observer.residual.models import refitted_models
+from ...observer.residual.signal_bounds import signal_lower_bounds
+from ...synthesis import Injection, ObserverProblem, ResidualProblem, Status, Synthesis, hinf, residual_h2
+from ...synthesis.problem.plants import shaped_plant
+from ...synthesis.residual_shaped.shaping_filter import Basis, shaping_filter
+from ...synthesis.result import enclosed
+from ...uncertainty import Form
+from ...uncertainty.coprime.bands import BandEnergies
+from ...uncertainty.coprime.signals import SignalSet
+from ..certificates import certified_on, scales_of
+from ..task import DesignResult, DesignTask, first_of
+from ..validation import ValidationSet, hidden_mean, rank
+from .residual_shaped import MAX_ORDER
+from .tuned import held_out
+
+log = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
+SIGNALS = "signals"
+UNCOVERED = "the observer is certified for the signals that a model of its own leaves, not for the set around the nominal unit"
+_STEPS, _ROUNDS, _EPISODES = 8, 2, 12
+_POINTS, _SMALL = 2049, Basis(2, (0.95,))
+_CLOSE = 1.25  # times the least certified cost, within which accuracy decides
+_UNKNOWN: dict[str, Any] = {"h2_norm": None, "lower_bound": None, "gap_percent": None}  # of tuned gains
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An observer for the set of signals of its own model, with what it is certified to stay below."""
+
+    nominal: str
+    observer: Observer
+    synthesis: Synthesis
+    bound: SignalBound
+
+    @property
+    def cost(self) -> float:
+        """Geometric mean over the hidden states of the certified error for the cover; infinite where there is none."""
+        return float(hidden_mean(self.bound.cover, self.observer.measured)) if self.bound.certified else np.inf
+
+
+class Judge:
+    """Certifies observers for the signals of their own models, on the episodes that all observers are certified on."""
+
+    def __init__(self, task: DesignTask, data: ValidationSet) -> None:
+        self.task, self.data = task, data
+        self._energies: dict[bytes, BandEnergies] = {}
+
+    def __call__(self, nominal: str, observer: Observer, synthesis: Synthesis) -> Candidate:
+        """Return an observer with what it is certified to stay below."""
+        certificate = relift_certificate(observer, scales=scales_of([observer], self.data, self.task)[0], mismatch=False)
+        return Candidate(nominal, observer, synthesis, signal_bound(certificate, observer, self.data.batch, known=self._energies))
+
+
+def design_for_signals(task: DesignTask) -> DesignResult:
+    """The Kalman predictor for the residuals of a nominal of its own, tuned or not: the most accurate of those with nearly the least certified error."""
+    began, data = time.perf_counter(), task.training.read()
+    best, facts = chosen(task, data)
+    notes = (
+        *best.synthesis.notes,
+        "The set: signals with energies in bands below the cover of all units' residuals, of the observer's own model.",
+    )
+    synthesis = replace(best.synthesis, method=task.method, status=Status.CERTIFIED, solve_s=time.perf_counter() - began, notes=notes)
+    return DesignResult(task.name, best.observer, synthesis, facts, task.problem, UNCOVERED)
+
+
+def design_for_signals_in_hinf(task: DesignTask) -> DesignResult:
+    """The H-infinity filter of residuals ``W_L w``, W_L a shaping filter of the cover, for the nominal that the H2 observer has.
+
+    ``||W_p T W_L||`` is the largest error, over what the H2 observer is certified for, that any w of energy one can make: a signal may put all of
+    its energy into one frequency.
+    """
+    began, data = time.perf_counter(), task.training.read()
+    best, facts = chosen(task, data)
+    models, n, observer, dt = task.models, task.models.lifting.n_states, best.observer, task.models.sample_period_s
+    F = mean_error_dynamics(models.lifting, observer.A, data.batch.states, data.batch.inputs, data.batch.parameters)
+    W_L = shaping_filter(signals_of(certified_on(task), observer).spectrum(_POINTS), _SMALL, dt)
+    hidden = [i for i in range(n) if i not in models.measured] or list(range(n))
+    one, nothing = gain(np.eye(n), dt), gain(np.zeros((1, 0)), dt)
+    problem = ObserverProblem(
+        nominal=StateSpace(F, np.zeros((n, 1)), np.eye(n), np.zeros((n, 1)), dt),
+        C=task.selector[:, :n],
+        W_L=one,
+        W_R=gain(np.eye(1), dt),
+        input_scale=np.ones(1),
+        output_scale=np.ones(n),
+        noise=task.noise,
+        W_p=np.eye(n)[hidden] / best.bound.cover[hidden, None],
+        correction_penalty=task.settings.penalty,
+        form=Form.ADDITIVE,
+    )
+    found = hinf(shaped_plant(problem, nothing, W_L), injection=Injection.STATE)
+    K = problem.to_physical(found.controller)
+    level = hinf_norm(
+        problem.error_system(K)
+        @ block_diagonal([gain(np.zeros((1, 0)), dt), W_L, gain(np.eye(len(task.noise)), dt), gain(np.zeros((n, 0)), dt)])
+    )
+    rows = np.zeros((models.lifting.n_lifted - n, K.n_inputs))
+    K = StateSpace(K.A, K.B, np.vstack([K.C, np.zeros((len(rows), K.n_states))]), np.vstack([K.D, rows]), dt)
+    lower, gap, notes = enclosed(level, found.lower_bound)
+    synthesis = Synthesis(
+        task.method,
+        K,
+        Status.CERTIFIED,
+        Injection.STATE,
+        hinf_norm=level,
+        lower_bound=lower,
+        gap_percent=gap,
+        solver="riccati",
+        notes=notes,
+    )
+    candidate = Judge(task, certified_on(task))(best.nominal, task.observer(synthesis, observer.A, observer.B), synthesis)
+    if not np.isfinite(candidate.cost):
+        raise SynthesisError(f"H-infinity synthesis for signals: the observer has no certificate ({candidate.bound.reason}).")
+    return DesignResult(
+        task.name, candidate.observer, replace(synthesis, solve_s=time.perf_counter() - began), facts, task.problem, UNCOVERED
+    )
+
+
+def chosen(task: DesignTask, data: ValidationSet) -> tuple[Candidate, dict[str, Any]]:
+    """Return the observer that is taken, and facts for the records."""
+    found = [candidate for candidate in candidates(task, data) if np.isfinite(candidate.cost)]
+    if not found:
+        raise SynthesisError(
+            "Worst-case synthesis for signals: no observer has a certificate as it runs; check what is measured, and the lifting's slopes."
+        )
+    least = min(candidate.cost for candidate in found)
+    close = [candidate for candidate in found if candidate.cost <= _CLOSE * least]
+    held = held_out(data.batch.keys)
+    judged_on = data.part([i for i, unseen in enumerate(held) if unseen])
+    limit, *errors = judged_on.percent_of_all([task.open_loop(), *(candidate.observer for candidate in close)])
+    best = close[first_of([rank(error, limit, task.models.measured) for error in errors])]
+    cost: dict[str, float] = {}
+    for one in found:
+        cost[one.nominal] = min(one.cost, cost.get(one.nominal, np.inf))
+    states, measured = best.observer.recorded, best.observer.measured
+    lower = lower_bounds(task, certified_on(task), best.observer)
+    facts: dict[str, Any] = {"set": SIGNALS, "nominal": best.nominal}
+    facts["certified_cost_percent"] = {name: 100 * value for name, value in cost.items()}
+    facts["set_lower_bound_percent"] = {
+        name: 100 * float(value) if np.isfinite(value) else None
+        for i, (name, value) in enumerate(zip(states, lower, strict=True))
+        if i not in measured
+    }
+    return best, facts
+
+
+def lower_bounds(task: DesignTask, data: ValidationSet, observer: Observer) -> Array:
+    """Return the errors that no other correction of an observer's model is certified to stay below, over the ranges."""
+    batch, models = data.batch, task.models
+    dynamics = mean_error_dynamics(models.lifting, observer.A, batch.states, batch.inputs, batch.parameters)
+    C = task.selector[:, : models.lifting.n_states]
+    return signal_lower_bounds(dynamics, C, task.noise, signals_of(data, observer), models.sample_period_s)
+
+
+def signals_of(data: ValidationSet, observer: Observer) -> SignalSet:
+    """Return the residuals of an observer's model, with the error of its first estimate."""
+    batch, history = data.batch, observer.lifting.history
+    values = observer.own(batch.parameters)
+    residual = one_step_residual(observer.lifting, observer.A, observer.B, batch.states, batch.inputs, values)
+    start = batch.states[history] - observer.initial(batch.states[history][:, list(observer.measured)], values)
+    return SignalSet.of(residual, batch.lengths - 1 - history, batch.units, start)
+
+
+def candidates(task: DesignTask, data: ValidationSet) -> Iterator[Candidate]:
+    """Yield observers of all nominals as they are; then, rows and gains improved in turn, of the mean of the units and of rows fitted to single steps."""
+    judge = Judge(task, certified_on(task))
+    first = [one for name, A, B in task.nominals for one in attempts(task, data, name, A, B, judge, 0)]
+    yield from first
+    models, n = task.models, task.models.lifting.n_states
+    name, A, B = task.nominals[-1]
+    yield from islice(attempts(task, data, name, A, B, judge, 1), 1, None)  # the first one is known
+    for model in refitted_models(models.lifting, A, B, models.measured, data.batch)[0]:
+        if len(model.rows) == n:
+            yield from attempts(task, data, "single steps", model.A, model.B, judge, _ROUNDS)
+
+
+def attempts(task: DesignTask, data: ValidationSet, name: str, A: Array, B: Array, judge: Judge, rounds: int) -> Iterator[Candidate]:
+    """Yield the observer of a nominal, and what becomes of it when rows and gains are fitted in turn; those that fail end it."""
+    seen, what = fitting(data), name
+    try:
+        for turn in range(rounds + 1):
+            synthesis = gains(task, data, A, B)
+            observer = task.observer(synthesis, A, B)
+            yield judge(what, observer, synthesis)
+            if turn == rounds:
+                return
+            observer, what = tuned(seen, observer), f"{name}, fitted"
+            yield judge(what, observer, replace(synthesis, controller=observer.controller, **_UNKNOWN))
+            A, B = observer.A, observer.B
+    except (KrosError, np.linalg.LinAlgError) as error:
+        log.info("%s, nominal %s: %s", task.name, what, error)
+
+
+def fitting(data: ValidationSet) -> ValidationSet:
+    """Return the episodes that rows and gains are fitted to, some of those that observers are not judged on."""
+    held = held_out(data.batch.keys)
+    seen = [i for i, unseen in enumerate(held) if not unseen] or list(range(len(held)))
+    some = np.unique(np.linspace(0, len(seen) - 1, min(len(seen), _EPISODES)).round().astype(int))
+    return data.part([seen[i] for i in some])
+
+
+def gains(task: DesignTask, data: ValidationSet, A: Array, B: Array) -> Synthesis:
+    """Return the Kalman predictor for the mean of the residual spectra that a model leaves on all units."""
+    models, n, batch = task.models, task.models.lifting.n_states, data.batch
+    residual = one_step_residual(models.lifting, A, B, batch.states, batch.inputs, batch.parameters)
+    spectra = residual_spectra(residual, batch.lengths - 1 - models.lifting.history, batch.units)
+    dynamics = mean_error_dynamics(models.lifting, A, batch.states, batch.inputs, batch.parameters)
+    problem = ResidualProblem(dynamics, task.selector[:, :n], spectra, task.noise, np.ones(n), models.sample_period_s)
+    return residual_h2(problem, n_lifted=models.lifting.n_lifted, max_order=MAX_ORDER)
+
+
+def tuned(data: ValidationSet, start: Observer) -> Observer:
+    """Return an observer whose rows and gains are fitted to its errors."""
+    found = tune_observer(replace(start, runtime=Runtime()), data.on_time.batch, _STEPS)[0]
+    return replace(found, runtime=start.runtime)

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from kros.core.lti import StateSpace, gain
 from kros.lifting import Lifting
-from kros.observer import Observer, Runtime, relift_certificate, run_observer
+from kros.observer import Observer, Runtime, Seen, relift_certificate, run_observer
 from kros.observer.certificate.majorants import energy, majorants
 from kros.observer.certificate.signals import signal_bound
 from kros.synthesis import Injection
@@ -127,15 +127,30 @@ def test_bounds_hold_for_other_signals_of_the_same_energies(case: str) -> None:
     assert (largest > 0.5 * found.bounds).all()
 
 
+@pytest.mark.parametrize("relift", [True, False])
+def test_recordings_may_be_beyond_limits_by_their_noise(relift: bool) -> None:
+    x, u = recordings()
+    batch = batch_of(x, u, DT, units=["1", "1", "2", "2", "3", "3"])
+    free, limited = observer(), observer((), upper=np.array([np.inf, 0.25, np.inf]), relift=relift)
+    bounds = [signal_bound(relift_certificate(o), o, batch) for o in (free, limited)]
+    assert not bounds[1].outside
+    assert ((bounds[1].ratios >= 1) & (bounds[1].ratios < 20)).all()
+    beyond = np.sqrt(np.mean(np.maximum(x[..., 1] - 0.25, 0) ** 2))
+    if not relift:  # estimates are cut off, and nothing else changes but the states that stand for the true ones
+        assert (bounds[1].cover <= bounds[0].cover + 4 * beyond).all()
+
+
 def test_what_leaves_the_assumptions_has_no_bound() -> None:
     x, u = recordings()
     batch = batch_of(x, u, DT, units=["1", "1", "2", "2", "3", "3"])
-    tight = observer((), upper=np.array([np.inf, float(np.sort(x[..., 1].max(axis=0))[-2]), np.inf]))
-    found = signal_bound(relift_certificate(tight), tight, batch)
+    refuses = replace(observer(), seen=Seen(np.array([float(np.sort(np.abs(x[..., 0]).max(axis=0))[-2]) / 1.5]), np.array([9.0])))
+    found = signal_bound(relift_certificate(refuses), refuses, batch)
     assert len(found.outside) == 1
     assert found.facts((0,))["set_outside"] == list(found.outside)
-    assert np.isinf(found.bounds[[unit in found.outside for unit in found.units]]).all()
-    assert np.isfinite(found.bounds[[unit not in found.outside for unit in found.units]]).all()
+    out = np.array([unit in found.outside for unit in found.units])
+    assert np.isinf(found.bounds[out]).all()
+    assert (found.bounds >= found.errors).all()
+    assert np.isfinite(found.bounds[~out]).all()
     grows = replace(observer(), A=1.5 * observer().A)
     found = signal_bound(relift_certificate(grows), grows, batch)
     assert not found.certified

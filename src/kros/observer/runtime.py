@@ -134,6 +134,11 @@ class Runtime:
             return x
         return np.asarray(np.clip(x, self.lower, self.upper))
 
+    def within(self, states: Array) -> Array:
+        """Return recorded states, shape (..., n_recorded), within the limits that they have."""
+        low, high = (side if side is None else side[: states.shape[-1]] for side in (self.lower, self.upper))
+        return states if low is None and high is None else np.asarray(np.clip(states, low, high))
+
     def relifted(self, x: Array) -> Array:
         """Return the estimates that an observer goes on from, shape (..., n)."""
         return self.clip_estimate(x) if self.relift else x

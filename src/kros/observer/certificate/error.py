@@ -12,7 +12,7 @@ box of its slopes; the middle of the box goes into A, every entry that can move 
 
 Symbols
 -------
-xi        : [e, earlier errors that the lifting reads, x^c], with a delay followed by its residuals, the latest first, and the predicted error
+xi        : [e, earlier errors that the lifting reads, x^c], with a delay followed by its residuals, the latest first, and the predicted errors that count
 w, z      : [omega / residual, n / noise] and e / error, the scaled signals of `ReliftScales`
 p, q      : what the slopes' movement adds, and what it acts on
 d_k       : position of every slope in its interval
@@ -254,7 +254,8 @@ def error_system(
     h, order, link = len(names), K.n_states, len(clips) + len(moving)
     slots = _driven(observer, scales, h)
     width, own = len(slots), sum(i < n for i in slots)
-    n_xi, n_p = h + order + (delay * width + n if delay else 0), link * (delay + 1) + len(cuts)
+    shown = _counted(scales)
+    n_xi, n_p = h + order + (delay * width + len(shown) if delay else 0), link * (delay + 1) + len(cuts)
     of = _Signals(n_xi, n_p, n + q)
     q_rows, channels = np.zeros((n_p, sum(of.sizes))), [""] * n_p
     rest = np.zeros(n_p)
@@ -295,16 +296,16 @@ def error_system(
         ahead = new[0]
         for i in range(1, delay + 1):
             ahead = predicted(ahead, i * link)[1] + enters @ (held[delay - 1 - i] if i < delay else arriving)
-        new += [arriving, *held[:-1], ahead[:n]]
+        new += [arriving, *held[:-1], ahead[shown]]
     A, L, B = of.split(np.vstack(new))
     M, E, D = of.split(q_rows)
     C = np.zeros((n, n_xi))
-    C[:, n_xi - n if delay else 0 :][:, :n] = np.diag(1 / scales.error)
+    C[shown, n_xi - len(shown) + np.arange(len(shown)) if delay else shown] = 1 / scales.error[shown]
     start = np.eye(n_xi, h)
     if delay:
         start = np.zeros((n_xi, h))
         start[h + order : h + order + width] = enters.T
-        start[n_xi - n :, :n] = np.eye(n)
+        start[n_xi - len(shown) :, :n] = np.eye(n)[shown]
     return ErrorSystem(A, L, B, M, D, C, observer.sample_period_s, tuple(channels), E if E.any() else None, rest, start)
 
 
@@ -314,10 +315,15 @@ def _driven(observer: ObserverData, scales: ReliftScales, h: int) -> list[int]:
     return [i for i in range(h) if i < n - observer.internal or i >= n or scales.residual[i] > 0]
 
 
+def _counted(scales: ReliftScales) -> list[int]:
+    """Return the states whose errors count."""
+    return [int(i) for i in np.flatnonzero(np.isfinite(scales.error))]
+
+
 def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> Array:
     """Return the sizes of all of xi, shape (n_xi,), from those of the errors with the earlier ones, shape (n_window,)."""
-    delay, n = observer.runtime.delay, observer.lifting.n_states
-    late = [*[errors[_driven(observer, scales, len(errors))]] * delay, errors[:n]] if delay else []
+    delay = observer.runtime.delay
+    late = [*[errors[_driven(observer, scales, len(errors))]] * delay, errors[_counted(scales)]] if delay else []
     return np.concatenate([errors, np.ones(observer.controller.n_states), *late])
 
 

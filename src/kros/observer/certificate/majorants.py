@@ -37,7 +37,7 @@ _TINY = np.finfo(float).tiny
 _SAFE = 1 + 1e-9  # for rounding of small matrices
 
 
-def majorants(system: StateSpace, edges: Array, weight: Array) -> Array:
+def majorants(system: StateSpace, edges: Array, weight: Array, close: float = _CLOSE) -> Array:
     """Return matrices above the responses of every row of a system in every band, shape (p, b, m, m).
 
     Parameters
@@ -48,8 +48,11 @@ def majorants(system: StateSpace, edges: Array, weight: Array) -> Array:
         From zero to pi.
     weight : ndarray, shape (b, m, m)
         Energies that the matrices are for; they hold for all.
+    close : float
+        How far the response may be from those in the middle of arcs, relative to its size.
     """
-    size = np.sqrt(np.maximum(np.einsum("bii->i", weight).real, _TINY))
+    size = np.sqrt(np.maximum(np.einsum("bii->i", weight).real, 0.0))
+    size = np.where(size > 1e-100, size, 1.0)  # a channel without energy
     scaled = StateSpace(system.A, system.B * size, system.C, system.D * size, system.dt)
     W = weight / np.outer(size, size)
     W = W + _RIDGE * np.maximum(np.einsum("bii->b", W).real, _TINY)[:, None, None] * np.eye(len(size))
@@ -57,7 +60,7 @@ def majorants(system: StateSpace, edges: Array, weight: Array) -> Array:
     root = (vectors * np.sqrt(values)[:, None, :]) @ adjoint(vectors)
     back = (vectors / np.sqrt(values)[:, None, :]) @ adjoint(vectors)
     sizes = np.sqrt(np.einsum("bii->bi", W).real)
-    band, T, reach = _arcs(scaled, edges, root, sizes)
+    band, T, reach = _arcs(scaled, edges, root, sizes, close)
 
     n_bands, (p, m) = len(edges) - 1, T.shape[1:]
     t = T @ root[band]
@@ -82,7 +85,7 @@ def energy(matrices: Array, energies: Array) -> Array:
     return np.asarray(np.einsum("pbij,...bji->...p", matrices, energies, optimize=True).real)
 
 
-def _arcs(system: StateSpace, edges: Array, root: Array, sizes: Array) -> tuple[Array, Array, Array]:
+def _arcs(system: StateSpace, edges: Array, root: Array, sizes: Array, close: float) -> tuple[Array, Array, Array]:
     """Return the band of every arc, the responses in the middle, (k, p, m), and the distances of entries on the arc, (k, p, m)."""
     enclosed, n_bands = Enclosure(system), len(edges) - 1
     cuts = edges[:-1, None] + np.diff(edges)[:, None] * np.linspace(0, 1, _FIRST + 1)
@@ -93,7 +96,7 @@ def _arcs(system: StateSpace, edges: Array, root: Array, sizes: Array) -> tuple[
     for remaining in reversed(range(_ROUNDS)):
         T, reach = enclosed.entries(theta, half)
         np.maximum.at(peak, band, np.sum(np.abs(T @ root[band]) ** 2, axis=-1))
-        allowed = _CLOSE * np.sqrt(np.maximum(peak, peak.mean(axis=0)))
+        allowed = close * np.sqrt(np.maximum(peak, peak.mean(axis=0)))
         loose = (np.einsum("kpi,ki->kp", reach, sizes[band]) > allowed[band]).any(axis=1)
         tried += 2 * int(loose.sum())
         if not remaining or tried > _ARCS:

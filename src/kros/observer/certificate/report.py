@@ -119,8 +119,10 @@ class Course:
         First error, with the earlier ones that the lifting reads.
     error : ndarray, shape (n_samples, batch, n)
     lengths : ndarray, shape (batch,)
-    states, inputs, y : ndarray
-        Recorded states and inputs, and the measurements as they arrive.
+    inputs, y : ndarray
+        Recorded inputs, and the measurements as they arrive.
+    beyond : ndarray, shape (n_samples, batch, n_recorded)
+        What recorded states are beyond declared limits, by noise: what stands for the true states is within.
     """
 
     omega: Array
@@ -128,43 +130,33 @@ class Course:
     first: Array
     error: Array
     lengths: npt.NDArray[np.int64]
-    states: Array
     inputs: Array
     y: Array
+    beyond: Array
 
     def mean_square(self, signal: Array) -> Array:
         """Return the mean square of every channel over every episode, shape (batch, k)."""
         inside = (np.arange(len(signal))[:, None] < self.lengths)[..., None]
         return np.asarray(np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None])
 
-    def beyond(self, observer: ObserverData) -> Array:
-        """Return the mean square by which recorded states are beyond limits that only cut off what the observer gives out, shape (batch, n).
-
-        Cut off at a limit, an estimate is no further from a state within it than before, and from one beyond it at most as far as that is beyond.
-        """
-        return self.mean_square(np.zeros_like(self.states) if observer.runtime.relift else self._excess(observer))
-
-    def _excess(self, observer: ObserverData) -> Array:
-        own, limits = self.states.shape[-1], observer.runtime
-        low, high = (np.full(own, s) if side is None else side[:own] for s, side in ((-np.inf, limits.lower), (np.inf, limits.upper)))
-        return np.asarray(self.states - np.clip(self.states, low, high))
-
-    def inside(self, observer: ObserverData) -> npt.NDArray[np.bool_]:
-        """Whether the true state keeps declared limits and no sample is refused, shape (batch,)."""
-        taken, limits = screened(observer, self.y, self.inputs), observer.runtime
-        good = np.ones(self.states.shape[:2], dtype=bool)
-        if limits.relift:
-            good = (self._excess(observer) == 0).all(axis=-1)
-        good &= np.isfinite(taken.y).all(axis=-1) & (taken.u == limits.clip_inputs(self.inputs)).all(axis=-1)
+    def taken(self, observer: ObserverData) -> npt.NDArray[np.bool_]:
+        """Whether the observer takes all samples, measurements at most at the limit and inputs within theirs, shape (batch,)."""
+        found, u = screened(observer, self.y, self.inputs), observer.runtime.clip_inputs(self.inputs)
+        good = np.isfinite(found.y).all(axis=-1) & (found.u == u).all(axis=-1)
         return np.asarray((good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0))
 
 
 def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None) -> Course:
     """Return what drove an observer along recorded episodes; recorded states stand for the true ones, and no sample is lost."""
-    states, inputs, at, late = batch.states, batch.inputs, list(observer.measured), observer.runtime.delay
+    inputs, at, late = batch.inputs, list(observer.measured), observer.runtime.delay
+    states = observer.runtime.within(batch.states)
     values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
     due = states[np.maximum(np.arange(len(states)) - late, 0)][..., at]
-    y = due if batch.shown is None else batch.measurements(at, arrived=False)
+    y = (
+        batch.states[np.maximum(np.arange(len(states)) - late, 0)][..., at]
+        if batch.shown is None
+        else batch.measurements(at, arrived=False)
+    )
     if estimates is None:
         estimates = run_observer(observer, y, inputs, values)
     # Measurements beyond the limits of their states are taken at the limit: what is left of their noise is smaller.
@@ -174,7 +166,7 @@ def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None 
     noise[:late] = 0.0
     truth = with_internal(observer, states, observer.runtime.clip_inputs(inputs), values, start)
     omega = held_residual(observer, truth, inputs, values)
-    return Course(omega, noise, first_error(observer, truth[0] - start), truth - estimates, batch.lengths, states, inputs, y)
+    return Course(omega, noise, first_error(observer, truth[0] - start), truth - estimates, batch.lengths, inputs, y, batch.states - states)
 
 
 def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:

@@ -17,6 +17,7 @@ from .status import ReliftStatus
 Proof = tuple[Proposal, float]  # with its margin
 MOST_CORNERS = 64
 _LONGEST = 3
+_MANY_CORNERS = 4  # beyond which one larger matrix is decided sooner
 _BIG_SDP = 48  # states, beyond which a semidefinite program takes minutes
 _CLOSE = 1.1
 
@@ -109,6 +110,7 @@ def mismatch_gain(modes: list[ErrorSystem], lookahead: int, time_limit_s: float)
 
 def quick_gain(system: ErrorSystem) -> float:
     """Return a proven gain of one system by Riccati equations alone, infinite where they prove none."""
-    few = system.corner_count <= MOST_CORNERS
-    found = _first_proof(riccati_proposals(system), system.corners(), system) if few else _prove_by_multipliers([system])[0]
+    found = _prove_by_multipliers([system])[0] if system.corner_count > _MANY_CORNERS else None
+    if found is None and system.corner_count <= MOST_CORNERS:
+        found = _first_proof(riccati_proposals(system), system.corners(), system)
     return np.inf if found is None else found[0].gain

@@ -32,6 +32,7 @@ from .search import quick_gain
 Array = npt.NDArray[np.float64]
 _BANDS, _BELOW = 96, 10  # bands, the lowest of which ends at a tenth of an episode's lowest frequency
 _RIDGE = 1e-6
+_ROUGH = 0.1
 _SPARE = 1e-6
 _OTHERS = (
     0.0,
@@ -62,7 +63,7 @@ class SignalBound:
     reason : str
         Why there is no bound; empty where there is one.
     outside : tuple of str
-        Units whose recordings leave what is assumed: declared limits, or samples that the observer refuses. Their rows are infinite.
+        Units of which the observer refuses samples as implausible. Their rows are infinite.
     """
 
     states: tuple[str, ...]
@@ -146,7 +147,8 @@ def signal_bound(
     units = list(dict.fromkeys(batch.units))
     member = np.array([[unit == name for unit in batch.units] for name in units], dtype=float)
     member /= member.sum(axis=1, keepdims=True)
-    errors = np.sqrt(member @ seen.mean_square(seen.error[..., :n]))
+    beyond = np.sqrt(member @ seen.mean_square(seen.beyond))
+    errors = np.sqrt(member @ seen.mean_square(seen.error[..., :n] + seen.beyond))
     nothing = np.full(n, np.inf)
     found = SignalBound(
         observer.recorded, tuple(units), nothing, np.full(errors.shape, np.inf), errors, nothing, certificate.scales.error[:n].copy()
@@ -162,7 +164,7 @@ def signal_bound(
     plant = StateSpace(
         frozen.A, frozen.B, np.vstack([system.C[:n], frozen.C]), np.vstack([np.zeros((n, frozen.n_inputs)), frozen.D]), system.dt
     )
-    rough = majorants(plant, energies.edges, first.energy)
+    rough = majorants(plant, energies.edges, first.energy, _ROUGH)
     # The cover is made once more for the states' errors: a matrix that no unit exceeds, where it matters.
     size = energy(rough[:n], energies.energy).max(axis=0)
     matter = np.einsum("p,pbij->bij", 1 / np.maximum(size, np.finfo(float).tiny), rough[:n])
@@ -175,13 +177,13 @@ def signal_bound(
     with np.errstate(invalid="ignore"):
         movement = np.where(kappa > 0, kappa * np.sqrt(len(acted)), 0.0)
         each = own[:, :n] + np.where(kappa > 0, kappa * np.linalg.norm(own[:, n:] / acted, axis=1)[:, None], 0.0)
-    each = np.sqrt(each**2 + member @ seen.beyond(observer) / found.sizes**2)
-    inside = seen.inside(observer)
+    inside = seen.taken(observer)
     left = tuple(unit for unit, rows in zip(units, member > 0, strict=True) if not inside[rows].all())
     each[[unit in left for unit in units]] = np.inf
     reason = "" if np.isfinite(kappa).all() else "what slopes and limits can add has no proven gain"
     by = found.sizes * (1 + _SPARE)
-    return replace(found, cover=(linear[:n] + movement) * by, bounds=each * by, movement=movement * by, reason=reason, outside=left)
+    of_all = (linear[:n] + movement) * by + beyond.max(axis=0)
+    return replace(found, cover=of_all, bounds=each * by + beyond, movement=movement * by, reason=reason, outside=left)
 
 
 def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:

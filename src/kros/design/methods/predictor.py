@@ -25,7 +25,7 @@ UNCOVERED = "the observer has states of its own, identified from recordings; the
 log = logging.getLogger(__name__)
 _SAMPLES, _EPISODES = 6000, 12  # that an observer is conditioned on, at most
 _SHARES = (1.0, 0.5)  # of the gain that is best, until a certificate covers it
-_CLOSE, _SHARE = 0.99, 0.001  # what counts as at a limit, and how much of an episode has to be
+_CLOSE, _SHARE = 0.01, 0.001  # share of a limit that counts as at it, and how much of an episode has to be
 _CIRCLE = {"sin": "cos", "cos": "sin"}
 
 
@@ -115,6 +115,8 @@ def reaching(task: DesignTask) -> EpisodeBatch | None:
     batch = task.at_limits.read().on_time.batch
     batch = batch.head(min(_SAMPLES, int(batch.lengths.min())))
     x = batch.states[..., at]
-    met = np.mean((x <= _CLOSE * lower[at]) | (x >= _CLOSE * upper[at]), axis=(0, 2))
+    ends = [np.clip(side[at], -np.finfo(float).max, np.finfo(float).max) for side in (lower, upper)]
+    low, high = (end - sign * _CLOSE * np.abs(end) for sign, end in zip((-1, 1), ends, strict=True))
+    met = np.mean((x <= low) | (x >= high), axis=(0, 2))
     rows = [int(i) for i in np.argsort(-met, kind="stable")[:_EPISODES] if met[i] > _SHARE]
     return batch.take(rows) if rows else None

@@ -42,13 +42,17 @@ class SynthesisSettings(Settings):
 class PredictorSettings(Settings):
     """The observer with a memory.
 
-    As many tuning `steps` as these, on so many `episodes` of every unit, keep a study short; 25 and 2 take half a minute, and are what an observer that
-    goes into machines is worth. `importance` weights the logarithmic errors of states that are not measured, by name; one where none is given.
+    Its memory, order and the weight of every condition are chosen on training episodes of units that are left out in turn: with effort "full" among
+    longer memories and more states and on five times as many recordings as with "quick", which tunes by a few steps instead. `states` and tuning
+    `steps`, on so many `episodes` of every unit and condition, may be given. `others` is how much errors in conditions besides that of synthesis count
+    when this is chosen; `importance` weights the logarithmic errors of states that are not measured, by name; one where none is given.
     """
 
-    states: int = Field(12, ge=1, description="states besides the recorded ones")
-    steps: int = Field(4, ge=0)
+    effort: Literal["full", "quick"] = "full"
+    states: int | None = Field(None, ge=1, description="states besides the recorded ones; chosen where none is given")
+    steps: int | None = Field(None, ge=0, description="most steps of tuning; by default 0 with full effort and 4 with quick")
     episodes: int = Field(1, ge=1)
+    others: float = Field(0.5, ge=0)
     importance: dict[str, float] = Field(default_factory=dict)
 
     @field_validator("importance")

@@ -249,11 +249,12 @@ def tasks_of(
     predictor.require_hidden(identified.population.states, identified.population.measured)
     require_measured(sensor or {}, identified.population.measured)
     recorded, own = identified.models(kind), uncertain.sets[kind]
-    training, models = TrainingSet.of(identified, recorded, sensor).normalised(recorded), recorded.normalised()
+    training, whole = (of(identified, recorded, sensor).normalised(recorded) for of in (TrainingSet.of, TrainingSet.whole))
+    models = recorded.normalised()
     noise = measurement_noise(identified, recorded, sensor or {}) / recorded.output_scale[list(recorded.measured)]
     problem, refusal = usable_problem(models, own, noise, settings)
     shared: dict[str, Any] = {"models": models, "unit": uncertain.nominal, "problem": problem, "refusal": refusal, "noise": noise}
-    shared |= {"training": training, "covered": own.unit_ids}
+    shared |= {"training": training, "recordings": whole, "covered": own.unit_ids}
     shared |= {"max_order": uncertain.max_order, "settings": settings, "predictor": predictor}
     if own_limits := limits_of(limits or {}, identified.facts.limits, identified.population.states):
         shared["limits"] = {name: limit.in_unit(recorded.sizes[name]) for name, limit in own_limits.items()}

@@ -53,6 +53,8 @@ class DesignTask:
         Episodes among which there are some that meet them.
     pooled : bool
         Whether the mean of the units' models may be the nominal, where that is free.
+    recordings : TrainingSet, optional
+        All training episodes of all units in all conditions; those of `training` by default.
     """
 
     name: str
@@ -70,6 +72,7 @@ class DesignTask:
     limits: Limits = field(default_factory=dict)
     at_limits: TrainingSet | None = None
     pooled: bool = True
+    recordings: TrainingSet | None = None
 
     def observer(self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None, lifting: Lifting | None = None) -> Observer:
         """Return the observer of a synthesis, with the nominal model or another one."""

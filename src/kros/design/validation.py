@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,7 @@ from ..observer import Observer, Seen, Sensor, Sensors, run_observer, run_observ
 from ..observer.sensor import in_units
 
 Array = npt.NDArray[np.float64]
+T = TypeVar("T")
 TUNING_UNITS = 12
 TUNING_EPISODES = 3
 TUNING_S = 10.0
@@ -79,6 +81,18 @@ class TrainingSet:
     def read(self) -> ValidationSet:
         """Read the episodes, cut short."""
         return self._shown(self.keys, round(TUNING_S / self.population.sample_period_s))
+
+    def read_whole(self) -> ValidationSet:
+        """Read the episodes."""
+        return self._shown(self.keys)
+
+    def within(self, n_samples: int, groups: int) -> TrainingSet:
+        """Return as many whole episodes as have about so many samples, the first ones; of so many units and conditions at most, and two of each of these."""
+        own = list(dict.fromkeys((key.unit, key.condition) for key in self.keys))
+        units = set(spread(list(dict.fromkeys(unit for unit, _ in own)), max(2, groups * len({u for u, _ in own}) // len(own))))
+        keys = [key for key in self.keys if key.unit in units]
+        count = max(2 * len([group for group in own if group[0] in units]), n_samples // len(self.population.read(keys[0])))
+        return replace(self, keys=tuple(keys[:count]))
 
     def one_by_one(self) -> Iterator[ValidationSet]:
         """Read every episode by itself, whole, without the bias: its size is declared, and its sign nobody can learn."""
@@ -165,8 +179,8 @@ def seen_by(identified: IdentifiedModels, measured: Sequence[int]) -> Seen:
     return Seen(np.array([sizes[states[i]] for i in measured]), np.array([sizes[name] for name in inputs]))
 
 
-def spread(keys: Sequence[EpisodeKey], count: int) -> list[EpisodeKey]:
-    """Return so many episodes from the first to the last."""
+def spread(keys: Sequence[T], count: int) -> list[T]:
+    """Return so many from the first to the last."""
     if len(keys) <= count:
         return list(keys)
     return [keys[i] for i in np.linspace(0, len(keys) - 1, count).round().astype(int)]

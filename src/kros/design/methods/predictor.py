@@ -4,29 +4,65 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ...core.errors import KrosError, SynthesisError
 from ...data import EpisodeBatch
 from ...lifting import Lifting
-from ...observer import Observer, Runtime, conditioned, driven_coordinates, identify_predictor, relift_certificate, with_limits
+from ...observer import Observer, PastMoments, Runtime, conditioned, driven_coordinates, relift_certificate, with_limits
 from ...observer.limits import sides
+from ...observer.predictor import Recipe, choose, embedded, tune_predictor
+from ...observer.predictor.choice import AT_LIMITS
+from ...observer.predictor.moments import limited
 from ...synthesis import Status, Synthesis
-from ..certificates import DIVERGED, scales_of
+from ...synthesis.residual_shaped.shaping_filter import Basis
+from ..certificates import DIVERGED, dropout_error_percent, scales_of
 from ..task import DesignResult, DesignTask
-from ..validation import ValidationSet, hidden_mean
+from ..validation import TrainingSet, ValidationSet, hidden_mean
 from .tuned import tuned_where_better
 
+_PARTS = ((25.0,), (60.0, 12.0), (60.0, 12.0, 2.4))  # of an episode: sets of time constants of slow lags
+_TUNED = 6000  # samples
+_RIDGES = (1e-6, 1e-5, 1e-7, 1e-8)  # of what predicts measurements that are missing
 UNCOVERED = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
 log = logging.getLogger(__name__)
 _SAMPLES, _EPISODES = 6000, 12  # that an observer is conditioned on, at most
 _SHARES = (1.0, 0.5)  # of the gain that is best, until a certificate covers it
 _CLOSE, _SHARE = 0.01, 0.001  # share of a limit that counts as at it, and how much of an episode has to be
+_NEAR = 0.03  # share of a limit that may have touched it, noise taken off
 _CIRCLE = {"sin": "cos", "cos": "sin"}
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much a predictor may cost.
+
+    Parameters
+    ----------
+    samples, groups : int
+        Of recordings, in so many units and conditions at most.
+    delays, internal : tuple of int
+        Candidates.
+    steps : int
+        Of tuning.
+    """
+
+    samples: int
+    groups: int
+    delays: tuple[int, ...]
+    internal: tuple[int, ...]
+    steps: int
+
+
+EFFORTS = {
+    "full": Effort(1_000_000, 100, (40, 80), (12, 18, 24, 32), 0),
+    "quick": Effort(200_000, 24, (40,), (24,), 0),
+}
 
 
 def design_predictor(task: DesignTask) -> DesignResult:
@@ -37,42 +73,108 @@ def design_predictor(task: DesignTask) -> DesignResult:
     SynthesisError
         Where the lifting reads what is not measured or past, everything is measured, recordings are too short, or the observer diverges.
     """
-    began, data = time.perf_counter(), task.training.read()
-    recipe = partial(identified, task, on_the_circle(task.models.lifting))
+    began, effort = time.perf_counter(), EFFORTS[task.predictor.effort]
     try:
-        kept, facts = tuned_where_better(
-            task, data, recipe(data.on_time, iterations=0), lambda seen, _: recipe(seen.on_time), partial(settled, task, reaching(task))
-        )
+        data, settle = recordings(task, effort).read_whole(), partial(settled, task, reaching(task))
+        plan = Plan.of(task, effort, data.on_time.batch)
+        start, facts = plan.observer(task, data), dict[str, Any]()
+        if steps := effort.steps if task.predictor.steps is None else task.predictor.steps:
+            kept, facts = tuned_where_better(task, data, start, lambda seen, _: plan.observer(task, seen, steps), settle)
+        else:
+            kept = settle(data.part(firsts(data.batch)), start)
     except (KrosError, np.linalg.LinAlgError) as error:
         raise SynthesisError(str(error)) from error
-    percent = float(hidden_mean(data.percent(kept), kept.measured))
+    percent = float(hidden_mean(task.training.read().percent(kept), kept.measured))
     if not percent < DIVERGED:
         raise SynthesisError(
             f"Subspace-identified predictor: it diverges on training episodes (error {percent:.3g} % of the largest value); "
             "lifted functions that say nearly the same as the measurement do that, take them out of the lifting."
         )
     synthesis = Synthesis("memory", kept.controller, Status.CERTIFIED, kept.injection, solve_s=time.perf_counter() - began)
-    facts = {"memory_states": task.predictor.states, **facts}
     nominal = {name: float(values[task.models.index(task.unit)]) for name, values in task.models.parameters.items()}
     observer = replace(kept, parameters=nominal, seen=task.training.seen)
-    return DesignResult(task.name, observer, synthesis, facts, task.problem, UNCOVERED)
+    return DesignResult(task.name, observer, synthesis, {**plan.facts(task), **facts}, task.problem, UNCOVERED)
 
 
-def identified(task: DesignTask, lifting: Lifting, data: ValidationSet, **options: Any) -> Observer:
-    """Return the observer that episodes give; `options` as in `identify_predictor`."""
-    models = task.models
-    observer = identify_predictor(
-        task.name,
-        lifting,
-        models.measured,
-        models.recorded_inputs,
-        data.batch,
-        task.predictor.states,
-        importance_of(task),
-        **({"episodes": task.predictor.episodes, "iterations": task.predictor.steps} | options),
-    )
-    observer = replace(observer, runtime=Runtime(task.runtime.delay), sensor=task.sensor)
-    return with_limits(observer, *sides(task.limits, observer.recorded)) if task.limits else observer
+def recordings(task: DesignTask, effort: Effort) -> TrainingSet:
+    """Return the training episodes that a predictor is made from."""
+    whole = task.recordings or task.training
+    if not task.predictor.others:
+        whole = replace(whole, keys=tuple(key for key in whole.keys if key.condition == task.training.keys[0].condition))
+    return whole.within(effort.samples, effort.groups)
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a predictor is made by: moments of the recordings and the recipe that units which were left out have chosen."""
+
+    past: PastMoments
+    recipe: Recipe
+    importance: list[float]
+
+    @classmethod
+    def of(cls, task: DesignTask, effort: Effort, batch: EpisodeBatch) -> Plan:
+        """Choose it."""
+        models, asked, shortest = task.models, task.predictor, int(batch.lengths.min())
+        first = task.training.keys[0].condition
+        others = sorted({key.condition for key in batch.keys} - {first})
+        delays = tuple(d for d in effort.delays if 8 * d <= shortest) or (max(2, min(effort.delays[0], shortest // 8)),)
+        lags = tuple(tuple(1 - part / max(shortest, 2 * part) for part in parts) for parts in _PARTS)
+        every = Basis(delays[-1], tuple(dict.fromkeys(pole for poles in lags for pole in poles)))
+        importance, until = importance_of(task), before_limits(task, batch)
+        past = PastMoments.of(on_the_circle(models.lifting), models.measured, batch, every, until)
+        internal = effort.internal if asked.states is None else (asked.states,)
+        emphasis: dict[str, Any] = {first: 1.0, **dict.fromkeys(others, asked.others)}
+        free = np.array([name not in task.limits for i, name in enumerate(models.lifting.states) if i not in models.measured])
+        emphasis |= {limited(c): AT_LIMITS * count * free for c, count in emphasis.items() if limited(c) in past.conditions}
+        rows = firsts(batch)
+        recipe = choose(past, batch.take(rows), emphasis, importance, delays, lags, internal, until[rows])
+        return cls(past.restricted(recipe.basis), recipe, importance)
+
+    def observer(self, task: DesignTask, data: ValidationSet, steps: int = 0) -> Observer:
+        """Return the observer, tuned by some steps on recordings, that of the moments without any."""
+        batch, model, asked, models = data.on_time.batch, self.recipe.model(self.past, self.importance), task.predictor, task.models
+        few = batch.take(firsts(batch, asked.episodes if steps else 1))
+        few = few.head(min(_TUNED, int(few.lengths.min())))
+        if steps:
+            slowest, recipe = max(self.recipe.basis.poles), self.recipe
+            model, _ = tune_predictor(model, self.past, few, self.importance, recipe.deviation, slowest, steps, weights=recipe.weights)
+        made = [embedded(task.name, self.past, model, models.recorded_inputs, few, ridge) for ridge in _RIDGES]
+        made = [replace(one, runtime=Runtime(task.runtime.delay), sensor=task.sensor) for one in made]
+        if task.limits:
+            made = [with_limits(one, *sides(task.limits, one.recorded)) for one in made]
+        without = dropout_error_percent(made, task.training.first_of_units().read(), models.sample_period_s)
+        return made[int(np.argmin(without))]
+
+    def facts(self, task: DesignTask) -> dict[str, Any]:
+        """Return what the records say."""
+        recipe, dt = self.recipe, task.models.sample_period_s
+        hidden = [name for i, name in enumerate(task.models.lifting.states) if i not in task.models.measured]
+        return {
+            "memory_states": recipe.internal,
+            "memory": {
+                "effort": task.predictor.effort,
+                "delays": recipe.basis.delays,
+                "lags_s": [dt / (1 - pole) for pole in recipe.basis.poles],
+                "deviation": recipe.deviation,
+                "conditions": {condition: dict(zip(hidden, shares, strict=True)) for condition, shares in recipe.weights.items()},
+                "left_out_percent": {name: 100 * error for name, error in zip(hidden, recipe.held_out, strict=True)},
+            },
+        }
+
+
+def firsts(batch: EpisodeBatch, count: int = 1) -> list[int]:
+    """Return where the first episodes of every unit and condition are."""
+    groups = [(key.unit, key.condition) for key in batch.keys]
+    return [i for i, group in enumerate(groups) if groups[:i].count(group) < count]
+
+
+def before_limits(task: DesignTask, batch: EpisodeBatch) -> npt.NDArray[np.int64]:
+    """Return how many samples of every episode there are before a state comes to a limit, shape (batch,)."""
+    lower, upper = sides(task.limits, task.models.lifting.states[: batch.states.shape[-1]])
+    lower, upper = lower * (1 + _NEAR * np.sign(lower)), upper * (1 - _NEAR * np.sign(upper))
+    met = np.any((batch.states <= lower) | (batch.states >= upper), axis=-1)
+    return np.where(met.any(axis=0), np.minimum(met.argmax(axis=0), batch.lengths), batch.lengths)
 
 
 def importance_of(task: DesignTask) -> list[float]:

@@ -67,9 +67,9 @@ def tuned_where_better(
 
 
 def held_out(keys: Sequence[EpisodeKey]) -> list[bool]:
-    """Tell which episodes tuning does not see: the last one of every unit, or every third unit's where units have one each."""
-    last = {key.unit: i for i, key in enumerate(keys)}
+    """Tell which episodes tuning does not see: the last one of every unit and condition, or every third where there is one of each."""
+    last = {(key.unit, key.condition): i for i, key in enumerate(keys)}
     if len(last) == len(keys):
         period = min(3, len(keys))
         return [i % period == period - 1 for i in range(len(keys))]
-    return [last[key.unit] == i for i, key in enumerate(keys)]
+    return [last[key.unit, key.condition] == i for i, key in enumerate(keys)]

@@ -5,6 +5,7 @@
 """
 
 from .build import embedded, identify_predictor
+from .choice import Recipe, choose
 from .driven import driven_coordinates, with_internal
 from .limited import conditioned, with_limits
 from .moments import PastMoments
@@ -12,6 +13,8 @@ from .tuning import tune_predictor
 
 __all__ = [
     "PastMoments",
+    "Recipe",
+    "choose",
     "conditioned",
     "driven_coordinates",
     "embedded",

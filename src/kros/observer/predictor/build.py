@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from ...core.linalg import least_squares
 from ...core.lti import gain
 from ...data import EpisodeBatch
 from ...lifting import Lifting
@@ -16,10 +15,11 @@ from ...synthesis.residual_shaped.shaping_filter import Basis
 from ...synthesis.result import Injection
 from ..observer import Observer
 from ..tuning.blocks import Array, Model
-from .moments import DELAYS, SHORT, SKIP, THIN, PastMoments, hidden_of
+from .moments import DELAYS, SHORT, THIN, PastMoments, hidden_of, skipped
 from .tuning import tune_predictor
 
 DEVIATION = 0.4
+RIDGE = 1e-6  # errors without measurements are up to five times smaller than with none
 
 
 def identify_predictor(
@@ -78,8 +78,10 @@ def identify_predictor(
     return embedded(name, past, model, inputs, few)
 
 
-def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], batch: EpisodeBatch) -> Observer:
+def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], batch: EpisodeBatch, ridge: float = RIDGE) -> Observer:
     """Write a model F, G, H of `PastMoments.model` into an observer; the rows of the measured states are fitted to the recordings.
+
+    These rows matter where measurements are missing: the observer runs by them then. `ridge` is their penalty, relative to mean squares.
 
     Returns
     -------
@@ -95,7 +97,7 @@ def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], 
     turn = np.vstack([H, null_space(H / np.linalg.norm(H, axis=1)[:, None]).T])
     back = np.linalg.inv(turn)
     F, G = turn @ F @ back, turn @ G
-    following = _measured_rows(F, G, past.channels(batch), batch.measurements(measured, arrived=False))
+    following = _measured_rows(F, G, past.channels(batch), batch.measurements(measured, arrived=False), ridge)
     place = [*hidden, *range(n, n + internal)]
     raw = np.zeros((n + internal, q + m + len(lifting.functions)))  # of y, u and sigma, in place of z
     own = np.zeros((n + internal, n + internal))
@@ -113,12 +115,16 @@ def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], 
     return Observer(name, widened, A, B, measured, tuple(inputs), gain(D, dt), Injection.STATE, dt, replaces=True, internal=internal)
 
 
-def _measured_rows(F: Array, G: Array, z: Array, y: Array) -> Array:
+def _measured_rows(F: Array, G: Array, z: Array, y: Array, ridge: float) -> Array:
     """Fit the change of the measured states on h and z, shape (q, order + channels)."""
     h = np.zeros((*z.shape[:2], len(F)))
     driven = z @ G.T
     for k in range(len(z) - 1):
         h[k + 1] = h[k] @ F.T + driven[k]
-    regressors = np.concatenate([h, z], axis=-1)[SKIP:-1:THIN].reshape(-1, len(F) + z.shape[-1])
-    change = np.diff(y, axis=0)[SKIP::THIN].reshape(-1, y.shape[-1])
-    return least_squares(regressors, change).T
+    start = skipped(len(z))
+    regressors = np.concatenate([h, z], axis=-1)[start:-1:THIN].reshape(-1, len(F) + z.shape[-1])
+    change = np.diff(y, axis=0)[start::THIN].reshape(-1, y.shape[-1])
+    size = np.sqrt(np.mean(regressors**2, axis=0))
+    scaled = regressors / np.where(size > 0, size, 1.0)
+    normal = scaled.T @ scaled / len(scaled) + ridge * np.eye(len(size))
+    return np.asarray((np.linalg.solve(normal, scaled.T @ change / len(scaled)) / np.where(size > 0, size, 1.0)[:, None]).T)

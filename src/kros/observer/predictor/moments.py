@@ -21,8 +21,8 @@ D. F. Enns, "Model reduction with balanced realizations: an error bound and a fr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -35,10 +35,14 @@ from ...lifting import Lifting
 from ...synthesis.residual_shaped.shaping_filter import Basis
 
 Array = npt.NDArray[np.float64]
+Model = tuple[Array, Array, Array]
+Weights = Mapping[str, npt.ArrayLike]
 DELAYS = 40
 THIN, SKIP = 4, 300
 SHORT = 25  # internal states forget within this part of an episode by default
-_RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 1e-5, 0.5, 0.1, 1e-13
+_RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 1e-5, 0.5, 0.01, 1e-13
+_REWEIGHTED = 3
+_CHANGES, _EXPLAINS = (2, 10, 50), 1.05  # samples; growth of the error
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +59,15 @@ class PastMoments:
     free : tuple of int
         Inputs that no measurement follows.
     units : tuple of str
-    gram : ndarray, shape (unit, N, N)
+        Unit of every row: a row is what one unit did in one condition.
+    gram : ndarray, shape (row, N, N)
         Second moments of s.
-    cross : ndarray, shape (unit, N, h)
+    cross : ndarray, shape (row, N, h)
         Of s and the hidden states.
-    power : ndarray, shape (unit, h)
+    power : ndarray, shape (row, h)
         Mean squares of the hidden states.
+    conditions : tuple of str
+        Condition of every row; one and the same where none is given.
     """
 
     lifting: Lifting
@@ -72,6 +79,7 @@ class PastMoments:
     gram: Array
     cross: Array
     power: Array
+    conditions: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -80,6 +88,7 @@ class PastMoments:
         measured: Sequence[int],
         batch: EpisodeBatch,
         basis: Basis | None = None,
+        until: npt.ArrayLike | None = None,
     ) -> PastMoments:
         """Collect moments of recordings.
 
@@ -92,6 +101,8 @@ class PastMoments:
         basis : Basis, optional
             By default 40 delays, and a lag of the tracking errors that forgets in a twenty-fifth of the shortest episode: controllers
             integrate.
+        until : array_like of int, shape (batch,), optional
+            Samples of every episode before its machine comes to a limit; those behind are rows of their own, of the condition `limited`.
 
         Raises
         ------
@@ -106,18 +117,23 @@ class PastMoments:
                 f"Predictor: functions of the lifting should read {', '.join(sorted(seen))} alone, found {', '.join(lifting.functions)}."
             )
         hidden, lengths, states, inputs = hidden_of(lifting, measured), batch.lengths, batch.states, batch.inputs
-        if not hidden or lengths.min() <= 2 * SKIP:
+        basis = basis or Basis(DELAYS, (1 - SHORT / int(lengths.min()),))
+        if not hidden or lengths.min() <= 2 * basis.delays:
             raise DataError(
-                f"Predictor: needs a state that is not measured and episodes of more than {2 * SKIP} samples, "
+                f"Predictor: needs a state that is not measured and episodes of more than {2 * basis.delays} samples, "
                 f"found {len(hidden)} and {lengths.min()}."
             )
-        basis = basis or Basis(DELAYS, (1 - SHORT / int(lengths.min()),))
         y = batch.measurements(measured, arrived=False)
         static = _static(inputs, y)
         share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
         free = tuple(int(j) for j in np.flatnonzero(share.max(axis=0) < _FOLLOWS))
         z = _channels(lifting, tuple(measured), static, free, batch)
-        names = tuple(dict.fromkeys(batch.units))
+        ends = lengths if until is None else np.minimum(np.asarray(until), lengths)
+        own = [(key.unit, key.condition) for key in batch.keys]
+        pieces = [(i, own[i], skipped(int(lengths[i])), int(ends[i])) for i in range(len(own))]
+        pieces += [(i, (own[i][0], limited(own[i][1])), int(ends[i]), int(lengths[i])) for i in range(len(own))]
+        pieces = [piece for piece in pieces if piece[3] - piece[2] >= THIN]
+        names = tuple(dict.fromkeys(name for _, name, _, _ in pieces))
         size = basis.delays * z.shape[-1] + len(basis.poles) * len(measured)
         gram, cross, power = (
             np.zeros((len(names), size, size)),
@@ -125,23 +141,37 @@ class PastMoments:
             np.zeros((len(names), len(hidden))),
         )
         counts = np.zeros(len(names))
-        for i, unit in enumerate(batch.units):
-            rows, k = np.arange(SKIP, lengths[i], THIN), names.index(unit)
+        for i, name, start, end in pieces:
+            rows, k = np.arange(start, end, THIN), names.index(name)
             s, truth = _basis_states(basis, z[:, i], rows, len(measured)), states[rows, i][:, hidden]
             gram[k] += s.T @ s
             cross[k] += s.T @ truth
             power[k] += np.sum(truth**2, axis=0)
             counts[k] += len(rows)
-        each = counts[:, None]
-        return cls(lifting, tuple(measured), basis, static, free, names, gram / each[:, None], cross / each[:, None], power / each)
+        each, (units, conditions) = counts[:, None], zip(*names, strict=True)
+        moments = gram / each[:, None], cross / each[:, None], power / each
+        return cls(lifting, tuple(measured), basis, static, free, tuple(units), *moments, tuple(conditions))
+
+    def restricted(self, basis: Basis) -> PastMoments:
+        """Return the same for fewer delays and lags of those that there are."""
+        whole, channels, q = self.basis, self.n_channels, len(self.measured)
+        lags = [whole.delays * channels + whole.poles.index(pole) * q + i for pole in basis.poles for i in range(q)]
+        kept = np.array([*range(basis.delays * channels), *lags])
+        return replace(self, basis=basis, gram=self.gram[:, kept[:, None], kept], cross=self.cross[:, kept])
 
     def model(
-        self, order: int, without: Sequence[str] = (), importance: npt.ArrayLike = 1.0, deviation: float = 0.0
-    ) -> tuple[Array, Array, Array]:
+        self,
+        order: int,
+        without: Sequence[str] = (),
+        importance: npt.ArrayLike = 1.0,
+        deviation: float = 0.0,
+        weights: Weights | None = None,
+    ) -> Model:
         """Return a stable model ``h+ = F h + G z``, ``x_h = H h`` of an order, of all units but some; F (order, order).
 
         `importance`, shape (h,) or a number, weights the hidden states' mean square errors, each relative to what the whole basis leaves of it.
         With `deviation` every lifted function's effect is known but for an independent factor 1 +- deviation, which differs from machine to machine.
+        `weights`: see `regression`.
 
         Raises
         ------
@@ -150,49 +180,144 @@ class PastMoments:
         DimensionError
             When the order is below the number of hidden states.
         """
-        rows = [i for i, unit in enumerate(self.units) if unit not in without]
-        if not rows:
-            raise DataError(f"Predictor: no unit is left without {', '.join(sorted(without))}; record more units.")
-        P, cross, power = self.gram[rows].mean(axis=0), self.cross[rows].mean(axis=0), self.power[rows].mean(axis=0)
-        if not cross.shape[1] <= order:
-            raise DimensionError(f"Predictor: {cross.shape[1]} hidden states need an order of at least as many, found {order}.")
-        q, delays = len(self.measured), self.basis.delays
-        channels = (len(P) - len(self.basis.poles) * q) // delays
+        return self.balanced(without, importance, deviation, weights).model(order)
+
+    def balanced(
+        self, without: Sequence[str] = (), importance: npt.ArrayLike = 1.0, deviation: float = 0.0, weights: Weights | None = None
+    ) -> Balanced:
+        """Return what all orders of `model` have in common."""
+        W, P, left = self.regression(without, deviation, weights)
+        q, delays, channels = len(self.measured), self.basis.delays, self.n_channels
         S, E = self.basis.system(channels)
         present = [i for i in range(len(S)) if i < delays * channels or i % channels < q]
-        size = self._channel_sizes(P, channels)
-        P, cross = P / np.outer(size, size), cross / size[:, None]
+        size = self._channel_sizes(P)
+        P, W = P / np.outer(size, size), W * size
         S, E = S[np.ix_(present, present)] * size / size[:, None], E[present] / size[:, None]
-        functions = len(self.lifting.functions)
-        for channel in range(channels - functions, channels):
-            own = np.arange(channel, delays * channels, channels)
-            P[np.ix_(own, own)] *= 1 + deviation**2
-        W = _ridge(P, cross, self.basis, channels)
-        left = np.sqrt(np.maximum(power - 2 * np.sum(W * cross.T, axis=1) + np.sum((W @ P) * W, axis=1), _NEGLIGIBLE * power))
         values, vectors = np.linalg.eigh(gramian(S.T, (W * (np.sqrt(importance) / left)[:, None]).T, 1.0))
         kept = values > _NEGLIGIBLE * values[-1]
         root, inverse = np.sqrt(values[kept])[:, None] * vectors[:, kept].T, vectors[:, kept] / np.sqrt(values[kept])
-        leading = np.linalg.eigh(root @ P @ root.T)[1][:, ::-1][:, :order]
-        down, up = leading.T @ root, inverse @ leading
-        scale = np.sqrt(np.diag(down @ P @ down.T))
-        down, up = down / scale[:, None], up * scale
-        return down @ S @ up, down @ E, W @ up
+        leading = np.linalg.eigh(root @ P @ root.T)[1][:, ::-1]
+        return Balanced(S, E, W, P, leading.T @ root, inverse @ leading)
+
+    def regression(self, without: Sequence[str] = (), deviation: float = 0.0, weights: Weights | None = None) -> tuple[Array, Array, Array]:
+        """Regress the hidden states on the basis.
+
+        Parameters
+        ----------
+        without : sequence of str
+            Units that take no part.
+        deviation : float
+        weights : mapping of str to array_like, shape (h,) or a number, optional
+            How much the error in every condition counts, relative to what is left of it there: the sum of logarithms of mean square errors, weighted
+            by these, is made small. Without them all rows count alike.
+
+        Returns
+        -------
+        W : ndarray, shape (h, N)
+        P : ndarray, shape (N, N)
+            Second moments of s, lifted functions larger by their deviation.
+        left : ndarray, shape (h,)
+            Size of what is left.
+        """
+        rows = [i for i, unit in enumerate(self.units) if unit not in without]
+        if not rows:
+            raise DataError(f"Predictor: no unit is left without {', '.join(sorted(without))}; record more units.")
+        power, share = self.power[rows], np.ones((len(rows), self.power.shape[1]))
+        if weights is not None:
+            own = [self.conditions[i] for i in rows]
+            share = np.array([np.broadcast_to(np.asarray(weights.get(c, 0.0)), power.shape[1:]) / own.count(c) for c in own])
+        share = share / share.sum(axis=0)
+        found = self._solved(rows, share, deviation)
+        for _ in range(_REWEIGHTED if weights is not None and len(set(own)) > 1 else 0):
+            missed = self.errors(found[0])[rows]
+            by_condition = {c: missed[[i for i, other in enumerate(own) if other == c]].mean(axis=0) for c in set(own)}
+            relative = share / np.maximum([by_condition[c] for c in own], _NEGLIGIBLE * power.mean(axis=0))
+            found = self._solved(rows, relative / relative.sum(axis=0), deviation)
+        return found
+
+    def errors(self, W: Array) -> Array:
+        """Return the mean square errors of a regression, shape (row, h)."""
+        found = self.power - 2 * np.einsum("hn,rnh->rh", W, self.cross) + np.einsum("hn,rnm,hm->rh", W, self.gram, W, optimize=True)
+        return np.maximum(found, _NEGLIGIBLE * self.power)
+
+    def _solved(self, rows: list[int], share: Array, deviation: float) -> tuple[Array, Array, Array]:
+        """Solve the normal equations of rows that count by shares, shape (row, h) of sum one for every hidden state."""
+        channels, power = self.n_channels, np.sum(share * self.power[rows], axis=0)
+
+        def pooled(own: Array) -> Array:
+            P = np.asarray(np.tensordot(own, self.gram[rows], 1))
+            for channel in range(channels - len(self.lifting.functions), channels):
+                of_one = np.arange(channel, self.basis.delays * channels, channels)
+                P[np.ix_(of_one, of_one)] *= 1 + deviation**2
+            return P
+
+        P = pooled(share.mean(axis=1))
+        W, left, size = np.empty((share.shape[1], len(P))), np.empty(share.shape[1]), self._channel_sizes(P)
+        for column, own in enumerate(share.T):
+            cross = np.tensordot(own, self.cross[rows][..., column], 1)
+            mine = P if np.allclose(own, share.mean(axis=1)) else pooled(own)
+            W[column] = _ridge(mine / np.outer(size, size), (cross / size)[:, None], self.basis, channels)[0] / size
+            missed = power[column] - 2 * W[column] @ cross + W[column] @ mine @ W[column]
+            left[column] = np.sqrt(max(missed, _NEGLIGIBLE * power[column]))
+        return W, P, left
+
+    @property
+    def n_channels(self) -> int:
+        """Number of channels z."""
+        return (self.gram.shape[1] - len(self.basis.poles) * len(self.measured)) // self.basis.delays
 
     def channels(self, batch: EpisodeBatch) -> Array:
         """Return the channels z along recordings, shape (n_samples, batch, channels)."""
         return _channels(self.lifting, self.measured, self.static, self.free, batch)
 
-    def _channel_sizes(self, P: Array, channels: int) -> Array:
+    def _channel_sizes(self, P: Array) -> Array:
         """Size of the channel that every state of the basis is of: what is negligible must not depend on units of measure."""
-        delays, q = self.basis.delays, len(self.measured)
+        delays, q, channels = self.basis.delays, len(self.measured), self.n_channels
         power = np.diag(P)[: delays * channels].reshape(delays, channels).mean(axis=0)
         size = np.sqrt(np.where(power > 0, power, 1.0))
         return np.concatenate([np.tile(size, delays), np.tile(size[:q], len(self.basis.poles))])
 
 
+@dataclass(frozen=True, eq=False)
+class Balanced:
+    """A regression in coordinates that are ordered by how much they matter: S, E, W of the basis, P its second moments, `down` and `up` to and fro."""
+
+    S: Array
+    E: Array
+    W: Array
+    P: Array
+    down: Array
+    up: Array
+
+    def model(self, order: int) -> Model:
+        """Return the model F, G, H of an order.
+
+        Raises
+        ------
+        DimensionError
+            When the order is below the number of hidden states.
+        """
+        if not len(self.W) <= order:
+            raise DimensionError(f"Predictor: {len(self.W)} hidden states need an order of at least as many, found {order}.")
+        down, up = self.down[:order], self.up[:, :order]
+        scale = np.sqrt(np.diag(down @ self.P @ down.T))
+        down, up = down / scale[:, None], up * scale
+        return down @ self.S @ up, down @ self.E, self.W @ up
+
+
+def limited(condition: str) -> str:
+    """Return what the rows of a condition are called in which a machine has come to a limit."""
+    return f"{condition} at a limit"
+
+
 def hidden_of(lifting: Lifting, measured: Sequence[int]) -> list[int]:
     """Indices of the states that are not measured."""
     return [i for i in range(lifting.n_states) if i not in measured]
+
+
+def skipped(length: int) -> int:
+    """Return how many samples at the start of an episode do not count: what was before is not known yet."""
+    return min(SKIP, length // 4)
 
 
 def _centred(values: Array) -> Array:
@@ -201,13 +326,31 @@ def _centred(values: Array) -> Array:
 
 
 def _static(inputs: Array, y: Array) -> Array:
-    """M, shape (q, m): on the first samples, where machines rest, if they start in different places; else on all.
+    """M, shape (q, m): on the first samples, where machines rest, if they start in different places; else beside what changes of the inputs explain.
 
-    A lag that depends on the speed would bias M by little, but start every run with an error that the differences of the past magnify.
+    A lag that depends on the speed would bias M by little, but start every run with an error that the differences of the past magnify. An input that
+    explains nothing beside its changes is left out.
     """
-    starts = np.all(y[0].std(axis=0) > _APART * _centred(y).std(axis=0))
-    rows, values = (inputs[:1], y[:1]) if starts else (inputs, y)
-    return least_squares(_centred(rows), _centred(values), rcond=1e-9).T
+    if np.all(y[0].std(axis=0) > _APART * _centred(y).std(axis=0)):
+        return least_squares(_centred(inputs[:1]), _centred(y[:1]), rcond=1e-9).T
+    m, longest = inputs.shape[-1], max(_CHANGES)
+    changes = [inputs[longest::THIN] - inputs[longest - d : len(inputs) - d : THIN] for d in _CHANGES]
+    X, Y = _centred(np.concatenate([inputs[longest::THIN], *changes], axis=-1)), _centred(y[longest::THIN])
+    size = X.std(axis=0)
+    X = X / np.where(size > 0, size, 1.0)
+
+    def fitted(kept: list[int]) -> tuple[Array, Array]:
+        found = np.zeros((X.shape[1], Y.shape[1]))
+        found[kept] = least_squares(X[:, kept], Y, rcond=1e-10)
+        return found, np.mean((Y - X @ found) ** 2, axis=0)
+
+    kept = [i for i in range(X.shape[1]) if size[i] > 0]
+    best, left = fitted(kept)
+    for j in range(m):
+        fewer = [i for i in kept if i != j]
+        if fewer and np.all((other := fitted(fewer))[1] <= _EXPLAINS * left):
+            kept, (best, left) = fewer, other
+    return (best[:m] / np.where(size > 0, size, 1.0)[:m, None]).T
 
 
 def _channels(lifting: Lifting, measured: tuple[int, ...], static: Array, free: tuple[int, ...], batch: EpisodeBatch) -> Array:

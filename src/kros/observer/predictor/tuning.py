@@ -2,12 +2,12 @@ r"""Tuning of linear models for hidden states: all coefficients, dynamics includ
 
 The estimates are ``x_h = H (q I - F)^-1 G z`` with z as recorded (`PastMoments.channels`): no observer has to be run for a step. The criterion is
 
-.. math:: \sum_i s_i \log \bigl( \operatorname{mean}_u \overline{e_{iu}^2} \bigr)^{1/2},
+.. math:: \sum_{i, c} s_{ic} \log \bigl( \operatorname{mean}_{u \in c} \overline{e_{iu}^2} \bigr)^{1/2},
 
-with :math:`\overline{e_{iu}^2}` the mean square error of hidden state i on unit u. Every episode counts twice, with the lifted functions larger
-and smaller by a share: machines on which they act more or less than on the mean machine look like that, and an observer that relied on the mean
-machine's would fail there. Steps are taken in coordinates in which the states are white along the recordings, all coefficients free: of the many models
-with the same estimates, the nearest one. In those of companion forms or of single modes the search ends early.
+with :math:`\overline{e_{iu}^2}` the mean square error of hidden state i on unit u in condition c. Every episode counts twice, with the lifted
+functions larger and smaller by a share: machines on which they act more or less than on the mean machine look like that, and an observer that relied on
+the mean machine's would fail there. Steps are taken in coordinates in which the states are white along the recordings, all coefficients free: of the
+many models with the same estimates, the nearest one. In those of companion forms or of single modes the search ends early.
 
 References
 ----------
@@ -27,7 +27,7 @@ from ...core.errors import DataError
 from ...data import EpisodeBatch
 from ..tuning.blocks import Array, Block, Model, blocks_of, joined
 from ..tuning.gauss_newton import SETTLED, Damping, mean_log, scaled, search, whitening
-from .moments import PastMoments, hidden_of
+from .moments import PastMoments, Weights, hidden_of
 
 _DAMPING = Damping(1e-7, 1e-3, 1e4, 4.0)
 _THIN, _SIDE_BY_SIDE = 8, 4  # episodes: keeps derivatives in some ten megabytes
@@ -44,6 +44,7 @@ def tune_predictor(
     slowest: float | None = None,
     iterations: int = 25,
     least_gain: float = 1e-4,
+    weights: Weights | None = None,
 ) -> tuple[Model, tuple[float, ...]]:
     """Improve a model of `PastMoments.model` on recordings of one length.
 
@@ -64,6 +65,8 @@ def tune_predictor(
         Most steps.
     least_gain : float
         Decrease of the criterion in two steps below which the search ends.
+    weights : mapping of str to array_like, shape (h,) or a number, optional
+        How much the logarithmic error in every condition counts; without them all recordings are alike.
 
     Returns
     -------
@@ -76,7 +79,7 @@ def tune_predictor(
     DataError
         When the model is not stable.
     """
-    problem = _Tuning(past, batch, importance, deviation)
+    problem = _Tuning(past, batch, importance, deviation, weights)
     own = float(np.abs(np.linalg.eigvals(model[0])).max())
     problem.slowest = max(own, 1 - SETTLED / len(batch.states) if slowest is None else slowest)
     if not problem.slowest < 1:
@@ -87,7 +90,7 @@ def tune_predictor(
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A model in blocks, and its mean square errors, shape (unit, h)."""
+    """A model in blocks, and its mean square errors, shape (condition, h)."""
 
     blocks: list[Block]
     errors: Array
@@ -97,32 +100,39 @@ class _Point:
 class _Tuning:
     """Recordings to tune on, samples on the last axis."""
 
-    def __init__(self, past: PastMoments, batch: EpisodeBatch, importance: npt.ArrayLike, deviation: float) -> None:
+    def __init__(
+        self, past: PastMoments, batch: EpisodeBatch, importance: npt.ArrayLike, deviation: float, weights: Weights | None
+    ) -> None:
         hidden = hidden_of(past.lifting, past.measured)
         seen, truth = past.channels(batch), batch.states[..., hidden]
         z, truth = (np.ascontiguousarray(np.moveaxis(a, 0, 2).swapaxes(0, 1)) for a in (seen, truth))
-        names = list(dict.fromkeys(batch.units))
-        unit = np.array([names.index(u) for u in batch.units])
+        names = list(dict.fromkeys(key.condition for key in batch.keys)) if weights else [""]
+        group = np.array([names.index(key.condition) if weights else 0 for key in batch.keys])
         lifted = slice(len(z) - len(past.lifting.functions), None)
         if deviation and past.lifting.functions:  # twice where machines deviate
-            sign = np.where(np.arange(len(unit)) % 2 == 0, deviation, -deviation)[:, None]
+            sign = np.where(np.arange(len(group)) % 2 == 0, deviation, -deviation)[:, None]
             both = [z.copy(), z.copy()]
             both[0][lifted] *= 1 + sign
             both[1][lifted] *= 1 - sign
-            z, truth, unit = np.concatenate(both, axis=1), np.concatenate([truth, truth], axis=1), np.tile(unit, 2)
-        share = np.broadcast_to(np.asarray(importance, dtype=float), len(hidden))
-        self.z, self.truth, self.unit, self.share, self.slowest = z, truth, unit, share / share.sum(), 1.0
+            z, truth, group = np.concatenate(both, axis=1), np.concatenate([truth, truth], axis=1), np.tile(group, 2)
+        counts = np.array([np.broadcast_to(np.asarray((weights or {"": 1.0}).get(c, 0.0), dtype=float), len(hidden)) for c in names])
+        share = np.broadcast_to(np.asarray(importance, dtype=float), len(hidden)) * counts / counts.sum(axis=0)
+        self.z, self.truth, self.group, self.share, self.slowest = z, truth, group, share / share.sum(), 1.0
+        rows = list(zip(group.tolist(), np.resize(batch.units, len(group)).tolist(), strict=True))
+        units = [len({u for g, u in rows if g == own}) for own, _ in rows]
+        self.each = np.array(
+            [1 / (rows.count(row) * n) for row, n in zip(rows, units, strict=True)]
+        )  # all units of a condition count alike
         self.rest = np.zeros(z.shape[:2])
         self.rest[lifted] = z[lifted, :, 0]
 
     def at(self, blocks: list[Block]) -> _Point:
         """Run a model."""
-        found, counts = np.zeros((self.unit.max() + 1, len(self.truth))), np.bincount(self.unit)
+        found = np.zeros(self.share.shape)
         with np.errstate(over="ignore", invalid="ignore"):
             for part in self._parts():
-                np.add.at(found, self.unit[part], np.mean(self._missed(blocks, part)[2] ** 2, axis=-1).T)
-            errors = found / counts[:, None]
-            return _Point(blocks, errors, mean_log(self.share, errors.mean(axis=0)))
+                np.add.at(found, self.group[part], np.mean(self._missed(blocks, part)[2] ** 2, axis=-1).T * self.each[part, None])
+            return _Point(blocks, found, mean_log(self.share.ravel(), found.ravel()))
 
     def steps(self, point: _Point) -> Callable[[float], _Point]:
         """Gauss-Newton steps, bounded where they slow down the slowest pole.
@@ -136,7 +146,7 @@ class _Tuning:
         n, outputs = len(model[0]), len(self.truth)
         into, out = self._whitening(blocks)
         width = into.shape[1]
-        weight = self.share / point.errors.sum(axis=0) / np.bincount(self.unit)[:, None]
+        weight = (self.share / point.errors)[self.group] * self.each[:, None]
         H, g = np.zeros((n * (width + outputs),) * 2), np.zeros(n * (width + outputs))
         for part in self._parts():
             h, rest, missed = self._missed(blocks, part)
@@ -145,7 +155,7 @@ class _Tuning:
             inner = np.concatenate([b.responses(signals, rest, _THIN) for b in blocks])
             direct = np.zeros((outputs, *h[..., ::_THIN].shape[:1], outputs, *h[..., ::_THIN].shape[1:]))
             direct[range(outputs), :, range(outputs)] = h[..., ::_THIN]
-            root = np.sqrt(weight[self.unit[part]].T)[..., None]
+            root = np.sqrt(weight[part].T)[..., None]
             X = np.concatenate([(part_of * root).reshape(-1, root[..., 0].size * inner.shape[-1]) for part_of in (inner, direct)])
             H += X @ X.T
             g += X @ (missed[..., ::_THIN] * root).ravel()
@@ -186,7 +196,7 @@ class _Tuning:
         return h, rest, self.truth[:, part] - np.tensordot(np.hstack([b.H for b in blocks]), h, 1)
 
     def _parts(self) -> list[slice]:
-        return [slice(i, i + _SIDE_BY_SIDE) for i in range(0, len(self.unit), _SIDE_BY_SIDE)]
+        return [slice(i, i + _SIDE_BY_SIDE) for i in range(0, len(self.group), _SIDE_BY_SIDE)]
 
 
 def _slowing(F: Array) -> Array:

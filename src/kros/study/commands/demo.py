@@ -65,7 +65,7 @@ def run_demo(
 ) -> RunResult:
     """Simulate a population with one badly assembled drive and run the study on it, all below one folder.
 
-    An earlier demo there is continued, or changed to what is asked now.
+    An earlier demo there is continued, or changed to what is asked now. Predictors are made with little effort unless `overrides` say otherwise.
 
     Raises
     ------
@@ -73,7 +73,8 @@ def run_demo(
         When the folder holds anything but an earlier demo.
     """
     out = Path(out).absolute()
-    config = validate_config({"name": "demo", "data": {"source": str(out / _RECORDINGS), "reader": "parquet"}}, out, overrides=overrides)
+    raw = {"name": "demo", "data": {"source": str(out / _RECORDINGS), "reader": "parquet"}, "predictor": {"effort": "quick"}}
+    config = validate_config(raw, out, overrides=overrides)
     with open_run(out, config) as store:
         _simulate_in(store, units, episodes, seconds, seed, progress)
         require_usable(config, Stage.REPORT)

@@ -1,0 +1,191 @@
+"""Choosing a predictor's memory, weights of conditions and order: by the errors on units that had no part in it.
+
+What is regressed on the whole basis costs no run: the moments of the units that are left out say what it misses there. So the lags, the delays, the
+weight of every condition for every hidden state, and the deviation of lifted functions are compared with all of the past; orders then with models that run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ...data import EpisodeBatch
+from ...synthesis.residual_shaped.shaping_filter import Basis
+from ..tuning.blocks import Array, Model
+from .moments import PastMoments, hidden_of, limited
+
+FOLDS = 3
+SHARES = (0.0, 0.3, 1.0)  # of the other conditions in training
+DEVIATIONS = (0.0, 0.2, 0.4)
+AS_GOOD = 0.003  # difference of logarithms that is worth no longer memory, and no more states
+AT_LIMITS = 0.25  # weight of what machines do after they have come to a limit, beside what they do before
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What `PastMoments.model` needs to know.
+
+    Parameters
+    ----------
+    basis : Basis
+    weights : mapping of str to tuple of float
+        Of every condition, one for every hidden state.
+    deviation : float
+        Share by which the lifted functions' effect may differ from machine to machine.
+    internal : int
+        States besides the recorded ones.
+    held_out : tuple of float
+        Root mean square errors of the hidden states on units that were left out: logarithmic mean over conditions by emphasis.
+    """
+
+    basis: Basis
+    weights: Mapping[str, tuple[float, ...]]
+    deviation: float
+    internal: int
+    held_out: tuple[float, ...]
+
+    def model(self, past: PastMoments, importance: npt.ArrayLike = 1.0) -> Model:
+        """Return the model that the moments of all units give."""
+        order = past.power.shape[1] + self.internal
+        return past.restricted(self.basis).model(order, (), importance, self.deviation, self.weights)
+
+
+def choose(
+    past: PastMoments,
+    batch: EpisodeBatch,
+    emphasis: Mapping[str, npt.ArrayLike],
+    importance: npt.ArrayLike = 1.0,
+    delays: Sequence[int] = (),
+    lags: Sequence[tuple[float, ...]] = (),
+    internal: Sequence[int] = (12,),
+    until: npt.ArrayLike | None = None,
+) -> Recipe:
+    """Choose a recipe on units that are left out in turn.
+
+    Parameters
+    ----------
+    past : PastMoments
+        Of the longest basis.
+    batch : EpisodeBatch
+        Recordings that models are run on.
+    emphasis : mapping of str to array_like, shape (h,) or a number
+        How much the logarithmic error in every condition counts; the first one is trained on in full, the others to the share that is best.
+    importance : array_like, shape (h,) or a number
+        How much that of every hidden state counts.
+    delays : sequence of int
+        Candidates, the shortest first; by default those of the basis.
+    lags : sequence of tuple of float
+        Sets of poles, the fastest first; by default those of the basis.
+    internal : sequence of int
+        Candidates, the fewest first.
+    until : array_like of int, shape (batch,), optional
+        As in `PastMoments.of`, of `batch`.
+    """
+    stressed = {c: np.broadcast_to(np.asarray(own, dtype=float), past.power.shape[1:]) for c, own in emphasis.items()}
+    share = np.broadcast_to(np.asarray(importance, dtype=float), past.power.shape[1:])
+    share = share / share.sum()
+    first = next(iter(stressed))
+    at_limits = {limited(c) for c in stressed}
+    others = [c for c in stressed if c not in (first, limited(first))]
+    delays, lags = delays or (past.basis.delays,), lags or (past.basis.poles,)
+    shares = SHARES if others else (0.0,)
+
+    def weights(of_states: npt.ArrayLike) -> dict[str, tuple[float, ...]]:
+        own = {c: of_states if c in others else 1.0 for c in stressed}
+        return {
+            c: tuple(map(float, np.where(counts > 0, own[c], 0.0) * (AT_LIMITS if c in at_limits else 1.0)))
+            for c, counts in stressed.items()
+        }
+
+    def judged(basis: Basis, of_states: npt.ArrayLike, deviation: float) -> Array:
+        part, given = past.restricted(basis), weights(of_states)
+        return _held_out(past, stressed, lambda units, rows: part.errors(part.regression(units, deviation, given)[0])[rows])
+
+    tried = {poles: np.array([judged(Basis(delays[0], poles), s, DEVIATIONS[-1]) for s in shares]) for poles in lags}
+    poles = lags[_first_good(np.array([[share @ tried[p].min(axis=0)] for p in lags]))]
+    own = np.asarray(shares)[tried[poles].argmin(axis=0)]
+    basis = Basis(delays[0], poles)
+    deviations = DEVIATIONS if past.lifting.functions else (0.0,)
+    deviation = deviations[int(np.argmin([share @ judged(basis, own, deviation) for deviation in deviations]))]
+    if len(delays) > 1:
+        basis = Basis(delays[_first_good(np.array([judged(Basis(d, poles), own, deviation) for d in delays]))], poles)
+    errors = _orders(past.restricted(basis), batch, stressed, share, weights(own), deviation, internal, until)
+    best = _first_good(np.array(errors))
+    return Recipe(basis, weights(own), deviation, internal[best], tuple(np.exp(errors[best]).tolist()))
+
+
+def _orders(
+    past: PastMoments,
+    batch: EpisodeBatch,
+    emphasis: Mapping[str, Array],
+    share: Array,
+    weights: Mapping[str, tuple[float, ...]],
+    deviation: float,
+    internal: Sequence[int],
+    until: npt.ArrayLike | None,
+) -> list[Array]:
+    """Errors of models of several orders that run on units without which they were made, shape (h,) each, as logarithms."""
+    rows, hidden = list(zip(past.units, past.conditions, strict=True)), hidden_of(past.lifting, past.measured)
+    ends = batch.lengths if until is None else np.minimum(np.asarray(until), batch.lengths)
+    pieces = [(i, (key.unit, key.condition), 0, int(ends[i])) for i, key in enumerate(batch.keys)]
+    pieces += [(i, (key.unit, limited(key.condition)), int(ends[i]), int(batch.lengths[i])) for i, key in enumerate(batch.keys)]
+    pieces = [piece for piece in pieces if piece[3] > piece[2] and piece[1] in rows]
+
+    def missed(units: Sequence[str], which: list[int]) -> Array:
+        own = [piece for piece in pieces if rows.index(piece[1]) in which]
+        runs = sorted({i for i, *_ in own})
+        held, total, count = batch.take(runs), np.zeros((len(internal), len(rows), len(hidden))), np.zeros(len(rows))
+        for _, name, start, end in own:
+            count[rows.index(name)] += end - start
+        balanced = past.balanced(units, share, deviation, weights)
+        for n, memories in enumerate(internal):
+            error = estimates(balanced.model(len(hidden) + memories), past, held) - held.states[..., hidden]
+            for i, name, start, end in own:
+                total[n, rows.index(name)] += np.sum(error[start:end, runs.index(i)] ** 2, axis=0)
+        found = total / np.where(count > 0, count, np.nan)[:, None]
+        return np.moveaxis(found, 0, -1)[which]
+
+    return list(_held_out(past, emphasis, missed).T)
+
+
+def _held_out(past: PastMoments, emphasis: Mapping[str, Array], missed: Callable[[list[str], list[int]], Array]) -> Array:
+    """Weighted mean over conditions of the logarithm of the root mean square error on units that are left out, shape (h, ...) as a row of `missed`."""
+    names = list(dict.fromkeys(past.units))
+    folds = [names[i::FOLDS] for i in range(min(FOLDS, len(names)))]
+    found: dict[int, Array] = {}
+    for fold in folds:
+        rows = [i for i, unit in enumerate(past.units) if unit in fold]
+        found |= dict(zip(rows, missed(fold if len(names) > 1 else [], rows), strict=True))
+    total: Array = np.zeros(1)
+    weights: Array = np.zeros(1)
+    for condition, counts in emphasis.items():
+        own = [found[i] for i, other in enumerate(past.conditions) if other == condition and np.isfinite(found[i]).all()]
+        if own:
+            shape = (-1,) + (1,) * (own[0].ndim - 1)
+            total = total + counts.reshape(shape) * np.log(np.mean(own, axis=0)) / 2
+            weights = weights + counts.reshape(shape)
+    return np.asarray(total / weights)
+
+
+def _first_good(scores: Array) -> int:
+    """Return which is the first candidate, shape (candidate, h), that is as good as the best ones for every hidden state; else the best in the mean."""
+    good = np.flatnonzero((scores <= scores.min(axis=0) + AS_GOOD).all(axis=1))
+    return int(good[0] if len(good) else scores.mean(axis=1).argmin())
+
+
+def estimates(model: Model, past: PastMoments, batch: EpisodeBatch) -> Array:
+    """Run a model along recordings from rest, shape (n_samples, batch, h)."""
+    F, G, H = model
+    z = past.channels(batch)
+    held = np.zeros(z.shape[1:])
+    lifted = slice(z.shape[-1] - len(past.lifting.functions), None)
+    held[:, lifted] = z[0][:, lifted]
+    driven, own = z @ G.T, np.ascontiguousarray(F.T)
+    h = np.empty((*z.shape[:2], len(F)))
+    h[0] = np.linalg.solve(np.eye(len(F)) - F, G @ held.T).T
+    for k in range(len(z) - 1):
+        h[k + 1] = h[k] @ own + driven[k]
+    return np.asarray(h @ H.T)

@@ -54,7 +54,7 @@ def test_metrics_keep_the_contract(metrics):
         assert [len(orders) for orders in uncertain["weight"]["orders"]] == [2, 2]
     for name in (f"{model}/worst_case_h2" for model in metrics["models"]):
         observer = metrics["observers"][name]
-        if observer["set"] == "signals":
+        if observer.get("set") == "signals":
             assert observer["set_certified"]
             bounds = observer["set_lower_bound_percent"]
             assert all(bound is None or bound <= observer["set_bound_percent"][state] for state, bound in bounds.items())

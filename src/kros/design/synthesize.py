@@ -33,7 +33,7 @@ from .about import about
 from .certificates import DIVERGED, Running, certify_running
 from .methods.table import BY_NAME, preferred, slowest_first, suitable
 from .settings import BASELINES, ObserverSettings, PredictorSettings, SynthesisSettings
-from .task import DesignResult, DesignTask, split_name
+from .task import DesignResult, DesignTask, is_robust, split_name
 from .validation import TrainingSet
 
 log = logging.getLogger(__name__)
@@ -255,7 +255,7 @@ def tasks_of(
     problem, refusal = usable_problem(models, own, noise, settings)
     shared: dict[str, Any] = {"models": models, "unit": uncertain.nominal, "problem": problem, "refusal": refusal, "noise": noise}
     shared |= {"training": training, "recordings": whole, "covered": own.unit_ids}
-    shared |= {"max_order": uncertain.max_order, "settings": settings, "predictor": predictor}
+    shared |= {"max_order": uncertain.max_order, "pooled": uncertain.pooled, "settings": settings, "predictor": predictor}
     if own_limits := limits_of(limits or {}, identified.facts.limits, identified.population.states):
         shared["limits"] = {name: limit.in_unit(recorded.sizes[name]) for name, limit in own_limits.items()}
         shared["at_limits"] = TrainingSet.at_limits(identified, recorded, sensor).normalised(recorded)
@@ -339,4 +339,4 @@ def choose_deployed(wanted: str | None, made: list[str], running: Sequence[Runni
 
 def robust_of(running: Sequence[Running], facts: Mapping[str, Mapping[str, Any]]) -> Sequence[Running]:
     """Return the observers that are certified for the uncertain set; all where none is."""
-    return [r for r in running if facts[r.name].get("worst_case_h2") is not None] or running
+    return [r for r in running if is_robust(facts[r.name])] or running

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -175,6 +175,14 @@ def without_correction(task: DesignTask) -> Synthesis:
 def first_of(ranks: Sequence[tuple[bool, float]]) -> int:
     """Return which rank is the least, the first of equal ones."""
     return min(range(len(ranks)), key=lambda i: ranks[i])
+
+
+def is_robust(facts: Mapping[str, Any]) -> bool:
+    """Tell from the facts about an observer whether it is certified for a set of machines: that around the nominal, or the one that it was designed for."""
+    own = facts.get("set")
+    if own == "signals":
+        return bool(facts.get("set_certified"))
+    return facts.get("models_worst_case_h2" if own == "models" else "worst_case_h2") is not None
 
 
 def split_name(observer: str) -> tuple[str, str]:

@@ -12,6 +12,7 @@ from ..core.artifacts import read_json
 from ..core.errors import ConfigError
 from ..core.work import Progress, Silent, Work
 from ..data import Population, detect_reader
+from ..design.task import is_robust
 from ..observer import Observer
 from .config import Stage, StudyConfig, load_config, validate_config
 from .engine.context import Context
@@ -191,7 +192,7 @@ def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:
     """Return the requirements of the study that its result does not meet."""
     found = []
     deployed = metrics.get("observers", {}).get(metrics["study"].get("deployed") or "", {})
-    if config.require.robust and (deployed.get("status") == "failed" or deployed.get("worst_case_h2") is None):
+    if config.require.robust and (deployed.get("status") == "failed" or not is_robust(deployed)):
         reason = deployed.get("reason", "none was computed")
         found.append(f"require.robust: the deployed observer {metrics['study'].get('deployed')} has no certificate ({reason})")
     flagged = [f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]]

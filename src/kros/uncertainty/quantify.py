@@ -31,7 +31,7 @@ from .settings import UncertaintySettings
 from .small_matrices import sigma_max
 from .systems import quantify_systems
 
-_KIND = "choice"
+_KIND, _BEST = "choice", "unit"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,6 +54,8 @@ class UncertainModels:
         By place of the models in `models.sets`.
     max_order : int
         Highest order of a weight.
+    pooled : bool
+        Whether observers whose nominal need not be a unit may have the mean of the units' models.
     """
 
     models: IdentifiedModels
@@ -64,6 +66,7 @@ class UncertainModels:
     scores: tuple[dict[str, Any], ...] = ()
     outliers: Mapping[str, OutlierModel] = field(default_factory=dict)
     max_order: int = 4
+    pooled: bool = True
 
     def __repr__(self) -> str:
         flagged = sum(bool(row["outlier"]) for row in self.scores)
@@ -84,7 +87,7 @@ class UncertainModels:
             outliers.save(folder / "outliers" / place)
         write_json(folder / "outliers" / "scores.json", {"schema": 1, "rows": self.scores})
         content: dict[str, Any] = {"nominal": self.nominal, "worst_off_nominal": self.worst_off_nominal, "dropped": self.dropped}
-        content |= {"kinds": list(self.sets), "outliers": list(self.outliers), "max_order": self.max_order}
+        content |= {"kinds": list(self.sets), "outliers": list(self.outliers), "max_order": self.max_order, "pooled": self.pooled}
         save_artifact(folder / "uncertainty", _KIND, content)
 
     @classmethod
@@ -101,7 +104,9 @@ class UncertainModels:
         outliers = Stored(OutlierModel.load, {place: folder / "outliers" / place for place in content["outliers"]})
         scores = tuple(read_json(folder / "outliers" / "scores.json")["rows"])
         dropped, order = tuple(content["dropped"]), content["max_order"]
-        return cls(models, content["nominal"], content["worst_off_nominal"], dropped, sets, scores, outliers, order)
+        return cls(
+            models, content["nominal"], content["worst_off_nominal"], dropped, sets, scores, outliers, order, content.get("pooled", True)
+        )
 
 
 @overload
@@ -149,12 +154,14 @@ def quantify(models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: 
     tasks = [partial(quantify_models, models.models(kind), units, asked, nominal) for kind in models.kinds]
     sets = dict(zip(models.kinds, (work or Work()).run("quantify", tasks), strict=True))
     farthest = worst_off_nominal(first, sets[models.kinds[0]])
-    return UncertainModels(models, nominal, farthest, tuple(sorted(dropped)), sets, tuple(scores), outliers, asked.max_order)
+    return UncertainModels(
+        models, nominal, farthest, tuple(sorted(dropped)), sets, tuple(scores), outliers, asked.max_order, asked.nominal is None
+    )
 
 
 def choose_unit(models: ModelSet, units: list[str], settings: UncertaintySettings) -> str:
     """Return the nominal unit: the one asked for, else the best of the first kind of models, which all others share as in the paper."""
-    if settings.nominal is None:
+    if settings.nominal is None or (settings.nominal == _BEST and _BEST not in units):
         responses = models.scaled_responses(models.frequencies(settings.n_freqs), units)
         return units[choose_nominals(responses)[Form(settings.form)].index]
     if settings.nominal not in units:

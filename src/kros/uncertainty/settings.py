@@ -22,7 +22,9 @@ class UncertaintySettings(Settings):
     """Uncertainty model and outlier scores."""
 
     form: FORMS = "inverse_input_multiplicative"
-    nominal: str | None = None
+    nominal: str | None = Field(
+        None, description='a unit, or "unit" for the best one; by default observers that are free to may have the mean of the units instead'
+    )
     structure: Literal["auto", "diagonal", "scalar", "entrywise"] = "auto"
     n_freqs: int = Field(1000, ge=50)
     max_order: int = Field(4, ge=1, le=8)

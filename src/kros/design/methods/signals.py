@@ -3,8 +3,7 @@
 The worst member of the set is its cover, and what an observer is certified to stay below is a sum over bands (`kros.observer.certificate.signals`). Rows of
 a nominal need not be those of a unit, nor of free runs: models that are refined for long free runs miss single steps by residuals that nearly cancel in
 the error, and the cancelling is lost where signals are covered. So nominals compete by certified cost: the unit, the population's mean, rows fitted to
-single steps, and rows fitted to the errors of the observer that runs them, in turn with its gains. Among those that cost hardly more than the least, the
-most accurate one on episodes that nothing was fitted to is taken: the cost is that of the worst signal of the set.
+single steps, and rows fitted to the errors of the observer that runs them, in turn with its gains.
 """
 
 from __future__ import annotations
@@ -42,8 +41,8 @@ from ...uncertainty import Form
 from ...uncertainty.coprime.bands import BandEnergies
 from ...uncertainty.coprime.signals import SignalSet
 from ..certificates import certified_on, scales_of
-from ..task import DesignResult, DesignTask, first_of
-from ..validation import ValidationSet, hidden_mean, rank
+from ..task import DesignResult, DesignTask
+from ..validation import ValidationSet, hidden_mean
 from .residual_shaped import MAX_ORDER
 from .tuned import held_out
 
@@ -53,7 +52,6 @@ SIGNALS = "signals"
 UNCOVERED = "the observer is certified for the signals that a model of its own leaves, not for the set around the nominal unit"
 _STEPS, _ROUNDS, _EPISODES = 8, 2, 12
 _POINTS, _SMALL = 2049, Basis(2, (0.95,))
-_CLOSE = 1.25  # times the least certified cost, within which accuracy decides
 _UNKNOWN: dict[str, Any] = {"h2_norm": None, "lower_bound": None, "gap_percent": None}  # of tuned gains
 
 
@@ -86,7 +84,7 @@ class Judge:
 
 
 def design_for_signals(task: DesignTask) -> DesignResult:
-    """The Kalman predictor for the residuals of a nominal of its own, tuned or not: the most accurate of those with nearly the least certified error."""
+    """The Kalman predictor for the residuals of a nominal of its own, tuned or not: the one of least certified error."""
     began, data = time.perf_counter(), task.training.read()
     best, facts = chosen(task, data)
     notes = (
@@ -157,12 +155,7 @@ def chosen(task: DesignTask, data: ValidationSet) -> tuple[Candidate, dict[str, 
         raise SynthesisError(
             "Worst-case synthesis for signals: no observer has a certificate as it runs; check what is measured, and the lifting's slopes."
         )
-    least = min(candidate.cost for candidate in found)
-    close = [candidate for candidate in found if candidate.cost <= _CLOSE * least]
-    held = held_out(data.batch.keys)
-    judged_on = data.part([i for i, unseen in enumerate(held) if unseen])
-    limit, *errors = judged_on.percent_of_all([task.open_loop(), *(candidate.observer for candidate in close)])
-    best = close[first_of([rank(error, limit, task.models.measured) for error in errors])]
+    best = min(found, key=lambda candidate: candidate.cost)
     cost: dict[str, float] = {}
     for one in found:
         cost[one.nominal] = min(one.cost, cost.get(one.nominal, np.inf))

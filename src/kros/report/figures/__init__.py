@@ -37,6 +37,7 @@ FIGURES: dict[str, Row] = {
     "free_run_spectra": Row("Spectra of the prediction errors", "models.free_run_spectra"),
     "trade_off": Row("Accuracy against uncertainty", "models.trade_off"),
     "forms": Row("Six uncertainty forms", "uncertainty.forms"),
+    "signal_set": Row("Residuals of recorded motion", "uncertainty.signals"),
     "variation": Row("Manufacturing or finite recordings", "uncertainty.variation"),
     "weights": Row("Weights over the optimal cover", "uncertainty.weights"),
     "weight_orders": Row("Order against tightness", "uncertainty.weight_orders"),

@@ -41,7 +41,9 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     paragraphs += [*confounded_text(metrics), *small_set_text(metrics), *noise_text(entries)]
     tables = [_peaks(entries), *_noise(entries), _weights(entries)]
     more = [("As in the paper, entry by entry", ["forms_entrywise", "weights_entrywise"])]
-    return Section("uncertainty", "Uncertainty", paragraphs, tables, ["forms", "variation", "weights", "weight_orders"], more=more)
+    return Section(
+        "uncertainty", "Uncertainty", paragraphs, tables, ["forms", "signal_set", "variation", "weights", "weight_orders"], more=more
+    )
 
 
 def noise_text(entries: Mapping[str, Any]) -> list[str]:

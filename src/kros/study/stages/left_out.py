@@ -22,6 +22,7 @@ from ...core.errors import ConfigError, IdentificationError, KrosError
 from ...core.work import Progress
 from ...data.population import OUTLIERS, Population, split_episodes
 from ...data.survey import RecordingFacts
+from ...design.task import is_robust
 from ...evaluate import fewest_units, next_unit_bound
 from ...identify.calibrate import calibration_keys, segments_of
 from ...identify.identified import recordings_of, recordings_path
@@ -239,7 +240,7 @@ def facts_of_folds(found: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict
             "made": len(made),
             "orders": sorted({e["order"] for e in observers}),
             "relift_certified": sum(bool(e["relift_certified"]) for e in observers) if observers else None,
-            "robust": sum(e.get("worst_case_h2") is not None for e in observers) if observers else None,
+            "robust": sum(is_robust(e) for e in observers) if observers else None,
             "reasons": sorted({str(e[key]) for e in entries for key in ("reason", "relift_reason") if e.get(key)}),
         }
     return facts

@@ -18,7 +18,7 @@ _SECONDS, _METHOD, _MOST = 5.0, "worst_case_h2", 24
 
 def draw(run: RunFolder) -> tuple[Figure, str]:
     """Draw a row for every hidden state and a column for every kind of model that has a worst-case observer."""
-    names = [name for name in best_models(run.models) if f"{name}/{_METHOD}" in run.observers_record["names"]]
+    names = best_models(name for name in run.models if f"{name}/{_METHOD}" in run.observers_record["names"])
     if not names:
         raise NotShownError("no worst-case H2 observer was designed, for whose model the residuals would be shown")
     hidden, states = run.hidden_states, [c.name for c in run.states]

@@ -220,10 +220,15 @@ def error_system(
     arrives: npt.ArrayLike = True,
     applied: bool = True,
 ) -> ErrorSystem:
-    """Return the error dynamics of an observer as it runs, its delay and limits included; arguments as in `relift_certificate`.
+    """Return the error dynamics of an observer as it runs, its delay and limits included.
 
     Parameters
     ----------
+    observer : ObserverData
+    scales : ReliftScales, optional
+    box, parameters : mapping of str to (lower, upper), optional
+    clipped : bool
+        As in `relift_certificate`.
     arrives : bool or array_like of bool, shape (q,)
         Which measurements arrive at this step; the innovation of the others is zero. The channels are the same whatever arrives.
     applied : bool

@@ -6,10 +6,12 @@ import logging
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from ...core.errors import SynthesisError
 from ...identify.kinds import kind_of
-from ..task import DesignResult, DesignTask, first_of
-from ..validation import rank
+from ..task import DesignResult, DesignTask
+from ..validation import hidden_mean
 from .coprime_models import design_for_models
 from .disturbance_model import TUNED, DisturbanceModel
 from .robust import design_worst_case_h2, design_worst_case_hinf
@@ -50,9 +52,7 @@ def design_worst_case(task: DesignTask) -> DesignResult:
     data = task.training.read()
     held = held_out(data.batch.keys)
     judged = data.part([i for i, unseen in enumerate(held) if unseen])
-    errors = [judged.percent(found.observer) for found in made if found.observer is not None]
-    limit = judged.percent(task.open_loop())
-    ranks = [rank(error, limit, task.models.measured) for error in errors]
-    best, form = made[first_of(ranks)], made[-1]
+    errors = np.array([judged.percent(found.observer) for found in made if found.observer is not None])
+    best, form = made[int(np.argmin(hidden_mean(errors, task.models.measured)))], made[-1]
     assumed = DisturbanceModel.recorded(form.facts)  # all observers are certified on the form's set with its model, whichever is taken
     return replace(best, problem=form.problem, facts={"set": "form"} | (assumed.facts() if assumed else {}) | best.facts)

@@ -13,6 +13,7 @@ T : coordinates in which X = E^-1 = diag(s)
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -48,6 +49,21 @@ class Balanced:
         """Return the controller of the original plant."""
         c, m = self.controls[:, None], self.measurements
         return StateSpace(K.A, K.B / m, c * K.C, c * K.D / m, K.dt)
+
+
+def in_balance(
+    plant: GeneralizedPlant, controller: StateSpace, improve: Callable[[GeneralizedPlant, StateSpace], StateSpace]
+) -> StateSpace:
+    """Improve a controller on the balanced plant, where a search does not depend on units of measure; on the plant itself where there is none."""
+    if np.any(plant.D22):
+        return improve(plant, controller)
+    try:
+        balanced = balance(plant)
+    except SynthesisError:
+        return improve(plant, controller)
+    c, m = balanced.controls[:, None], balanced.measurements
+    inside = StateSpace(controller.A, controller.B * m, controller.C / c, controller.D * m / c, controller.dt)
+    return balanced.controller(improve(balanced.plant, inside))
 
 
 def balance(plant: GeneralizedPlant) -> Balanced:

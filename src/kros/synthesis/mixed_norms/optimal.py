@@ -22,6 +22,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from ...core.errors import ConfigError, SynthesisError
@@ -32,7 +33,7 @@ from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
 from ..riccati.h2_optimal import h2
 from .attainable import require_attainable, require_reachable
-from .balance import reached
+from .balance import in_balance, reached
 from .candidates import by_hinf, by_inequalities
 from .channels import Verified, part, verify
 from .continuous import continuous_controller, discrete_twin, speed
@@ -223,9 +224,8 @@ def _improved(plant: GeneralizedPlant, found: list[Verified], gamma: float, end:
         left = end - time.perf_counter()
         if left <= 0:
             break
-        verdict = verify(
-            plant, polish(plant, v.controller, gamma, left / 2), gamma, f"{v.origin}; then local improvement", v.solver, v.optimal
-        )
+        polished = in_balance(plant, v.controller, partial(polish, gamma=gamma, time_limit_s=left / 2))
+        verdict = verify(plant, polished, gamma, f"{v.origin}; then local improvement", v.solver, v.optimal)
         if isinstance(verdict, Verified):
             better.append(verdict)
     return better

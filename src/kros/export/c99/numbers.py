@@ -49,7 +49,6 @@ class Source:
         o, lifting, run = self.observer, self.observer.lifting, self.observer.runtime
         n, q, m, K = lifting.n_states, len(o.measured), len(o.inputs), o.controller
         functions, widened = lifting.n_lifted - n, o.B.shape[1]
-        C = np.eye(n)[list(o.measured)]
         screen = Screen.of(o)
         limited = run.limited
         return {
@@ -94,8 +93,7 @@ class Source:
             "default_parameters": self.numbers(np.array([o.parameters.get(p, 0.0) for p in lifting.parameters])),
             "sigma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.formulas],
             "gamma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.input_formulas],
-            "uses_parameters": any(set(f.used) & set(lifting.parameters) for f in (*lifting.formulas, *lifting.input_formulas)),
-            "initial": self.initial(C),
+            "held_start": self.held_start(),
             "shift": self.shift,
             "shift_states": None if self.shift is None else self.wide(self.shift.states),
             "shift_inputs": None if self.shift is None else self.wide(self.shift.inputs),
@@ -107,7 +105,7 @@ class Source:
             "sample_period_s": Precision().literal(o.sample_period_s),
         }
 
-    def initial(self, C: Array) -> dict[str, Any]:
+    def held_start(self) -> dict[str, Any]:
         """Return how the observer starts (`ObserverData.initial`): other states at rest, or where the lifted functions hold them."""
         o, n = self.observer, self.observer.lifting.n_states
         if not (o.replaces and o.lifting.functions and not o.lifting.history):

@@ -83,7 +83,6 @@ def c_files(observer: Observer, name: str, precision: str) -> dict[str, str]:
 
     source, golden = Source.of(observer, name, precision), Golden.of(observer)
     context = source.context() | {"version": version("kros")}
-    context["held_start"] = context.pop("initial")
     context["sigma_uses_parameters"] = any(set(f.used) & set(observer.lifting.parameters) for f in observer.lifting.formulas)
     tolerance = _TOLERANCE[precision]
     context["golden"] = {

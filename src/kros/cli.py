@@ -203,11 +203,12 @@ def export_c(
     name: Annotated[str | None, typer.Option(help="Prefix of all names, a C identifier; default: the study's name.")] = None,
     precision: Annotated[str, typer.Option(help="double or float")] = "double",
     observer: Annotated[str, typer.Option(help="Observer of the run; default: the one that is deployed.")] = "deployed",
+    track: Annotated[str | None, typer.Option(metavar="NAME", help="Parameter that a phase-locked loop follows.")] = None,
 ) -> None:
     """Write an observer as C99 source with a self-test."""
     from .study.commands.export import export_run
 
-    path = export_run(run_folder, out, name, observer, precision=precision)
+    path = export_run(run_folder, out, name, observer, precision=precision, track=track)
     _say(f"C source in {path}; start with {path / 'README.md'}")
 
 
@@ -219,11 +220,12 @@ def export_fmu(
     name: Annotated[str | None, typer.Option(help="Name of the model, a C identifier; default: the study's name.")] = None,
     precision: Annotated[str, typer.Option(help="double or float")] = "double",
     observer: Annotated[str, typer.Option(help="Observer of the run; default: the one that is deployed.")] = "deployed",
+    track: Annotated[str | None, typer.Option(metavar="NAME", help="Parameter that a phase-locked loop follows.")] = None,
 ) -> None:
     """Write an observer as a functional mock-up unit for co-simulation."""
     from .study.commands.export import export_run
 
-    _say(f"FMU in {export_run(run_folder, out, name, observer, fmi=fmi, precision=precision)}")
+    _say(f"FMU in {export_run(run_folder, out, name, observer, fmi=fmi, precision=precision, track=track)}")
 
 
 @app.command()

@@ -30,6 +30,21 @@ def test_same_estimates_and_the_same_status_under_faults(kind, tmp_path):
 
 
 @needs_compiler
+@pytest.mark.parametrize("kind", ["lifted", "limits", "through the input", "replaced"])
+def test_a_parameter_that_follows_the_machine(kind, tmp_path):
+    observer, (y, u) = MACHINES[kind](), samples(800)
+    wanted, status = in_python(observer, y, u, "phase")
+    for precision, close in (("double", 1e-9), ("float", 1e-4)):
+        folder = export_c(observer, tmp_path / precision, "drive", precision, track="phase")
+        compiled = CompiledObserver.build(folder, flags=(*STRICT, "-Wno-unused-function"))
+        assert compiled.selftest() == 0
+        found, bits = compiled.run(y, u)
+        np.testing.assert_array_equal(bits, status)
+        assert apart(found, wanted) < close
+    assert apart(in_python(observer, y, u)[0], wanted) > 10 * close  # the parameter moved
+
+
+@needs_compiler
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_a_thousand_turns_cost_no_accuracy(precision, tmp_path):
     observer, (y, u) = replace(drive(), seen=None), samples(4000, turns=1000, faults=False)

@@ -14,16 +14,16 @@ from kros.export import export_fmu, find_compiler
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler is on the PATH")
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.parametrize("from_source", [False, True])
-def test_two_instances_at_once_and_after_a_reset(fmi, from_source, tmp_path):
+@pytest.mark.parametrize(("from_source", "track"), [(False, None), (True, "phase")])
+def test_two_instances_at_once_and_after_a_reset(fmi, from_source, track, tmp_path):
     fmpy = pytest.importorskip("fmpy", reason="FMPy (the extra fmu) is not installed")
     from fmpy import fmi2, fmi3
     from fmpy.build import build_platform_binary
     from fmpy.validation import validate_fmu
 
     units = {"units_of_measure": {"position": "rad", "velocity": "rad/s"}}
-    observer, (y, u) = replace(drive(delay=2), about=units), samples(120, faults=False)
-    path = export_fmu(observer, tmp_path / "drive.fmu", fmi, "drive")
+    observer, (y, u) = replace(drive(delay=0 if track else 2), about=units), samples(120, faults=False)
+    path = export_fmu(observer, tmp_path / "drive.fmu", fmi, "drive", track=track)
     assert validate_fmu(str(path)) == []
     folder, model = fmpy.extract(str(path), tmp_path / "unpacked"), fmpy.read_model_description(str(path))
     if from_source:
@@ -51,7 +51,7 @@ def test_two_instances_at_once_and_after_a_reset(fmi, from_source, tmp_path):
                 unit.doStep(k * 1e-3, 1e-3)
             found.append([(unit.getReal if fmi == 2 else unit.getFloat64)(wanted) for unit in units])
         for estimates in np.swapaxes(found, 0, 1):
-            np.testing.assert_allclose(estimates, in_python(observer, y, u)[0], rtol=1e-9, atol=1e-11)
+            np.testing.assert_allclose(estimates, in_python(observer, y, u, track)[0], rtol=1e-9, atol=1e-11)
         for unit in units:
             unit.reset()
     for unit in units:

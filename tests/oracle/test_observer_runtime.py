@@ -137,6 +137,10 @@ def test_phase_locked_loop_finds_the_phase_in_both_directions():
     tracked = track_parameter(o, x[..., :1], u, {"phase": true + off}, settle_s=0.3)
     np.testing.assert_allclose(tracked.values[0], true + off)
     np.testing.assert_allclose(tracked.values[2000:].mean(axis=0), true, atol=0.05)
+    running = o.start(x[0, 0, :1], phase=true + off[0])
+    running.track("phase", settle_s=0.3)
+    sampled = [np.asarray(running.step(*sample)) for sample in zip(x[:300, 0, :1], u[:, 0], strict=False)]
+    np.testing.assert_allclose(sampled[:-1], tracked.estimates[1:300, 0], rtol=1e-12)
     as_at_first = run_observer(o, x[..., :1], u, {"phase": true + off})
     assert np.all(np.std((tracked.estimates - x)[2000:, :, 1], axis=0) < 0.7 * np.std((as_at_first - x)[2000:, :, 1], axis=0))
 

@@ -85,8 +85,10 @@ def samples(count, turns=0.0, faults=True):
     return y, u
 
 
-def in_python(observer, y, u):
+def in_python(observer, y, u, track=None):
     running = observer.start(y[0])
+    if track is not None:
+        running.track(track)
     found = [(np.asarray(running.step(*sample)), int(running.status)) for sample in zip(y, u, strict=True)]
     return np.array([x for x, _ in found])[:, : len(observer.recorded)], np.array([status for _, status in found])
 

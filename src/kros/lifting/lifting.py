@@ -246,6 +246,13 @@ class Lifting:
         self._derivatives.fill(self._values(x, parameters, x[..., self.n_states :]), slopes)
         return slopes.reshape(*x.shape[:-1], len(self.functions), x.shape[-1])
 
+    def parameter_slopes(self, x: npt.ArrayLike, parameters: Parameters, name: str) -> Array:
+        """Return the derivative of the lifted functions alone by one of the parameters, shape (..., p); x as in `slopes`."""
+        x = self._windows(x)
+        slopes = np.empty((*x.shape[:-1], len(self.functions)))
+        self._parameter_derivatives[name].fill(self._values(x, parameters, x[..., self.n_states :]), slopes)
+        return slopes
+
     def input_slopes(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the derivative of the input functions by every entry of the window, the inputs held, shape (..., r, n_window).
 
@@ -320,6 +327,10 @@ class Lifting:
     @cached_property
     def _derivatives(self) -> Columns:
         return Columns.of([formula.derivative(name) for formula in self.formulas for name in self.window.names])
+
+    @cached_property
+    def _parameter_derivatives(self) -> dict[str, Columns]:
+        return {name: Columns.of([formula.derivative(name) for formula in self.formulas]) for name in self.parameters}
 
     @cached_property
     def _input_derivatives(self) -> Columns:

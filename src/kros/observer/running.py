@@ -15,6 +15,7 @@ from .data import ObserverData
 from .samples import LONGEST, Held, SampleStatus, Screened
 from .screen import Screen
 from .step import Steps
+from .tracking import SETTLE_S, PhaseLockedLoop
 
 Array = npt.NDArray[np.float64]
 
@@ -61,6 +62,7 @@ class RunningObserver:
         self._steps, self._ahead = Steps([observer], 1, {}), Steps([observer], 1, {})
         self._places = {name: i for i, name in enumerate(observer.lifting.states)}
         self._unknown = np.ones((1, len(observer.measured)), dtype=bool)
+        self._loop: PhaseLockedLoop | None = None
         self.parameters = parameters
         self.reset(y)
 
@@ -79,6 +81,16 @@ class RunningObserver:
         """Change all of them."""
         self._parameters = self._steps.values = self._ahead.values = _Checked(self.observer, values)
 
+    def track(self, name: str, settle_s: float = SETTLE_S) -> None:
+        """Let one of the parameters follow the machine from now on; see `PhaseLockedLoop`, and `parameters` for its value.
+
+        Raises
+        ------
+        ConfigError
+            When the observer has no such parameter, or has delays.
+        """
+        self._loop = PhaseLockedLoop(self.observer, name, 1, settle_s)
+
     @property
     def status(self) -> SampleStatus:
         """What was wrong with the last sample, or with the first measurement before there was one."""
@@ -93,6 +105,8 @@ class RunningObserver:
 
     def _begin(self, y: Array) -> None:
         self._steps.begin(y)
+        if self._loop is not None:
+            self._loop.begin()
         self._inputs: deque[Array] = deque()
 
     @property
@@ -131,8 +145,12 @@ class RunningObserver:
         measurement, known = self._take(self._measurement(y), self._input(u))
         self._inputs.append(known)
         if len(self._inputs) > self.observer.runtime.delay:
-            missing, steps = ~np.isfinite(measurement), self._steps
-            steps.step(measurement, self._inputs.popleft(), missing if missing.any() else None)
+            missing, steps, taken = ~np.isfinite(measurement), self._steps, self._inputs.popleft()
+            absent = missing if missing.any() else None
+            if self._loop is None:
+                steps.step(measurement, taken, absent)
+            else:
+                self.parameters[self._loop.name] = float(self._loop.step(steps, measurement, taken, absent)[0])
             if self.observer.runtime.binds(steps.x[0, 0], steps.correction):
                 self._status |= SampleStatus.LIMIT
         return self.estimate

@@ -9,7 +9,7 @@ gearbox angle, filtered as the machine filters it, whichever way it turns. The i
 
     p+ = p + (dt / tau) psi nu / r,      r the mean of psi^2 over about tau,
 
-so that an error of p decays in the time tau while psi is excited, the integrand kept within 1. Several measurements count in units of their scale.
+so that an error of p decays in the time tau while psi is excited, the integrand kept within 1. Several measurements count in units of their sizes in training.
 
 References
 ----------
@@ -27,11 +27,11 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 from .data import ObserverData
 from .screen import screened
-from .step import Steps
+from .step import Flags, Steps
 
 Array = npt.NDArray[np.float64]
-_STEP = 1e-5
-_MOST = 1.0  # largest error of the parameter that is corrected at once: transients at the start show more
+MOST = 1.0  # largest error of the parameter that is corrected at once: transients at the start show more
+SETTLE_S = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,20 +50,95 @@ class Tracked:
     values: Array
 
 
+class PhaseLockedLoop:
+    """The loop beside an observer's `Steps`, for a batch of machines.
+
+    Parameters
+    ----------
+    observer : ObserverData
+        Without delays in its lifting and delay of the measurement; with several measurements, it knows their sizes in training.
+    name : str
+        The parameter that is followed.
+    batch : int
+    settle_s : float, s
+        Time tau in which its error decays; long against the vibration that shows it.
+
+    Raises
+    ------
+    ConfigError
+        When the observer is another, or the time is not positive.
+    """
+
+    def __init__(self, observer: ObserverData, name: str, batch: int, settle_s: float = SETTLE_S) -> None:
+        lifting = observer.lifting
+        if name not in lifting.parameters or lifting.history or lifting.input_functions or observer.runtime.delay:
+            raise ConfigError(
+                f"Phase-locked loop of observer {observer.name}: needs a lifting of present states with the parameter {name!r} and measurements without delay, "
+                f"found parameters {lifting.parameters}, a history of {lifting.history} and a delay of {observer.runtime.delay}."
+            )
+        if not settle_s > 0:
+            raise ConfigError(
+                f"Phase-locked loop of observer {observer.name}: the time to settle should be positive, found {settle_s:g} s."
+            )
+        n = lifting.n_states
+        self.observer, self.name, self.forget = observer, name, min(observer.sample_period_s / settle_s, 1.0)
+        self._sizes = measurement_sizes(observer)
+        self._model, self._into, self._C = observer.A[:n], observer.into[:n], list(observer.measured)
+        self._s, self._s_c = np.zeros((batch, n)), np.zeros((batch, observer.controller.n_states))
+        self._power, self._weight = np.zeros(batch), np.zeros(batch)
+
+    def begin(self, machines: Flags | None = None) -> None:
+        """Start all machines, or some, again; the parameter stays."""
+        for array in (self._s, self._s_c, self._power, self._weight):
+            array[slice(None) if machines is None else machines] = 0.0
+
+    def step(self, steps: Steps, y: Array, u: Array, missing: Flags | None = None) -> Array:
+        """Move the observer on by a sample, as `Steps.step` does, and return the parameter for the next one, shape (batch,)."""
+        K, n, values = self.observer.controller, self._model.shape[0], steps.values
+        x, nu, psi = steps.x[0].copy(), steps.innovation(y)[0], self._s[:, self._C]
+        slopes, by_value = steps.lifting.slopes(x, values)[..., :n], steps.lifting.parameter_slopes(x, values, self.name)
+        steps.step(y, u, missing)
+        lifted = np.concatenate([self._s, (slopes @ self._s[..., None])[..., 0] + by_value], axis=-1)
+        moved = lifted @ self._model.T + (self._s_c @ K.C.T - psi @ K.D.T) @ self._into.T
+        self._s, self._s_c = moved, self._s_c @ K.A.T - psi @ K.B.T
+        self._power += self.forget * (np.sum((psi / self._sizes) ** 2, axis=-1) - self._power)
+        self._weight += self.forget * (1.0 - self._weight)  # over the mean of psi^2 so far
+        pull = np.sum(psi * nu / self._sizes**2, axis=-1) * self._weight
+        seen = np.divide(pull, self._power, out=np.zeros_like(pull), where=(self._power > 0) & np.isfinite(pull))
+        return np.asarray(values[self.name] + self.forget * np.clip(seen, -MOST, MOST))
+
+
+def measurement_sizes(observer: ObserverData) -> Array:
+    """Return by what measurements are divided where they count together, shape (q,): sizes seen in training.
+
+    Raises
+    ------
+    ConfigError
+        When there are several measurements and their sizes are not known.
+    """
+    if len(observer.measured) == 1:
+        return np.ones(1)
+    if observer.seen is None:
+        raise ConfigError(
+            f"Phase-locked loop of observer {observer.name}: {len(observer.measured)} measurements count in units of their sizes, which it "
+            "does not know; give it Observer(..., seen=Seen(measured, inputs))."
+        )
+    return np.where(observer.seen.measured > 0, observer.seen.measured, 1.0)
+
+
 def track_parameter(
     observer: ObserverData,
     y: Array,
     u: Array,
     parameters: Mapping[str, npt.ArrayLike] | None = None,
     name: str = "phase",
-    settle_s: float = 2.0,
+    settle_s: float = SETTLE_S,
 ) -> Tracked:
     """Run an observer that follows one of its lifting's parameters.
 
     Parameters
     ----------
     observer : ObserverData
-        Without delays in its lifting, delay of the measurement and limits.
     y : ndarray, shape (n_samples, batch, q)
         NaN where a measurement is missing: neither the estimate nor the parameter is corrected then.
     u : ndarray, shape (n_samples, batch, m)
@@ -72,7 +147,7 @@ def track_parameter(
     name : str
         The parameter that is followed.
     settle_s : float, s
-        Time tau in which its error decays; long against the vibration that shows it.
+        See `PhaseLockedLoop`.
 
     Returns
     -------
@@ -81,42 +156,21 @@ def track_parameter(
     Raises
     ------
     ConfigError
-        When the lifting has no such parameter, a parameter is unknown or not finite, or the observer has delays.
+        When the observer cannot be followed (`PhaseLockedLoop`), or a parameter is unknown or not finite.
     """
-    lifting = observer.lifting
-    if name not in lifting.parameters or lifting.history or lifting.input_functions or observer.runtime.delay:
-        raise ConfigError(
-            f"Phase-locked loop of observer {observer.name}: needs a lifting of present states with the parameter {name!r} and measurements without delay, "
-            f"found parameters {lifting.parameters}, a history of {lifting.history} and a delay of {observer.runtime.delay}."
-        )
-    samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
+    batch = np.shape(y)[1]
+    loop = PhaseLockedLoop(observer, name, batch, settle_s)
+    samples, values = screened(observer, y, u), observer.values(parameters, (batch,))
     y, u, starts = samples.y, samples.u, samples.starts
-    K, n, batch, C = observer.controller, lifting.n_states, y.shape[1], list(observer.measured)
     values = {k: np.broadcast_to(np.asarray(v, dtype=float), (batch,)).copy() for k, v in values.items()}
-    forget = min(observer.sample_period_s / settle_s, 1.0)
-    coupling, into = observer.A[:n, n:], observer.into[:n]
     steps, missing = Steps([observer], batch, values), ~np.isfinite(y)
-    s, s_c, power, age = np.zeros((batch, n)), np.zeros((batch, K.n_states)), np.zeros(batch), np.zeros(batch, dtype=int)
-    estimates, followed = np.empty((*y.shape[:2], n)), np.empty(y.shape[:2])
-    scale = np.max(y, axis=(0, 1), where=~missing, initial=-np.inf) - np.min(y, axis=(0, 1), where=~missing, initial=np.inf)
-    scale = np.where(scale > 0, scale, 1.0)
+    estimates, followed = np.empty((*y.shape[:2], observer.lifting.n_states)), np.empty(y.shape[:2])
     steps.begin(y[0])
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for k in range(len(y)):
             estimates[k], followed[k] = observer.runtime.clip_estimate(steps.x[0]), values[name]
             if k and starts[k].any():  # the parameter stays
                 steps.begin(y[k], starts[k])
-                s[starts[k]], s_c[starts[k]], power[starts[k]], age[starts[k]] = 0.0, 0.0, 0.0, 0
-            age += 1
-            x, nu, psi = steps.x[0].copy(), steps.innovation(y[k])[0], s[:, C]
-            by_state = lifting.slopes(x, values)[..., :n]
-            ahead, behind = ({**values, name: values[name] + h} for h in (_STEP, -_STEP))
-            by_value = (lifting.lift(x, ahead) - lifting.lift(x, behind))[:, n:] / (2 * _STEP)
-            power += forget * (np.sum((psi / scale) ** 2, axis=-1) - power)
-            pull = np.sum(psi * nu / scale**2, axis=-1) * (1 - (1 - forget) ** age)  # over the mean of psi^2 so far
-            steps.step(y[k], u[k], missing[k] if missing[k].any() else None)
-            moved = ((observer.A[:n, :n] + coupling @ by_state) @ s[..., None])[..., 0] + by_value @ coupling.T
-            s, s_c = moved + (s_c @ K.C.T - psi @ K.D.T) @ into.T, s_c @ K.A.T - psi @ K.B.T
-            seen = np.divide(pull, power, out=np.zeros(batch), where=(power > 0) & np.isfinite(pull))
-            values[name] = values[name] + forget * np.clip(seen, -_MOST, _MOST)
+                loop.begin(starts[k])
+            values[name] = loop.step(steps, y[k], u[k], missing[k] if missing[k].any() else None)
     return Tracked(estimates, followed)

@@ -18,6 +18,18 @@ from ...core.errors import ConfigError, DimensionError
 Array = npt.NDArray[np.float64]
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fno-math-errno", "-ffp-contract=off")
 COMPILERS = ("cc", "gcc", "clang")
+# The loop over time, compiled beside the observer: what arrives and leaves lies sample after sample.
+_LOOP = """
+#include "{name}.h"
+void {name}_run({name}_state *s, long count, const double *y, const double *u, double *x_hat, uint32_t *status);
+void {name}_run({name}_state *s, long count, const double *y, const double *u, double *x_hat, uint32_t *status)
+{{
+    long k;
+    for (k = 0; k < count; k++) {{
+        status[k] = {name}_step{wide}(s, y + k * {q}, u + k * {m}, x_hat + k * {n});
+    }}
+}}
+"""
 
 
 def find_compiler() -> str | None:
@@ -43,9 +55,8 @@ class CompiledObserver:
         self._q, self._m = len(manifest["measured"]), len(manifest["inputs"])
         self._real = np.float32 if manifest["precision"] == "float" else np.float64
         self._c = ctypes.CDLL(str(library))
-        self._step = self._c[f"{self.name}_step_wide" if self._real is np.float32 else f"{self.name}_step"]
-        self._reset = self._c[f"{self.name}_reset_wide" if self._real is np.float32 else f"{self.name}_reset"]
-        self._step.restype = ctypes.c_uint32
+        self._run = self._c[f"{self.name}_run"]
+        self._reset = self._c[f"{self.name}_reset{_wide(manifest)}"]
 
     @classmethod
     def build(cls, folder: Path | str, compiler: str | None = None, flags: Sequence[str] = ()) -> Self:
@@ -59,10 +70,12 @@ class CompiledObserver:
         folder, compiler = Path(folder), compiler or find_compiler()
         if compiler is None:
             raise ConfigError(f"Compiling {folder}: no C compiler is on the PATH, tried {', '.join(COMPILERS)}; install one.")
-        name = json.loads((folder / "manifest.json").read_text())["name"]
-        library = folder / f"lib{name}.so"
-        command = [compiler, *FLAGS, *flags, str(folder / f"{name}.c"), str(folder / f"{name}_selftest.c"), "-o", str(library), "-lm"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        manifest = json.loads((folder / "manifest.json").read_text())
+        name, sizes = manifest["name"], {"q": len(manifest["measured"]), "m": len(manifest["inputs"]), "n": len(manifest["states"])}
+        library, loop = folder / f"lib{name}.so", _LOOP.format(name=name, wide=_wide(manifest), **sizes)
+        sources = [f"-I{folder}", str(folder / f"{name}.c"), str(folder / f"{name}_selftest.c"), "-x", "c", "-"]
+        command = [compiler, *FLAGS, *flags, *sources, "-o", str(library), "-lm"]
+        done = subprocess.run(command, input=loop, capture_output=True, text=True, check=False)
         if done.returncode:
             raise ConfigError(f"Compiling {folder}: {compiler} refused the source: {done.stderr.strip()[:500]}")
         return cls(folder, library)
@@ -90,17 +103,25 @@ class CompiledObserver:
             raise DimensionError(
                 f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m}), found {y.shape} and {u.shape}."
             )
-        state = np.zeros(-(-self.state_bytes // 8))
-        at = state.ctypes.data_as(ctypes.c_void_p)
-        self._c[f"{self.name}_init"](at)
-        for name, value in (parameters or {}).items():
-            real = ctypes.c_float if self._real is np.float32 else ctypes.c_double
-            self._c[f"{self.name}_set_{name}"](at, real(value))
+        machine = self.start(y[0], parameters)
         x_hat, status = np.empty((len(y), len(self.states))), np.empty(len(y), dtype=np.uint32)
-        self._reset(at, y[:1].ctypes.data_as(ctypes.c_void_p))
-        rows = [ctypes.c_void_p(a.ctypes.data) for a in (y, u, x_hat)]
-        strides = [a.strides[0] for a in (y, u, x_hat)]
-        bases = [r.value or 0 for r in rows]
-        for k in range(len(y)):
-            status[k] = self._step(at, *(ctypes.c_void_p(b + k * s) for b, s in zip(bases, strides, strict=True)))
+        self._run(_at(machine), ctypes.c_long(len(y)), *(_at(array) for array in (y, u, x_hat, status)))
         return x_hat, status
+
+    def start(self, y: Array, parameters: Mapping[str, float] | None = None) -> npt.NDArray[np.uint8]:
+        """Return the state of a machine that starts at a measurement, shape (q,), as the C source keeps it."""
+        machine, real = np.zeros(self.state_bytes, dtype=np.uint8), ctypes.c_float if self._real is np.float32 else ctypes.c_double
+        self._c[f"{self.name}_init"](_at(machine))
+        for name, value in (parameters or {}).items():
+            self._c[f"{self.name}_set_{name}"](_at(machine), real(value))
+        self._reset(_at(machine), _at(np.ascontiguousarray(y, dtype=float)))
+        return machine
+
+
+def _wide(manifest: Mapping[str, Any]) -> str:
+    """Return the ending of the functions that take and give doubles."""
+    return "_wide" if manifest["precision"] == "float" else ""
+
+
+def _at(array: npt.NDArray[Any]) -> ctypes.c_void_p:
+    return array.ctypes.data_as(ctypes.c_void_p)

@@ -35,7 +35,7 @@ class Golden:
     size: Array
 
     @classmethod
-    def of(cls, observer: Observer, count: int = SAMPLES) -> Golden:
+    def of(cls, observer: Observer, track: str | None = None, count: int = SAMPLES) -> Golden:
         """Run an observer on smooth signals of the size seen in training, with a missing measurement, a lost input and a spike."""
         q, m = len(observer.measured), len(observer.inputs)
         seen = observer.seen
@@ -48,6 +48,8 @@ class Golden:
         if seen is not None:
             y[2 * count // 3] = 40 * y_size
         running = observer.start(y[0])
+        if track is not None:
+            running.track(track)
         found = [(np.asarray(running.step(*sample)), int(running.status)) for sample in zip(y, u, strict=True)]
         x_hat = np.array([x for x, _ in found])[:, : len(observer.recorded)]
         return cls(y, u, x_hat, np.array([s for _, s in found]), np.maximum(np.abs(x_hat).max(axis=0), 1e-300))

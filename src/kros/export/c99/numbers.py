@@ -13,6 +13,7 @@ from ...observer import Observer
 from ...observer.predictor.driven import in_coordinates
 from ...observer.samples import LONGEST
 from ...observer.screen import Bounds, Screen
+from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from .shift import Shift, find_shift
 
 Array = npt.NDArray[np.float64]
@@ -31,18 +32,22 @@ class Source:
     precision : Precision
     shift : Shift or None
         Of a single-precision build whose origin can move.
+    loop : PhaseLockedLoop or None
+        Of a parameter that follows the machine.
     """
 
     observer: Observer
     name: str
     precision: Precision
     shift: Shift | None
+    loop: PhaseLockedLoop | None = None
 
     @classmethod
-    def of(cls, observer: Observer, name: str, precision: str) -> Source:
+    def of(cls, observer: Observer, name: str, precision: str, track: str | None = None) -> Source:
         """Look at an observer."""
         observer = in_modes(observer)
-        return cls(observer, name, Precision(precision), find_shift(observer) if precision == "float" else None)
+        loop = None if track is None else PhaseLockedLoop(observer, track, 1)
+        return cls(observer, name, Precision(precision), find_shift(observer) if precision == "float" else None, loop)
 
     def context(self) -> dict[str, Any]:
         """Return everything that the templates name."""
@@ -94,6 +99,7 @@ class Source:
             "sigma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.formulas],
             "gamma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.input_formulas],
             "held_start": self.held_start(),
+            "tracked": self.tracked(),
             "shift": self.shift,
             "shift_states": None if self.shift is None else self.wide(self.shift.states),
             "shift_inputs": None if self.shift is None else self.wide(self.shift.inputs),
@@ -103,6 +109,34 @@ class Source:
             "far": None if self.shift is None else self.precision.literal(8 * self.shift.period),
             "period": None if self.shift is None else Precision().literal(self.shift.period),
             "sample_period_s": Precision().literal(o.sample_period_s),
+        }
+
+    def tracked(self) -> dict[str, Any] | None:
+        """Return what a phase-locked loop consists of: the observer's linear part, and slopes of lifted functions by states and parameter."""
+        if self.loop is None:
+            return None
+        o, K, name, write = self.observer, self.observer.controller, self.loop.name, self.precision.literal
+        n, states = o.lifting.n_states, o.lifting.states
+
+        def code(slope: Any) -> str:
+            return f"({c_code(slope, self.symbol, self.precision)})"
+
+        slopes = []
+        for f in o.lifting.formulas:
+            by_state = {j: f.derivative(s) for j, s in enumerate(states) if s in f.used}
+            slopes.append({"by_value": code(f.derivative(name)), "by_state": [(j, code(d)) for j, d in by_state.items() if d != 0]})
+        return {
+            "name": name,
+            "place": o.lifting.parameters.index(name),
+            "slopes": slopes,
+            "reads_states": any("w[" in str(row) for row in slopes),
+            "model": self.sums(o.A[:n]),
+            "correction": self.sums(o.into[:n] @ np.hstack([K.C, K.D])),
+            "shares": [write(float(v) ** -2) for v in measurement_sizes(o)],
+            "settle_s": f"{o.sample_period_s / self.loop.forget:g}",
+            "forget": write(self.loop.forget),
+            "one": write(1.0),
+            "most": write(MOST),
         }
 
     def held_start(self) -> dict[str, Any]:

@@ -32,6 +32,7 @@ def export_c(
     name: str = "observer",
     precision: str = "double",
     study: Mapping[str, Any] | None = None,
+    track: str | None = None,
 ) -> Path:
     """Write an observer as C99 source with a self-test, a project and a description.
 
@@ -46,6 +47,8 @@ def export_c(
         ``double`` or ``float``.
     study : mapping, optional
         The resolved study, written beside the source.
+    track : str, optional
+        A lifting parameter that follows the machine by a phase-locked loop (`PhaseLockedLoop`).
 
     Returns
     -------
@@ -55,12 +58,12 @@ def export_c(
     Raises
     ------
     ConfigError
-        When the name is no C identifier, the folder holds something, or a lifted function has no expression in C.
+        When the name is no C identifier, the folder holds something, a lifted function has no expression in C, or the parameter cannot be followed.
     """
     require_identifier(name)
     if precision not in _TOLERANCE:
         raise ConfigError(f"Export to C: precision should be 'double' or 'float', found {precision!r}.")
-    files = c_files(observer, name, precision)
+    files = c_files(observer, name, precision, track)
     if study is not None:
         files["study.json"] = json_bytes(study).decode()
     with whole_folder(Path(out)) as folder:
@@ -77,11 +80,11 @@ def require_identifier(name: str) -> None:
         )
 
 
-def c_files(observer: Observer, name: str, precision: str) -> dict[str, str]:
+def c_files(observer: Observer, name: str, precision: str, track: str | None = None) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    source, golden = Source.of(observer, name, precision), Golden.of(observer)
+    source, golden = Source.of(observer, name, precision, track), Golden.of(observer, track)
     context = source.context() | {"version": version("kros")}
     context["sigma_uses_parameters"] = any(set(f.used) & set(observer.lifting.parameters) for f in observer.lifting.formulas)
     tolerance = _TOLERANCE[precision]
@@ -123,6 +126,7 @@ def c_files(observer: Observer, name: str, precision: str) -> dict[str, str]:
         "measured": context["measured"],
         "inputs": list(observer.inputs),
         "parameters": list(observer.lifting.parameters),
+        **({} if track is None else {"tracked": track}),
         "sample_period_s": observer.sample_period_s,
         "state_bytes": state_bytes,
         "observer": observer.name,
@@ -146,6 +150,7 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     real = 4 if context["single"] else 8
     doubles = context["m"] + (1 + context["m"] + len(context["shift_others"]) if context["shift"] else 0)
     reals = context["n"] + context["order"] + context["history"] + len(context["parameters"]) + context["delay"] * context["m"]
+    reals += context["n"] + context["order"] + 2 if context["tracked"] else 0
     words = context["m"] + (1 if context["delay"] else 0) + 1
     size = 8 * doubles + real * reals + 4 * words
     align = 8 if doubles or real == 8 else 4

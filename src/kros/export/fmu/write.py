@@ -9,7 +9,7 @@ import sys
 import tempfile
 import uuid
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ def export_fmu(
     fmi: int = 2,
     name: str = "observer",
     precision: str = "double",
+    track: str | None = None,
 ) -> Path:
     """Write an observer as an FMU for co-simulation.
 
@@ -48,6 +49,8 @@ def export_fmu(
         A C identifier.
     precision : str
         ``double`` or ``float``.
+    track : str, optional
+        A parameter that follows the machine, from its variable's value on; its present value is ``<parameter>_hat``.
 
     Raises
     ------
@@ -60,10 +63,10 @@ def export_fmu(
         raise ConfigError(f"Export of an FMU: fmi should be 2 or 3, found {fmi!r}.")
     if out.suffix != ".fmu" or out.exists():
         raise ConfigError(f"Export of an FMU: {out} should be a new file that ends in .fmu.")
-    files = c_files(observer, name, precision)
+    files = c_files(observer, name, precision, track)
     sources = {f"sources/{file}": files[file] for file in (f"{name}.h", f"{name}.c")}
     guid = str(uuid.uuid5(_KROS, sources[f"sources/{name}.c"] + files["manifest.json"]))
-    texts = rendered(observer, name, precision, fmi, guid, known)
+    texts = rendered(Source.of(observer, name, precision, track), fmi, guid, known)
     packed: dict[str, bytes] = {
         file: text.encode() for file, text in {**texts, **sources, "documentation/README.md": files["README.md"]}.items()
     }
@@ -71,12 +74,14 @@ def export_fmu(
     return out
 
 
-def rendered(observer: Observer, name: str, precision: str, fmi: int, guid: str, units: Mapping[str, str]) -> dict[str, str]:
+def rendered(source: Source, fmi: int, guid: str, units: Mapping[str, str]) -> dict[str, str]:
     """Return the files that make C source an FMU."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    context = Source.of(observer, name, precision).context()
-    context |= {"version": version("kros"), "fmi": fmi, "guid": guid, "units": units, "variables": variables(observer, units)}
+    observer, name, context = source.observer, source.name, source.context()
+    estimates = [*observer.recorded, *([] if source.loop is None else [source.loop.name])]
+    context |= {"version": version("kros"), "fmi": fmi, "guid": guid, "units": units, "estimates": len(estimates)}
+    context["variables"] = variables(observer, units, estimates)
     context["wide_parameters"] = [f"{observer.parameters.get(p, 0.0):.17g}" for p in observer.lifting.parameters]
     environment = Environment(loader=PackageLoader("kros.export.fmu"), undefined=StrictUndefined, keep_trailing_newline=True)
     chosen = {f"sources/{name}_fmu.c": "machine.c", "modelDescription.xml": f"model{fmi}.xml"}
@@ -85,7 +90,7 @@ def rendered(observer: Observer, name: str, precision: str, fmi: int, guid: str,
     return {file: environment.get_template(f"{template}.jinja").render(context) for file, template in chosen.items()}
 
 
-def variables(observer: Observer, units: Mapping[str, str]) -> list[dict[str, Any]]:
+def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[str]) -> list[dict[str, Any]]:
     """Return the variables in the order of their references: measurements, inputs, parameters, estimates, status."""
     measured = [observer.lifting.states[i] for i in observer.measured]
 
@@ -107,7 +112,7 @@ def variables(observer: Observer, units: Mapping[str, str]) -> list[dict[str, An
     found += rows(
         observer.lifting.parameters, "parameter", "tunable", "this machine's {}", lambda n: f"{observer.parameters.get(n, 0.0):.17g}"
     )
-    found += rows(observer.recorded, "output", "discrete", "estimate of {} at the end of the step", lambda _: None, "_hat")
+    found += rows(estimates, "output", "discrete", "estimate of {} at the end of the step", lambda _: None, "_hat")
     bits = "1 missing measurement, 2 invalid input, 4 limit, 8 outside the certificate"
     found.append(
         {"name": "status", "causality": "output", "variability": "discrete", "description": bits, "unit": "", "start": None, "real": False}

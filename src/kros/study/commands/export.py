@@ -15,9 +15,16 @@ DEPLOYED = "deployed"
 
 
 def export_run(
-    run: Path, out: Path, name: str | None, observer: str = DEPLOYED, *, fmi: int | None = None, precision: str = "double"
+    run: Path,
+    out: Path,
+    name: str | None,
+    observer: str = DEPLOYED,
+    *,
+    fmi: int | None = None,
+    precision: str = "double",
+    track: str | None = None,
 ) -> Path:
-    """Write one of a run's observers as C source, or as an FMU of a version; `name` is the study's by default.
+    """Write one of a run's observers as C source, or as an FMU of a version; `name` is the study's by default; `track` is followed.
 
     Raises
     ------
@@ -30,8 +37,8 @@ def export_run(
             raise ConfigError(f"Run {run}: has no observer {observer!r}; known are {', '.join((DEPLOYED, *names))}.")
         chosen, name = Observer.load(store.path("observers", f"{observer}.json")), name or identifier(config.name)
         if fmi is not None:
-            return export_fmu(chosen, out, fmi, name, precision)
-        return export_c(chosen, out, name, precision, config.dump())
+            return export_fmu(chosen, out, fmi, name, precision, track)
+        return export_c(chosen, out, name, precision, config.dump(), track)
 
 
 def identifier(text: str) -> str:

@@ -8,7 +8,8 @@ import pytest
 from machines import LIMITS, MACHINES, apart, drive, in_python, samples
 
 from kros.core.errors import ConfigError, DataError
-from kros.export import CompiledObserver, export_c, find_compiler
+from kros.export import CompiledObserver, LoadOutput, export_c, find_compiler
+from kros.motor_drive import AngleLoad
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Werror", "-pedantic")
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler is on the PATH")
@@ -42,6 +43,36 @@ def test_a_parameter_that_follows_the_machine(kind, tmp_path):
         np.testing.assert_array_equal(bits, status)
         assert apart(found, wanted) < close
     assert apart(in_python(observer, y, u)[0], wanted) > 10 * close  # the parameter moved
+
+
+@needs_compiler
+@pytest.mark.parametrize(("precision", "limit"), [("double", np.inf), ("double", 0.05), ("float", 0.05)])
+def test_load_torque_with_its_level(precision, limit, tmp_path):
+    """Also where the current meets its limit, and angles are missing."""
+    import ctypes
+
+    rng, count = np.random.default_rng(7), 3000
+    angle = (3 * np.sin(2e-3 * np.arange(count)))[:, None]
+    angle[0], angle[500:510] = np.nan, np.nan
+    estimate = np.stack([angle[:, 0], *(0.1 * np.cumsum(rng.normal(size=(2, count)), axis=1) / 30)], axis=1)
+    level = AngleLoad(2.0, 1e-3, limit=limit)
+    wanted = level.run(estimate[:, 1:2], estimate[:, 2:], angle)
+    outputs = LoadOutput(level, load="velocity", current="current")
+    folder = export_c(drive(), tmp_path / "c", "drive", precision, load=outputs)
+    library = CompiledObserver.build(folder, flags=STRICT)
+    real = np.float32 if precision == "float" else np.float64
+    kept, found = np.zeros(12), np.empty((count, 2), dtype=real)
+    at = kept.ctypes.data_as(ctypes.c_void_p)
+    library._c.drive_load_init(at)
+    for k in range(count):
+        x_hat, value = np.nan_to_num(estimate[k]).astype(real), (ctypes.c_float if precision == "float" else ctypes.c_double)(angle[k, 0])
+        places = [ctypes.c_void_p(a.ctypes.data) for a in (x_hat, found[k, :1], found[k, 1:])]
+        library._c.drive_load_step(at, places[0], value, *places[1:])
+    for got, truth in zip(found.T, (wanted.load[:, 0], wanted.current[:, 0]), strict=True):
+        assert np.isfinite(truth).all()
+        np.testing.assert_allclose(got, truth, atol=(1e-12 if precision == "double" else 1e-5))
+    if np.isfinite(limit):
+        assert np.count_nonzero(np.abs(wanted.current) == limit) > 50
 
 
 @needs_compiler

@@ -1,7 +1,8 @@
 """The observer as C99 source and as a functional mock-up unit."""
 
 from .c99.compiled import CompiledObserver, find_compiler
+from .c99.numbers import LoadOutput
 from .c99.write import export_c
 from .fmu.write import export_fmu
 
-__all__ = ["CompiledObserver", "export_c", "export_fmu", "find_compiler"]
+__all__ = ["CompiledObserver", "LoadOutput", "export_c", "export_fmu", "find_compiler"]

@@ -66,7 +66,7 @@ class AngleLoad:
         current : array_like, shape (n_samples, batch)
             The observer's current.
         position : array_like, shape (n_samples, batch), rad
-            As measured.
+            As measured; where it is NaN the last angle stands for it.
         """
         seen, current, position = (np.asarray(x, dtype=float) for x in (seen, current, position))
         if seen.ndim != 2 or not seen.shape == current.shape == position.shape:
@@ -78,6 +78,11 @@ class AngleLoad:
             found.load[k], found.current[k] = running.step(seen[k], current[k], position[k])
         return found
 
+    @property
+    def pole(self) -> float:
+        """What of a level is left after a sample."""
+        return float(np.exp(-self.sample_period_s / self.level_s))
+
     def start(self, position: npt.ArrayLike) -> RunningAngleLoad:
         """Return the same sample by sample, for machines that start at angles in rad, shape (batch,)."""
         return RunningAngleLoad(self, np.atleast_1d(np.asarray(position, dtype=float)))
@@ -87,8 +92,7 @@ class RunningAngleLoad:
     """`AngleLoad` sample by sample, for some machines at once."""
 
     def __init__(self, settings: AngleLoad, position: Array) -> None:
-        self.settings = settings
-        self._pole = float(np.exp(-settings.sample_period_s / settings.level_s))
+        self.settings, self._pole = settings, settings.pole
         self._phi = np.stack([np.sin(position), np.cos(position)])
         self._psi, self._right = np.zeros_like(self._phi), np.zeros_like(self._phi)
         self._excess, self._need = np.zeros_like(position), np.zeros_like(position)  # taken off the load, and off the unloaded current
@@ -98,8 +102,10 @@ class RunningAngleLoad:
     def step(self, seen: Array, current: Array, position: Array) -> tuple[Array, Array]:
         """Return load and total current now, from the observer's and the measured angles in rad; all of shape (batch,)."""
         phi = np.stack([np.sin(position), np.cos(position)])
-        self._psi = psi = self._pole * self._psi + phi - self._phi
+        phi = np.where(np.isnan(phi), self._phi, phi)
+        self._psi = psi = self._pole * self._psi + np.nan_to_num(phi - self._phi)
         self._phi = phi
+        phi = np.nan_to_num(phi)  # none has arrived yet
         self._excess *= self._pole
         self._need *= self._pole
         coefficients = self._coefficients()

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.errors import ConfigError
 from ...lifting.c_code import Precision, c_code
+from ...motor_drive import AngleLoad
 from ...observer import Observer
 from ...observer.predictor.driven import in_coordinates
 from ...observer.samples import LONGEST
@@ -18,6 +20,22 @@ from .shift import Shift, find_shift
 
 Array = npt.NDArray[np.float64]
 _ALIKE = 1e4  # condition of the modes, by which rounding grows
+
+
+@dataclass(frozen=True)
+class LoadOutput:
+    """Load torque and total current with their levels as outputs (`AngleLoad`), of an observer that estimates a load.
+
+    Parameters
+    ----------
+    level : AngleLoad
+    load, current : str
+        Names of the observer's states.
+    """
+
+    level: AngleLoad
+    load: str = "load"
+    current: str = "current"
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +52,7 @@ class Source:
         Of a single-precision build whose origin can move.
     loop : PhaseLockedLoop or None
         Of a parameter that follows the machine.
+    load : LoadOutput or None
     """
 
     observer: Observer
@@ -41,13 +60,16 @@ class Source:
     precision: Precision
     shift: Shift | None
     loop: PhaseLockedLoop | None = None
+    load: LoadOutput | None = None
 
     @classmethod
-    def of(cls, observer: Observer, name: str, precision: str, track: str | None = None) -> Source:
-        """Look at an observer."""
+    def of(cls, observer: Observer, name: str, precision: str, track: str | None = None, load: LoadOutput | None = None) -> Source:
+        """Look at an observer; refuse what it cannot give."""
+        if load is not None and (missing := [s for s in (load.load, load.current) if s not in observer.recorded]):
+            raise ConfigError(f"Export: load torque needs the states {', '.join(missing)}, found {', '.join(observer.recorded)}.")
         observer = in_modes(observer)
         loop = None if track is None else PhaseLockedLoop(observer, track, 1)
-        return cls(observer, name, Precision(precision), find_shift(observer) if precision == "float" else None, loop)
+        return cls(observer, name, Precision(precision), find_shift(observer) if precision == "float" else None, loop, load)
 
     def context(self) -> dict[str, Any]:
         """Return everything that the templates name."""
@@ -100,6 +122,7 @@ class Source:
             "gamma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.input_formulas],
             "held_start": self.held_start(),
             "tracked": self.tracked(),
+            "load": self.load_torque(),
             "shift": self.shift,
             "shift_states": None if self.shift is None else self.wide(self.shift.states),
             "shift_inputs": None if self.shift is None else self.wide(self.shift.inputs),
@@ -137,6 +160,23 @@ class Source:
             "forget": write(self.loop.forget),
             "one": write(1.0),
             "most": write(MOST),
+        }
+
+    def load_torque(self) -> dict[str, Any] | None:
+        """Return the numbers of `AngleLoad`, in double precision: it sums up for as long as it runs."""
+        if self.load is None:
+            return None
+        level, places, write = self.load.level, self.observer.recorded, Precision().literal
+        return {
+            "load_name": self.load.load,
+            "current_name": self.load.current,
+            "load": places.index(self.load.load),
+            "current": places.index(self.load.current),
+            "pole": write(level.pole),
+            "period": write(level.sample_period_s),
+            "trust": write(0.5 * level.settling_s),
+            "limit": write(level.limit) if np.isfinite(level.limit) else None,
+            "trusted": write(level.trusted * level.limit) if np.isfinite(level.limit) else None,
         }
 
     def held_start(self) -> dict[str, Any]:

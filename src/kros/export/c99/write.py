@@ -17,7 +17,7 @@ from ...data.writers import whole_folder
 from ...observer import Observer
 from ...observer.file import observer_content
 from .golden import Golden
-from .numbers import Source
+from .numbers import LoadOutput, Source
 
 _TOLERANCE = {"double": 1e-9, "float": 1e-3}
 _C_WORDS = """
@@ -33,6 +33,7 @@ def export_c(
     precision: str = "double",
     study: Mapping[str, Any] | None = None,
     track: str | None = None,
+    load: LoadOutput | None = None,
 ) -> Path:
     """Write an observer as C99 source with a self-test, a project and a description.
 
@@ -49,6 +50,8 @@ def export_c(
         The resolved study, written beside the source.
     track : str, optional
         A lifting parameter that follows the machine by a phase-locked loop (`PhaseLockedLoop`).
+    load : LoadOutput, optional
+        Load torque and total current with their levels, as outputs of their own.
 
     Returns
     -------
@@ -63,7 +66,7 @@ def export_c(
     require_identifier(name)
     if precision not in _TOLERANCE:
         raise ConfigError(f"Export to C: precision should be 'double' or 'float', found {precision!r}.")
-    files = c_files(observer, name, precision, track)
+    files = c_files(observer, name, precision, track, load)
     if study is not None:
         files["study.json"] = json_bytes(study).decode()
     with whole_folder(Path(out)) as folder:
@@ -80,11 +83,11 @@ def require_identifier(name: str) -> None:
         )
 
 
-def c_files(observer: Observer, name: str, precision: str, track: str | None = None) -> dict[str, str]:
+def c_files(observer: Observer, name: str, precision: str, track: str | None = None, load: LoadOutput | None = None) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    source, golden = Source.of(observer, name, precision, track), Golden.of(observer, track)
+    source, golden = Source.of(observer, name, precision, track, load), Golden.of(observer, track)
     context = source.context() | {"version": version("kros")}
     context["sigma_uses_parameters"] = any(set(f.used) & set(observer.lifting.parameters) for f in observer.lifting.formulas)
     tolerance = _TOLERANCE[precision]

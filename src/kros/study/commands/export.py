@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from ...core.artifacts import load_artifact
 from ...core.errors import ConfigError
-from ...export import export_c, export_fmu
+from ...export import LoadOutput, export_c, export_fmu
+from ...motor_drive import AngleLoad
 from ...observer import Observer
 from ..config import Stage
 from ..engine.run_folder import open_finished
 
-DEPLOYED = "deployed"
+DEPLOYED, LOAD = "deployed", "load"
 
 
 def export_run(
@@ -24,7 +27,9 @@ def export_run(
     precision: str = "double",
     track: str | None = None,
 ) -> Path:
-    """Write one of a run's observers as C source, or as an FMU of a version; `name` is the study's by default; `track` is followed.
+    """Write one of a run's observers as C source, or as an FMU of a version; `name` is the study's by default.
+
+    The parameter `track` is followed by a phase-locked loop; observers of a load torque, ``koopman/load``, give its level too.
 
     Raises
     ------
@@ -32,13 +37,18 @@ def export_run(
         When there is no such observer, or no such run.
     """
     with open_finished(run, Stage.READ, Stage.SYNTHESIZE) as (config, store):
-        names = load_artifact(store.path("observers"), "observers")[0]["names"]
-        if observer not in (DEPLOYED, *names):
-            raise ConfigError(f"Run {run}: has no observer {observer!r}; known are {', '.join((DEPLOYED, *names))}.")
-        chosen, name = Observer.load(store.path("observers", f"{observer}.json")), name or identifier(config.name)
+        names = (DEPLOYED, *load_artifact(store.path("observers"), "observers")[0]["names"])
+        loads = {f"{kind}/{LOAD}": f"{kind}.json" for kind in ("koopman", "linear") if store.holds(LOAD, f"{kind}.json")}
+        if observer not in (*names, *loads):
+            raise ConfigError(f"Run {run}: has no observer {observer!r}; known are {', '.join((*names, *loads))}.")
+        path = store.path(LOAD, loads[observer]) if observer in loads else store.path("observers", f"{observer}.json")
+        chosen, name = Observer.load(path), name or identifier(config.name)
         if fmi is not None:
             return export_fmu(chosen, out, fmi, name, precision, track)
-        return export_c(chosen, out, name, precision, config.dump(), track)
+        limit = np.inf if config.load.limit is None else config.load.limit
+        level = AngleLoad(config.load.level_s, chosen.sample_period_s, limit=limit)
+        load = LoadOutput(level, current=config.load.current) if observer in loads else None
+        return export_c(chosen, out, name, precision, config.dump(), track, load)
 
 
 def identifier(text: str) -> str:

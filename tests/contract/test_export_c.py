@@ -1,5 +1,7 @@
 """Generated C against the observer in Python: estimates, status bits, precision after many turns, and compilers that complain about nothing."""
 
+import re
+import shutil
 import subprocess
 from dataclasses import replace
 
@@ -102,6 +104,18 @@ def test_everything_compiles_without_a_warning(precision, tmp_path):
     subprocess.run(["cc", "size.c", "-o", "size"], cwd=folder, check=True)
     printed = subprocess.run(["./size"], cwd=folder, check=True, capture_output=True, text=True).stdout
     assert f'"state_bytes": {printed},' in (folder / "manifest.json").read_text()
+
+
+@pytest.mark.skipif(shutil.which("cppcheck") is None, reason="cppcheck is not on the PATH")
+def test_misra_deviations_are_those_that_the_documentation_lists(tmp_path):
+    outputs = LoadOutput(AngleLoad(2.0, 1e-3, limit=0.3), load="velocity")
+    folder = export_c(drive(**LIMITS), tmp_path / "c", "drive", "float", track="phase", load=outputs)
+    sources = ("drive.c", "drive_selftest.c", "example_main.c")
+    command = ["cppcheck", "-q", "--addon=misra", "--std=c99", "--enable=style", *sources]
+    said = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)
+    assert set(re.findall(r"\[([\w.-]+)\]$", said.stdout + said.stderr, re.MULTILINE)) <= {
+        f"misra-c2012-{r}" for r in ("2.5", "8.7", "8.9")
+    }
 
 
 @needs_compiler

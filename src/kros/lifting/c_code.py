@@ -84,7 +84,8 @@ class _Writer:
         if kind == "Abs":
             return f"fabs{suffix}({inner})"
         if kind == "sign":
-            return f"({self.precision.type})((({inner}) > 0) - (({inner}) < 0))"
+            zero, one = self.precision.literal(0.0), self.precision.literal(1.0)
+            return f"((({inner}) > {zero}) ? {one} : ((({inner}) < {zero}) ? -{one} : {zero}))"
         raise ConfigError(f"Formula node {kind!r}: it has no expression in C; write the formula with other functions.")
 
     def _power(self, exponent: float, base: str) -> str:

@@ -84,6 +84,7 @@ class Source:
             "observer": o,
             "real": self.precision.type,
             "suffix": self.precision.suffix,
+            "zero": self.precision.literal(0.0),
             "single": self.precision.type == "float",
             "states": o.recorded,
             "measured": [lifting.states[i] for i in o.measured],

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
+from .scaling import Scaling
 
 DEFAULT_CONDITION = "default"
 OUTLIERS = "outliers"  # units of this group are scored, but take no part in pooled results
@@ -146,6 +147,8 @@ class Population:
         Facts about the batch, for example ``{"plant": "harmonic-drive", "gear_ratio": 100}``.
     truths : tuple of TrueChannel
         Further columns of the source, behind the inputs: what some states really were. No model and no observer sees them.
+    scaling : mapping of str to Scaling
+        The columns that channels were read from, and how; a channel that is not named is the column of its name, as it is.
     """
 
     channels: tuple[Channel, ...]
@@ -155,6 +158,7 @@ class Population:
     source: EpisodeSource
     metadata: Mapping[str, Any] = field(default_factory=dict)
     truths: tuple[TrueChannel, ...] = ()
+    scaling: Mapping[str, Scaling] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         """Say how much was recorded of what."""

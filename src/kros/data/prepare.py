@@ -13,6 +13,7 @@ from ..core.errors import DataError
 from .checks import check_episode, check_period, check_structure
 from .population import Channel, EpisodeKey, EpisodeSource, Population, Unit, columns_in_order, natural_key, part_columns, restrict
 from .recording import TIME_TOLERANCE, Recording, Recordings, check_even, estimate_period
+from .scaling import Scalings
 from .steps import Step
 
 
@@ -87,6 +88,7 @@ def assemble(
     *,
     steps: Iterable[Step] = (),
     tolerance: float = TIME_TOLERANCE,
+    scaling: Scalings | None = None,
 ) -> Population:
     """Make the population that a reader found: natural order, one sampling period, steps declared, names checked.
 
@@ -110,7 +112,15 @@ def assemble(
     source = PreparedSource(recordings, channels, period, first, tolerance=tolerance)
     parts = part_columns(channels)
     return prepare(
-        Population(sample_period_s=period, units=tuple(found), episodes=episodes, source=source, metadata=dict(metadata or {}), **parts),
+        Population(
+            sample_period_s=period,
+            units=tuple(found),
+            episodes=episodes,
+            source=source,
+            metadata=dict(metadata or {}),
+            scaling=dict(scaling or {}),
+            **parts,
+        ),
         steps,
     )
 
@@ -144,13 +154,13 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     added = tuple(steps)
     if not added:
         return population
-    channels, period = population.columns, population.sample_period_s
+    channels, period, scaling = population.columns, population.sample_period_s, population.scaling
     for step in added:
-        channels, period = step.channels_after(channels), step.period_after(period)
+        channels, period, scaling = step.channels_after(channels), step.period_after(period), step.scaling_after(scaling)
     check_structure(channels, population.episodes)
     source = population.source
     if isinstance(source, PreparedSource):
         source = replace(source, steps=source.steps + added)
     else:
         source = PreparedSource(EvenRecordings(source), population.columns, population.sample_period_s, population.episodes[0], added)
-    return replace(population, sample_period_s=period, source=source, **part_columns(channels))
+    return replace(population, sample_period_s=period, source=source, scaling=scaling, **part_columns(channels))

@@ -302,7 +302,8 @@ def certified(
         assert found.observer is not None
         assert found.synthesis is not None
         one, facts = by_name[found.name], {**found.facts, **holds, **by_name[found.name].facts()}
-        observer = replace(in_sizes(found.observer, {}), about=about(task, identified, one.certificate, facts))
+        observer = in_sizes(found.observer, {})
+        observer = replace(observer, about=about(task, identified, observer, one.certificate, facts))
         synthesis = replace(found.synthesis, controller=observer.controller)
         designs[found.name] = Design(found.name, observer, synthesis, one.certificate, facts)
     return designs, running

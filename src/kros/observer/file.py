@@ -23,6 +23,7 @@ from ..core.loading import as_written
 from ..core.lti import StateSpace
 from ..lifting import Lifting
 from ..synthesis.result import Injection
+from .about import checked_about
 from .data import ObserverData, measurement_replaces
 from .runtime import Runtime, Seen
 from .sensor import Sensor
@@ -55,6 +56,7 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "measurement_replaces_estimate": observer.replaces,
         "internal_states": observer.internal,
         **({"sensor": {name: own.model_dump() for name, own in observer.sensor.items()}} if observer.sensor else {}),
+        **({"about": observer.about} if observer.about else {}),
     }
     found: dict[str, Any] = plain(content)
     return found
@@ -131,9 +133,8 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
         sensor=_sensor(content.get("sensor", {}), where),
     )
     _known(content, [*observer_content(observer), "runtime", "sensor", "lifting_inputs", "input_functions", "about", CHECKSUM], where)
-    about = content.get("about", {})
-    _require(isinstance(about, dict), f"{where}: about should be an object", about)
-    observer = replace(observer, about=dict(about))
+    about = checked_about(content.get("about", {}), lifting.states, observer.inputs, lifting.parameters, f"{where}: about")
+    observer = replace(observer, about=about)
     if content["schema"] == _FIRST:
         return replace(observer, replaces=measurement_replaces(observer), internal=_named_memories(lifting.states))
     replaces, internal = content["measurement_replaces_estimate"], content["internal_states"]

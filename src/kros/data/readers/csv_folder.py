@@ -100,7 +100,9 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
     recordings = CsvRecordings(places, dialect, None if chosen.time is None else chosen.time_scale)
     units = [Unit(unit, group) for unit, group in groups.items()]
     period, tolerance = chosen.sample_period_s, chosen.time_tolerance
-    return assemble(recordings, chosen.channels, units, period, chosen.metadata, steps=chosen.steps, tolerance=tolerance)
+    return assemble(
+        recordings, chosen.channels, units, period, chosen.metadata, steps=chosen.steps, tolerance=tolerance, scaling=chosen.scaling
+    )
 
 
 def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:

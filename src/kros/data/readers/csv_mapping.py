@@ -13,6 +13,7 @@ from ...core.errors import ConfigError
 from ...core.files import read_toml
 from ..population import Channel, Role, TrueChannel, columns_in_order
 from ..recording import TIME_TOLERANCE
+from ..scaling import Scaling
 from ..steps import Scale, Step, parse_steps
 from ..tables import build
 
@@ -203,6 +204,12 @@ class CsvMapping:
     def steps(self) -> tuple[Step, ...]:
         """Scaling as declared per channel, then the mapping's own steps."""
         return (*(Scale((c.name,), c.scale) for c in self.ordered if c.scale != 1), *parse_steps(self.prepare, "CSV mapping: prepare"))
+
+    @property
+    def scaling(self) -> dict[str, Scaling]:
+        """Columns of the channels, before any step."""
+        columns = {c.name: {self.column(c, unit) for unit in self.units} for c in self.channel}
+        return {name: Scaling(next(iter(own)) if len(own) == 1 else None) for name, own in columns.items()}
 
     def without(self, names: Collection[str]) -> CsvMapping:
         """Return the mapping without some channels."""

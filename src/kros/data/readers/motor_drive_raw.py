@@ -22,6 +22,7 @@ from ...core.errors import DataError
 from ..population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
 from ..prepare import assemble, episode_order
 from ..recording import Recording, Recordings, estimate_period
+from ..scaling import Scaling
 from ..steps import Offset, Scale, Shift, Step, Trim
 from .csvfile import first_fields, read_columns
 
@@ -116,7 +117,8 @@ def read_motor_drive_raw(source: Path | str) -> Population:
     if not files:
         raise DataError(f"Reading {source} as motor-drive-raw: found {len(groups)} folders of units and no .csv in them; check the path.")
     recordings = RawRecordings(files, _time_scale(RawRecordings(files)(min(files, key=episode_order))))
-    return assemble(recordings, CHANNELS, units, metadata=METADATA, steps=STEPS)
+    scaling = {name: Scaling(number + 1) for number, name in enumerate(COLUMNS) if number}
+    return assemble(recordings, CHANNELS, units, metadata=METADATA, steps=STEPS, scaling=scaling)
 
 
 def _time_scale(first: Recording) -> float:

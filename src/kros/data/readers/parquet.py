@@ -19,6 +19,8 @@ from ..checks import check_period
 from ..population import Channel, EpisodeKey, Population, Role, TrueChannel, Unit
 from ..prepare import assemble
 from ..recording import Recording, Recordings
+from ..scaling import Scaling
+from ..tables import build
 
 INDEX = "population"  # kind of the artifact, hence population.json
 KEYS = ("unit", "condition", "episode")
@@ -108,6 +110,7 @@ def read_parquet(folder: Path | str) -> Population:
         places = _places(content["groups"])
         period = check_period(content["sample_period_s"], f"Reading {Path(folder) / 'population.json'}")
         metadata = dict(content["metadata"])
+        scaling = {name: build(Scaling, own, f"scaling.{name}") for name, own in content.get("scaling", {}).items()}
     except DataError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError) as error:
@@ -117,7 +120,8 @@ def read_parquet(folder: Path | str) -> Population:
     missing = sorted({name for name, _, _ in places.values() if not (Path(folder) / name).is_file()})
     if missing:
         raise DataError(f"Reading {folder}: {len(missing)} files are missing, the first {missing[0]}; convert the recordings again.")
-    return assemble(ParquetRecordings(places, str(folder), tuple(c.name for c in channels)), channels, units, period, metadata)
+    recordings = ParquetRecordings(places, str(folder), tuple(c.name for c in channels))
+    return assemble(recordings, channels, units, period, metadata, scaling=scaling)
 
 
 def _places(groups: Iterable[Mapping[str, Any]]) -> dict[EpisodeKey, tuple[str, int, int]]:

@@ -12,6 +12,7 @@ from ...core.errors import ConfigError, DataError
 from ..checks import check_finite
 from ..population import Channel
 from ..recording import Recording, title
+from ..scaling import Scalings, scaling_of
 from .step import Step
 
 
@@ -30,6 +31,11 @@ class Scale(Step):
             raise ConfigError(f"Step 'scale' needs a finite factor other than zero, found {self.factor}; correct it.")
         self.columns(self.channels, channels)
         return channels if self.unit is None else tuple(replace(c, unit=self.unit) if c.name in self.channels else c for c in channels)
+
+    def scaling_after(self, scaling: Scalings) -> Scalings:
+        """Return where channels come from, multiplied."""
+        before = {name: scaling_of(scaling, name) for name in self.channels}
+        return {**scaling, **{name: replace(own, factor=own.factor * self.factor) for name, own in before.items()}}
 
     def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
         """Return the recording with some columns multiplied."""
@@ -56,6 +62,11 @@ class Shift(Step):
         """Return the channels, unchanged."""
         self.columns(self.channels, channels)
         return channels
+
+    def scaling_after(self, scaling: Scalings) -> Scalings:
+        """Return where channels come from, moved."""
+        before = {name: scaling_of(scaling, name) for name in self.channels}
+        return {**scaling, **{name: replace(own, lag_samples=own.lag_samples + self.lag) for name, own in before.items()}}
 
     def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
         """Return the aligned recording, `abs(lag)` samples shorter."""
@@ -86,6 +97,11 @@ class Offset(Step):
         if not 0 <= self.start < self.stop:
             raise ConfigError(f"Step 'offset' needs 0 <= start < stop, found start = {self.start}, stop = {self.stop}; correct the window.")
         return channels
+
+    def scaling_after(self, scaling: Scalings) -> Scalings:
+        """Return where channels come from, with the offset in words."""
+        said = f"mean of {self.reference} - {self.channel} over samples {self.start} to {self.stop - 1} of every episode"
+        return {**scaling, self.channel: replace(scaling_of(scaling, self.channel), offset=said)}
 
     def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
         """Return the recording with the offset removed."""

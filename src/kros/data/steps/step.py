@@ -9,6 +9,7 @@ from typing import ClassVar
 from ...core.errors import ConfigError
 from ..population import Channel
 from ..recording import Recording
+from ..scaling import Scalings
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,10 @@ class Step:
     def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
         """Return the prepared recording; `channels` and `period_s` describe the one given."""
         raise NotImplementedError
+
+    def scaling_after(self, scaling: Scalings) -> Scalings:
+        """Return where channels come from, with what this step does to them."""
+        return scaling
 
     def without(self, names: Collection[str]) -> Step | None:
         """Return the step where some channels are absent: for those that are left, or None where it has nothing to do."""

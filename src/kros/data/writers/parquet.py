@@ -142,6 +142,7 @@ def write_index(population: Population, records: Iterable[GroupRecord], folder: 
         "units": [u for u in population.units if u.id in written],
         "metadata": population.metadata,
         **({"truths": population.truths} if population.truths else {}),
+        **({"scaling": population.scaling} if population.scaling else {}),
         "groups": [{name: getattr(g, name) for name in _INDEXED} for g in groups],
     }
     save_artifact(Path(folder), INDEX, content)

@@ -9,6 +9,7 @@ import pytest
 from kros.report.advice import advice
 from kros.report.caveats import conditions_apart, small_set_text
 from kros.report.sections.uncertainty import noise_text
+from kros.report.summary import find_alerts
 from kros.report.verdict import verdict
 
 NAME = "koopman/worst_case_h2"
@@ -24,7 +25,7 @@ def metrics(recorded: dict[str, list[str]], **parts: Any) -> dict[str, Any]:
 
 
 def told(found: dict[str, Any]) -> str:
-    return " ".join([*verdict(found), *advice(found)])
+    return " ".join([*verdict(found), *advice(found), *(alert.text for alert in find_alerts(found))])
 
 
 def uncertainty(peak_db: float, share: float = 0.01) -> dict[str, Any]:
@@ -73,7 +74,7 @@ def test_a_set_far_smaller_than_the_models_errors_is_a_warning(peak_db: float, p
     """The rule: five times the largest residual, 10^(-49 / 20) = 0.35 %, against the worst channel of the middle unit."""
     found = metrics(TOGETHER, uncertainty=uncertainty(peak_db), models=models(percent))
     assert bool(small_set_text(found)) is warned
-    assert ("far smaller than their own errors" in " ".join(advice(found))) is warned
+    assert ("far smaller than their own errors" in told(found)) is warned
     if peak_db == -49.0:
         assert "−49.0 dB, 0.35 %" in small_set_text(found)[0]
         assert "velocity by 20 %" in small_set_text(found)[0]

@@ -18,6 +18,7 @@ import numpy.typing as npt
 import pytest
 from matplotlib.figure import Figure
 from scipy.signal import welch
+from tests.support.browser import printed_pages, probe
 
 from kros.core.artifacts import save_artifact, write_json
 from kros.core.errors import ConfigError, DataError
@@ -33,7 +34,7 @@ from kros.identify.refine import RefinedModels, TradeOff
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.report import plot, render, write_figures
-from kros.report.figures import FIGURES, draw, draw_all
+from kros.report.figures import FIGURES, ON_THE_PAGE, draw, draw_all
 from kros.report.figures.episodes import longest_steady, steady_stretches
 from kros.report.figures.outliers.scores import referred_range
 from kros.report.figures.residuals import beside, entry_names
@@ -74,6 +75,7 @@ CHANNELS = (
     Channel("target_position", Role.INPUT, "rad"),
     Channel("target_velocity", Role.INPUT, "rad/s"),
 )
+DEPLOYED = "koopman_edmd/worst_case_h2"
 METHODS = ("open_loop", "kalman_tuned", "mixed", "worst_case_h2")
 Array = npt.NDArray[np.float64]
 
@@ -228,9 +230,11 @@ def write_observers(run: Path) -> list[str]:
         result.save(run / "synthesis" / name)
         observer = Observer(name, found.lifting, found.A[1], found.B[1], (0,), found.inputs, result.controller, Injection.STATE, DT)
         observer.save(run / "observers" / f"{name}.json")
+        if name == DEPLOYED:
+            observer.save(run / "observers" / "deployed.json")
     facts: dict[str, Any] = {n: {"order": 0, "spectral_radius_max": 0.99, "worst_case_h2": 1.0 + i} for i, n in enumerate(names)}
     facts["linear_edmd/hinf"] = {"status": "failed", "reason": "a reason; a reason; another"}
-    save_artifact(run / "observers", "observers", {"names": names, "deployed": "koopman_edmd/worst_case_h2", "facts": facts})
+    save_artifact(run / "observers", "observers", {"names": names, "deployed": DEPLOYED, "facts": facts})
     return names
 
 
@@ -340,7 +344,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory, uncertain: dict[str, Unce
         "evaluation": rows,
         "outliers": [{"unit": u, "condition": "load", "score": 1.0, "outlier": u == "000000"} for u in UNITS],
     }
-    metrics["study"] = {**metrics["study"], "deployed": "koopman_edmd/worst_case_h2"}
+    metrics["study"] = {**metrics["study"], "deployed": DEPLOYED}
     return run, metrics
 
 
@@ -397,7 +401,7 @@ def outline(page: str) -> Outline:
 def test_page_stands_alone(page: str) -> None:
     found = outline(page)
     assert all(link.startswith("#") for link in found.links)
-    assert not found.tags & {"script", "link", "img", "iframe"}
+    assert not found.tags & {"link", "img", "iframe"}
     assert "@import" not in page
     assert re.findall(r"url\((?!#)", page) == []
     assert len(page) < 6_000_000
@@ -410,9 +414,41 @@ def test_identifiers_are_unique_and_references_lead_somewhere(page: str) -> None
 
 
 def test_every_figure_is_on_the_page_with_a_caption(page: str) -> None:
-    expected = set(FIGURES) - {"load_torque", "signal_set"}  # of studies that declare a load alone, or whose recordings are in their place
+    expected = set(ON_THE_PAGE) - {
+        "load_torque",
+        "signal_set",
+    }  # of studies that declare a load alone, or whose recordings are in their place
     assert page.count("<figure") == page.count("<figcaption>") == len(expected)
     assert page.count("is left out") == 1
+
+
+_LOOK = """
+const details = [...page.querySelectorAll("details")];
+details.forEach(one => { one.removeAttribute("name"); one.open = true; });
+const cut = [...page.querySelectorAll(".wide")].filter(one => one.querySelector("table") && one.scrollWidth > one.clientWidth + 1);
+const table = page.querySelector("#observers table.sortable"), column = () => [...table.tBodies[0].rows].map(row => row.cells[3].dataset.value ?? "");
+const [first, second] = [0, 1].map(() => { table.querySelector("thead tr:last-child th:nth-child(4) button").click(); return column(); });
+const field = page.querySelector("#observers input");
+field.value = "kalman no"; field.dispatchEvent(new Event("input"));
+const kept = [...table.tBodies[0].rows].filter(row => !row.hidden).map(row => row.textContent.toLowerCase());
+const unnamed = [...page.querySelectorAll("svg[role=img], nav, input, button")].filter(
+  one => !(one.getAttribute("aria-label") || one.textContent.trim() || one.closest("label")));
+return { overflow: page.documentElement.scrollWidth - width, cut: cut.map(one => one.getAttribute("aria-label")), first, second, kept, unnamed: unnamed.length };
+"""
+
+
+def test_page_in_a_browser(page: str, tmp_path: Path) -> None:
+    found, console = probe(page, _LOOK, [1400, 900, 390], tmp_path)
+    assert console == []
+    for width, seen in found.items():
+        assert (seen["overflow"], seen["cut"], seen["unnamed"]) == (0, [], 0), width
+        known = [[float(text) for text in order if text] for order in (seen["first"], seen["second"])]
+        assert known[0] == sorted(known[0])
+        assert known[1] == known[0][::-1]
+        assert known[0][0] < known[0][-1]
+        assert 0 < len(seen["kept"]) < len(seen["first"])
+        assert all("kalman" in text and "no" in text for text in seen["kept"])
+    assert printed_pages(page, tmp_path) <= 12
 
 
 def test_text_is_escaped(page: str) -> None:

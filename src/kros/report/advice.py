@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .caveats import confounded_text, small_set_text
 from .error_tables import ErrorTable, error_table
 from .names import condition_label, model_label, number, observer_label, split_observer
 from .sections.uncertainty import MANY
@@ -15,9 +14,7 @@ def advice(metrics: Mapping[str, Any], measured: tuple[str, ...] = ()) -> list[s
     """Return what ``metrics.json`` asks for, given the channels that are measured at run time; nothing for a run that stopped before an observer was made."""
     if metrics["study"].get("deployed") is None:
         return []
-    model = split_observer(metrics["study"]["deployed"])[0]
-    caveats = [*confounded_text(metrics), *small_set_text(metrics, (model,))]
-    return [*caveats, *_outliers(metrics), *_observer(metrics, measured), *_recordings(metrics)]
+    return [*_outliers(metrics), *_observer(metrics, measured), *_recordings(metrics)]
 
 
 def _outliers(metrics: Mapping[str, Any]) -> list[str]:
@@ -64,29 +61,36 @@ def _observer(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str
     tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
     if not tables or name not in tables[0].cells:
         return []
-    table, other = tables[0], f"{split_observer(name)[0]}/open_loop"
+    table = tables[0]
     hidden = [c for c in table.channels if c not in measured and c in table.cells[name]] or list(table.cells[name])
-    own = [table.cells[name][c].mean for c in hidden]
-    if any(value is None for value in own):
+    if any(table.cells[name][c].mean is None for c in hidden):
         return [
             f"Do not use “{observer_label(name)}”: its estimates diverge. Look at Models first: free runs there should not diverge either."
         ]
-    better = [o for o in table.cells if o != name and _smaller(table, o, name, hidden, 0.95)]
-    if better:
-        best = min(better, key=lambda o: sum(table.cells[o][c].mean or 0.0 for c in hidden))
+    if (better := better_observer(table, name, hidden)) is not None:
         return [
-            f"Look at “{observer_label(best)}” before deploying anything: it is better in all that is not measured. Compare what is certified under "
-            "Synthesis; observer.deployed names the one that is deployed."
+            f"Look at “{observer_label(better)}” before deploying anything: it is better in all that is not measured. Compare under Trust; "
+            "observer.deployed names the one that is deployed."
         ]
-    if name != other and other in table.cells and not _smaller(table, name, other, hidden, 0.99):
-        return ["The observer is no better than its model alone: correction from these measurements brings nothing here."]
+    if no_better_than_open_loop(table, name, hidden):
+        return ["The observer is no better than its model alone: measure something that tells more of what is hidden, or look at Models."]
     entry = metrics.get("observers", {}).get(name, {})
-    text = (
-        "The observer is one JSON file, observers/deployed.json; “kros estimate” runs it on recordings, and “kros check” scores new units."
-    )
+    text = "Try it on recordings with “kros estimate”, then hand observers/deployed.json over: “kros export” writes C99 or an FMU."
     if entry.get("relift_certified") is False:
         text += " No certificate covers it as it runs, so let it run beside the machine before anything depends on it."
     return [text]
+
+
+def better_observer(table: ErrorTable, name: str, channels: Sequence[str]) -> str | None:
+    """Return the most accurate of the observers that are better in every channel by 5 % at least; None where there is none."""
+    better = [o for o in table.cells if o != name and _smaller(table, o, name, channels, 0.95)]
+    return min(better, key=lambda o: sum(table.cells[o][c].mean or 0.0 for c in channels), default=None)
+
+
+def no_better_than_open_loop(table: ErrorTable, name: str, channels: Sequence[str]) -> bool:
+    """Tell whether an observer is no better than its model without correction, in some channel."""
+    other = f"{split_observer(name)[0]}/open_loop"
+    return name != other and other in table.cells and not _smaller(table, name, other, channels, 0.99)
 
 
 def _smaller(table: ErrorTable, one: str, other: str, channels: Sequence[str], ratio: float) -> bool:

@@ -4,6 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from enum import Enum
+
+
+class Level(Enum):
+    """How urgent something is, with its word: colour alone says nothing to everybody."""
+
+    GO = "ready"
+    LOOK = "look first"
+    STOP = "do not use"
+
+
+@dataclass(frozen=True)
+class Alert:
+    """What has to be looked at; `section` is the anchor of where it comes from."""
+
+    level: Level
+    text: str
+    section: str
 
 
 @dataclass(frozen=True)
@@ -19,12 +37,18 @@ class Cell:
         Shown smaller, behind the text.
     bar : float or None
         Share of the cell's width that is shaded, 0 to 1.
+    value : float or None
+        What the cell is sorted by; its text by default.
+    href : str
+        Anchor that the text leads to.
     """
 
     text: str
     strong: bool = False
     note: str = ""
     bar: float | None = None
+    value: float | None = None
+    href: str = ""
 
 
 Cells = Sequence[Cell | str]
@@ -48,6 +72,8 @@ class Table:
         Rows that are set off.
     prose : bool
         Whether cells hold sentences instead of numbers.
+    sortable : bool
+        Whether the reader sorts it by any column, and filters its rows by their text.
     """
 
     head: Sequence[str]
@@ -57,11 +83,29 @@ class Table:
     folded: bool = False
     emphasised: Sequence[int] = ()
     prose: bool = False
+    sortable: bool = False
 
     @property
     def cells(self) -> list[list[Cell]]:
         """All rows as cells."""
         return [[Cell(c) if isinstance(c, str) else c for c in row] for row in self.rows]
+
+    @property
+    def labels(self) -> list[str]:
+        """What every column is called where it stands alone: its group's title and its own."""
+        titles = [title for title, span in self.groups for _ in range(span)] or [""] * len(self.head)
+        return [f"{title}: {own}" if title and own else title or own for title, own in zip(titles, self.head, strict=True)]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A part of a section that stands for one thing of many, such as a unit: anchor, title, terms, tables and inline pictures."""
+
+    key: str
+    title: str
+    card: Sequence[tuple[str, Sequence[str]]] = ()
+    tables: Sequence[Table] = ()
+    pictures: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -78,8 +122,14 @@ class Section:
     figures : sequence of str
     folded : sequence of (str, str)
         Titles and preformatted texts that the reader opens.
-    more : sequence of (str, sequence of str)
-        Titles and names of further figures that the reader opens.
+    lists : sequence of (str, sequence of str)
+        Titles and sentences, one below the other.
+    card : sequence of (str, sequence of str)
+        Terms and what there is to say about them.
+    notes : sequence of str
+        Paragraphs behind the tables.
+    panels : sequence of Panel
+        What the reader opens one at a time.
     """
 
     key: str
@@ -88,7 +138,10 @@ class Section:
     tables: Sequence[Table] = ()
     figures: Sequence[str] = ()
     folded: Sequence[tuple[str, str]] = ()
-    more: Sequence[tuple[str, Sequence[str]]] = ()
+    lists: Sequence[tuple[str, Sequence[str]]] = ()
+    card: Sequence[tuple[str, Sequence[str]]] = ()
+    notes: Sequence[str] = ()
+    panels: Sequence[Panel] = ()
 
 
 def where(names: Iterable[str], name: str | None) -> list[int]:

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
 from ..core.artifacts import write_bytes
 from ..data.population import DEFAULT_CONDITION
 from .advice import advice
-from .figures import FIGURES, draw
+from .content import Section
+from .figures import ON_THE_PAGE, draw
 from .files import to_svg
 from .names import condition_label
 from .run_folder import RunFolder
-from .sections import SECTIONS
+from .sections import EVIDENCE, SECTIONS
+from .summary import summary
 from .theme import Tone
-from .verdict import findings, trust
 
 log = logging.getLogger(__name__)
 
 _TEMPLATES = Path(__file__).parent / "templates"
+LEFT_TO_FILES = "Figures of the paper's entrywise kind are not among it: “kros figures” writes all of them."
 
 
 Encoded = dict[str, str]
@@ -67,30 +70,41 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
         loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     figures = {}
-    for found in mapped(partial(encoded, run), FIGURES):
+    for found in mapped(partial(encoded, run), ON_THE_PAGE):
         if found["reason"]:
             log.info("figure %s: left out, %s", found["name"], found["reason"])
         figures[found["name"]] = {**found, "svg": Markup(found["svg"])}
     study = metrics["study"]
     conditions = [condition_label(c) for c in study["conditions"] if c != DEFAULT_CONDITION]
+    measured = run.measured_states
     return environment.get_template("report.html.jinja").render(
         name=run.study.get("name", run.folder.name),
         subtitle=" · ".join([f"{study['units']} units", *conditions]),
-        verdict={
-            "What was found": findings(metrics, run.measured_states),
-            "Can it be trusted": trust(metrics),
-            "What to do next": advice(metrics, run.measured_states),
-        },
-        sections=[s for s in (section(run, metrics) for section in SECTIONS) if s is not None],
+        head=summary(metrics, measured),
+        actions=advice(metrics, measured),
+        sections=_made(SECTIONS, run, metrics),
+        evidence=_made(EVIDENCE, run, metrics),
+        left_to_files=LEFT_TO_FILES,
         figures=figures,
         style=Markup(stylesheet()),
+        script=Markup((_TEMPLATES / "report.js").read_text(encoding="utf-8")),
     )
+
+
+def _made(
+    makers: Sequence[Callable[[RunFolder, Mapping[str, Any]], Section | None]], run: RunFolder, metrics: Mapping[str, Any]
+) -> list[Section]:
+    return [found for make in makers if (found := make(run, metrics)) is not None]
 
 
 def encoded(run: RunFolder, name: str) -> Encoded:
     """Draw a figure and return it as the page shows it."""
     drawn = draw(name, run)
-    svg = "" if drawn.figure is None else to_svg(drawn.figure, name)
+    svg = (
+        ""
+        if drawn.figure is None
+        else to_svg(drawn.figure, name).replace('role="img"', f'role="img" aria-label="{escape(drawn.title)}"', 1)
+    )
     return {"name": name, "title": drawn.title, "svg": svg, "caption": drawn.caption, "reason": drawn.reason}
 
 

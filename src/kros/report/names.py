@@ -134,9 +134,19 @@ def paper_pair(names: Iterable[str]) -> list[str]:
     return max(pairs, key=len)
 
 
+def readable_unit(unit: str) -> str:
+    """Return a unit of measure for people; nothing where there is none."""
+    return _UNITS.get(unit, unit)
+
+
+def joined(parts: Sequence[str]) -> str:
+    """Return a list for a sentence: with commas, and an "and" before the last."""
+    return " and ".join(part for part in (", ".join(parts[:-1]), *parts[-1:]) if part)
+
+
 def axis_label(channel: str, unit: str) -> str:
     """Return a channel's name with its unit of measure, for an axis."""
-    readable = _UNITS.get(unit, unit)
+    readable = readable_unit(unit)
     name = channel.replace("_", " ")
     return f"{name} ({readable})" if readable else name
 

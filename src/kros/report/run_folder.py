@@ -21,6 +21,7 @@ from ..core.records import recorded_files
 from ..data.population import Channel, EpisodeKey, Population, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..identify.refine import RefinedModels
+from ..observer import Observer
 from ..synthesis.result import Synthesis
 from ..uncertainty import OutlierModel, Tightness, UncertainModel, VariationAndNoise
 from ..uncertainty.unit_residuals import UnitResiduals
@@ -212,6 +213,12 @@ class RunFolder:
     def observers_record(self) -> dict[str, Any]:
         """What the synthesis stage says about its observers."""
         return self._record("observers", "observers", "no observer has been made yet")
+
+    @cached_property
+    def observer(self) -> Observer:
+        """The deployed observer itself."""
+        self._require("observers/deployed.json", "no observer is deployed")
+        return Observer.load(self.folder / "observers" / "deployed.json")
 
     @property
     def deployed(self) -> str | None:

@@ -16,7 +16,7 @@ from ..theme import style
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["FIGURES", "Drawn", "Row", "draw", "draw_all"]
+__all__ = ["FIGURES", "ON_THE_PAGE", "Drawn", "Row", "draw", "draw_all"]
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,8 @@ FIGURES: dict[str, Row] = {
     "outlier_ratio": Row("The highest-scoring unit against the cover of the others", "outliers.ratio"),
     "outlier_residuals": Row("The highest-scoring unit, entry by entry", "outliers.residuals"),
 }
+LEFT_TO_FILES = ("forms_entrywise", "weights_entrywise", "robustness_second", "outlier_residuals")
+ON_THE_PAGE = tuple(name for name in FIGURES if name not in LEFT_TO_FILES)
 
 
 @dataclass(frozen=True, eq=False)

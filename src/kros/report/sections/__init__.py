@@ -9,6 +9,7 @@ from ..content import Section
 from ..run_folder import RunFolder
 from . import (
     calibration,
+    deployment,
     left_out,
     making,
     models,
@@ -19,25 +20,28 @@ from . import (
     relift,
     robustness,
     synthesis,
+    trust,
     uncertainty,
+    units,
 )
 
 Metrics = Mapping[str, Any]
 
-SECTIONS: tuple[Callable[[RunFolder, Metrics], Section | None], ...] = (
-    observers.result,
-    outliers.section,
+Maker = Callable[[RunFolder, Metrics], Section | None]
+SECTIONS: tuple[Maker, ...] = (deployment.section, observers.section, units.section, trust.section)
+EVIDENCE: tuple[Maker, ...] = (
     recordings.section,
     calibration.section,
     models.section,
     uncertainty.section,
     synthesis.section,
     relift.section,
-    observers.section,
+    outliers.section,
+    observers.estimates,
     left_out.section,
     robustness.section,
     other_conditions.section,
     making.section,
 )
 
-__all__ = ["SECTIONS"]
+__all__ = ["EVIDENCE", "SECTIONS"]

@@ -1,4 +1,4 @@
-"""Errors of the observers where they were designed for: the result table, and what they do in time and frequency."""
+"""Errors of the observers where they were designed for and elsewhere: six to compare, all others behind them, and what they do in time."""
 
 from __future__ import annotations
 
@@ -7,36 +7,50 @@ from typing import Any
 
 from ..content import Cell, Section, Table, where
 from ..error_tables import ErrorCell, ErrorTable, error_table
-from ..names import axis_label, channel_units, in_condition, number, observer_label
+from ..names import axis_label, channel_units, condition_label, in_condition, joined, number, observer_label, paper_pair, split_observer
 from ..run_folder import RunFolder
+from ..trust import best_certified, mean_error, trusts
 
 _RECORDED = "as recorded"
 
 
-def result(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
-    """Return the tables of all observers and channels, with the chart."""
+def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
+    """Return the observers that are compared first, and the table of all in all conditions; None where none was evaluated."""
     tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
     if not tables:
         return None
     text = (
-        "RMS error on held-out episodes that nothing was fitted to, in percent of the largest absolute value of the signal in the episode. Off nominal: mean "
-        "over the units other than the nominal one, with its 95 % interval by a bootstrap over these units, and the worst of them; RMS: the same mean in the "
-        "channel's own unit of measure. Best of each column in bold; the deployed observer is set off."
+        "RMS error on held-out episodes that nothing was fitted to, in the channel's unit of measure and in percent of the largest value of the signal in the "
+        "episode: mean over the units other than the nominal one, and the worst of them. What “plants” and “signals” certify stands under Trust."
+    )
+    six = _compared(tables[0], metrics, run.measured_states)
+    rows = [
+        [Cell(joined(roles), note=observer_label(name)), *_errors(tables[0], name, metrics, run.measured_states)]
+        for name, roles in six.items()
+    ]
+    deployed = metrics["study"].get("deployed")
+    first = Table(
+        ["observer", *_head(tables[0], metrics, run.measured_states)],
+        rows,
+        f"Observers to compare{in_condition(tables[0].condition)}",
+        [("", 1), *_groups(tables[0], run.measured_states)],
+        emphasised=where(six, deployed),
     )
     notes = baseline_notes(metrics.get("observers", {}))
-    shown = [_errors(t, metrics["study"].get("deployed"), run.measured_states, channel_units(metrics)) for t in tables]
-    return Section("results", "Results", [text, *([" ".join(notes)] if notes else [])], [*shown, *_against_truth(metrics)], ["errors"])
+    every = _all(tables, metrics, run.measured_states)
+    return Section("observers", "Observers", [text, *([" ".join(notes)] if notes else [])], [first, every], ["observers_in_time"])
 
 
-def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
-    """Return the figures of estimates and their spectra."""
+def estimates(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
+    """Return the figures of errors, estimates and their spectra, and errors against what the states really were."""
     if not metrics.get("evaluation"):
         return None
     text = (
         "The observers as they run: at every step the estimate is cut back to the original states and re-lifted with the unit's own parameters. An estimate "
         "for the next sample uses data up to this one."
     )
-    return Section("observers", "Estimates", [text], [], ["observers_in_time", "observers_in_time_paper", "observer_spectra"])
+    figures = ["errors", "observers_in_time_paper", "observer_spectra"]
+    return Section("estimates", "Estimates", [text], _against_truth(metrics), figures)
 
 
 def baseline_notes(observers: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -57,19 +71,74 @@ def baseline_notes(observers: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return [*notes, *missing]
 
 
-def _errors(table: ErrorTable, deployed: str | None, measured: tuple[str, ...], channel_units: Mapping[str, str]) -> Table:
-    """One condition's errors, channels that are measured last."""
-    channels = sorted(table.channels, key=lambda c: c in measured)
-    rows = [
-        [observer_label(o), *(cell for c in channels for cell in _cells(table, c, cells.get(c), c not in measured))]
-        for o, cells in table.cells.items()
+def _compared(table: ErrorTable, metrics: Mapping[str, Any], measured: Sequence[str]) -> dict[str, list[str]]:
+    """Return the few observers that answer most questions, each with the roles it is compared in."""
+    deployed, channels = metrics["study"].get("deployed"), _hidden(table, measured)
+
+    def tuned() -> str | None:
+        names = [n for n in table.cells if split_observer(n)[1] == "kalman_tuned"]
+        own = f"{split_observer(deployed or '')[0]}/kalman_tuned"
+        return own if own in names else min(names, key=lambda n: mean_error(table, n, channels), default=None)
+
+    chosen = [
+        ("deployed", deployed),
+        ("best that is certified for the set", best_certified(metrics, table, channels)),
+        ("the paper's", next(iter(paper_pair(table.cells)[::-1]), None)),
+        ("tuned Kalman", tuned()),
+        ("learned", "learned"),
+        ("filtered difference", "filtered_difference"),
     ]
-    head = ["observer", *(title for c in channels for title in ("nominal", "mean", "worst", axis_label("RMS", channel_units.get(c, ""))))]
-    groups = [("", 1), *((c.replace("_", " ") + ("" if c in table.ranked else " (not ranked)"), 4) for c in channels)]
-    caption = f"Errors in percent of the largest value, and as RMS in the channel's unit{in_condition(table.condition)}."
-    if len(table.ranked) < len(table.channels):
+    found: dict[str, list[str]] = {}
+    for role, name in chosen:
+        if name in table.cells:
+            found.setdefault(str(name), []).append(role)
+    return found
+
+
+def _all(tables: Sequence[ErrorTable], metrics: Mapping[str, Any], measured: Sequence[str]) -> Table:
+    """All observers in all conditions, a row each."""
+    pairs = [(table, name) for table in tables for name in table.cells]
+    rows = [[observer_label(name), condition_label(t.condition), *_errors(t, name, metrics, measured, interval=True)] for t, name in pairs]
+    caption = f"All {len(trusts(metrics))} observers in every condition: sort by any column, filter by words. Mean with its 95 % interval over units."
+    if any(len(table.ranked) < len(table.channels) for table in tables):
         caption += " The current's error under load is the load's torque itself: reported, not ranked."
-    return Table(head, rows, caption, groups, emphasised=where(table.cells, deployed))
+    head = ["observer", "condition", *_head(tables[0], metrics, measured)]
+    chosen = where((name for _, name in pairs), metrics["study"].get("deployed"))
+    return Table(head, rows, caption, [("", 2), *_groups(tables[0], measured)], folded=True, emphasised=chosen, sortable=True)
+
+
+def _hidden(table: ErrorTable, measured: Sequence[str]) -> list[str]:
+    return [c for c in table.channels if c not in measured] or list(table.channels)
+
+
+def _head(table: ErrorTable, metrics: Mapping[str, Any], measured: Sequence[str]) -> list[str]:
+    units = channel_units(metrics)
+    of_channels = [title for c in _hidden(table, measured) for title in (axis_label("RMS", units.get(c, "")), "mean (%)", "worst (%)")]
+    return [*of_channels, "for the set", "as it runs"]
+
+
+def _groups(table: ErrorTable, measured: Sequence[str]) -> list[tuple[str, int]]:
+    return [*((c.replace("_", " "), 3) for c in _hidden(table, measured)), ("certified", 2)]
+
+
+def _errors(table: ErrorTable, name: str, metrics: Mapping[str, Any], measured: Sequence[str], interval: bool = False) -> list[Cell | str]:
+    trust = trusts(metrics)[name]
+    channels = [cell for c in _hidden(table, measured) for cell in _cells(table, c, table.cells[name].get(c), interval)]
+    return [*channels, trust.by_set, trust.as_it_runs.partition(",")[0]]
+
+
+def _cells(table: ErrorTable, channel: str, cell: ErrorCell | None, interval: bool) -> list[Cell | str]:
+    if cell is None:
+        return ["–"] * 3
+    if cell.mean is None:
+        return ["–", Cell("diverged", note=f"{cell.diverged} units"), "–"]
+    note = f"{number(cell.interval[0], 2)}–{number(cell.interval[1], 2)}" if interval and cell.interval else ""
+    mean, worst = (getattr(cell, what) for what in ("mean", "worst"))
+    return [
+        Cell(number(cell.rms), value=cell.rms),
+        Cell(number(mean), strong=mean == table.best(channel, "mean"), note=note, value=mean),
+        Cell(number(worst), strong=worst == table.best(channel, "worst"), note="" if interval else cell.worst_unit or "", value=worst),
+    ]
 
 
 def _against_truth(metrics: Mapping[str, Any]) -> list[Table]:
@@ -90,7 +159,17 @@ def _against_truth(metrics: Mapping[str, Any]) -> list[Table]:
         "trails as well."
     )
     deployed = where(observers, metrics["study"].get("deployed"))
-    return [Table(["observer", *("mean", "worst", "lag (ms)") * len(places)], body, caption, groups, folded=True, emphasised=deployed)]
+    return [
+        Table(
+            ["observer", *("mean", "worst", "lag (ms)") * len(places)],
+            body,
+            caption,
+            groups,
+            folded=True,
+            emphasised=deployed,
+            sortable=True,
+        )
+    ]
 
 
 def _true_cells(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -99,14 +178,3 @@ def _true_cells(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         return ["–" if not rows else "diverged", "–", "–"]
     lag = None if None in lags else 1e3 * sum(lags) / len(lags)
     return [number(sum(errors) / len(errors)), number(max(errors)), number(lag)]
-
-
-def _cells(table: ErrorTable, channel: str, cell: ErrorCell | None, with_interval: bool) -> list[Cell | str]:
-    if cell is None:
-        return ["–"] * 4
-    if cell.mean is None:
-        return [number(cell.nominal), Cell("diverged", note=f"{cell.diverged} units"), "–", "–"]
-    values = {what: getattr(cell, what) for what in ("nominal", "mean", "worst")}
-    notes = {"mean": f"{number(cell.interval[0], 2)}–{number(cell.interval[1], 2)}"} if cell.interval and with_interval else {}
-    cells = [Cell(number(v), strong=v is not None and v == table.best(channel, w), note=notes.get(w, "")) for w, v in values.items()]
-    return [*cells, number(cell.rms)]

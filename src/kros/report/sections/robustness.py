@@ -37,8 +37,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         *([_noise(noise, deployed)] if noise else []),
     ]
     figures = [*(["robustness"] if rows else []), *(["members"] if sets else [])]
-    more = [("The second state that is not measured", ["robustness_second"])] if rows else []
-    return Section("robustness", "Robustness", paragraphs, tables, figures, more=more)
+    return Section("robustness", "Robustness", paragraphs, tables, figures)
 
 
 def _doubling(rows: Rows, condition: str, measured: Sequence[str], deployed: str | None) -> Table:

@@ -40,10 +40,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     paragraphs = [text, *([_PAPER] if tall else []), *([_HIGH.format(names=", ".join(model_label(n) for n in high))] if high else [])]
     paragraphs += [*confounded_text(metrics), *small_set_text(metrics), *noise_text(entries)]
     tables = [_peaks(entries), *_noise(entries), _weights(entries)]
-    more = [("As in the paper, entry by entry", ["forms_entrywise", "weights_entrywise"])]
-    return Section(
-        "uncertainty", "Uncertainty", paragraphs, tables, ["forms", "signal_set", "variation", "weights", "weight_orders"], more=more
-    )
+    return Section("uncertainty", "Uncertainty", paragraphs, tables, ["forms", "signal_set", "variation", "weights", "weight_orders"])
 
 
 def noise_text(entries: Mapping[str, Any]) -> list[str]:

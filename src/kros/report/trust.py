@@ -1,0 +1,133 @@
+"""What is certified about an observer, in one place: every table and sentence that speaks of it asks here.
+
+Two sets are never mixed: that of plants, around the nominal unit between the weights, and that of signals, the residuals of recorded motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..evaluate import Kind
+from .disturbances import AXES, Curve, curves, doubling
+from .error_tables import ErrorTable
+from .names import BASELINES, number, split_observer
+
+Facts = Mapping[str, Any]
+_SENSOR = (Kind.NOISE, Kind.QUANTISATION, Kind.BIAS, Kind.DELAY)
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What stands behind one observer.
+
+    Parameters
+    ----------
+    plants : float or None
+        Certified H2 norm of the error over the set of plants; None where there is none.
+    signals : mapping of str to float
+        Certified RMS error in percent of the largest value, by state, over the set of recorded signals; empty where there is none.
+    outside : tuple of str
+        Units whose own signals are outside that set.
+    running : bool or None
+        Whether a bound was found for it as it runs; None where it has no model, so that nothing was looked for.
+    gain : float or None
+        Of that bound, from residual to error.
+    dropouts : tuple (rate, certified) or None
+        The rate of losses that is declared, and whether a bound holds with it.
+    """
+
+    plants: float | None = None
+    signals: Mapping[str, float] | None = None
+    outside: tuple[str, ...] = ()
+    running: bool | None = None
+    gain: float | None = None
+    dropouts: tuple[float, bool] | None = None
+
+    @property
+    def by_set(self) -> str:
+        """For which sets it is certified, in words."""
+        found = [name for name, known in (("plants", self.plants is not None), ("signals", bool(self.signals))) if known]
+        return " and ".join(found) or "no"
+
+    @property
+    def as_it_runs(self) -> str:
+        """Whether it is certified as it runs, in words."""
+        return {True: f"yes, gain {number(self.gain)}", False: "no", None: "no model"}[self.running]
+
+
+def trust_of(facts: Facts) -> Trust:
+    """Return what an entry of ``observers`` in ``metrics.json`` says."""
+    signals = facts.get("set_bound_percent") if facts.get("set_certified") else None
+    lost = None if facts.get("dropout_rate") is None else (float(facts["dropout_rate"]), bool(facts.get("dropout_certified")))
+    return Trust(
+        facts.get("worst_case_h2"),
+        signals,
+        tuple(facts.get("set_outside") or ()),
+        facts.get("relift_certified"),
+        facts.get("relift_gain"),
+        lost,
+    )
+
+
+def trusts(metrics: Facts) -> dict[str, Trust]:
+    """Return it of all observers that were made, baselines included."""
+    found: dict[str, Facts] = {r["observer"]: {} for r in metrics.get("evaluation", [])}
+    found |= {name: facts for name, facts in metrics.get("observers", {}).items() if facts.get("status") != "failed"}
+    return {name: trust_of(facts) for name, facts in found.items()}
+
+
+def best_certified(metrics: Facts, table: ErrorTable, channels: Sequence[str]) -> str | None:
+    """Return the most accurate observer that was designed and is certified for the set of plants; for recorded signals where there is none."""
+    found = trusts(metrics)
+    for known in (lambda t: t.plants is not None, lambda t: bool(t.signals)):
+        names = [n for n, t in found.items() if known(t) and n in table.cells and split_observer(n)[1] not in BASELINES]
+        errors = {n: mean_error(table, n, channels) for n in names}
+        if any(np.isfinite(e) for e in errors.values()):
+            return min(errors, key=lambda n: errors[n])
+    return None
+
+
+def mean_error(table: ErrorTable, name: str, channels: Sequence[str]) -> float:
+    """Return the geometric mean of an observer's errors in some channels, percent of the largest value; infinite where one is not known."""
+    values = [table.cells[name][c].mean if c in table.cells[name] else None for c in channels]
+    known = [v for v in values if v is not None]
+    return float(np.exp(np.mean(np.log(np.maximum(known, 1e-300))))) if known and len(known) == len(values) else float("inf")
+
+
+def needed(
+    own: Mapping[Kind, Mapping[str, Curve]], measured: Sequence[str], kinds: Sequence[Kind] = _SENSOR
+) -> dict[Kind, tuple[float, bool]]:
+    """Return the severity at which an observer's error doubles, and whether it does so below all that was tried; kinds that do not double it are absent."""
+    found = {kind: doubling(kind, own.get(kind, {}), measured) for kind in kinds}
+    return {kind: (max(d), d[0] < d[1]) for kind, d in found.items() if d is not None and np.isfinite(d[0])}
+
+
+def sensor_text(metrics: Facts, name: str, measured: Sequence[str]) -> str:
+    """Return what sensor and timing an observer needs, short; a dash where that was not tried."""
+    own = curves(metrics.get("robustness", []), metrics["study"]["identify_on"]).get(name)
+    if own is None:
+        return "not tried"
+    parts = [f"{_SHORT[kind]} {_below(kind, *at)}" for kind, at in needed(own, measured).items()]
+    return "; ".join(parts) or "any that was tried"
+
+
+def dropout_text(metrics: Facts, name: str, trust: Trust, measured: Sequence[str]) -> str:
+    """Return which losses an observer tolerates: certified where a rate is declared, and as tried."""
+    told = [] if trust.dropouts is None else [f"{'certified' if trust.dropouts[1] else 'not certified'} at {100 * trust.dropouts[0]:g} %"]
+    own = curves(metrics.get("robustness", []), metrics["study"]["identify_on"]).get(name)
+    if own is not None and Kind.DROPPED in own:
+        at = needed(own, measured, (Kind.DROPPED,)).get(Kind.DROPPED)
+        told.append("no rate tried doubles it" if at is None else f"doubles at {_below(Kind.DROPPED, *at)}")
+    return "; ".join(told) or "not tried"
+
+
+def _below(kind: Kind, severity: float, below_all: bool) -> str:
+    text = f"{severity:.2g}" if kind is Kind.DELAY else f"{number(severity * AXES[kind].factor, 2)} %"
+    return f"< {text}" if below_all else text
+
+
+_SHORT = {Kind.NOISE: "noise", Kind.QUANTISATION: "step", Kind.BIAS: "bias", Kind.DELAY: "delay"}

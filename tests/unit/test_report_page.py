@@ -433,7 +433,8 @@ field.value = "kalman no"; field.dispatchEvent(new Event("input"));
 const kept = [...table.tBodies[0].rows].filter(row => !row.hidden).map(row => row.textContent.toLowerCase());
 const unnamed = [...page.querySelectorAll("svg[role=img], nav, input, button")].filter(
   one => !(one.getAttribute("aria-label") || one.textContent.trim() || one.closest("label")));
-return { overflow: page.documentElement.scrollWidth - width, cut: cut.map(one => one.getAttribute("aria-label")), first, second, kept, unnamed: unnamed.length };
+return { overflow: page.documentElement.scrollWidth - width, cut: cut.map(one => one.getAttribute("aria-label")),
+  first, second, kept, unnamed: unnamed.length };
 """
 
 

@@ -130,4 +130,4 @@ def _below(kind: Kind, severity: float, below_all: bool) -> str:
     return f"< {text}" if below_all else text
 
 
-_SHORT = {Kind.NOISE: "noise", Kind.QUANTISATION: "step", Kind.BIAS: "bias", Kind.DELAY: "delay"}
+_SHORT = {Kind.NOISE: "noise", Kind.QUANTISATION: "resolution", Kind.BIAS: "bias", Kind.DELAY: "delay"}

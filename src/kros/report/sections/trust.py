@@ -17,7 +17,7 @@ _COLUMNS = (
     "For the set: “plants”, a bound on the error's H2 norm for every plant between the weights around the nominal unit; “signals”, a bound on its RMS for all "
     "signals with the power in every band of frequency that was recorded. As it runs: a bound with the state re-lifted at every step, from the model's "
     "one-step residual to the error, for any machine. Dropouts and sensor: the severity at which the error doubles on held-out episodes, geometric mean over "
-    "the states that are not measured, “<” the mildest that was tried; noise, step of the resolution and bias in percent of the largest value, delay in samples."
+    "the states that are not measured, “<” the mildest that was tried; noise, resolution and bias in percent of the largest value, delay in samples."
 )
 _ASSUMED = (
     "The units recorded stand for those to come: nothing here is about another batch, or about wear.",

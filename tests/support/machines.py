@@ -1,10 +1,12 @@
 """Machines with observers of every kind, samples with faults, and what the observer in Python makes of them."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from kros.core.lti import StateSpace
 from kros.lifting import Lifting
-from kros.observer import Observer, Runtime, Seen
+from kros.observer import Monitor, Observer, Runtime, Seen, octaves
 from kros.synthesis import Injection
 
 STATES, DT = ("position", "velocity", "current"), 1e-3
@@ -55,6 +57,8 @@ MACHINES = {
     "earlier values and delay": lambda: drive(("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate"), delay=3),
     "input functions": lambda: drive(inputs=("target", "rate"), gamma=("rate*velocity",)),
     "replaced": lambda: replaced(),
+    "monitor": lambda: watched(drive()),
+    "monitor and delay": lambda: watched(drive(delay=2, **LIMITS)),
 }
 
 
@@ -72,6 +76,13 @@ def replaced():
     return Observer(
         "r", lifting, A, B, (0,), ("target", "rate"), gain, Injection.STATE, DT, {"phase": 0.3}, seen=seen, replaces=True, internal=2
     )
+
+
+def watched(observer, bound=1.0):
+    """With a monitor that is exceeded now and then by what `samples` does."""
+    filters = octaves()
+    monitor = Monitor(filters, 0.02, 50, np.array([0.7]), bound * np.full((1, len(filters)), 0.02), 0.02)
+    return replace(observer, monitor=monitor)
 
 
 def samples(count, turns=0.0, faults=True):

@@ -82,3 +82,6 @@ class ObserverSettings(Settings):
 
     baselines: tuple[BASELINES, ...] = get_args(BASELINES)
     deployed: str | None = None
+    false_alarm_rate: float = Field(
+        0.02, gt=0, lt=1, description="share of good machines that the monitor of the deployed observer may report"
+    )

@@ -32,6 +32,7 @@ from ..uncertainty.quantify import UncertainModels
 from .about import about
 from .certificates import DIVERGED, Running, certify_running
 from .methods.table import BY_NAME, preferred, slowest_first, suitable
+from .monitor import fit_monitor, monitor_facts
 from .settings import BASELINES, ObserverSettings, PredictorSettings, SynthesisSettings
 from .task import DesignResult, DesignTask, is_robust, split_name
 from .validation import TrainingSet
@@ -180,7 +181,8 @@ def synthesize(
     failed = {found.name: found.facts["reason"] for found in results if found.observer is None}
     if name in failed:
         raise SynthesisError(f"{name} could not be made: {failed[name]}")
-    return certified(tasks, results, uncertain.models, work or Work())[0][name]
+    made = certified(tasks, results, uncertain.models, work or Work())[0][name]
+    return watched(made, uncertain.models, told, among.false_alarm_rate)
 
 
 def synthesize_all(
@@ -216,7 +218,19 @@ def synthesize_all(
     designs, running = certified(tasks, results, uncertain.models, work)
     facts = {found.name: dict(designs[found.name].facts) if found.name in designs else dict(found.facts) for found in results}
     eligible = robust_of(running, facts) if robust else running
-    return Designs(designs, choose_deployed(observer.deployed, list(designs), eligible), facts, tuple(running))
+    deployed = choose_deployed(observer.deployed, list(designs), eligible)
+    designs[deployed] = watched(designs[deployed], uncertain.models, sensor, observer.false_alarm_rate)
+    facts[deployed] = dict(designs[deployed].facts)
+    return Designs(designs, deployed, facts, tuple(running))
+
+
+def watched(design: Design, identified: IdentifiedModels, sensor: Sensors | None, rate: float) -> Design:
+    """Return a design whose observer has a monitor, where there are enough units."""
+    training = TrainingSet.whole(identified, identified.models(split_name(design.name)[0]), sensor)
+    monitor = fit_monitor(design.observer, training, rate)
+    if monitor is None:
+        return design
+    return replace(design, observer=replace(design.observer, monitor=monitor), facts={**design.facts, "monitor": monitor_facts(monitor)})
 
 
 def named(uncertain: UncertainModels, method: str) -> str:

@@ -12,6 +12,7 @@ from .certificate.report import ReliftRow, relift_report
 from .certificate.signals import SignalBound, signal_bound
 from .certificate.status import Dropped, ReliftStatus
 from .limits import Limit, Limits
+from .monitor import Monitor, octaves
 from .observer import Observer
 from .predictor import PastMoments, conditioned, driven_coordinates, identify_predictor, with_internal, with_limits
 from .residual.models import ResidualModel, one_step_rows, residual_models
@@ -21,7 +22,7 @@ from .runtime import Runtime, Seen
 from .samples import SampleStatus
 from .screen import sample_status
 from .sensor import Sensor, Sensors
-from .simulate import EstimateKind, run_observer, run_observers
+from .simulate import EstimateKind, run_innovations, run_observer, run_observers
 from .tracking import Tracked, track_parameter
 from .tuning.observer_rows import tune_observer
 from .units import in_sizes
@@ -39,6 +40,7 @@ __all__ = [
     "Limit",
     "Limits",
     "Moments",
+    "Monitor",
     "Observer",
     "PastMoments",
     "ReliftCertificate",
@@ -66,6 +68,7 @@ __all__ = [
     "luenberger_candidates",
     "mean_error_dynamics",
     "noise_covariances",
+    "octaves",
     "one_step_residual",
     "one_step_rows",
     "rates",
@@ -73,6 +76,7 @@ __all__ = [
     "relift_report",
     "residual_models",
     "residual_spectra",
+    "run_innovations",
     "run_observer",
     "run_observers",
     "sample_status",

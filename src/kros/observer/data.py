@@ -26,6 +26,7 @@ from ..core.linalg import solve_balanced
 from ..core.lti import StateSpace
 from ..lifting import Lifting
 from ..synthesis.result import Injection
+from .monitor import Monitor
 from .runtime import Runtime, Seen
 from .sensor import Sensors, require_measured
 
@@ -63,6 +64,8 @@ class ObserverData:
         So many states at the end are the observer's own (`predictor`): recordings do not hold them.
     sensor : mapping of str to Sensor
         What it was told of the sensors of measured states, by name. What arrives late is corrected by `runtime`.
+    monitor : Monitor, optional
+        Watches the innovation for machines that are outside the population's envelope; nothing by default.
     about : mapping of str to JSON values
         What people should know of it: units of measure, ranges, certificates. It is part of the file; nothing computes with it.
 
@@ -89,6 +92,7 @@ class ObserverData:
     replaces: bool = False
     internal: int = 0
     sensor: Sensors = field(default_factory=dict)
+    monitor: Monitor | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -110,6 +114,10 @@ class ObserverData:
             raise DimensionError(
                 f"Observer {self.name}: {len(self.measured)} measurements and {len(self.inputs)} inputs need as many sizes seen in training, found "
                 f"{len(self.seen.measured)} and {len(self.seen.inputs)}."
+            )
+        if self.monitor is not None and len(self.monitor.size) != len(self.measured):
+            raise DimensionError(
+                f"Observer {self.name}: a monitor of {len(self.measured)} measurements is needed, found one of {len(self.monitor.size)}."
             )
         if not 0 <= self.internal <= n or any(i >= n - self.internal for i in self.measured):
             raise DimensionError(

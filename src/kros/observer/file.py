@@ -25,6 +25,7 @@ from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .about import checked_about
 from .data import ObserverData, measurement_replaces
+from .monitor import Monitor
 from .runtime import Runtime, Seen
 from .sensor import Sensor
 
@@ -57,6 +58,7 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "internal_states": observer.internal,
         **({"sensor": {name: own.model_dump() for name, own in observer.sensor.items()}} if observer.sensor else {}),
         **({"about": observer.about} if observer.about else {}),
+        **({} if observer.monitor is None else {"monitor": observer.monitor.content()}),
     }
     found: dict[str, Any] = plain(content)
     return found
@@ -131,6 +133,7 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
         _runtime(content, where),
         _seen(content.get("seen"), q, len(content["inputs"]), where),
         sensor=_sensor(content.get("sensor", {}), where),
+        monitor=_monitor(content.get("monitor"), q, where),
     )
     _known(content, [*observer_content(observer), "runtime", "sensor", "lifting_inputs", "input_functions", "about", CHECKSUM], where)
     about = checked_about(content.get("about", {}), lifting.states, observer.inputs, lifting.parameters, f"{where}: about")
@@ -237,6 +240,21 @@ def _seen(found: Any, measured: int, inputs: int, where: str) -> Seen | None:
 def _sensor(found: Any, where: str) -> dict[str, Sensor]:
     _require(isinstance(found, dict), f"{where}: sensor should be an object", found)
     return {name: Sensor.of(own, f"{where}: sensor.{name}") for name, own in found.items()}
+
+
+def _monitor(found: Any, measured: int, where: str) -> Monitor | None:
+    if found is None:
+        return None
+    _known(found, Monitor.__dataclass_fields__, f"{where}: monitor")
+    rows = {key: len(found[key]) if isinstance(found[key], list) else 0 for key in ("filters", "limits")}
+    shapes = {"filters": (rows["filters"], 3), "limits": (measured, rows["filters"]), "size": (1, measured)}
+    numbers = {
+        key: matrix([found[key]] if key == "size" else found[key], shape, f"{where}: monitor.{key}") for key, shape in shapes.items()
+    }
+    plain_ones = {key: value for key, value in found.items() if key not in shapes}
+    for key, value in plain_ones.items():
+        _require(_is_finite(value), f"{where}: monitor.{key} should be a finite number", value)
+    return Monitor.from_content(plain_ones | numbers | {"size": numbers["size"][0]})
 
 
 def _known(found: Any, known: Sequence[str] | Mapping[str, Any] | str, where: str) -> None:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
 from .data import ObserverData
+from .monitor import Watch
 from .samples import LONGEST, Held, SampleStatus, Screened
 from .screen import Screen
 from .step import Steps
@@ -61,8 +62,10 @@ class RunningObserver:
         self._screen = Screen.of(observer)
         self._steps, self._ahead = Steps([observer], 1, {}), Steps([observer], 1, {})
         self._places = {name: i for i, name in enumerate(observer.lifting.states)}
+        self._at = list(observer.measured)
         self._unknown = np.ones((1, len(observer.measured)), dtype=bool)
         self._loop: PhaseLockedLoop | None = None
+        self._watch = None if observer.monitor is None else Watch(observer.monitor)
         self.parameters = parameters
         self.reset(y)
 
@@ -96,17 +99,26 @@ class RunningObserver:
         """What was wrong with the last sample, or with the first measurement before there was one."""
         return self._status
 
+    @property
+    def level_db(self) -> float | None:
+        """Level of the innovation over the bound of the population, dB: above zero the machine is outside; None without a monitor."""
+        return None if self._watch is None else self._watch.level_db
+
     def reset(self, y: npt.ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
         first = self._judge(self._measurement(y), np.zeros(len(self.observer.inputs)))
         self._status, self._held = SampleStatus(int(first.status[0, 0])), Held.nothing(1, len(self.observer.inputs))
         self._fresh = bool(np.isfinite(first.y).any())
+        if self._watch is not None:
+            self._watch.reset()
         self._begin(first.y[0])
 
     def _begin(self, y: Array) -> None:
         self._steps.begin(y)
         if self._loop is not None:
             self._loop.begin()
+        if self._watch is not None:
+            self._watch.begin()
         self._inputs: deque[Array] = deque()
 
     @property
@@ -147,12 +159,16 @@ class RunningObserver:
         if len(self._inputs) > self.observer.runtime.delay:
             missing, steps, taken = ~np.isfinite(measurement), self._steps, self._inputs.popleft()
             absent = missing if missing.any() else None
+            if self._watch is not None:
+                self._watch.take((measurement[0] - steps.x[0, 0, self._at]).tolist(), not self._status)
             if self._loop is None:
                 steps.step(measurement, taken, absent)
             else:
                 self.parameters[self._loop.name] = float(self._loop.step(steps, measurement, taken, absent)[0])
             if self.observer.runtime.binds(steps.x[0, 0], steps.correction):
                 self._status |= SampleStatus.LIMIT
+        if self._watch is not None and self._watch.outside:
+            self._status |= SampleStatus.UNCERTIFIED
         return self.estimate
 
     def _judge(self, y: Array, u: Array, held: Held | None = None) -> Screened:

@@ -30,7 +30,7 @@ class SampleStatus(IntFlag):
     LIMIT
         A sample is beyond its limit or 1.5 times its range, or the estimate or the correction met a limit that is declared.
     UNCERTIFIED
-        Outside what the observer is certified for. Reserved: never set in this version.
+        Outside what the observer is certified for: the innovation is beyond the envelope of the population (see `monitor`).
     """
 
     GOOD = 0

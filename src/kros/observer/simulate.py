@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from .data import ObserverData
+from .monitor import judged_samples
 from .samples import Flags, Screened, Whole
 from .screen import Screen, screened
 from .step import Parameters, Steps
@@ -131,6 +132,42 @@ def _run(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Para
                 _predict(own, of_one, earlier, samples, pending, values)
         found[...] = observer.runtime.clip_estimate(found)
     return found
+
+
+def run_innovations(
+    observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None, settle: int = 0
+) -> tuple[Array, Flags]:
+    """Return innovations as an observer meets them, and which samples a monitor judges.
+
+    Parameters
+    ----------
+    observer, y, u, parameters
+        As in `run_observer`.
+    settle : int
+        Samples after a start that are not judged.
+
+    Returns
+    -------
+    innovation : ndarray, shape (n_samples, batch, q)
+        Zero where a measurement is missing.
+    judged : ndarray of bool, shape (n_samples, batch)
+    """
+    samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
+    (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
+    steps, missing = Steps([observer], batch, values), ~np.isfinite(samples.y)
+    gone, anew = (np.atleast_1d(flags.any(axis=axes)) for flags, axes in ((missing, (1, 2)), (samples.starts, 1)))
+    moving = (_pending(samples.starts, d) == d) & ~samples.starts if d else np.ones((n_samples, batch), dtype=bool)
+    innovation = np.zeros(samples.y.shape)
+    steps.begin(samples.y[0])
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(n_samples):
+            if anew[k] and k:
+                steps.begin(samples.y[k], samples.starts[k])
+            innovation[k] = steps.innovation(samples.y[k])[0]
+            steps.step(samples.y[k], samples.u[k - d], missing[k] if gone[k] else None, moving[k] if d else None)
+    starts = samples.starts.copy()
+    starts[0] = True
+    return innovation, judged_samples(settle, samples.status, starts, moving)
 
 
 def _pending(starts: Flags, delay: int) -> Whole:

@@ -41,6 +41,7 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
         controller=StateSpace(K.A, K.B / y, K.C * into[:, None], K.D * into[:, None] / y, K.dt),
         runtime=_runtime(observer.runtime, x[: lifting.n_states], y, into, u),
         seen=None if observer.seen is None else observer.seen.times(y, u[: len(observer.inputs)]),
+        monitor=None if observer.monitor is None else observer.monitor.times(y),
         sensor=in_units(observer.sensor, {lifting.states[i]: 1 / float(x[i]) for i in observer.measured}),
     )
 

@@ -26,6 +26,10 @@ class Golden:
     status : ndarray of int, shape (n_samples,)
     size : ndarray, shape (n_recorded,)
         Largest estimates, which differences are compared with.
+    passes : int
+        How often the samples are gone through until a monitor judges them; 1 without one.
+    last_status : ndarray of int, shape (n_samples,)
+        In the last pass.
     """
 
     y: Array
@@ -33,6 +37,8 @@ class Golden:
     x_hat: Array
     status: npt.NDArray[Any]
     size: Array
+    passes: int
+    last_status: npt.NDArray[Any]
 
     @classmethod
     def of(cls, observer: Observer, track: str | None = None, count: int = SAMPLES) -> Golden:
@@ -50,6 +56,7 @@ class Golden:
         running = observer.start(y[0])
         if track is not None:
             running.track(track)
-        found = [(np.asarray(running.step(*sample)), int(running.status)) for sample in zip(y, u, strict=True)]
-        x_hat = np.array([x for x, _ in found])[:, : len(observer.recorded)]
-        return cls(y, u, x_hat, np.array([s for _, s in found]), np.maximum(np.abs(x_hat).max(axis=0), 1e-300))
+        passes = 1 if observer.monitor is None else 2 + observer.monitor.settle // (count // 2)
+        found = [(np.asarray(running.step(*sample)), int(running.status)) for _ in range(passes) for sample in zip(y, u, strict=True)]
+        x_hat, status = np.array([x for x, _ in found[:count]])[:, : len(observer.recorded)], np.array([s for _, s in found])
+        return cls(y, u, x_hat, status[:count], np.maximum(np.abs(x_hat).max(axis=0), 1e-300), passes, status[-count:])

@@ -12,6 +12,7 @@ from ...core.errors import ConfigError
 from ...lifting.c_code import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
+from ...observer.monitor import LARGEST, RECOVERY
 from ...observer.predictor.driven import in_coordinates
 from ...observer.samples import LONGEST
 from ...observer.screen import Bounds, Screen
@@ -113,6 +114,7 @@ class Source:
             "into": self.sums(o.into[:n]) if limited else [],
             "controller": self.sums(np.hstack([K.A, K.B])),
             "filter_gain": self.sums(o.filter_gain),
+            "monitor": self.monitor(),
             "lower": self.numbers(_filled(run.lower, n, -np.inf), wide=True),
             "upper": self.numbers(_filled(run.upper, n, np.inf), wide=True),
             "largest": self.numbers(_filled(run.correction, o.into.shape[1], np.inf)),
@@ -191,6 +193,23 @@ class Source:
 
         held = solve_balanced(still, o.A[others, n:])
         return {"others": others, "held": self.matrix(held)}
+
+    def monitor(self) -> dict[str, Any] | None:
+        """Return what the monitor computes with; None where the observer has none."""
+        own = self.observer.monitor
+        if own is None:
+            return None
+        return {
+            "bands": len(own.filters),
+            "filters": self.matrix(own.filters),
+            "inverse_size": self.numbers(1 / own.size),
+            "inverse_limit": self.matrix(1 / own.limits),
+            "forget": self.precision.literal(own.forget),
+            "largest": self.precision.literal(LARGEST),
+            "one": self.precision.literal(1.0),
+            "settle": own.settle,
+            "recovery": RECOVERY,
+        }
 
     def symbol(self, name: str) -> str:
         """Return what stands for a quantity of a formula in C: window w, parameters p, inputs u."""

@@ -96,16 +96,19 @@ def c_files(observer: Observer, name: str, precision: str, track: str | None = N
         "u": [[_sample(v) for v in row] for row in golden.u],
         "x": [[f"{v:.17g}" for v in row] for row in golden.x_hat],
         "status": [f"{int(s)}u" for s in golden.status],
+        "last": [f"{int(s)}u" for s in golden.last_status],
+        "passes": golden.passes,
         "tolerance": [f"{tolerance * v:.9g}" for v in golden.size],
     }
     state_bytes = _state_bytes(context)
     numbers = sum(len(row) for key in ("model", "correction", "into", "controller", "filter_gain") for row in context[key] or ())
+    watched = 0 if observer.monitor is None else observer.monitor.limits.size
     largest = None if observer.seen is None else f"{1.5 * float(observer.seen.measured.max()):.6g}"
     functions = sorted({f for text in context["sigma"] + context["gamma"] for f in re.findall(r"\b([a-z]+)\(", text)})
     context |= {
         "state_bytes": state_bytes,
-        "constant_bytes": numbers * (4 if precision == "float" else 8),
-        "operations": numbers - sum(map(len, context["filter_gain"])),
+        "constant_bytes": (numbers + 4 * watched) * (4 if precision == "float" else 8),
+        "operations": numbers - sum(map(len, context["filter_gain"])) + 7 * watched,
         "largest_angle": largest,
         "tolerance": tolerance,
         "library": " and ".join(f"`{f}`" for f in functions) or "nothing",
@@ -154,7 +157,8 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     doubles = context["m"] + (1 + context["m"] + len(context["shift_others"]) if context["shift"] else 0)
     reals = context["n"] + context["order"] + context["history"] + len(context["parameters"]) + context["delay"] * context["m"]
     reals += context["n"] + context["order"] + 2 if context["tracked"] else 0
-    words = context["m"] + (1 if context["delay"] else 0) + 1
+    reals += context["q"] * context["monitor"]["bands"] * 3 if context["monitor"] else 0
+    words = context["m"] + (1 if context["delay"] else 0) + (1 if context["monitor"] else 0) + 1
     size = 8 * doubles + real * reals + 4 * words
     align = 8 if doubles or real == 8 else 4
     return -(-size // align) * align

@@ -1,0 +1,214 @@
+r"""The monitor: whether a machine still moves as the population does, by the mean level of the innovation over octaves.
+
+The innovation :math:`\nu = y - C\hat x` of every measured channel goes through band-pass filters an octave apart, and the mean square of each band is
+remembered exponentially, :math:`p \leftarrow p + g\,(b^2 - p)`. The machine is outside the population's envelope while
+
+.. math:: \prod_{c,b} p_{cb} / \ell_{cb} > 1,
+
+that is while the mean of the bands' levels in decibels exceeds its bound. A mean over octaves weighs a quiet band like a loud one, and what differs
+from machine to machine in one band alone averages out: on simulated drives it found badly assembled ones two to four times as often as a threshold
+for every band. A product needs no logarithm on the machine.
+
+A sample that was missing, invalid or beyond a limit is not judged, nor are those in which the observer forgets it, or its start: while they go by,
+all that the monitor remembers is held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+LARGEST = 1e3  # sizes of the innovation, beyond which more says nothing
+RECOVERY = 4  # samples that are not judged after one that is not good
+
+
+@dataclass(frozen=True, eq=False)
+class Monitor:
+    """What a monitor computes with, and how often it is wrong about good machines.
+
+    Parameters
+    ----------
+    filters : ndarray, shape (bands, 3)
+        ``b, a1, a2`` of ``b (1 - z^-2) / (1 + a1 z^-1 + a2 z^-2)``.
+    forget : float
+        Share of a mean square that a sample replaces.
+    settle : int
+        Samples after a start that are not judged.
+    size : ndarray, shape (q,)
+        What innovations are divided by: their RMS in training.
+    limits : ndarray, shape (q, bands)
+        Mean squares whose product is the bound.
+    false_alarm_rate : float
+        Probability that one more good machine exceeds the bound while it is moved as much as those in training.
+    units : int
+        Machines that the bound was found on.
+    hours : float
+        Motion of these machines that was judged.
+    alarms : int
+        How often the bound was exceeded in it.
+
+    Raises
+    ------
+    DataError
+        When a number is out of its range, or sizes do not fit.
+    """
+
+    filters: Array
+    forget: float
+    settle: int
+    size: Array
+    limits: Array
+    false_alarm_rate: float
+    units: int = 0
+    hours: float = 0.0
+    alarms: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("filters", "size", "limits"):
+            value = np.asarray(getattr(self, name), dtype=float)
+            object.__setattr__(self, name, value)
+            if not np.isfinite(value).all():
+                raise DataError(f"Monitor of an observer: {name} should hold finite numbers.")
+        bands, q = len(self.filters), len(np.atleast_1d(self.size))
+        if self.filters.shape != (bands, 3) or self.size.shape != (q,) or self.limits.shape != (q, bands) or not bands:
+            raise DataError(
+                f"Monitor of an observer: filters (bands, 3), size (q) and limits (q, bands) do not fit together, found {self.filters.shape}, "
+                f"{self.size.shape} and {self.limits.shape}."
+            )
+        if np.any(self.size <= 0) or np.any(self.limits <= 0) or not 0 < self.forget <= 1 or self.settle < 0:
+            raise DataError("Monitor of an observer: size and limits should be positive, forget within 0 and 1, settle at least 0.")
+
+    def content(self) -> dict[str, Any]:
+        """Return what an observer's file holds of it."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    @classmethod
+    def from_content(cls, content: Mapping[str, Any]) -> Self:
+        """Read what `content` returned."""
+        return cls(**content)
+
+    def times(self, y: Array) -> Self:
+        """Return the monitor for measurements in other units, multiplied by `y`, shape (q,)."""
+        return replace(self, size=self.size * y)
+
+    def mean_squares(self, innovation: Array, judged: Flags) -> Array:
+        """Return the mean squares of all bands after every sample, for many machines that start together.
+
+        Parameters
+        ----------
+        innovation : ndarray, shape (n_samples, batch, q)
+        judged : ndarray of bool, shape (n_samples, batch)
+            The other samples hold what was.
+
+        Returns
+        -------
+        ndarray, shape (n_samples, batch, q, bands)
+        """
+        from scipy.signal import lfilter
+
+        found = np.zeros((*innovation.shape, len(self.filters)))
+        scaled = innovation / self.size
+        scaled = np.clip(np.where(np.isnan(scaled), LARGEST, scaled), -LARGEST, LARGEST)
+        for machine in range(innovation.shape[1]):
+            taken = np.flatnonzero(judged[:, machine])
+            if not len(taken):
+                continue
+            own = scaled[taken, machine]
+            bands = np.stack([lfilter([b, 0.0, -b], [1.0, a1, a2], own, axis=0) for b, a1, a2 in self.filters], axis=-1)
+            squares = lfilter([self.forget], [1.0, self.forget - 1.0], bands**2, axis=0)
+            latest = np.searchsorted(taken, np.arange(len(judged)), side="right")
+            found[:, machine] = np.concatenate([np.zeros((1, *squares.shape[1:])), squares])[latest]
+        return found
+
+    def level(self, mean_squares: Array) -> Array:
+        """Return the mean level over the bound in dB, shape (...), of mean squares of shape (..., q, bands)."""
+        return np.asarray(10 * np.log10(np.maximum(mean_squares, 1e-30) / self.limits).mean(axis=(-2, -1)))
+
+
+def octaves(count: int = 6, quality: float = 1.4) -> Array:
+    """Return band-pass filters of the second order an octave apart, shape (count, 3); the highest is centred at half of the Nyquist frequency."""
+    w = 2 * np.pi * 0.256 / 2.0 ** np.arange(count)
+    alpha = np.sin(w) / (2 * quality)
+    return np.stack([alpha / (1 + alpha), -2 * np.cos(w) / (1 + alpha), (1 - alpha) / (1 + alpha)], axis=-1)
+
+
+def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:
+    """Return which samples are judged, shape (n_samples, batch), as a running observer does it.
+
+    Parameters
+    ----------
+    settle : int
+    status : ndarray of int, shape (n_samples, batch)
+        What was wrong with every sample by itself.
+    starts : ndarray of bool, shape (n_samples, batch)
+        Samples at which the observer starts.
+    moving : ndarray of bool, shape (n_samples, batch)
+        Samples that the observer takes: not those that wait for late measurements.
+    """
+    wait = np.zeros(status.shape[1], dtype=int)
+    judged = np.empty(status.shape, dtype=bool)
+    for k in range(len(status)):
+        wait[starts[k]] = settle
+        bad = status[k] != 0
+        judged[k] = moving[k] & ~bad & (wait == 0)
+        after = np.where(bad, np.minimum(wait + RECOVERY, settle), np.maximum(wait - 1, 0))
+        wait = np.where(moving[k], after, wait)
+    return judged
+
+
+class Watch:
+    """A monitor with its memory, on one machine."""
+
+    def __init__(self, monitor: Monitor) -> None:
+        self._settle, self._forget = monitor.settle, monitor.forget
+        self._inverse = (1 / monitor.size).tolist()
+        self._filters: list[list[float]] = monitor.filters.tolist()
+        self._limits = (1 / monitor.limits).tolist()
+        self._monitor = monitor
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._memory = [[[0.0, 0.0, 0.0] for _ in self._filters] for _ in self._inverse]
+        self.begin()
+        self.outside = False
+
+    def begin(self) -> None:
+        """Judge nothing until the observer has settled."""
+        self._wait = self._settle
+
+    def take(self, innovation: Sequence[float], good: bool) -> None:
+        """Take the innovation of every channel; whether the sample is good by itself."""
+        if not good:
+            self._wait = min(self._wait + RECOVERY, self._settle)
+            return
+        if self._wait > 0:
+            self._wait -= 1
+            return
+        product, forget = 1.0, self._forget
+        for value, inverse, channel, limits in zip(innovation, self._inverse, self._memory, self._limits, strict=True):
+            v = value * inverse
+            if not v < LARGEST:
+                v = LARGEST
+            elif v < -LARGEST:
+                v = -LARGEST
+            for (b, a1, a2), memory, limit in zip(self._filters, channel, limits, strict=True):
+                band = b * v + memory[0]
+                memory[0] = memory[1] - a1 * band
+                memory[1] = -b * v - a2 * band
+                memory[2] += forget * (band * band - memory[2])
+                product *= memory[2] * limit
+        self.outside = product > 1.0
+
+    @property
+    def level_db(self) -> float:
+        """Mean level of the bands over its bound, dB; far below zero before anything was judged."""
+        return float(self._monitor.level(np.array([[band[2] for band in channel] for channel in self._memory])))

@@ -1,0 +1,126 @@
+"""The monitor: one machine against batches computed otherwise, band powers against their integrals, and the bound of a population against one by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from machines import DT, LIMITS, drive, samples, watched
+
+from kros.core.errors import DataError, DimensionError
+from kros.core.lti import gain
+from kros.design.monitor import fit_monitor, monitor_facts, poisson_interval
+from kros.design.validation import TrainingSet
+from kros.lifting import Lifting
+from kros.observer import Monitor, Observer, SampleStatus, in_sizes, octaves, run_innovations
+from kros.observer.monitor import RECOVERY
+from kros.plants import HarmonicDrivePopulation
+from kros.synthesis import Injection
+from kros.uncertainty.outliers.tail import prediction_bound
+
+
+def levels(observer, y, u):
+    running = observer.start(y[0])
+    found, status = [], []
+    for sample in zip(y, u, strict=True):
+        running.step(*sample)
+        found.append(running.level_db)
+        status.append(int(running.status))
+    return np.array(found), np.array(status)
+
+
+@pytest.mark.parametrize("kind", [{}, {"delay": 2, **LIMITS}])
+def test_one_machine_is_watched_as_many_at_once(kind):
+    observer, (y, u) = watched(drive(**kind)), samples(800)
+    found, status = levels(observer, y, u)
+    innovation, judged = run_innovations(observer, y[:, None], u[:, None], settle=observer.monitor.settle)
+    wanted = observer.monitor.level(observer.monitor.mean_squares(innovation, judged))[:, 0]
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+    outside = (status & SampleStatus.UNCERTIFIED) > 0
+    np.testing.assert_array_equal(outside, wanted > 0)
+    assert 0.05 < outside.mean() < 0.95
+
+
+def test_bands_pass_the_power_that_their_filters_say():
+    filters, rng = octaves(), np.random.default_rng(0)
+    w = np.linspace(0, np.pi, 200_001)
+    z = np.exp(-1j * w)
+    response = np.array([b * (1 - z**2) / (1 + a1 * z + a2 * z**2) for b, a1, a2 in filters])
+    np.testing.assert_allclose(w[np.abs(response).argmax(axis=1)] / (2 * np.pi), 0.256 / 2.0 ** np.arange(6), atol=1e-5)
+    np.testing.assert_allclose(np.abs(response).max(axis=1), 1, rtol=1e-6)
+    noise = rng.normal(size=(400_000, 1, 1))
+    monitor = Monitor(filters, 1e-5, 0, np.ones(1), np.ones((1, 6)), 0.02)
+    powers = monitor.mean_squares(noise, np.ones((400_000, 1), dtype=bool))[-1, 0, 0]
+    np.testing.assert_allclose(powers, np.mean(np.abs(response) ** 2, axis=1) * (1 - (1 - 1e-5) ** 400_000), rtol=0.05)
+
+
+def test_what_is_missing_holds_the_monitor_and_a_reset_clears_it():
+    observer, (y, u) = watched(drive()), samples(400, faults=False)
+    before, _ = levels(observer, y, u)
+    y[300:303] = np.nan
+    found, _ = levels(observer, y, u)
+    np.testing.assert_array_equal(found[:300], before[:300])
+    np.testing.assert_array_equal(found[300 : 303 + 3 * RECOVERY], found[299])
+    assert found[303 + 3 * RECOVERY] != found[299]
+    running = observer.start(y[0])
+    for sample in zip(y[:200], u[:200], strict=True):
+        running.step(*sample)
+    running.reset(y[0])
+    assert running.level_db == levels(observer, y[:1], u[:1])[0][0]
+    assert drive().start(y[0]).level_db is None
+
+
+def test_units_of_measure_and_files_change_nothing(tmp_path):
+    observer, (y, u) = watched(drive()), samples(400)
+    other = in_sizes(observer, {"position": 0.01, "velocity": 3.0, "target": 0.01})
+    np.testing.assert_allclose(levels(other, y / 0.01, u / [0.01, 1])[0], levels(observer, y, u)[0], atol=1e-8)
+    observer.save(tmp_path / "o.json")
+    np.testing.assert_array_equal(levels(Observer.load(tmp_path / "o.json"), y, u)[0], levels(observer, y, u)[0])
+
+
+def test_what_cannot_be_a_monitor_is_refused():
+    filters = octaves(3)
+    for wrong in (
+        {"limits": np.ones((1, 2))},
+        {"limits": np.zeros((1, 3))},
+        {"size": np.full(1, np.nan)},
+        {"forget": 0.0},
+        {"filters": np.ones((3, 2))},
+    ):
+        with pytest.raises(DataError, match="Monitor of an observer"):
+            Monitor(
+                **({"filters": filters, "forget": 0.1, "settle": 9, "size": np.ones(1), "limits": np.ones((1, 3))} | wrong),
+                false_alarm_rate=0.1,
+            )
+    with pytest.raises(DimensionError, match="monitor of 1 measurements"):
+        replace(drive(), monitor=Monitor(filters, 0.1, 9, np.ones(2), np.ones((2, 3)), 0.1))
+
+
+def test_poisson_interval_is_that_of_the_tables():
+    np.testing.assert_allclose(poisson_interval(0), (0, 3.689), atol=1e-3)
+    np.testing.assert_allclose(poisson_interval(3), (0.619, 8.767), atol=1e-3)
+
+
+def test_the_bound_is_that_of_one_more_unit():
+    """Peaks by the running observer, the bound by hand; a unit whose gearbox is ten times as rough is outside."""
+    simulated = HarmonicDrivePopulation(n_units=6, n_episodes=2, seconds=4.0, conditions=("noload",), seed=3).simulate()
+    A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.zeros((2, 2))
+    K = gain(np.array([[0.2], [10.0]]), DT)
+    observer = Observer(
+        "tracking", Lifting(("position", "velocity")), A, B, (0,), ("target_position", "target_velocity"), K, Injection.STATE, DT
+    )
+    population = simulated.population
+    training = TrainingSet(population, population.episodes, {u: {} for u in population.unit_ids})
+    monitor = fit_monitor(observer, training, 0.05)
+    own = replace(observer, monitor=monitor)
+    records = {key: population.read(key) for key in population.episodes}
+    found = {key: levels(own, r[:, :1], r[:, 3:])[0].max() for key, r in records.items()}
+    peaks = np.array([max(v for key, v in found.items() if key.unit == unit) for unit in population.unit_ids])
+    assert abs(prediction_bound(peaks, 0.05)) < 1e-6  # levels are over the bound already
+    facts = monitor_facts(monitor)
+    assert (facts["units"], facts["alarms"]) == (6, 0)
+    assert 0.75 * 48 < 3600 * facts["hours"] < 48
+    y, u = next(iter(records.values()))[:, :1], next(iter(records.values()))[:, 3:]
+    shaken = y + 3e-4 * np.sin(100 * y)
+    assert not (levels(own, y, u)[1] & SampleStatus.UNCERTIFIED).any()
+    assert (levels(own, shaken, u)[1] & SampleStatus.UNCERTIFIED).any()
+    assert fit_monitor(observer, replace(training, keys=training.keys[:4]), 0.05) is None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,14 +13,13 @@ from ...lifting.c_code import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
 from ...observer.monitor import LARGEST, RECOVERY
-from ...observer.predictor.driven import in_coordinates
 from ...observer.samples import LONGEST
 from ...observer.screen import Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
+from .realise import Realised
 from .shift import Shift, find_shift
 
 Array = npt.NDArray[np.float64]
-_ALIKE = 1e4  # condition of the modes, by which rounding grows
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class Source:
 
     Parameters
     ----------
-    observer : Observer
+    realised : Realised
     name : str
         Prefix of everything that is public, a C identifier.
     precision : Precision
@@ -56,7 +55,7 @@ class Source:
     load : LoadOutput or None
     """
 
-    observer: Observer
+    realised: Realised
     name: str
     precision: Precision
     shift: Shift | None
@@ -68,9 +67,15 @@ class Source:
         """Look at an observer; refuse what it cannot give."""
         if load is not None and (missing := [s for s in (load.load, load.current) if s not in observer.recorded]):
             raise ConfigError(f"Export: load torque needs the states {', '.join(missing)}, found {', '.join(observer.recorded)}.")
-        observer = in_modes(observer)
+        realised = Realised.of(observer)
+        observer = realised.observer
         loop = None if track is None else PhaseLockedLoop(observer, track, 1)
-        return cls(observer, name, Precision(precision), find_shift(observer) if precision == "float" else None, loop, load)
+        return cls(realised, name, Precision(precision), find_shift(observer) if precision == "float" else None, loop, load)
+
+    @property
+    def observer(self) -> Observer:
+        """The observer in the coordinates in which it is computed."""
+        return self.realised.observer
 
     def context(self) -> dict[str, Any]:
         """Return everything that the templates name."""
@@ -109,7 +114,8 @@ class Source:
             "history": len(lifting.window.earlier),
             "window_shift": [int(i) for i in lifting.window._shift] if lifting.history else [],
             "window_present": [int(i) for i in lifting.window._present] if lifting.history else [],
-            "model": self.sums(np.hstack([o.A[:n], o.B[:n]])),
+            "model": self.sums(self.realised.model),
+            "less": [(j, i, None if factor == 1 else self.precision.literal(factor)) for j, i, factor in self.realised.less],
             "correction": self.sums(np.hstack([K.C, K.D]) if limited else o.into[:n] @ np.hstack([K.C, K.D])),
             "into": self.sums(o.into[:n]) if limited else [],
             "controller": self.sums(np.hstack([K.A, K.B])),
@@ -156,8 +162,8 @@ class Source:
             "place": o.lifting.parameters.index(name),
             "slopes": slopes,
             "reads_states": any("w[" in str(row) for row in slopes),
-            "model": self.sums(o.A[:n]),
-            "correction": self.sums(o.into[:n] @ np.hstack([K.C, K.D])),
+            "model": self.sums(_uncorrected(o)[:n]),
+            "correction": self.sums((o.into @ K.C)[:n]),
             "shares": [write(float(v) ** -2) for v in measurement_sizes(o)],
             "settle_s": f"{o.sample_period_s / self.loop.forget:g}",
             "forget": write(self.loop.forget),
@@ -250,31 +256,11 @@ class Source:
         return found
 
 
-def in_modes(observer: Observer) -> Observer:
-    """Return the observer with its internal states in the coordinates of their modes: two operations a state in place of one for every other state.
-
-    One for real modes, pairs for complex ones; where modes are so alike that rounding would grow, the observer stays as it is.
-    """
-    n, first = observer.lifting.n_states, len(observer.recorded)
-    if first == n:
-        return observer
-    values, vectors = np.linalg.eig(observer.A[first:n, first:n])
-    columns = [
-        part
-        for i, v in enumerate(values)
-        if v.imag >= 0
-        for part in ([vectors[:, i].real, vectors[:, i].imag] if v.imag else [vectors[:, i].real])
-    ]
-    basis = np.array(columns).T
-    if basis.shape != (n - first, n - first) or np.linalg.cond(basis) > _ALIKE:
-        return observer
-    turn = np.eye(observer.lifting.n_lifted)
-    turn[first:n, first:n] = np.linalg.inv(basis)
-    turned = in_coordinates(observer, turn)
-    A = turned.A.copy()
-    block = np.abs(A[first:n, first:n])
-    A[first:n, first:n][block < 1e-12 * block.max()] = 0.0
-    return replace(turned, A=A)
+def _uncorrected(observer: Observer) -> Array:
+    """Return what the model and the direct correction make of a change of the estimate, the lifted functions held; shape (n_lifted, n_lifted)."""
+    A = observer.A.copy()
+    A[:, list(observer.measured)] -= observer.into @ observer.controller.D
+    return A
 
 
 def _filled(values: Array | None, count: int, otherwise: float) -> Array:

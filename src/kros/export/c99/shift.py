@@ -57,7 +57,7 @@ def find_shift(observer: Observer) -> Shift | None:
     direction = np.zeros(n + m)
     direction[at], direction[free] = 1.0, found * sizes[free]
     reads = {lifting.states[i] for i in range(n) if direction[i] != 0}
-    period = _period(observer, lifting.states[at], reads)
+    period = _period(observer, lifting.states[at], reads, 0.01 * sizes[at])
     plain = np.where(np.abs(direction) < _NOTHING * sizes / sizes[at], 0.0, direction)
     largest = float(np.abs(moving * direction).max(initial=0.0))
     direction = plain if np.abs(moving @ plain).max() <= _EXACT * max(largest, 1e-300) else direction
@@ -66,8 +66,11 @@ def find_shift(observer: Observer) -> Shift | None:
     return Shift(direction[:n], direction[n:], period)
 
 
-def _period(observer: Observer, name: str, moving: set[str]) -> float | None:
-    """Return the movement of one state after which all lifted functions are what they were; None where there is none."""
+def _period(observer: Observer, name: str, moving: set[str], otherwise: float) -> float | None:
+    """Return the movement of one state after which all lifted functions are what they were; None where there is none.
+
+    Without functions of it any movement will do: `otherwise`.
+    """
     import sympy as sp
 
     symbol, rates = sp.Symbol(name, real=True), []
@@ -80,12 +83,10 @@ def _period(observer: Observer, name: str, moving: set[str]) -> float | None:
         rates += [sp.diff(f.args[0], symbol) for f in circular]
     if any(not rate.is_number for rate in rates):
         return None
-    return _common([abs(float(rate)) for rate in rates])
+    return _common([abs(float(rate)) for rate in rates]) if rates else otherwise
 
 
 def _common(rates: list[Any]) -> float | None:
-    if not rates:
-        return 1.0
     ratios = np.array(rates) / min(rates)
     for count in range(1, _MOST + 1):
         if np.abs(ratios * count - np.round(ratios * count)).max() < 1e-9:

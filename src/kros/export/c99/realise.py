@@ -1,0 +1,105 @@
+r"""The linear part of an observer as numbers that rounding does little to, and with few operations.
+
+Internal states are in the coordinates of their modes, a real block diagonal form: two multiplications each in place of one for every other state.
+
+An observer that watches the difference of a reference and a measurement has large columns of either that cancel: what is left is a millionth of
+either, and rounding is not. So the difference is formed first. For the input j and the measured state i with :math:`B_j \approx -c\,(A - I)_i`
+
+.. math:: (A - I)_i\, x_i + B_j u_j = \bigl((A - I)_i + c\, B_j\bigr) x_i + B_j\, (u_j - c\, x_i),
+
+of which the first column is small; it is formed before coordinates change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ...observer import Observer
+from ...observer.predictor.driven import in_coordinates
+
+Array = npt.NDArray[np.float64]
+_ALIKE = 1e4  # condition of the modes, by which rounding grows
+_SMALLER = 0.1  # of a column, where a difference is worth a subtraction
+_PLAIN = 0.01  # factors as near to one are one: that difference is exact
+
+
+@dataclass(frozen=True, eq=False)
+class Realised:
+    """An observer as it is computed.
+
+    Parameters
+    ----------
+    observer : Observer
+        In the coordinates in which it is computed.
+    model : ndarray, shape (n, n_lifted + m)
+        From the lifted state and the inputs, of which some are differences, to the next state.
+    less : tuple of (int, int, float)
+        Input, state, factor: of the input the state times the factor is taken off.
+    """
+
+    observer: Observer
+    model: Array
+    less: tuple[tuple[int, int, float], ...]
+
+    @classmethod
+    def of(cls, observer: Observer) -> Realised:
+        """Realise an observer."""
+        n, less, A = observer.lifting.n_states, differences(observer), observer.A.copy()
+        for j, i, factor in less:
+            A[:, i] += factor * observer.B[:, j]
+        turn = to_modes(observer)
+        if turn is None:
+            return cls(observer, np.hstack([A[:n], observer.B[:n]]), less)
+        turned = in_coordinates(observer, turn)
+        first, own = len(observer.recorded), turned.A.copy()
+        measured = list(observer.measured)
+        A = turn @ A @ np.linalg.inv(turn)  # leaves the measured columns apart from the others
+        block = np.abs(own[first:n, first:n])
+        own[first:n, first:n][block < 1e-12 * block.max()] = 0.0
+        model = np.hstack([own[:n], turned.B[:n]])
+        model[:, measured] = A[:n, measured]
+        return cls(replace(turned, A=own), model, less)
+
+
+def differences(observer: Observer) -> tuple[tuple[int, int, float], ...]:
+    """Return which input is better taken relative to which measured state, and the factor of the state."""
+    n, found, free = observer.lifting.n_states, [], set(range(len(observer.inputs)))
+    for i in observer.measured:
+        column = observer.A[:n, i] - np.eye(n)[i]
+        left = {}
+        for j in free:
+            along = observer.B[:n, j]
+            factor = -float(along @ column) / max(float(along @ along), 1e-300)
+            factor = 1.0 if abs(factor - 1) < _PLAIN else factor
+            left[j] = float(np.linalg.norm(column + factor * along)), factor
+        best = min(left, key=left.__getitem__, default=None)
+        if best is not None and left[best][0] < _SMALLER * np.linalg.norm(column):
+            found.append((best, i, left[best][1]))
+            free.remove(best)
+    return tuple(found)
+
+
+def to_modes(observer: Observer) -> Array | None:
+    """Return the coordinates of the modes of internal states, shape (n_lifted, n_lifted); one for real modes, pairs for complex ones.
+
+    None without such states, or where modes are so alike that rounding would grow.
+    """
+    n, first = observer.lifting.n_states, len(observer.recorded)
+    if first == n:
+        return None
+    values, vectors = np.linalg.eig(observer.A[first:n, first:n])
+    columns = [
+        part
+        for i, v in enumerate(values)
+        if v.imag >= 0
+        for part in ([vectors[:, i].real, vectors[:, i].imag] if v.imag else [vectors[:, i].real])
+    ]
+    basis = np.array(columns).T
+    if basis.shape != (n - first, n - first) or np.linalg.cond(basis) > _ALIKE:
+        return None
+    turn = np.eye(observer.lifting.n_lifted)
+    turn[first:n, first:n] = np.linalg.inv(basis)
+    return turn

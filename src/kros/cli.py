@@ -53,6 +53,44 @@ def main(
 
 
 @app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of CSV or Parquet files.")],
+    measured: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="State that is available at run time; may be given several times.")
+    ] = None,
+    input_: Annotated[list[str] | None, typer.Option("--input", metavar="NAME", help="Input; may be given several times.")] = None,
+    out: Annotated[Path, typer.Option(help="New study file.")] = Path("study.toml"),
+    files: Annotated[str | None, typer.Option(metavar="REGEX", help="What a file is, in place of what its name seems to say.")] = None,
+    period: Annotated[float | None, typer.Option(metavar="SECONDS", help="Sampling period, where no column holds time.")] = None,
+) -> None:
+    """Look at a folder of recordings and write a study for it."""
+    from .data.discovery import Wanted
+    from .study.commands.init import init_study
+    from .study.engine.progress import make_progress
+
+    wanted = Wanted(tuple(measured or ()), tuple(input_ or ()), files, period)
+    asked = _ask_parts if sys.stdin.isatty() and sys.stdout.isatty() else None
+    with make_progress(False, asks=asked is not None) as progress:
+        found = init_study(folder, out, wanted, asked, progress)
+    for line in found.lines:
+        typer.echo(line)
+
+
+def _ask_parts(columns: Any) -> Any:
+    """Ask which columns are measured and which are inputs; Return takes what is proposed."""
+    from .data.discovery import Part, assign
+    from .study.commands.init import column_lines
+
+    for line in column_lines(columns):
+        typer.echo(line)
+    answers = []
+    for part, what in ((Part.MEASURED, "Measured states"), (Part.INPUT, "Inputs")):
+        proposed = ", ".join(c.name for c in columns if c.part is part)
+        answers.append([n for n in typer.prompt(what, default=proposed).replace(",", " ").split() if n])
+    return assign(columns, *answers)
+
+
+@app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Run folder: new, empty, or that of an earlier demo.")] = Path("runs/demo"),
     units: Annotated[int, typer.Option(min=2)] = 12,

@@ -87,12 +87,12 @@ def test_text_with_a_mark_and_windows_line_ends(tmp_path: Path) -> None:
 def test_more_lines_to_skip_than_there_are(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(GOOD)
     with pytest.raises(DataError, match=r"100000000000 lines stand before the numbers by the mapping, found 51 in all"):
-        scan(tmp_path, skip=10**11)
+        scan(tmp_path, skip_rows=10**11)
 
 
 def test_lines_before_the_header_are_counted_alike_whatever_they_hold(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(b'made "on monday\nby, me\n' + GOOD)
-    found = scan(tmp_path, skip=2)
+    found = scan(tmp_path, skip_rows=2)
     assert found.read(found.episodes[0])[1, 0] == pytest.approx(np.sin(1), abs=1e-4)
 
 

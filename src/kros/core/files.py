@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import stat
 import tomllib
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -104,3 +106,15 @@ def _said(error: BaseException) -> str:
 def shortened(text: str, longest: int = 300) -> str:
     """Return a text for a message, without the middle of a very long one."""
     return text if len(text) <= longest else f"{text[: longest // 2]} ... {text[-longest // 4 :]}"
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """Return a hint for a message where a name is nearly one that is known, else nothing.
+
+    Examples
+    --------
+    >>> did_you_mean("alpa", ["alpha", "refine"])
+    "; did you mean 'alpha'?"
+    """
+    close = get_close_matches(str(name), list(known), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]!r}?" if close else ""

@@ -8,7 +8,7 @@ what they share, wherever the common part lies in either. A print takes half a k
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 
@@ -63,6 +63,22 @@ def print_of(values: npt.NDArray[np.float64], channels: Sequence[Channel]) -> Pr
     return Print(digest, tuple(np.unique(hashes[smallest[moving]])[:KEPT].tolist()))
 
 
+def copies_among(prints: Iterable[tuple[EpisodeKey, Print]]) -> Iterator[tuple[EpisodeKey, EpisodeKey, float]]:
+    """Yield the episodes that are copies of earlier ones with these, and the share of samples that both have: 1 for a whole copy."""
+    whole: dict[bytes, EpisodeKey] = {}
+    holders: dict[int, EpisodeKey] = {}
+    for key, found in prints:
+        if found.digest in whole:
+            yield key, whole[found.digest], 1.0
+            continue
+        common = Counter(holders[h] for h in found.hashes if h in holders).most_common(1)
+        if common and common[0][1] >= SHARED * KEPT:
+            yield key, common[0][0], min(common[0][1] / len(found.hashes), 0.99)
+        whole[found.digest] = key
+        for h in found.hashes:
+            holders.setdefault(h, key)
+
+
 def refuse_copies(prints: Iterable[tuple[EpisodeKey, Print]]) -> None:
     """Refuse episodes that are copies of others, whole or in a good part.
 
@@ -71,23 +87,16 @@ def refuse_copies(prints: Iterable[tuple[EpisodeKey, Print]]) -> None:
     DataError
         Names both.
     """
-    whole: dict[bytes, EpisodeKey] = {}
-    holders: dict[int, EpisodeKey] = {}
-    for key, found in prints:
-        if found.digest in whole:
+    for key, other, shared in copies_among(prints):
+        if shared >= 1:
             raise DataError(
-                f"{title(key)} is a copy of {whole[found.digest]}, sample by sample; a copy leaks test episodes into training and makes units look "
+                f"{title(key)} is a copy of {other}, sample by sample; a copy leaks test episodes into training and makes units look "
                 "alike, so remove one of them."
             )
-        common = Counter(holders[h] for h in found.hashes if h in holders).most_common(1)
-        if common and common[0][1] >= SHARED * KEPT:
-            raise DataError(
-                f"{title(key)} and {common[0][0]} share about {100 * common[0][1] / len(found.hashes):.0f} % of their samples in all channels; "
-                "recordings never repeat bit by bit, so remove one of them, or cut the common part."
-            )
-        whole[found.digest] = key
-        for h in found.hashes:
-            holders.setdefault(h, key)
+        raise DataError(
+            f"{title(key)} and {other} share about {100 * shared:.0f} % of their samples in all channels; "
+            "recordings never repeat bit by bit, so remove one of them, or cut the common part."
+        )
 
 
 def _stretches(values: npt.NDArray[np.float64]) -> npt.NDArray[np.uint64]:

@@ -49,9 +49,11 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
         return _convert_union(value, arguments, where)
+    if origin is typing.Literal and value in arguments:
+        return value
     if origin is tuple and isinstance(value, (list, tuple)):
         return tuple(_convert(item, arguments[0], f"{where}[{i}]") for i, item in enumerate(value))
-    if origin is not None and issubclass(origin, Mapping) and isinstance(value, Mapping):
+    if isinstance(origin, type) and issubclass(origin, Mapping) and isinstance(value, Mapping):
         return {str(key): _convert(item, arguments[1], f"{where}.{key}") for key, item in value.items()}
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return build(hint, value, where)
@@ -92,5 +94,7 @@ def _fits(value: Any, kind: type) -> bool:
 
 
 def _word(hint: Any) -> str:
+    if typing.get_origin(hint) is typing.Literal:
+        return " or ".join(repr(value) for value in typing.get_args(hint))
     words = {str: "text", int: "a whole number", float: "a number", bool: "true or false"}
     return words.get(hint, "a list" if typing.get_origin(hint) is tuple else "a table")

@@ -1,36 +1,42 @@
-"""A folder of CSV files, described by a mapping."""
+"""A folder of tables, text or Parquet, described by a mapping."""
 
 from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ...core.errors import DataError
+from ...core.files import require_regular
 from ..checks import check_names
 from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Role, Unit
 from ..prepare import assemble
 from ..recording import Recording, Recordings
 from .csv_mapping import Column, CsvMapping, UnitMapping, load_mapping
 from .csvfile import Dialect, first_fields, read_columns
+from .lookup import read_lookup
+from .parquet_table import parquet_columns, parquet_fields
 
-ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz")
+ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz", ".parquet")
 DEFAULT_UNIT = "unit"
 DEFAULT_EPISODE = "0"
 
 
 @dataclass(frozen=True)
 class FilePlace:
-    """Where an episode is: a file, the names of its columns, and those wanted (time first, where there is one)."""
+    """Where an episode is: a file, the names of its columns, those wanted (time first, where there is one), and which piece of how many."""
 
     path: str
     names: tuple[str, ...]
     wanted: tuple[str, ...]
+    piece: tuple[int, int] = (0, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,17 +45,43 @@ class CsvRecordings(Recordings):
 
     dialect: Dialect
     time_scale: float | None
+    timestamp: str | None = None
 
     def read(self, key: EpisodeKey, place: FilePlace) -> Recording:
         """Return one episode as recorded."""
-        columns = read_columns(Path(place.path), place.names, place.wanted, self.dialect)
+        path, (i, n) = Path(place.path), place.piece
+        columns = self._columns(path, place) if n == 1 else _latest(self, replace(place, piece=(0, n)), *_version(path))
+        columns = columns[:, i * columns.shape[1] // n : (i + 1) * columns.shape[1] // n]
         if self.time_scale is None:
             return Recording(key, np.ascontiguousarray(columns.T))
-        return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0] * self.time_scale)
+        scale = 1.0 if self.timestamp is not None else self.time_scale
+        return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0] * scale)
+
+    def _columns(self, path: Path, place: FilePlace) -> npt.NDArray[np.float64]:
+        if path.suffix == ".parquet":
+            return parquet_columns(path, place.wanted, self.timestamp is not None)
+        return read_columns(path, place.names, place.wanted, self.dialect, self.timestamp)
+
+
+def _version(path: Path) -> tuple[int, int]:
+    require_regular(path, sys.maxsize)
+    status = path.stat()
+    return status.st_mtime_ns, status.st_size
+
+
+_kept: dict[str, tuple[Any, npt.NDArray[np.float64]]] = {}
+
+
+def _latest(recordings: CsvRecordings, place: FilePlace, *version: int) -> npt.NDArray[np.float64]:
+    """Return the columns of a file of which pieces are read one behind the other: the latest one is kept."""
+    asked = (place, recordings.dialect, recordings.timestamp, version)
+    if "latest" not in _kept or _kept["latest"][0] != asked:
+        _kept["latest"] = asked, recordings._columns(Path(place.path), place)
+    return _kept["latest"][1]
 
 
 def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str, optional: Collection[str] = ()) -> Population:
-    """Read a folder of CSV files (also gzip-compressed).
+    """Read a folder of CSV files (also gzip-compressed), or of anybody's Parquet files.
 
     Parameters
     ----------
@@ -72,32 +104,33 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
         No file matches, a column is missing, or two files are the same episode.
     """
     chosen, source = load_mapping(mapping), Path(source)
-    dialect = Dialect(chosen.delimiter, chosen.header, chosen.skip, chosen.decimal)
+    dialect, table = chosen.dialect, None if chosen.lookup is None else read_lookup(source, chosen.lookup, chosen)
     places: dict[EpisodeKey, FilePlace] = {}
     groups: dict[str, str] = {}
-    for path, match in _matches(source, chosen):
-        fields = first_fields(path, dialect)
+    for path, relative, match in _matches(source, chosen):
+        fields = parquet_fields(path) if path.suffix == ".parquet" else first_fields(path, dialect)
         if optional and not places:
             chosen = chosen.without(_absent(chosen, fields, optional))
-        found = match.groupdict()
+        found = match.groupdict() if table is None else table.completed(relative, match.groupdict())
         for unit in chosen.units:
-            key = EpisodeKey(
-                f"{found.get('unit') or DEFAULT_UNIT}{unit.suffix}",
-                found.get("condition") or DEFAULT_CONDITION,
-                found.get("episode") or DEFAULT_EPISODE,
-            )
-            if key in places:
-                raise DataError(
-                    f"Duplicate episodes: {key} is in {places[key].path} and in {path}; name more groups in files, or exclude one."
+            place, group = _place(path, fields, chosen, unit), found.get("group") or ""
+            for i in range(chosen.pieces):
+                key = EpisodeKey(
+                    f"{found.get('unit') or DEFAULT_UNIT}{unit.suffix}",
+                    found.get("condition") or DEFAULT_CONDITION,
+                    f"{found.get('episode') or DEFAULT_EPISODE}{f'.{i + 1}' if chosen.pieces > 1 else ''}",
                 )
-            check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
-            places[key] = _place(path, fields, chosen, unit)
-            group = found.get("group") or ""
+                if key in places:
+                    raise DataError(
+                        f"Duplicate episodes: {key} is in {places[key].path} and in {path}; name more groups in files, or exclude one."
+                    )
+                check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
+                places[key] = replace(place, piece=(i, chosen.pieces))
             if groups.setdefault(key.unit, group) != group:
                 raise DataError(f"Unit {key.unit} is in both groups {groups[key.unit]!r} and {group!r} ({path}); a unit has one group.")
     if not places:
         raise DataError(f"Reading {source} as csv: no file matches files = {chosen.files!r}{_sample(source)}; correct the expression.")
-    recordings = CsvRecordings(places, dialect, None if chosen.time is None else chosen.time_scale)
+    recordings = CsvRecordings(places, dialect, None if chosen.time is None else chosen.time_scale, chosen.timestamp)
     units = [Unit(unit, group) for unit, group in groups.items()]
     period, tolerance = chosen.sample_period_s, chosen.time_tolerance
     return assemble(
@@ -118,16 +151,16 @@ def csv_files(source: Path) -> Iterator[tuple[Path, str]]:
     for folder, folders, names in os.walk(source):
         folders[:] = sorted(f for f in folders if not f.startswith("."))
         for name in sorted(names):
-            if name.endswith(ENDINGS) and not name.startswith("."):
+            if name.lower().endswith(ENDINGS) and not name.startswith("."):
                 path = Path(folder) / name
                 yield path, path.relative_to(source).as_posix()
 
 
-def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match[str]]]:
+def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, str, re.Match[str]]]:
     for path, relative in csv_files(source):
         match = re.search(mapping.files, relative)
-        if match and not (mapping.exclude and re.search(mapping.exclude, relative)):
-            yield path, match
+        if match and relative != mapping.lookup and not (mapping.exclude and re.search(mapping.exclude, relative)):
+            yield path, relative, match
 
 
 def _sample(source: Path) -> str:

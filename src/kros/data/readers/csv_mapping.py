@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import codecs
 import math
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ...core.errors import ConfigError
 from ...core.files import read_toml
@@ -16,6 +17,7 @@ from ..recording import TIME_TOLERANCE
 from ..scaling import Scaling
 from ..steps import Scale, Step, parse_steps
 from ..tables import build
+from .csvfile import Dialect
 
 Column = str | int  # a name in the header, or a number counted from 1
 GROUPS = ("unit", "condition", "episode", "group")
@@ -30,7 +32,7 @@ class ChannelMapping:
     name : str
     role : Role
     column : str or int, optional
-        Name in the header or number from 1; may be left out where every ``[[unit]]`` gives its own.
+        Name in the header or number from 1; default: the channel's name.
     measured : bool
     unit : str
         Unit of measure after scaling.
@@ -97,10 +99,20 @@ class CsvMapping:
     delimiter : str
     header : bool
         False where the first line holds numbers already; columns are then given by number.
-    skip : int
+    skip_rows : int
         Lines before the header, or before the first line of numbers.
+    unit_rows : int
+        Lines between the header and the numbers, such as units of measure.
     decimal : str
         Decimal point, for example ``","`` in files of some countries.
+    encoding : str
+        Of the text, for example ``cp1252`` or ``utf-16``; a mark at the start of the file is left out.
+    timestamp : {"ymd", "dmy", "mdy"}, optional
+        Where time is a timestamp such as ``2024-05-31 12:00:00.010``: the order of its date. A time of day alone takes any of them.
+    pieces : int
+        Every file is cut into so many episodes of equal length, named ``<episode>.1`` and so on.
+    lookup : str, optional
+        A CSV file in the folder that says more about the files: see `kros.data.readers.lookup`.
     prepare : tuple of mapping
         Preparation steps of this mapping.
     metadata : mapping
@@ -117,8 +129,13 @@ class CsvMapping:
     exclude: str | None = None
     delimiter: str = ","
     header: bool = True
-    skip: int = 0
+    skip_rows: int = 0
+    unit_rows: int = 0
     decimal: str = "."
+    encoding: str = "utf-8"
+    timestamp: Literal["ymd", "dmy", "mdy"] | None = None
+    pieces: int = 1
+    lookup: str | None = None
     prepare: tuple[Mapping[str, Any] | Step, ...] = ()
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
@@ -134,8 +151,10 @@ class CsvMapping:
             found = f"delimiter = {self.delimiter!r}, decimal = {self.decimal!r}"
             wanted = "two different characters of ASCII that stand in no number otherwise"
             raise ConfigError(f"CSV mapping: delimiter and decimal should be {wanted}, found {found}; correct them.")
-        if self.skip < 0:
-            raise ConfigError(f"CSV mapping: skip should be zero or more lines, found {self.skip}; correct it.")
+        for name, least in (("skip_rows", 0), ("unit_rows", 0), ("pieces", 1)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"CSV mapping: {name} should be at least {least}, found {getattr(self, name)}; correct it.")
+        _check_encoding(self.encoding)
         if not self.channel:
             raise ConfigError("CSV mapping: there is no [[channel]]; declare each channel with name, column and role.")
         self._check_pattern("files")
@@ -171,12 +190,7 @@ class CsvMapping:
             unknown = sorted(set(unit.columns) - set(names))
             if unknown:
                 raise ConfigError(f"CSV mapping: [[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}; the channels are {names}.")
-            for channel in self.channel:
-                if self.column(channel, unit) is None:
-                    raise ConfigError(
-                        f"CSV mapping: channel {channel.name!r} has no column, neither its own nor in [[unit]] {unit.suffix!r}; add one."
-                    )
-        used = [self.time, *(c.column for c in self.channel), *(c for u in self.unit for c in u.columns.values())]
+        used = [self.time, *(self.column(c, u) for u in self.units for c in self.channel)]
         for column in used:
             if isinstance(column, int) and column < 1:
                 raise ConfigError(f"CSV mapping: columns are numbered from 1, found {column}; correct it.")
@@ -217,9 +231,23 @@ class CsvMapping:
         steps = tuple(step for s in parse_steps(self.prepare, "CSV mapping: prepare") if (step := s.without(names)) is not None)
         return replace(self, channel=tuple(c for c in self.channel if c.name not in names), unit=units, prepare=steps)
 
-    def column(self, channel: ChannelMapping, unit: UnitMapping) -> Column | None:
+    def column(self, channel: ChannelMapping, unit: UnitMapping) -> Column:
         """Return where a channel of a unit is read from."""
-        return unit.columns.get(channel.name, channel.column)
+        return unit.columns.get(channel.name, channel.name if channel.column is None else channel.column)
+
+    @property
+    def dialect(self) -> Dialect:
+        """How its files are written."""
+        return Dialect(self.delimiter, self.header, self.skip_rows, self.decimal, self.encoding, self.unit_rows)
+
+
+def _check_encoding(name: str) -> None:
+    try:
+        codecs.lookup(name)
+    except LookupError as error:
+        raise ConfigError(
+            f"CSV mapping: encoding {name!r} is unknown; known are utf-8, latin-1, cp1252, utf-16 and others of Python."
+        ) from error
 
 
 def _is_mark(text: str) -> bool:

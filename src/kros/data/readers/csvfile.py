@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import gzip
 import re
@@ -19,18 +20,34 @@ from ...core import limits
 from ...core.errors import DataError
 from ...core.files import require_regular, shortened
 from ..arrow import fill
+from .timestamps import seconds_of
 
+ABSENT = (
+    "-",
+    "--",
+    "---",
+    "#DIV/0!",
+    "#NUM!",
+    "#REF!",
+    "#VALUE!",
+    "#WERT!",
+    "#ZAHL!",
+    "#BEZUG!",
+    "#NV",
+)  # cells of spreadsheets without a number
 BLOCK = 1 << 22  # bytes that Arrow parses at once; a line has to fit into two
 
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a file is written: delimiter, whether a line names the columns, lines to skip before it, and the decimal point."""
+    """How a file is written: delimiter, whether a line names the columns, lines before it, decimal point, encoding, lines behind the header."""
 
     delimiter: str = ","
     header: bool = True
-    skip: int = 0
+    skip_rows: int = 0
     decimal: str = "."
+    encoding: str = "utf-8"
+    unit_rows: int = 0
 
 
 COMMA = Dialect()
@@ -81,8 +98,8 @@ class Bounded:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Bounded]:
-    """Open a regular text file, unpacked where it ends in ``.gz``.
+def opened(path: Path, encoding: str = "utf-8") -> Iterator[Bounded]:
+    """Open a regular text file, unpacked where it ends in ``.gz``; what has two bytes a character is given in UTF-8.
 
     Raises
     ------
@@ -93,26 +110,47 @@ def opened(path: Path) -> Iterator[Bounded]:
     opener: Any = gzip.open if path.suffix == ".gz" else open
     try:
         with opener(path, "rb") as file:
-            yield Bounded(file, path)
-    except (OSError, EOFError, zlib.error) as error:
+            yield Bounded(file if _has_ascii(encoding) else codecs.EncodedFile(file, "utf-8", encoding), path)
+    except (OSError, EOFError, zlib.error, UnicodeError) as error:
         raise DataError(f"Reading {path}: cannot be read ({error}); check the file, or restore it.") from error
 
 
+def _has_ascii(encoding: str) -> bool:
+    """Tell whether digits and marks are the bytes that they are in ASCII."""
+    return "0;".encode(encoding) == b"0;"
+
+
 def first_fields(path: Path, dialect: Dialect = COMMA) -> list[str]:
-    """Return the fields of the first line after those skipped, without surrounding space and quotes."""
-    with opened(path) as file:
-        _skip(file, dialect.skip, path)
-        line = _text(file.readline(), path)
-    if not line.strip():
-        raise DataError(f"Reading {path}: the file is empty or starts with an empty line; remove it or restore it.")
+    """Return the fields of the header, or of the first line of numbers, without surrounding space and quotes.
+
+    There are as many as in a line of numbers: delimiters at the end of the one or of the other name no column.
+    """
+    with opened(path, dialect.encoding) as file:
+        _skip(file, dialect.skip_rows, path)
+        line = _text(file.readline(), path, dialect.encoding)
+        if not line.strip():
+            raise DataError(f"Reading {path}: the file is empty or starts with an empty line; remove it or restore it.")
+        fields = _fields(line, path, dialect)
+        if dialect.header:
+            _skip(file, dialect.unit_rows, path)
+            row = _fields(_text(file.readline(), path, dialect.encoding), path, dialect)
+            if len(row) > len(fields) and not any(row[len(fields) :]):
+                fields += row[len(fields) :]
+            elif len(fields) > len(row) > 1 and not any(fields[len(row) :]):
+                fields = fields[: len(row)]
+    return fields
+
+
+def _fields(line: str, path: Path, dialect: Dialect) -> list[str]:
     try:
-        fields = next(csv.reader([line], delimiter=dialect.delimiter, skipinitialspace=True))
+        return [part.strip() for part in next(csv.reader([line], delimiter=dialect.delimiter, skipinitialspace=True), [])]
     except csv.Error as error:
         raise DataError(f"Reading {path}: its first line is no list of columns ({error}); correct the file.") from error
-    return [part.strip() for part in fields]
 
 
-def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect = COMMA) -> npt.NDArray[np.float64]:
+def read_columns(
+    path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect = COMMA, timestamp: str | None = None
+) -> npt.NDArray[np.float64]:
     """Read some columns of a file.
 
     Parameters
@@ -123,6 +161,8 @@ def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialec
         Names of all columns, in order.
     wanted : sequence of str
     dialect : Dialect
+    timestamp : str, optional
+        Order of the date, where the first of the columns that are wanted holds timestamps: it is given in seconds.
 
     Returns
     -------
@@ -140,9 +180,17 @@ def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialec
     read = arrow.ReadOptions(use_threads=False, column_names=list(names), block_size=BLOCK)
     parse = arrow.ParseOptions(delimiter=dialect.delimiter)
     numbers = {name: pa.float64() for name in wanted}
-    convert = arrow.ConvertOptions(column_types=numbers, include_columns=list(numbers), decimal_point=dialect.decimal)
-    with opened(path) as file:
-        _skip(file, dialect.skip + dialect.header, path)  # here, so that both readings count lines alike
+    if timestamp is not None:
+        numbers[wanted[0]] = pa.string()
+    convert = arrow.ConvertOptions(
+        column_types=numbers,
+        include_columns=list(numbers),
+        decimal_point=dialect.decimal,
+        null_values=[*arrow.ConvertOptions().null_values, *ABSENT],
+    )
+    with opened(path, dialect.encoding) as file:
+        lines = dialect.skip_rows + dialect.header + (dialect.unit_rows if dialect.header else 0)
+        _skip(file, lines, path)  # here, so that both readings count lines alike
         try:
             table = arrow.read_csv(pa.PythonFile(file, mode="r"), read, parse, convert)
         except DataError:
@@ -153,21 +201,29 @@ def read_columns(path: Path, names: Sequence[str], wanted: Sequence[str], dialec
             raise DataError(f"Reading {path}: {_explain(str(error), names)}; correct the file.") from error
     values = np.empty((len(wanted), table.num_rows))
     for row, name in enumerate(wanted):
-        fill(values[row], table.column(name))
+        if row == 0 and timestamp is not None:
+            values[row] = seconds_of(table.column(name), timestamp)
+        else:
+            fill(values[row], table.column(name))
     return values
 
 
 def _skip(file: Bounded, lines: int, path: Path) -> None:
     for line in range(lines):
         if not file.readline():
-            raise DataError(f"Reading {path}: {lines} lines stand before the numbers by the mapping, found {line} in all; correct skip.")
+            raise DataError(
+                f"Reading {path}: {lines} lines stand before the numbers by the mapping, found {line} in all; correct skip_rows."
+            )
 
 
-def _text(line: bytes, path: Path) -> str:
+def _text(line: bytes, path: Path, encoding: str) -> str:
+    named = encoding if _has_ascii(encoding) else "utf-8"
     try:
-        return line.decode("utf-8-sig").rstrip("\r\n")
+        return line.decode("utf-8-sig" if codecs.lookup(named).name == "utf-8" else named).rstrip("\r\n").removeprefix("\ufeff")
     except UnicodeDecodeError as error:
-        raise DataError(f"Reading {path}: its first line is not UTF-8 ({error}); convert the file.") from error
+        raise DataError(
+            f"Reading {path}: its first line is not {encoding.upper()} ({error}); name the encoding, such as cp1252."
+        ) from error
 
 
 def _explain(message: str, names: Sequence[str]) -> str:

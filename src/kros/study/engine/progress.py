@@ -53,9 +53,9 @@ class Bars:
 
 
 @contextmanager
-def make_progress(quiet: bool) -> Iterator[Progress]:
-    """Return the progress listener that fits where standard error goes."""
-    if quiet:
+def make_progress(quiet: bool, asks: bool = False) -> Iterator[Progress]:
+    """Return the progress listener that fits where standard error goes; bars would hide questions."""
+    if quiet or asks:
         yield Silent()
     elif not sys.stderr.isatty():
         yield Lines()

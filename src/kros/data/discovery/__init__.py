@@ -1,0 +1,9 @@
+"""What a folder of unknown recordings holds: the first half of `kros init`.
+
+Nothing here decides what a study computes: it writes down a mapping that people can correct, and says what it rests on.
+"""
+
+from .discover import Discovery, Wanted, assign, discover
+from .roles import Column, Part
+
+__all__ = ["Column", "Discovery", "Part", "Wanted", "assign", "discover"]

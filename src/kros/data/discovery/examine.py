@@ -1,0 +1,195 @@
+"""What looks wrong in recordings, found in one pass before anything is computed: nothing stops at the first of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DataError
+from ...core.work import Work
+from ..alerts import period_alerts
+from ..checks import MIN_SAMPLES, is_constant
+from ..copies import Print, copies_among, print_of
+from ..population import Channel, EpisodeKey, Population, Role
+from ..prepare import PreparedSource
+from ..recording import TIME_TOLERANCE, title
+
+Array = npt.NDArray[np.float64]
+GAP = 10.0  # median steps that a step may take before it counts as a gap, as in the step `resample`
+MANY, BRIDGED = 5, 50.0  # where a fifth of the episodes or more have gaps, those of up to so many median steps are bridged
+_LONG_REST = 0.2  # of an episode, from which on a signal that stands still while others move is worth a word
+_SLOWER = 1.5
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one episode looks like.
+
+    Parameters
+    ----------
+    key : EpisodeKey
+    wrong : str
+        Why it cannot be used, or nothing.
+    doubts : tuple of str
+        What is odd about it.
+    n_samples : int
+    period_s : float
+        Median step of time; NaN where there is no column of time.
+    uneven : bool
+    nan : bool
+    gap : tuple of float and int, or None
+        Longest step of time, s, where it is a gap, and the sample before it.
+    mark : Print or None
+    alerts : tuple of str
+    """
+
+    key: EpisodeKey
+    wrong: str = ""
+    doubts: tuple[str, ...] = ()
+    n_samples: int = 0
+    period_s: float = np.nan
+    uneven: bool = False
+    nan: bool = False
+    gap: tuple[float, int] | None = None
+    mark: Print | None = None
+    alerts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What all episodes look like.
+
+    Parameters
+    ----------
+    wrong : dict of EpisodeKey to str
+        Episodes that cannot be used, with the reason.
+    doubts : tuple of str
+        What else looks wrong.
+    resample_s : float or None
+        Period to resample to, where time is uneven.
+    nan : tuple of EpisodeKey
+        Episodes with NaN or infinity.
+    counts : Counter of (unit, condition)
+        Episodes that can be used.
+    shortest : int
+        Samples of the shortest of them.
+    max_gap_s : float or None
+        Longest gap to bridge, where many episodes have gaps.
+    """
+
+    wrong: dict[EpisodeKey, str]
+    doubts: tuple[str, ...]
+    resample_s: float | None
+    nan: tuple[EpisodeKey, ...]
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
+    shortest: int = 0
+    max_gap_s: float | None = None
+
+
+def examine(population: Population, work: Work | None = None) -> Examined:
+    """Read every episode once, as it was recorded.
+
+    Parameters
+    ----------
+    population : Population
+        Without preparation.
+    work : Work, optional
+    """
+    tasks = [population.select([u], [c]) for u, c, _ in population.groups()]
+    seen = [s for found in (work or Work()).map("look", _look, tasks) for s in found]
+    wrong = {s.key: s.wrong for s in seen if s.wrong}
+    good = [s for s in seen if not s.wrong]
+    median = float(np.median([s.period_s for s in good])) if good else np.nan
+    slow = {s.key: f"sampled every {s.period_s:.3g} s, the others every {median:.3g} s" for s in good if s.period_s > _SLOWER * median}
+    wrong |= slow
+    broken = {s.key: s.gap for s in good if s.gap is not None and s.key not in wrong}
+    bridged = max((g for g, _ in broken.values() if g <= BRIDGED * median), default=0.0) if MANY * len(broken) > len(good) else 0.0
+    wrong |= {key: f"a gap of {g:.3g} s after sample {k}" for key, (g, k) in broken.items() if g > bridged}
+    good = [s for s in good if s.key not in wrong]
+    for key, other, shared in copies_among((s.key, s.mark) for s in good if s.mark is not None):
+        wrong.setdefault(key, f"{'a copy' if shared >= 1 else f'shares {100 * shared:.0f} % of its samples'} of {other}")
+    good = [s for s in good if s.key not in wrong]
+    different = any(abs(s.period_s - median) > 1e-4 * median for s in good)
+    resample = float(f"{median:.3g}") if any(s.uneven for s in good) or different else None
+    n_bridged = sum(s.gap is not None for s in good)
+    told = (
+        [f"{n_bridged} episodes have gaps, of up to {bridged:.3g} s: they are bridged by straight lines (max_gap_s)"] if n_bridged else []
+    )
+    doubts = told + [d for s in good for d in s.doubts] + list(dict.fromkeys(a for s in good for a in s.alerts))
+    max_gap = float(f"{1.01 * bridged:.3g}") if n_bridged else None
+    counts = Counter((s.key.unit, s.key.condition) for s in good if not s.nan)
+    shortest = min((s.n_samples for s in good), default=0)
+    return Examined(wrong, tuple(doubts), resample, tuple(s.key for s in good if s.nan), counts, shortest, max_gap)
+
+
+def _look(population: Population) -> list[Seen]:
+    """Look at the episodes of one unit and condition, in a worker."""
+    source: Any = population.source
+    recordings = source.recordings if isinstance(source, PreparedSource) else None
+    found = []
+    for i, key in enumerate(population.episodes):
+        try:
+            if recordings is None:
+                found.append(_looked(key, population.source(key), None, population.columns, population.sample_period_s, i == 0))
+            else:
+                recording = recordings(key)
+                found.append(_looked(key, recording.values, recording.time_s, population.columns, population.sample_period_s, i == 0))
+        except DataError as error:
+            found.append(Seen(key, str(error)))
+    return found
+
+
+def _looked(key: EpisodeKey, values: Array, time: Array | None, channels: Sequence[Channel], period_s: float, first: bool) -> Seen:
+    n = len(values)
+    if n < MIN_SAMPLES:
+        return Seen(key, f"has {n} samples", n_samples=n)
+    period, uneven, gap = period_s, False, None
+    if time is not None:
+        steps = np.diff(time)
+        backwards = np.flatnonzero(~(steps > 0))
+        if backwards.size:
+            k = int(backwards[0])
+            return Seen(
+                key,
+                f"time stands still or runs back at sample {k} ({time[k]:g} s, then {time[k + 1]:g} s), {backwards.size} times",
+                n_samples=n,
+            )
+        period = float(np.median(steps))
+        worst = int(steps.argmax())
+        gap = (float(steps[worst]), worst) if steps[worst] > GAP * period else None
+        uneven = bool(np.abs(steps - period).max() > TIME_TOLERANCE * period)
+    if not np.isfinite(values).all():
+        bad = np.count_nonzero(~np.isfinite(values), axis=0)
+        names = ", ".join(f"{c.name!r} ({count})" for c, count in zip(channels, bad, strict=True) if count)
+        return Seen(key, "", (f"{title(key)}: no number in some samples of {names}",), n, period, uneven, True, gap)
+    still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
+    if still and len(still) < sum(not is_constant(values[:, i]) or i in still for i in range(len(channels))):
+        stuck = channels[still[0]].name
+        return Seen(key, f"state {stuck!r} stays at {values[0, still[0]]:g} in all samples while others move: a stuck sensor", n_samples=n)
+    alerts = period_alerts(values, channels, period) if first else ()
+    return Seen(key, "", tuple(_rests(key, values, channels)), n, period, uneven, False, gap, print_of(values, channels), alerts)
+
+
+def _rests(key: EpisodeKey, values: Array, channels: Sequence[Channel]) -> list[str]:
+    """Say where a state stands still for long while other states move a good part of their range."""
+    states = [i for i, c in enumerate(channels) if c.role is Role.STATE]
+    ranges, found = np.ptp(values, axis=0), []
+    for i in states:
+        changes = np.flatnonzero(np.diff(values[:, i]) != 0)
+        ends = np.concatenate([[-1], changes, [len(values) - 1]])
+        longest = int(np.diff(ends).argmax())
+        start, stop = int(ends[longest]) + 1, int(ends[longest + 1]) + 1
+        if stop - start < max(50, _LONG_REST * len(values)):
+            continue
+        moving = [channels[j].name for j in states if j != i and np.ptp(values[start:stop, j]) > 0.2 * ranges[j] > 0]
+        if moving:
+            name = channels[i].name
+            found.append(
+                f"{title(key)}: {name!r} stays at {values[start, i]:g} from sample {start} to {stop - 1} while {', '.join(moving)} move"
+            )
+    return found

@@ -1,0 +1,183 @@
+"""`kros init` on folders as strangers have them: several dialects, oddities of spreadsheets, names in two languages; nothing is edited."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from kros.data import EpisodeKey, Population
+from kros.plants import DcMotorPopulation, PendulumPopulation
+from kros.study import load_config
+from kros.study.stages.read import open_source
+
+Array = np.ndarray
+DEGREE = np.pi / 180
+
+
+@pytest.fixture(scope="module")
+def motors() -> Population:
+    """DC motors: position, velocity, current, voltage."""
+    return DcMotorPopulation(n_units=4, n_episodes=4, seconds=5, seed=3).simulate().population
+
+
+def comma(value: float) -> str:
+    return f"{value:.12g}".replace(".", ",")
+
+
+def european(path: Path, values: Array, period_s: float) -> None:
+    """Semicolons, decimal commas, latin-1, units in a second row, milliseconds, degrees, CR LF."""
+    rows = np.column_stack([1e3 * period_s * np.arange(len(values)), values / [DEGREE, np.pi / 30, 1, 1]])
+    lines = ["Zeit;Winkel Abtrieb;Drehzahl;Strom;Spannung (Klemmen)", "ms;°;1/min;A;V", *(";".join(map(comma, r)) for r in rows.tolist())]
+    path.write_bytes(("\r\n".join(lines) + "\r\n").encode("latin-1"))
+
+
+def spreadsheet(path: Path, values: Array, period_s: float) -> None:
+    """A mark at the start, a title, quoted headers with delimiters in them, semicolons behind the numbers, timestamps, an empty line."""
+    clock = [f"31.05.2024 12:00:{k * period_s:06.3f}".replace(".", ",") for k in range(len(values))]
+    clock = [f"31.05.2024{c[10:]}" for c in clock]
+    lines = ["Prüfstand 4;;;;", "", '"Uhrzeit";"Position [rad]";"Speed; motor [rad/s]";"Current [A]";"Voltage [V]"']
+    lines += [";".join([t, *map(comma, r)]) + ";" for t, r in zip(clock, values.tolist(), strict=True)]
+    path.write_text("\ufeff" + "\n".join(lines) + "\n", encoding="utf-8")
+
+
+def tabs(path: Path, values: Array, period_s: float) -> None:
+    """UTF-16 with tabs, as spreadsheets write text; seconds in a column that counts from an hour."""
+    rows = np.column_stack([3600 + period_s * np.arange(len(values)), values])
+    lines = ["time\tpos_rad\tspeed (rad/s)\tcurrent in A\tu/V", *("\t".join(f"{x:.12g}" for x in r) for r in rows)]
+    path.write_text("\n".join(lines), encoding="utf-16")
+
+
+def plain(path: Path, values: Array, period_s: float) -> None:
+    """Commas and points; a counter, a column that rests, a note."""
+    lines = ["index,time_us,position,velocity,current,voltage,spare,note"]
+    lines += [f"{k},{1e6 * k * period_s:.6g},{','.join(f'{x:.12g}' for x in r)},0.5,fine" for k, r in enumerate(values.tolist())]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def arrow(path: Path, values: Array, period_s: float) -> None:
+    """Parquet of pandas: a column of timestamps."""
+    names = ("position", "velocity", "current", "voltage")
+    time = pa.array((1e9 * period_s * np.arange(len(values))).round().astype("datetime64[ns]"))
+    parquet.write_table(pa.table({"timestamp": time, **{n: values[:, i] for i, n in enumerate(names)}}), path)
+
+
+WRITERS: dict[str, tuple[Callable[[Path, Array, float], None], str]] = {
+    "european": (european, "Antrieb {unit}/Leerlauf_Messung_{episode}.csv"),
+    "spreadsheet": (spreadsheet, "motor{unit}_run{episode}.CSV"),
+    "tabs": (tabs, "SN10{unit}-{episode}.txt"),
+    "plain": (plain, "{unit}/2024-05-0{episode}.csv"),
+    "arrow": (arrow, "unit_{unit}_ep_{episode}.parquet"),
+}
+
+
+def written(folder: Path, population: Population, kind: str) -> Path:
+    """Write all episodes as a stranger would."""
+    write, name = WRITERS[kind]
+    for key in population.episodes:
+        path = folder / name.format(unit=int(key.unit.lstrip("abcdefghijklmnopqrstuvwxyz-_")), episode=int(key.episode) + 1)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(path, population.read(key), population.sample_period_s)
+    return folder
+
+
+@pytest.mark.parametrize("kind", list(WRITERS))
+def test_every_dialect_is_read_back_as_it_was_written(kros, tmp_path, motors, kind):
+    folder, study = written(tmp_path / "recordings", motors, kind), tmp_path / "study.toml"
+    result = kros("init", folder, "--out", study)
+    assert result.exit_code == 0, result.output
+    found = open_source(load_config(study))
+    assert len(found.unit_ids) == 4
+    assert [len(keys) for _, _, keys in found.groups()] == [4] * 4
+    assert found.sample_period_s == pytest.approx(motors.sample_period_s, rel=1e-9)
+    assert (len(found.measured), len(found.states), len(found.inputs)) == (1, 3, 1)
+    for ours, theirs in zip(found.episodes, motors.episodes, strict=True):
+        np.testing.assert_allclose(found.read(ours), motors.read(theirs), rtol=1e-8, atol=1e-10)
+
+
+def test_european_csv_to_a_report_with_two_commands(kros, tmp_path, motors):
+    folder = written(tmp_path / "Messungen", motors, "european")
+    result = kros("init", folder, "--out", tmp_path / "study.toml")
+    assert result.exit_code == 0, result.output
+    assert "winkel_abtrieb [rad]" in result.output
+    quick = ["uncertainty.n_freqs=60", "synthesis.input_weight=3.0", 'synthesis.methods=["worst_case_h2"]', "identify.refine=false"]
+    quick += ["evaluate.robustness=false", "evaluate.monte_carlo=0", 'observer.baselines=["open_loop"]', "predictor.effort=quick"]
+    result = kros("run", tmp_path / "study.toml", "--out", tmp_path / "run", "--workers", 1, *(a for q in quick for a in ("--set", q)))
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["study"]["units"] == 4
+
+
+def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tmp_path, motors):
+    folder, study = written(tmp_path / "recordings", motors, "plain"), tmp_path / "study.toml"
+    units = sorted(p.name for p in folder.iterdir())
+    shutil.copy(folder / units[0] / "2024-05-01.csv", folder / units[1] / "2024-05-01.csv")
+    stuck = folder / units[2] / "2024-05-02.csv"
+    lines = stuck.read_text().splitlines()
+    stuck.write_text("\n".join([lines[0], *(",".join([*(c := line.split(","))[:4], "1.5", *c[5:]]) for line in lines[1:])]))
+    gap = folder / units[3] / "2024-05-03.csv"
+    lines = gap.read_text().splitlines()
+    gap.write_text("\n".join(lines[:500] + lines[600:]))
+    (folder / "notes.csv").write_text("who,when\nme,today\n")
+    result = kros("init", folder, "--out", study)
+    assert result.exit_code == 0, result.output
+    for part in (
+        "a copy of episode",
+        "'current' stays at 1.5 in all samples",
+        "a gap of",
+        "1 files are not like the others and left alone: notes.csv",
+    ):
+        assert part in result.output
+    found = open_source(load_config(study))
+    assert len(found.episodes) == 13
+    assert EpisodeKey(units[0], "default", "01") not in found.episodes or EpisodeKey(units[1], "default", "01") not in found.episodes
+    assert kros("run", study, "--out", tmp_path / "run", "--until", "read", "--workers", 1).exit_code == 0
+
+
+def test_roles_are_taken_from_options_and_never_asked_without_a_terminal(kros, tmp_path, motors):
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for key in motors.episodes[:8]:
+        np.savetxt(
+            folder / f"{key.unit}_{key.episode}.csv", motors.read(key), delimiter=",", header="aa,bb,cc,dd", comments="", fmt="%.10g"
+        )
+    result = kros("init", folder, "--out", tmp_path / "study.toml")
+    assert result.exit_code == 2
+    assert "--period SECONDS" in result.output
+    result = kros("init", folder, "--out", tmp_path / "study.toml", "--period", 0.002)
+    assert result.exit_code == 2
+    assert "no column is a measured state by its name; name it, --measured NAME. The columns are aa, bb, cc, dd" in result.output
+    result = kros("init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "d")
+    assert result.exit_code == 2
+    assert "there is no column 'd'" in result.output
+    result = kros("init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "dd")
+    assert result.exit_code == 0, result.output
+    found = open_source(load_config(tmp_path / "study.toml"))
+    assert (found.measured, found.states, found.inputs) == (("aa",), ("aa", "bb", "cc"), ("dd",))
+    before = (tmp_path / "study.toml").read_bytes()
+    result = kros("init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "dd")
+    assert result.exit_code == 2
+    assert "exists; name another file" in result.output
+    assert (tmp_path / "study.toml").read_bytes() == before
+
+
+def test_one_recording_a_unit_is_cut_into_episodes(kros, tmp_path):
+    pendulums = PendulumPopulation(n_units=3, n_episodes=1, seconds=15, seed=1).simulate().population
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for key in pendulums.episodes:
+        t = pendulums.sample_period_s * np.arange(len(pendulums.read(key)))
+        rows = np.column_stack([t, pendulums.read(key)])
+        np.savetxt(folder / f"{key.unit}.csv", rows, delimiter=",", header="t,angle,rate,torque_cmd", comments="", fmt="%.10g")
+    result = kros("init", folder, "--out", tmp_path / "study.toml")
+    assert result.exit_code == 0, result.output
+    found = open_source(load_config(tmp_path / "study.toml"))
+    assert [len(keys) for _, _, keys in found.groups()] == [5] * 3
+    whole = np.concatenate([found.read(k) for k in found.keys(found.unit_ids[0])])
+    np.testing.assert_allclose(whole, pendulums.read(pendulums.episodes[0]), rtol=1e-8, atol=1e-9)

@@ -29,6 +29,7 @@ from ..synthesis.result import Injection
 from .monitor import Monitor
 from .runtime import Runtime, Seen
 from .sensor import Sensors, require_measured
+from .start import Start
 
 Array = npt.NDArray[np.float64]
 
@@ -66,6 +67,8 @@ class ObserverData:
         What it was told of the sensors of measured states, by name. What arrives late is corrected by `runtime`.
     monitor : Monitor, optional
         Watches the innovation for machines that are outside the population's envelope; nothing by default.
+    start_in_motion : Start, optional
+        What a machine's motion at the first samples says of its hidden states; without it the observer starts as from rest.
     about : mapping of str to JSON values
         What people should know of it: units of measure, ranges, certificates. It is part of the file; nothing computes with it.
 
@@ -93,6 +96,7 @@ class ObserverData:
     internal: int = 0
     sensor: Sensors = field(default_factory=dict)
     monitor: Monitor | None = None
+    start_in_motion: Start | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -124,6 +128,8 @@ class ObserverData:
                 f"Observer {self.name}: {self.internal} internal states at the end of {n} should leave out the measured ones."
             )
         require_measured(self.sensor, [self.lifting.states[i] for i in self.measured])
+        if self.start_in_motion is not None:
+            self.start_in_motion.require_fit(self.name, n, len(self.measured), len(self.inputs))
         if self.replaces and not measurement_replaces(self):
             raise DimensionError(
                 f"Observer {self.name}: where measurements replace estimates, the correction is a gain equal to the measured states' columns of A."
@@ -168,14 +174,14 @@ class ObserverData:
         """States that recordings hold: all but the internal ones."""
         return self.lifting.states[: self.lifting.n_states - self.internal]
 
-    def initial(self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def initial(self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None, u: npt.ArrayLike | None = None) -> Array:
         """Return the first estimate: the first measurement where there is one, other states zero; shape (..., n).
 
         Where measurements replace estimates, other states start at rest: where the lifted functions alone hold them, inputs
-        and measurements in balance.
+        and measurements in balance. To that comes what the motion says (`Start`), where the inputs are known.
         """
-        y = np.asarray(y, dtype=float)
-        y = np.where(np.isfinite(y), y, 0.0)
+        first = np.asarray(y, dtype=float)
+        y = np.where(np.isfinite(first), first, 0.0)
         n = self.lifting.n_states
         x = np.zeros((*y.shape[:-1], n))
         x[..., list(self.measured)] = y
@@ -184,7 +190,7 @@ class ObserverData:
             held = self.lifting.lift(x, {**self.parameters, **(parameters or {})})[..., n:] @ self.A[others, n:].T
             still = np.eye(len(others)) - self.A[np.ix_(others, others)]
             x[..., others] = solve_balanced(still, held.reshape(-1, len(others)).T).T.reshape(held.shape)
-        return x
+        return x if self.start_in_motion is None or u is None else x + self.start_in_motion.moved(first, np.asarray(u, dtype=float))
 
     def own(self, parameters: Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
         """Return those parameters of many that the lifting has."""

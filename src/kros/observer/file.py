@@ -28,6 +28,7 @@ from .data import ObserverData, measurement_replaces
 from .monitor import Monitor
 from .runtime import Runtime, Seen
 from .sensor import Sensor
+from .start import Start
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -56,6 +57,7 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         **({} if observer.seen is None else {"seen": {"measured": observer.seen.measured, "inputs": observer.seen.inputs}}),
         "measurement_replaces_estimate": observer.replaces,
         "internal_states": observer.internal,
+        **({} if observer.start_in_motion is None else {"start_in_motion": observer.start_in_motion.content()}),
         **({"sensor": {name: own.model_dump() for name, own in observer.sensor.items()}} if observer.sensor else {}),
         **({"about": observer.about} if observer.about else {}),
         **({} if observer.monitor is None else {"monitor": observer.monitor.content()}),
@@ -134,8 +136,10 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
         _seen(content.get("seen"), q, len(content["inputs"]), where),
         sensor=_sensor(content.get("sensor", {}), where),
         monitor=_monitor(content.get("monitor"), q, where),
+        start_in_motion=_start(content.get("start_in_motion"), lifting.n_states, q, len(content["inputs"]), where),
     )
-    _known(content, [*observer_content(observer), "runtime", "sensor", "lifting_inputs", "input_functions", "about", CHECKSUM], where)
+    optional = ("runtime", "sensor", "start_in_motion", "lifting_inputs", "input_functions", "about", CHECKSUM)
+    _known(content, [*observer_content(observer), *optional], where)
     about = checked_about(content.get("about", {}), lifting.states, observer.inputs, lifting.parameters, f"{where}: about")
     observer = replace(observer, about=about)
     if content["schema"] == _FIRST:
@@ -235,6 +239,16 @@ def _seen(found: Any, measured: int, inputs: int, where: str) -> Seen | None:
     counts = {"measured": measured, "inputs": inputs}
     _known(found, counts, f"{where}: seen")
     return Seen(*(matrix([found[name]], (1, count), f"{where}: seen.{name}")[0] for name, count in counts.items()))
+
+
+def _start(found: Any, n: int, measured: int, inputs: int, where: str) -> Start | None:
+    if found is None:
+        return None
+    _known(found, ("gain", "corrections"), f"{where}: start_in_motion")
+    gain, rows = matrix(found["gain"], (n, measured + inputs), f"{where}: start_in_motion.gain"), found["corrections"]
+    _require(isinstance(rows, list), f"{where}: start_in_motion.corrections should be a list of gains", rows)
+    each = [matrix(own, (n, measured), f"{where}: start_in_motion.corrections[{k}]") for k, own in enumerate(rows)]
+    return Start(gain, np.array(each).reshape(len(each), n, measured))
 
 
 def _sensor(found: Any, where: str) -> dict[str, Sensor]:

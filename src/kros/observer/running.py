@@ -113,8 +113,8 @@ class RunningObserver:
             self._watch.reset()
         self._begin(first.y[0])
 
-    def _begin(self, y: Array) -> None:
-        self._steps.begin(y)
+    def _begin(self, y: Array, u: Array | None = None) -> None:
+        self._steps.begin(y, u=u)
         if self._loop is not None:
             self._loop.begin()
         if self._watch is not None:
@@ -181,8 +181,10 @@ class RunningObserver:
         first, self._fresh = self._fresh, False
         if first and not (samples.held.since > LONGEST).any():
             self._held = replace(samples.held, stale=np.zeros(1, dtype=bool))
+            if self.observer.start_in_motion is not None and samples.starts[0, 0]:
+                self._begin(samples.y[0], samples.u[0])
         elif samples.starts[0, 0]:
-            self._begin(samples.y[0])
+            self._begin(samples.y[0], samples.u[0])
         return samples.y[0], samples.u[0]
 
     def _measurement(self, y: npt.ArrayLike) -> Array:

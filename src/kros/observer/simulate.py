@@ -90,12 +90,36 @@ def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, paramet
         )
     late = first.runtime.delay
     alone = any(
-        o.runtime.delay != late or not o.runtime.clips_alike(first.runtime) or not Screen.of(o).same_as(Screen.of(first)) for o in observers
+        o.start_in_motion is not None
+        or o.runtime.delay != late
+        or not o.runtime.clips_alike(first.runtime)
+        or not Screen.of(o).same_as(Screen.of(first))
+        for o in observers
     )
     alone |= bool(late and first.lifting.history)
     if alone and len(observers) > 1:
         return np.stack([_run([o], y, u, parameters, EstimateKind.PREDICT)[0] for o in observers])
     return _run(observers, y, u, parameters, EstimateKind.PREDICT)
+
+
+def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None) -> tuple[Array, Array]:
+    """Return the first estimate, shape (batch, n), and what the first innovations add beside the observer's own correction, shape (count, batch, n).
+
+    `y` and `u` as in `run_observer`, of which no sample is lost; the estimate is what the observer goes on from, within its limits.
+    """
+    samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
+    batch, start, late = samples.starts.shape[1], observer.start_in_motion, observer.runtime.delay
+    steps = Steps([observer], batch, values)
+    steps.begin(samples.y[0])
+    steps.begin(samples.y[0], samples.starts[0], samples.u[0])
+    first, count = steps.x[0].copy(), 0 if start is None else min(len(start), len(samples.y) - late)
+    added = np.zeros((count, batch, observer.lifting.n_states))
+    for k in range(count):
+        assert start is not None
+        arrived = samples.y[k + late]
+        added[k] = start.correction(np.full(batch, k), steps.innovation(arrived)[0])
+        steps.step(arrived, samples.u[k], ~np.isfinite(arrived))
+    return first, added
 
 
 def _run(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Parameters | None, wanted: EstimateKind) -> Array:
@@ -113,6 +137,7 @@ def _run(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Para
     estimates = np.empty((n_samples, len(observers), observer.lifting.n_states, batch))
     earlier = np.empty((n_samples, batch, len(observer.lifting.window.earlier))) if d else None
     steps.begin(samples.y[0])
+    steps.begin(samples.y[0], samples.starts[0], samples.u[0])
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(n_samples):
             estimates[k] = steps.x.swapaxes(1, 2)
@@ -121,7 +146,7 @@ def _run(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Para
                 earlier[k] = steps.earlier(samples.u[k - pending[k], np.arange(batch)])[0]
                 moving = (pending[k] == d) & ~samples.starts[k]
             if anew[k] and k:
-                steps.begin(samples.y[k], samples.starts[k])
+                steps.begin(samples.y[k], samples.starts[k], samples.u[k])
             if moving is None or moving.any():
                 steps.step(samples.y[k], samples.u[k - d], missing[k] if gone[k] else None, moving)
         found = estimates.transpose(1, 0, 3, 2)

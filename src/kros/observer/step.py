@@ -22,7 +22,7 @@ class Steps:
     Parameters
     ----------
     observers : sequence of ObserverData
-        Of the same lifting, measured states, inputs and limits; more than one only without limits of corrections.
+        Of the same lifting, measured states, inputs and limits; more than one only without limits of corrections and without a start in motion.
     batch : int
     values : mapping of str to array_like, shape (batch,)
         Lifting parameters; looked at anew in every step.
@@ -44,20 +44,23 @@ class Steps:
         self._plain = not (lifting.history or lifting.input_functions)
         self._earlier = np.zeros((len(observers), batch, len(lifting.window.earlier)))
         self._fresh = np.ones(batch, dtype=bool)
+        self._start, self._starting, self._since = observer.start_in_motion, False, np.zeros(batch, dtype=int)
         self._limits = observer.runtime if observer.runtime.limited else None
         self.correction: Array | None = None
 
-    def begin(self, y: Array, machines: Flags | None = None) -> None:
-        """Start all machines, or some, at measurements, shape (batch, q)."""
+    def begin(self, y: Array, machines: Flags | None = None, u: Array | None = None) -> None:
+        """Start all machines, or some, at measurements, shape (batch, q), and inputs where these are known, shape (batch, m)."""
         rows = slice(None) if machines is None else machines
         for own, observer in zip(self.x, self.observers, strict=True):
-            own[rows] = observer.runtime.relifted(observer.initial(y, self.values))[rows]
+            own[rows] = observer.runtime.relifted(observer.initial(y, self.values, u))[rows]
         self._x_c[:, rows] = 0.0
         self._fresh[rows] = True
+        self._since[rows], self._starting = 0, self._start is not None and len(self._start) > 0
 
     def place(self, x: Array, earlier: Array) -> None:
         """Put states, shape (batch, n), and earlier values in place; corrections start at rest."""
         self.x[...], self._x_c[...], self._earlier[...], self._fresh[:] = x, 0.0, earlier, False
+        self._starting = False
 
     def earlier(self, u: Array) -> Array:
         """Return the earlier values that the lifting reads, shape (observer, batch, n_earlier); after a start they equal the present ones."""
@@ -99,6 +102,10 @@ class Steps:
             np.copyto(self._y, self.x[..., self._at], where=missing)
         np.matmul(self.map, self._column, out=self._following)
         following = np.swapaxes(self._following, 1, 2)
+        if self._start is not None and self._starting:
+            following[0, :, :n] += self._start.correction(self._since, (self._y - self.x[..., self._at])[0])
+            self._since += True if moving is None else moving
+            self._starting = bool(self._since.min() < len(self._start))
         if self._limits is not None:
             self._limit(following)
         where = True if moving is None else moving[:, None]

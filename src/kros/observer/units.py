@@ -42,6 +42,9 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
         runtime=_runtime(observer.runtime, x[: lifting.n_states], y, into, u),
         seen=None if observer.seen is None else observer.seen.times(y, u[: len(observer.inputs)]),
         monitor=None if observer.monitor is None else observer.monitor.times(y),
+        start_in_motion=None
+        if observer.start_in_motion is None
+        else observer.start_in_motion.times(x[: lifting.n_states], y, u[: len(observer.inputs)]),
         sensor=in_units(observer.sensor, {lifting.states[i]: 1 / float(x[i]) for i in observer.measured}),
     )
 

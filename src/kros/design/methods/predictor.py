@@ -19,6 +19,7 @@ from ...observer.limits import sides
 from ...observer.predictor import Recipe, choose, embedded, tune_predictor
 from ...observer.predictor.choice import AT_LIMITS
 from ...observer.predictor.moments import limited
+from ...observer.predictor.start import with_start
 from ...synthesis import Status, Synthesis
 from ...synthesis.residual_shaped.shaping_filter import Basis
 from ..certificates import DIVERGED, dropout_error_percent, scales_of
@@ -134,8 +135,7 @@ class Plan:
     def observer(self, task: DesignTask, data: ValidationSet, steps: int = 0) -> Observer:
         """Return the observer, tuned by some steps on recordings, that of the moments without any."""
         batch, model, asked, models = data.on_time.batch, self.recipe.model(self.past, self.importance), task.predictor, task.models
-        few = batch.take(firsts(batch, asked.episodes if steps else 1))
-        few = few.head(min(_TUNED, int(few.lengths.min())))
+        few = some(batch, asked.episodes if steps else 1)
         if steps:
             slowest, recipe = max(self.recipe.basis.poles), self.recipe
             model, _ = tune_predictor(model, self.past, few, self.importance, recipe.deviation, slowest, steps, weights=recipe.weights)
@@ -144,7 +144,7 @@ class Plan:
         if task.limits:
             made = [with_limits(one, *sides(task.limits, one.recorded)) for one in made]
         without = dropout_error_percent(made, task.training.first_of_units().read(), models.sample_period_s)
-        return made[int(np.argmin(without))]
+        return with_start(made[int(np.argmin(without))], few, self.past.static, self.past.free)
 
     def facts(self, task: DesignTask) -> dict[str, Any]:
         """Return what the records say."""
@@ -167,6 +167,19 @@ def firsts(batch: EpisodeBatch, count: int = 1) -> list[int]:
     """Return where the first episodes of every unit and condition are."""
     groups = [(key.unit, key.condition) for key in batch.keys]
     return [i for i, group in enumerate(groups) if groups[:i].count(group) < count]
+
+
+def some(batch: EpisodeBatch, count: int) -> EpisodeBatch:
+    """Return the first so many episodes of every unit and condition, cut to a length; of short ones, as many samples from all over the recordings."""
+    length = min(_TUNED, int(batch.lengths.min()))
+    if length == _TUNED:
+        return batch.take(firsts(batch, count)).head(length)
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i, key in enumerate(batch.keys):
+        groups.setdefault((key.unit, key.condition), []).append(i)
+    wanted = -(-count * _TUNED // length)
+    rows = [own[j] for own in groups.values() for j in np.unique(np.linspace(0, len(own) - 1, min(wanted, len(own))).round().astype(int))]
+    return batch.take(sorted(rows)).head(length)
 
 
 def before_limits(task: DesignTask, batch: EpisodeBatch) -> npt.NDArray[np.int64]:

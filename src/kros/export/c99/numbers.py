@@ -130,6 +130,7 @@ class Source:
             "sigma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.formulas],
             "gamma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.input_formulas],
             "held_start": self.held_start(),
+            "start": self.start_in_motion(),
             "tracked": self.tracked(),
             "load": self.load_torque(),
             "shift": self.shift,
@@ -216,6 +217,18 @@ class Source:
             "settle": own.settle,
             "recovery": RECOVERY,
         }
+
+    def start_in_motion(self) -> dict[str, Any] | None:
+        """Return what motion at the first samples adds to hidden states; rows of zeros are left out."""
+        start, q = self.observer.start_in_motion, len(self.observer.measured)
+        if start is None or not len(start):
+            return None
+        rows = np.flatnonzero(np.any(start.gain, axis=1) | np.any(start.corrections, axis=(0, 2)))
+        gain = start.gain[rows]
+        if self.shift is not None:  # exactly, so that nothing is left of where the origin is
+            gain[:, 0] = -gain[:, q:] @ self.shift.inputs
+        corrections = start.corrections[:, rows].reshape(len(start), -1)
+        return {"rows": rows.tolist(), "count": len(start), "gain": self.matrix(gain), "corrections": self.matrix(corrections)}
 
     def symbol(self, name: str) -> str:
         """Return what stands for a quantity of a formula in C: window w, parameters p, inputs u."""

@@ -15,7 +15,7 @@ from ..data import ObserverData
 from ..predictor.driven import with_internal
 from ..residual.one_step import one_step_residual
 from ..screen import screened
-from ..simulate import run_observer
+from ..simulate import run_observer, started
 from .certificate import ReliftCertificate
 from .error import ErrorSystem
 
@@ -161,11 +161,12 @@ def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None 
         estimates = run_observer(observer, y, inputs, values)
     # Measurements beyond the limits of their states are taken at the limit: what is left of their noise is smaller.
     taken = screened(observer, y, inputs).y
-    start = observer.runtime.relifted(observer.initial(taken[0], values))  # what is given out may be cut off
+    start, early = started(observer, y, inputs, values)
     noise = np.where(np.isfinite(taken), taken, y)[:-1] - due[:-1]
     noise[:late] = 0.0
-    truth = with_internal(observer, states, observer.runtime.clip_inputs(inputs), values, start)
-    omega = held_residual(observer, truth, inputs, values)
+    truth = with_internal(observer, states, observer.runtime.clip_inputs(inputs), values, start, early)
+    omega, recorded = held_residual(observer, truth, inputs, values), len(observer.recorded)
+    omega[: len(early), :, :recorded] -= early[: len(omega), :, :recorded]  # what the first samples correct beside the observer's gain
     return Course(omega, noise, first_error(observer, truth[0] - start), truth - estimates, batch.lengths, inputs, y, batch.states - states)
 
 

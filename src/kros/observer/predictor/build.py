@@ -15,6 +15,7 @@ from ...synthesis.residual_shaped.shaping_filter import Basis
 from ...synthesis.result import Injection
 from ..observer import Observer
 from ..tuning.blocks import Array, Model
+from .free_start import FreeStart, in_motion
 from .moments import DELAYS, SHORT, THIN, PastMoments, hidden_of, skipped
 from .tuning import tune_predictor
 
@@ -97,7 +98,8 @@ def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], 
     turn = np.vstack([H, null_space(H / np.linalg.norm(H, axis=1)[:, None]).T])
     back = np.linalg.inv(turn)
     F, G = turn @ F @ back, turn @ G
-    following = _measured_rows(F, G, past.channels(batch), batch.measurements(measured, arrived=False), ridge)
+    truth = batch.states[..., hidden]
+    following = _measured_rows(F, G, past.channels(batch), batch.measurements(measured, arrived=False), truth, ridge)
     place = [*hidden, *range(n, n + internal)]
     raw = np.zeros((n + internal, q + m + len(lifting.functions)))  # of y, u and sigma, in place of z
     own = np.zeros((n + internal, n + internal))
@@ -115,12 +117,16 @@ def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], 
     return Observer(name, widened, A, B, measured, tuple(inputs), gain(D, dt), Injection.STATE, dt, replaces=True, internal=internal)
 
 
-def _measured_rows(F: Array, G: Array, z: Array, y: Array, ridge: float) -> Array:
-    """Fit the change of the measured states on h and z, shape (q, order + channels)."""
+def _measured_rows(F: Array, G: Array, z: Array, y: Array, truth: Array, ridge: float) -> Array:
+    """Fit the change of the measured states on h and z, shape (q, order + channels); the first states of h are the hidden ones."""
     h = np.zeros((*z.shape[:2], len(F)))
     driven = z @ G.T
     for k in range(len(z) - 1):
         h[k + 1] = h[k] @ F.T + driven[k]
+    if in_motion(truth):
+        weights = 1 / np.maximum(np.mean(truth**2, axis=(0, 1)), np.finfo(float).tiny)
+        free = FreeStart.of(F, np.eye(truth.shape[-1], len(F)), len(h), weights)
+        h += free.moved(free.fitted((truth - h[..., : truth.shape[-1]]).transpose(2, 1, 0))).transpose(2, 1, 0)
     start = skipped(len(z))
     regressors = np.concatenate([h, z], axis=-1)[start:-1:THIN].reshape(-1, len(F) + z.shape[-1])
     change = np.diff(y, axis=0)[start::THIN].reshape(-1, y.shape[-1])

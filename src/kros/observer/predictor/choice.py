@@ -15,6 +15,7 @@ import numpy.typing as npt
 from ...data import EpisodeBatch
 from ...synthesis.residual_shaped.shaping_filter import Basis
 from ..tuning.blocks import Array, Model
+from .free_start import FreeStart, in_motion
 from .moments import PastMoments, hidden_of, limited
 
 FOLDS = 3
@@ -177,7 +178,7 @@ def _first_good(scores: Array) -> int:
 
 
 def estimates(model: Model, past: PastMoments, batch: EpisodeBatch) -> Array:
-    """Run a model along recordings from rest, shape (n_samples, batch, h)."""
+    """Run a model along recordings, from rest or from the best start where these begin in motion, shape (n_samples, batch, h)."""
     F, G, H = model
     z = past.channels(batch)
     held = np.zeros(z.shape[1:])
@@ -188,4 +189,8 @@ def estimates(model: Model, past: PastMoments, batch: EpisodeBatch) -> Array:
     h[0] = np.linalg.solve(np.eye(len(F)) - F, G @ held.T).T
     for k in range(len(z) - 1):
         h[k + 1] = h[k] @ own + driven[k]
-    return np.asarray(h @ H.T)
+    truth, found = batch.states[..., hidden_of(past.lifting, past.measured)], h @ H.T
+    if in_motion(truth):
+        free = FreeStart.of(F, H, len(h), 1 / np.maximum(np.mean(truth**2, axis=(0, 1)), np.finfo(float).tiny))
+        found = truth - free.without((truth - found).transpose(2, 1, 0)).transpose(2, 1, 0)
+    return np.asarray(found)

@@ -40,7 +40,12 @@ Parameters = Mapping[str, npt.ArrayLike]
 
 
 def with_internal(
-    observer: ObserverData, states: Array, inputs: Array, parameters: Parameters | None = None, start: Array | None = None
+    observer: ObserverData,
+    states: Array,
+    inputs: Array,
+    parameters: Parameters | None = None,
+    start: Array | None = None,
+    added: Array | None = None,
 ) -> Array:
     """Return recordings with the internal states that they drive behind them, shape (n_samples, batch, n).
 
@@ -53,6 +58,8 @@ def with_internal(
     parameters : mapping of str to array_like, shape (batch,)
     start : ndarray, shape (batch, n), optional
         Where the observer starts; as it does from the recorded first measurement by default.
+    added : ndarray, shape (count, batch, n), optional
+        What the observer adds to its first estimates (`started`): internal states are the observer's own, so that it counts for them as well.
 
     Raises
     ------
@@ -75,6 +82,8 @@ def with_internal(
     constant = observer.lifting.lift(driven, values)
     constant[..., recorded:n] = 0.0
     drive, own = constant @ rows + inputs @ into, np.ascontiguousarray(rows[recorded:n])
+    if added is not None:
+        drive[: len(added)] += added[: len(drive), :, recorded:]
     for k in range(len(states) - 1):
         driven[k + 1, :, recorded:] = driven[k, :, recorded:] @ own + drive[k]
     return driven
@@ -120,5 +129,11 @@ def driven_coordinates(observer: Observer, batch: EpisodeBatch, sizes: npt.Array
 
 def in_coordinates(observer: Observer, turn: Array) -> Observer:
     """The observer in lifted coordinates ``turn @ theta`` that leave the recorded states and the lifted functions alone."""
-    A = turn @ observer.A @ np.linalg.inv(turn)
-    return replace(observer, A=A, B=turn @ observer.B, controller=replace(observer.controller, D=A[:, list(observer.measured)]))
+    n = observer.lifting.n_states
+    A, start = (
+        turn @ observer.A @ np.linalg.inv(turn),
+        None if observer.start_in_motion is None else observer.start_in_motion.turned(turn[:n, :n]),
+    )
+    return replace(
+        observer, A=A, B=turn @ observer.B, start_in_motion=start, controller=replace(observer.controller, D=A[:, list(observer.measured)])
+    )

@@ -124,9 +124,7 @@ class PastMoments:
                 f"found {len(hidden)} and {lengths.min()}."
             )
         y = batch.measurements(measured, arrived=False)
-        static = _static(inputs, y)
-        share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
-        free = tuple(int(j) for j in np.flatnonzero(share.max(axis=0) < _FOLLOWS))
+        static, free = followed_inputs(inputs, y)
         z = _channels(lifting, tuple(measured), static, free, batch)
         ends = lengths if until is None else np.minimum(np.asarray(until), lengths)
         own = [(key.unit, key.condition) for key in batch.keys]
@@ -318,6 +316,13 @@ def hidden_of(lifting: Lifting, measured: Sequence[int]) -> list[int]:
 def skipped(length: int) -> int:
     """Return how many samples at the start of an episode do not count: what was before is not known yet."""
     return min(SKIP, length // 4)
+
+
+def followed_inputs(inputs: Array, y: Array) -> tuple[Array, tuple[int, ...]]:
+    """Return the part M of the measurement that the inputs explain, shape (q, m), and the inputs that no measurement follows."""
+    static = _static(inputs, y)
+    share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
+    return static, tuple(int(j) for j in np.flatnonzero(share.max(axis=0) < _FOLLOWS))
 
 
 def _centred(values: Array) -> Array:

@@ -27,6 +27,7 @@ from ...core.errors import DataError
 from ...data import EpisodeBatch
 from ..tuning.blocks import Array, Block, Model, blocks_of, joined
 from ..tuning.gauss_newton import SETTLED, Damping, mean_log, scaled, search, whitening
+from .free_start import FreeStart, in_motion
 from .moments import PastMoments, Weights, hidden_of
 
 _DAMPING = Damping(1e-7, 1e-3, 1e4, 4.0)
@@ -125,6 +126,8 @@ class _Tuning:
         )  # all units of a condition count alike
         self.rest = np.zeros(z.shape[:2])
         self.rest[lifted] = z[lifted, :, 0]
+        self.free = in_motion(batch.states[..., hidden])
+        self.weights = 1 / np.maximum(np.mean(truth**2, axis=(1, 2)), np.finfo(float).tiny)
 
     def at(self, blocks: list[Block]) -> _Point:
         """Run a model."""
@@ -146,6 +149,7 @@ class _Tuning:
         n, outputs = len(model[0]), len(self.truth)
         into, out = self._whitening(blocks)
         width = into.shape[1]
+        free = self._free(blocks)
         weight = (self.share / point.errors)[self.group] * self.each[:, None]
         H, g = np.zeros((n * (width + outputs),) * 2), np.zeros(n * (width + outputs))
         for part in self._parts():
@@ -153,6 +157,8 @@ class _Tuning:
             signals = np.tensordot(into.T, np.concatenate([h, self.z[:, part]]), 1)
             rest = np.tensordot(into.T, np.concatenate([rest, self.rest[:, part]]), 1)
             inner = np.concatenate([b.responses(signals, rest, _THIN) for b in blocks])
+            if free is not None:
+                inner = free.without(inner, _THIN)
             direct = np.zeros((outputs, *h[..., ::_THIN].shape[:1], outputs, *h[..., ::_THIN].shape[1:]))
             direct[range(outputs), :, range(outputs)] = h[..., ::_THIN]
             root = np.sqrt(weight[part].T)[..., None]
@@ -193,7 +199,15 @@ class _Tuning:
         """States of all blocks on some episodes, their rest, and what the estimates miss."""
         runs = [b.run(self.z[:, part], self.rest[:, part]) for b in blocks]
         h, rest = np.concatenate([r[0] for r in runs]), np.concatenate([r[1] for r in runs])
-        return h, rest, self.truth[:, part] - np.tensordot(np.hstack([b.H for b in blocks]), h, 1)
+        H = np.hstack([b.H for b in blocks])
+        if (free := self._free(blocks)) is not None:
+            h += free.moved(free.fitted(self.truth[:, part] - np.tensordot(H, h, 1)))
+        return h, rest, self.truth[:, part] - np.tensordot(H, h, 1)
+
+    def _free(self, blocks: Sequence[Block]) -> FreeStart | None:
+        """What starts of their own do, where recordings begin in motion."""
+        F, _, H = joined(blocks)
+        return FreeStart.of(F, H, self.z.shape[-1], self.weights) if self.free else None
 
     def _parts(self) -> list[slice]:
         return [slice(i, i + _SIDE_BY_SIDE) for i in range(0, len(self.group), _SIDE_BY_SIDE)]

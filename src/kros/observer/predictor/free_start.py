@@ -1,0 +1,71 @@
+r"""Models along recordings that start in motion: what was before is not known, so the first states are whatever fits the hidden states best.
+
+From another start estimates differ by ``H F^k d``. Here d, one for every episode, is the least squares solution (variable projection): what is left
+is the error of the model, and not of a start that no recording says.
+
+References
+----------
+G. H. Golub and V. Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems whose variables separate", SIAM J. Numer.
+Anal. 10 (1973) 413-432; L. Kaufman, "A variable projection method for solving separable nonlinear least squares problems", BIT 15 (1975) 49-57.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+_AT_REST = 0.05  # of the root mean square
+_ALIKE = 1e-9
+
+
+def in_motion(truth: Array) -> bool:
+    """Whether recordings of hidden states, shape (n_samples, ...), begin while machines move."""
+    power = np.mean(truth.reshape(len(truth), -1) ** 2, axis=1)
+    return bool(power[0] > _AT_REST**2 * power.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class FreeStart:
+    """What a start of its own does to the estimates of every episode.
+
+    Parameters
+    ----------
+    powers : ndarray, shape (n_samples, n, n)
+        ``F^k``.
+    seen : ndarray, shape (h, n_samples, n)
+        ``H F^k``.
+    weights : ndarray, shape (h,)
+        Of the squares of the hidden states' errors.
+    """
+
+    powers: Array
+    seen: Array
+    weights: Array
+
+    @classmethod
+    def of(cls, F: Array, H: Array, n_samples: int, weights: Array) -> FreeStart:
+        """Look at a model."""
+        powers = np.eye(len(F))[None]
+        while len(powers) < n_samples:
+            powers = np.concatenate([powers, powers @ (powers[-1] @ F)])
+        return cls(powers[:n_samples], np.einsum("hn,knm->hkm", H, powers[:n_samples]), weights)
+
+    def fitted(self, missed: Array, every: int = 1) -> Array:
+        """Return the starts d, shape (n, ..., batch), that take the most from errors, shape (..., h, batch, n_samples / every)."""
+        root = np.sqrt(self.weights)[:, None]
+        rows = (self.seen[:, ::every] * root[..., None]).reshape(-1, self.seen.shape[-1])
+        weighted = np.moveaxis(missed * root[:, None], -3, -2)
+        inverse = np.linalg.pinv(rows, rcond=_ALIKE)
+        return np.asarray(np.moveaxis(weighted.reshape(*weighted.shape[:-2], -1) @ inverse.T, -1, 0))
+
+    def without(self, missed: Array, every: int = 1) -> Array:
+        """Return what the best starts leave of errors, of the same shape."""
+        left = missed - np.einsum("hkn,n...b->...hbk", self.seen[:, ::every], self.fitted(missed, every), optimize=True)
+        return np.asarray(left)
+
+    def moved(self, starts: Array) -> Array:
+        """Return what starts d, shape (n, batch), add to the states, shape (n, batch, n_samples)."""
+        return np.asarray(np.einsum("knm,mb->nbk", self.powers, starts, optimize=True))

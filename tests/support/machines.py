@@ -7,6 +7,7 @@ import numpy as np
 from kros.core.lti import StateSpace
 from kros.lifting import Lifting
 from kros.observer import Monitor, Observer, Runtime, Seen, octaves
+from kros.observer.start import Start
 from kros.synthesis import Injection
 
 STATES, DT = ("position", "velocity", "current"), 1e-3
@@ -57,6 +58,9 @@ MACHINES = {
     "earlier values and delay": lambda: drive(("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate"), delay=3),
     "input functions": lambda: drive(inputs=("target", "rate"), gamma=("rate*velocity",)),
     "replaced": lambda: replaced(),
+    "start in motion": lambda: moving(drive()),
+    "start in motion, delay and limits": lambda: moving(drive(delay=2, **LIMITS)),
+    "start in motion, replaced": lambda: moving(replaced()),
     "monitor": lambda: watched(drive()),
     "monitor and delay": lambda: watched(drive(delay=2, **LIMITS)),
 }
@@ -76,6 +80,16 @@ def replaced():
     return Observer(
         "r", lifting, A, B, (0,), ("target", "rate"), gain, Injection.STATE, DT, {"phase": 0.3}, seen=seen, replaces=True, internal=2
     )
+
+
+def moving(observer):
+    """With a start that differs from rest wherever the command is not the position."""
+    rng, n = np.random.default_rng(7), observer.lifting.n_states
+    hidden = (np.arange(n) > 0)[:, None]
+    gain = 0.3 * rng.normal(size=(n, 1)) * hidden * np.array([1.0, -1.0, 0.0]) + 0.05 * rng.normal(size=(n, 1)) * hidden * np.array(
+        [0, 0, 1.0]
+    )
+    return replace(observer, start_in_motion=Start(gain, 0.5 * rng.normal(size=(5, n, 1)) * hidden))
 
 
 def watched(observer, bound=1.0):

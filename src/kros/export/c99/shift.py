@@ -65,7 +65,9 @@ def find_shift(observer: Observer) -> Shift | None:
     if period is None or np.abs(moving @ direction).max() > _EXACT * max(largest, 1e-300):
         return None
     start = observer.start_in_motion
-    if start is not None and not np.allclose(start.gain @ direction[[at, *range(n, n + m)]], 0.0, atol=_STARTS * np.abs(start.gain[:, 0]).max()):
+    if start is not None and not np.allclose(
+        start.gain @ direction[[at, *range(n, n + m)]], 0.0, atol=_STARTS * np.abs(start.gain[:, 0]).max()
+    ):
         return None
     return Shift(direction[:n], direction[n:], period)
 

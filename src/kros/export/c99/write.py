@@ -102,12 +102,13 @@ def c_files(observer: Observer, name: str, precision: str, track: str | None = N
     }
     state_bytes = _state_bytes(context)
     numbers = sum(len(row) for key in ("model", "correction", "into", "controller", "filter_gain") for row in context[key] or ())
+    begins = 0 if observer.start_in_motion is None else observer.start_in_motion.gain.size + observer.start_in_motion.corrections.size
     watched = 0 if observer.monitor is None else observer.monitor.limits.size
     largest = None if observer.seen is None else f"{1.5 * float(observer.seen.measured.max()):.6g}"
     functions = sorted({f for text in context["sigma"] + context["gamma"] for f in re.findall(r"\b([a-z]+)\(", text)})
     context |= {
         "state_bytes": state_bytes,
-        "constant_bytes": (numbers + 4 * watched) * (4 if precision == "float" else 8),
+        "constant_bytes": (numbers + begins + 4 * watched) * (4 if precision == "float" else 8),
         "operations": numbers - sum(map(len, context["filter_gain"])) + 7 * watched,
         "largest_angle": largest,
         "tolerance": tolerance,
@@ -158,7 +159,7 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     reals = context["n"] + context["order"] + context["history"] + len(context["parameters"]) + context["delay"] * context["m"]
     reals += context["n"] + context["order"] + 2 if context["tracked"] else 0
     reals += context["q"] * context["monitor"]["bands"] * 3 if context["monitor"] else 0
-    words = context["m"] + (1 if context["delay"] else 0) + (1 if context["monitor"] else 0) + 1
+    words = context["m"] + (1 if context["delay"] else 0) + (1 if context["monitor"] else 0) + (1 if context["start"] else 0) + 1
     size = 8 * doubles + real * reals + 4 * words
     align = 8 if doubles or real == 8 else 4
     return -(-size // align) * align

@@ -271,7 +271,7 @@ def report(run_folder: Annotated[Path, typer.Argument(metavar="RUN")]) -> None:
     """Write the report of a run again, from the run folder only."""
     from .study.stages.report import render_run
 
-    path = render_run(run_folder)
+    path = render_run(run_folder, _count(None))
     _say(f"report: {path}")
 
 

@@ -38,6 +38,7 @@ from kros.report.figures import FIGURES, ON_THE_PAGE, draw, draw_all
 from kros.report.figures.episodes import longest_steady, steady_stretches
 from kros.report.figures.outliers.scores import referred_range
 from kros.report.figures.residuals import beside, entry_names
+from kros.report.figures.see import SEE
 from kros.report.figures.spectra import band_shares, of_episode
 from kros.report.figures.synthesis.bode import scaled_filter
 from kros.report.figures.uncertainty.forms import paper_bounds
@@ -434,7 +435,7 @@ const kept = [...table.tBodies[0].rows].filter(row => !row.hidden).map(row => ro
 const unnamed = [...page.querySelectorAll("svg[role=img], nav, input, button")].filter(
   one => !(one.getAttribute("aria-label") || one.textContent.trim() || one.closest("label")));
 return { overflow: page.documentElement.scrollWidth - width, cut: cut.map(one => one.getAttribute("aria-label")),
-  first, second, kept, unnamed: unnamed.length };
+  first, second, kept, unnamed: unnamed.length, units: page.querySelectorAll("svg [data-unit]").length };
 """
 
 
@@ -449,7 +450,24 @@ def test_page_in_a_browser(page: str, tmp_path: Path) -> None:
         assert known[0][0] < known[0][-1]
         assert 0 < len(seen["kept"]) < len(seen["first"])
         assert all("kalman" in text and "no" in text for text in seen["kept"])
+        assert seen["units"] > 0
     assert printed_pages(page, tmp_path) <= 12
+
+
+def test_every_figure_says_first_what_to_see(finished: tuple[Path, dict[str, Any]]) -> None:
+    assert set(SEE) == set(FIGURES)
+    assert all(text.endswith(".") and text.count(". ") == 0 for text in SEE.values())
+    assert draw("models", RunFolder(finished[0])).caption.startswith(SEE["models"])
+
+
+def test_lines_and_points_carry_the_names_of_their_units(finished: tuple[Path, dict[str, Any]], page: str) -> None:
+    assert 'data-unit="0&lt;b&gt;4"' in page
+    assert "units-" not in "".join(re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL))
+    drawn = draw("phase", RunFolder(finished[0]))
+    svg = to_svg(drawn.figure, "phase")
+    marks = dict(re.findall(r'<use data-unit="([^"]*)"[^>]* x="([\d.]+)"', svg.replace("\n", " ")))
+    order = [unit.replace("<", "&lt;").replace(">", "&gt;") for unit in UNITS]
+    assert sorted(marks, key=lambda unit: float(marks[unit])) == order  # the horizontal axis is units in order
 
 
 def test_text_is_escaped(page: str) -> None:
@@ -547,9 +565,13 @@ def test_observer_figures_show_nominal_above_worst_off_nominal_and_the_errors(fi
     run = RunFolder(finished[0])
     pair = ["linear_edmd/mixed", "koopman_edmd/mixed"]
     figure = draw("observers_in_time_paper", run).figure
-    titles = [axes.get_title("left") for axes in figure.axes[::6]]
+    titles = [axes.get_title("left") for axes in figure.axes[::8]]
     assert titles == ["nominal: unit 001, episode 1", "worst off-nominal: unit 002, episode 1"]
-    assert [line.get_label() for line in figure.axes[0].lines] == ["recorded", *map(observer_label, pair)]
+    assert [line.get_label() for line in figure.axes[0].lines] == ["recorded"]
+    assert [line.get_label() for line in figure.axes[2].lines] == list(map(observer_label, pair))  # errors, below
+    shown = run.shown[1]
+    drawn = figure.axes[11].lines[1].get_ydata()  # the zoom of velocity's errors on the worst unit, of all samples
+    assert np.isin(drawn, shown.states[:, 1] - shown.observers[pair[1]][:, 1]).all()
     spectra = of_episode(run, run.shown[1], pair)
     for name in pair:
         error = run.shown[1].observers[name].astype(float) - run.shown[1].states

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from math import ceil, floor, log10
 from typing import TYPE_CHECKING, Any, TypeAlias
+from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
@@ -13,14 +14,15 @@ from .names import RAISED
 from .theme import WIDTH_IN, Tone
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes as Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure as Figure
 else:  # for annotations alone: matplotlib is imported when something is drawn
-    Axes = Figure = Any
+    Artist = Axes = Figure = Any
 
 Array: TypeAlias = npt.NDArray[Any]
-_BUCKETS = 700  # pairs of points that a line across the page can show
+_BUCKETS = 280  # pairs of points that a line across the page can show
 _POINTS = 220  # of a frequency line
 _LEGEND_IN = 0.21  # height of a row of a legend
 _READABLE = 48  # units whose names fit on an axis
@@ -94,12 +96,20 @@ def line_over_shade(axes: Axes, freqs_hz: Array, line: Array, shade: Array, colo
     axes.plot(freqs, decibel(thin_log(freqs_hz, line)[1]), style, color=colour)
 
 
-def lines_of_units(axes: Axes, freqs_hz: Array, lines: Array, colour: str, label: str) -> None:
-    """Draw thin lines, shape (unit, frequency) in dB, a unit each; a unit without a residual is left out."""
+def lines_of_units(axes: Axes, freqs_hz: Array, lines: Array, colour: str, label: str, units: Sequence[str] = ()) -> None:
+    """Draw thin lines, shape (unit, frequency) in dB, a unit each, with their names; a unit without a residual is left out."""
     from matplotlib.collections import LineCollection
 
-    paths = [np.column_stack([freqs_hz, line]) for line in lines if np.isfinite(line).any()]
-    axes.add_collection(LineCollection(paths, colors=colour, linewidths=0.6, alpha=0.35, label=label))
+    kept = [k for k, line in enumerate(lines) if np.isfinite(line).any()]
+    paths = [np.column_stack([freqs_hz, lines[k]]) for k in kept]
+    drawn = axes.add_collection(LineCollection(paths, colors=colour, linewidths=0.6, alpha=0.35, label=label))
+    if units:
+        name_units(drawn, [units[k] for k in kept])
+
+
+def name_units(drawn: Artist, units: Sequence[str]) -> None:
+    """Name the units behind the lines or points of an artist, in their order: the page shows the one under the pointer."""
+    drawn.set_gid("units-" + ",".join(quote(unit, safe="") for unit in units))
 
 
 def frequency_axis(axes: Axes, freqs_hz: Array, label: str = "frequency (Hz)", most: int = 6) -> None:

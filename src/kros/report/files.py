@@ -5,8 +5,11 @@ from __future__ import annotations
 import io
 import logging
 import re
+from collections.abc import Iterator
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 from ..core.artifacts import write_bytes
 from ..core.errors import ConfigError
@@ -23,6 +26,7 @@ log = logging.getLogger(__name__)
 _DPI = 200
 _FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 _FAMILY = re.compile(r"(?<=px )'DejaVu Sans'(?:, [^;\"]*)?|(?<=font-family: )'?DejaVu Sans'?(?:, [^;\"]*)?")
+_SHORTER = re.compile(r"\s*([A-Z])\s*|(\.\d)\d+")
 
 
 def write_figures(run: Path, out: Path) -> list[str]:
@@ -79,11 +83,28 @@ def to_svg(figure: Figure, name: str) -> str:
     text = re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", text)
     opening = r'<svg viewBox="\1" role="img" xmlns:xlink="http://www.w3.org/1999/xlink">'
     text = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', opening, text, count=1)
+    text = _named_units(text)
     for tone in Tone:
         text = text.replace(tone.light, f"var({tone.variable})")
     text = _FAMILY.sub(_FONTS, text)
-    # coordinates stand inside tags; a hundredth of a point is enough
-    return re.sub(r"<[^>]*>", lambda tag: re.sub(r"(\d\.\d{2})\d+", r"\1", tag.group()), text).strip()
+    # coordinates stand inside tags; a hundredth of a point is enough, along lines a tenth
+    text = re.sub(r"<[^>]*>", lambda tag: re.sub(r"(\d\.\d{2})\d+", r"\1", tag.group()), text)
+    return re.sub(r'(?<= d=")[^"]*', lambda path: _SHORTER.sub(r"\1\2", path.group()), text).strip()
+
+
+def _named_units(text: str) -> str:
+    """Write the names of units, which groups carry as their identifiers, to the lines or points inside, in their order."""
+    first, *rest = re.split(r'<g id="[^"]*?units-([^"]*)">', text)
+    parts = [first]
+    for names, group in zip(rest[::2], rest[1::2], strict=True):
+        left = iter(names.split(","))
+
+        def named(found: re.Match[str], left: Iterator[str] = left) -> str:
+            name = None if found[2] is None else next(left, None)
+            return found[0] if name is None else f'{found[0]}data-unit="{escape(unquote(name))}" '
+
+        parts.append("<g>" + re.sub(r"<defs>.*?</defs>|(<(use|path) )", named, group, flags=re.DOTALL))
+    return "".join(parts)
 
 
 def _encode(figure: Figure, kind: str, **options: Any) -> bytes:

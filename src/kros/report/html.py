@@ -69,8 +69,10 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    drawing = mapped(partial(encoded, RunFolder(run.folder)), ON_THE_PAGE)  # of its own: what is loaded here need not go to workers
+    sections, evidence = _made(SECTIONS, run, metrics), _made(EVIDENCE, run, metrics)
     figures = {}
-    for found in mapped(partial(encoded, run), ON_THE_PAGE):
+    for found in drawing:
         if found["reason"]:
             log.info("figure %s: left out, %s", found["name"], found["reason"])
         figures[found["name"]] = {**found, "svg": Markup(found["svg"])}
@@ -82,8 +84,8 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
         subtitle=" · ".join([f"{study['units']} units", *conditions]),
         head=summary(metrics, measured),
         actions=advice(metrics, measured),
-        sections=_made(SECTIONS, run, metrics),
-        evidence=_made(EVIDENCE, run, metrics),
+        sections=sections,
+        evidence=evidence,
         left_to_files=LEFT_TO_FILES,
         figures=figures,
         style=Markup(stylesheet()),

@@ -1,6 +1,7 @@
 """Figures: one file a figure, one row of one table, in the order of the paper's argument.
 
-The function `draw` of a figure's file takes a `RunFolder`, and the options of its row, and returns the figure and a caption that says what to see in it.
+The function `draw` of a figure's file takes a `RunFolder`, and the options of its row, and returns the figure
+and what its caption says behind the sentence about what to see.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..run_folder import NotShownError, RunFolder
 from ..theme import style
+from .see import SEE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,7 +83,8 @@ def draw(name: str, run: RunFolder) -> Drawn:
     row = FIGURES[name]
     with style():
         try:
-            return Drawn(name, row.title, *import_module(f".{row.module}", __name__).draw(run, **row.options))
+            figure, text = import_module(f".{row.module}", __name__).draw(run, **row.options)
+            return Drawn(name, row.title, figure, f"{SEE[name]} {text}")
         except NotShownError as absent:
             return Drawn(name, row.title, reason=str(absent))
 

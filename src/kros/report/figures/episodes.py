@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 
@@ -13,6 +15,16 @@ from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import Tone
 
 Line = tuple[str, Array, Look]
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Lines of one channel over time: near the first one, the recorded signal, in shares of its range; or errors, where that is None."""
+
+    channel: Channel
+    lines: Sequence[Line]
+    near: float | None = None
+
 
 TRUTH = Look(Tone.INK.light, weight=2.2, opacity=0.38)
 _ABOUT_PAPER = "The paper's observers: mixed H2-H∞ synthesis, models of extended dynamic mode decomposition. "
@@ -83,45 +95,49 @@ def steady_stretches(speed: Array) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def overview_and_zoom(
-    run: RunFolder, blocks: Sequence[tuple[str, Shown, Mapping[int, Sequence[Line]]]], height_in: float, near: float | None = None
-) -> Figure:
-    """Draw whole episodes on the left and a zoom at constant speed on the right, a row a state.
+def overview_and_zoom(run: RunFolder, blocks: Sequence[tuple[str, Shown, Sequence[Strip]]], height_in: float) -> Figure:
+    """Draw whole episodes on the left and a zoom at constant speed on the right, one strip below the other.
 
     Parameters
     ----------
     run : RunFolder
-    blocks : sequence of (title, episode, lines by column of the state)
-        One below the other; the first line of a state is the recorded one.
+    blocks : sequence of (title, episode, strips)
     height_in : float
-        Of a row.
-    near : float, optional
-        Keep overviews this near to the first line, in shares of its range, and zooms within one range; by default lines are errors, shown whole.
+        Of a strip.
     """
-    rows = sum(len(lines) for _, _, lines in blocks)
-    figure, axes = grid(rows, 2, height_in, width_ratios=(1.4, 1))
+    figure, axes = grid(sum(len(strips) for _, _, strips in blocks), 2, height_in, width_ratios=(1.4, 1))
     first = 0
-    for title, episode, by_state in blocks:
-        panels = axes[first : first + len(by_state)]
-        first += len(by_state)
+    for title, episode, strips in blocks:
+        panels = axes[first : first + len(strips)]
+        first += len(strips)
         # some fifteen turns of a gearbox, for other plants an eighth of the episode
         length_s = 0.3 if run.calibrated else float(f"{episode.time_s[-1] / 8:.1g}")
         window = steady_window(run, episode, length_s)
-        for (full, zoom), lines in zip(panels, by_state.values(), strict=True):
-            draw_lines(full, episode.time_s, lines, width=0.9)
-            draw_lines(zoom, episode.time_s, lines, window, width=1.3)
-            if near is not None:
-                clip_to(full, lines[0][1], near)
-                clip_to(zoom, lines[0][1][window], 1.0)
+        for (full, zoom), strip in zip(panels, strips, strict=True):
+            draw_lines(full, episode.time_s, strip.lines, width=0.9)
+            draw_lines(zoom, episode.time_s, strip.lines, window, width=1.3)
+            if strip.near is not None:
+                clip_to(full, strip.lines[0][1], strip.near)
+                clip_to(zoom, strip.lines[0][1][window], 1.0)
+            else:
+                _clip_start(full, strip.lines)
             shade(full, episode.time_s, window)
-        label_rows(panels[:, 0], [run.states[i] for i in by_state], " error" if near is None else "")
+        label_rows(panels[:, 0], [strip.channel for strip in strips], [" error" if strip.near is None else "" for strip in strips])
         hide_times(panels[:-1].ravel())
         panels[0, 0].set_title(title)
         panels[0, 1].set_title(f"{length_s:g} s of it" + (" at constant speed" if run.calibrated else ""))
     label_below(axes[-1], "time (s)")
     figure.align_ylabels(axes[:, 0])
-    legend(figure, axes[0, 0])
+    legend(figure, max(axes[:, 0], key=lambda panel: len(panel.get_legend_handles_labels()[0])))
     return figure
+
+
+def _clip_start(axes: Axes, lines: Sequence[Line]) -> None:
+    """Keep the axis of errors near what they are after the first tenth: at the start an observer knows nothing yet."""
+    sizes = [np.abs(values[len(values) // 10 :]) for _, values, _ in lines]
+    largest = max((float(size.max()) for size in sizes if np.isfinite(size).all() and size.max() < 1e6), default=0.0)
+    if largest > 0:
+        axes.set_ylim(-1.5 * largest, 1.5 * largest)
 
 
 def draw_lines(axes: Axes, time_s: Array, lines: Sequence[Line], window: slice | None = None, width: float = 1.1) -> None:
@@ -141,9 +157,9 @@ def clip_to(axes: Axes, values: Array, margin: float) -> None:
     axes.set_ylim(max(bottom, low - room), min(top, high + room))
 
 
-def label_rows(axes: Iterable[Axes], channels: Sequence[Channel], suffix: str = "") -> None:
+def label_rows(axes: Iterable[Axes], channels: Sequence[Channel], suffixes: Iterable[str] = repeat("")) -> None:
     """Label the vertical axes with channel and unit of measure."""
-    for row, channel in zip(axes, channels, strict=True):
+    for row, channel, suffix in zip(axes, channels, suffixes):  # noqa: B905 - suffixes may go on for ever
         row.locator_params(axis="y", nbins=4)
         row.set_ylabel(axis_label(f"{channel.name}{suffix}", channel.unit).replace(" (", "\n("))
 

@@ -82,7 +82,7 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
     levels, bound, fitted = decibel(residuals.entries), decibel(residuals.largest), decibel(residuals.entry_weights)
     for i, row in enumerate(block):
         for j, panel in enumerate(row):
-            lines_of_units(panel, freqs, levels[inside][..., i, j], Tone.BLUE.light, "units")
+            lines_of_units(panel, freqs, levels[inside][..., i, j], Tone.BLUE.light, "units", [residuals.unit_ids[k] for k in inside])
             panel.plot(freqs, bound[:, i, j], color=Tone.BLUE.light, lw=2.6, alpha=0.45, label="largest")
             panel.plot(freqs, fitted[:, i, j], color=Tone.INK.light, lw=1.1, label="fitted weight")
             _mark_unit(panel, residuals, levels[..., i, j], alarm)
@@ -113,7 +113,7 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals, alarm: str | None = None, 
     """Draw the ratio of every unit to the weights, dB; the dashed line is what the weights allow."""
     inside, freqs = residuals.rows(inside=True), residuals.freqs_hz
     levels = decibel(residuals.ratio)
-    lines_of_units(axes, freqs, levels[inside], Tone.BLUE.light, "units")
+    lines_of_units(axes, freqs, levels[inside], Tone.BLUE.light, "units", [residuals.unit_ids[k] for k in inside])
     axes.plot(freqs, decibel(residuals.ratio[inside].max(axis=0)), color=Tone.BLUE.light, lw=1.3, label="largest")
     _mark_unit(axes, residuals, levels, alarm)
     axes.axhline(0, color=Tone.INK.light, lw=0.9, ls="--")

@@ -9,6 +9,7 @@ from pathlib import Path
 from ...core.artifacts import read_json
 from ..config import Stage
 from ..engine.context import Context
+from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 
 REPORT = "report.html"
@@ -24,13 +25,13 @@ def run(context: Context) -> None:
     render(context.store.folder, metrics, partial(context.work.map, "report"), context.store.draft(REPORT))
 
 
-def render_run(folder: Path) -> Path:
-    """Write the report of a finished run again."""
+def render_run(folder: Path, workers: int = 1) -> Path:
+    """Write the report of a finished run again; `workers` processes draw its figures."""
     from ...report import render
 
     began = time.perf_counter()
-    with open_finished(folder, *_SHOWN, alone=True) as (_, store), store.drafting() as draft:
-        render(store.folder, read_json(store.path("metrics.json")), out=draft.draft(REPORT))
+    with open_finished(folder, *_SHOWN, alone=True) as (_, store), store.drafting() as draft, open_executor(workers) as executor:
+        render(store.folder, read_json(store.path("metrics.json")), executor.map, draft.draft(REPORT))
         record = store.record(Stage.REPORT)
         key, seconds = (record.key, record.seconds) if record is not None else ("", time.perf_counter() - began)
         draft.commit(Stage.REPORT, key, seconds)

@@ -39,7 +39,7 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
     for i, row in enumerate(axes):
         for j, panel in enumerate(row):
             lines = magnitude[:, :, i, j]
-            lines_of_units(panel, freqs, lines, model_look(models.name).colour, f"{len(lines)} units")
+            lines_of_units(panel, freqs, lines, model_look(models.name).colour, f"{len(lines)} units", models.unit_ids)
             panel.autoscale_view()
             if nominal in models.unit_ids:
                 panel.plot(freqs, lines[models.index(nominal)], color=Tone.INK.light, lw=1.1, label=f"nominal, unit {nominal}")

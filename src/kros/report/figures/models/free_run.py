@@ -5,7 +5,7 @@ from __future__ import annotations
 from ...canvas import Figure
 from ...names import best_models, episode_title, is_koopman, model_label, model_look, number
 from ...run_folder import NotShownError, RunFolder
-from ..episodes import TRUTH, overview_and_zoom
+from ..episodes import TRUTH, Strip, overview_and_zoom
 from ..spectra import band_shares
 
 _MOST = 6  # states that are shown
@@ -17,11 +17,11 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     chosen = best_models(shown.models)
     if not chosen:
         raise NotShownError("no model was run freely on the episode that is shown")
-    lines = {
-        i: [("recorded", shown.states[:, i], TRUTH), *((model_label(n), shown.models[n][:, i], model_look(n)) for n in chosen)]
-        for i in range(len(run.states[:_MOST]))
-    }
-    return overview_and_zoom(run, [(episode_title(shown.key), shown, lines)], 1.25, near=0.35), _caption(run, chosen)
+    strips = []
+    for i, channel in enumerate(run.states[:_MOST]):
+        predicted = [(model_label(n), shown.models[n][:, i], model_look(n)) for n in chosen]
+        strips.append(Strip(channel, [("recorded", shown.states[:, i], TRUTH), *predicted], near=0.35))
+    return overview_and_zoom(run, [(episode_title(shown.key), shown, strips)], 1.25), _caption(run, chosen)
 
 
 def _caption(run: RunFolder, chosen: list[str]) -> str:

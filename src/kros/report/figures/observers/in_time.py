@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
-from ...canvas import Figure
-from ...names import deployed_pair, is_koopman, observer_label, observer_look, shorten
-from ...run_folder import NotShownError, RunFolder, Shown
-from ..episodes import TRUTH, overview_and_zoom, require_paper_pair
+from collections.abc import Sequence
 
-_ROWS = 3  # states of one unit
+from ...canvas import Figure
+from ...names import deployed_pair, observer_label, observer_look, shorten
+from ...run_folder import NotShownError, RunFolder, Shown
+from ..episodes import TRUTH, Line, Strip, overview_and_zoom, require_paper_pair
+
+_MOST = 2  # states of one unit
 
 
 def draw(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
-    """Draw full episodes with a zoom at constant speed, nominal above worst off-nominal; the states that are not measured come first."""
+    """Draw full episodes with a zoom at constant speed, nominal above worst off-nominal: every state that is not measured, and its errors below."""
     shown = kept_episodes(run)
     found = list(shown[0].observers)
     names, text = require_paper_pair(found) if paper else (deployed_pair(found, run.deployed), "")
-    rows = sorted(sorted(range(len(run.states)), key=lambda i: run.states[i].measured)[:_ROWS])
+    hidden = [i for i, channel in enumerate(run.states) if channel.name in run.hidden_states][:_MOST]
     blocks = []
     for role, episode in zip(("nominal", "worst off-nominal"), shown, strict=False):
-        lines = {
-            i: [
-                ("recorded", episode.states[:, i], TRUTH),
-                *((observer_label(n), episode.observers[n][:, i], observer_look(n)) for n in names),
-            ]
-            for i in rows
-        }
-        blocks.append((shorten(f"{role}: unit {episode.key.unit}, episode {episode.key.episode}", 46), episode, lines))
-    text += f"Estimates from {' and '.join(c.name for c in run.states if c.measured)} alone, as recorded. "
-    if run.calibrated and any(is_koopman(n) for n in names):
-        text += "On the right, how much of the gearbox oscillation each of them follows. "
-    text += "The start shows how fast an observer finds the true state: all begin at the first measurement with everything else at zero."
-    return overview_and_zoom(run, blocks, 1.15, near=0.15), text
+        strips = []
+        for i in hidden:
+            recorded = episode.states[:, i]
+            strips.append(Strip(run.states[i], [("recorded", recorded, TRUTH)], near=0.15))
+            strips.append(Strip(run.states[i], error_lines(episode, names, i)))
+        blocks.append((shorten(f"{role}: unit {episode.key.unit}, episode {episode.key.episode}", 46), episode, strips))
+    text += f"Estimated from {' and '.join(c.name for c in run.states if c.measured)} alone; grey: as recorded; errors are recorded minus estimated. "
+    text += "All begin at the first measurement with everything else at zero or at rest; errors of that start are cut off."
+    return overview_and_zoom(run, blocks, 0.95), text
+
+
+def error_lines(episode: Shown, names: Sequence[str], state: int) -> list[Line]:
+    """Return recorded minus estimated values of a state, a line an observer."""
+    return [(observer_label(n), episode.states[:, state] - episode.observers[n][:, state], observer_look(n)) for n in names]
 
 
 def kept_episodes(run: RunFolder) -> list[Shown]:

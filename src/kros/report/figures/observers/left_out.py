@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...canvas import Axes, Figure
+from ...canvas import Axes, Figure, name_units
 from ...error_tables import ErrorTable, left_out_tables
 from ...names import in_condition, observer_look
 from ...run_folder import NotShownError, RunFolder
@@ -46,10 +46,12 @@ def _draw_panel(
             say_diverged(axes, place)
             continue
         colour = observer_look(observer).colour
-        left_out = [float(v) for v in cell.units.values() if v is not None]
+        estimated = {u: float(v) for u, v in cell.units.items() if v is not None}
+        left_out = list(estimated.values())
         others = [v for unit in cell.units if (v := taking_part.get((observer, channel, unit))) is not None]
         axes.plot(others, np.full(len(others), place - _APART), "o", ms=3.4, mfc="none", mec=colour, mew=0.7)
-        axes.plot(left_out, np.full(len(left_out), place + _APART), "o", ms=3.4, color=colour, alpha=0.75)
+        (discs,) = axes.plot(left_out, np.full(len(left_out), place + _APART), "o", ms=3.4, color=colour, alpha=0.75)
+        name_units(discs, list(estimated))
         axes.plot(cell.mean, place + _APART, "|", ms=11, mew=1.6, color=colour)
         shown += [*left_out, *others]
     keep_comparable(axes, shown)

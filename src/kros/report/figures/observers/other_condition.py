@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from ...canvas import Figure
-from ...names import condition_label, deployed_pair, episode_title, observer_label, observer_look
+from ...names import condition_label, deployed_pair, episode_title
 from ...run_folder import NotShownError, RunFolder, Shown
-from ..episodes import overview_and_zoom, require_paper_pair
+from ..episodes import Strip, overview_and_zoom, require_paper_pair
+from .in_time import error_lines
 
 
 def draw(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
@@ -13,17 +14,14 @@ def draw(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
     shown = other_episode(run)
     found = list(shown.observers)
     names, text = require_paper_pair(found) if paper else (deployed_pair(found, run.deployed), "")
-    lines = {
-        i: [(observer_label(n), shown.states[:, i] - shown.observers[n][:, i], observer_look(n)) for n in names]
-        for i in range(len(run.states[:4]))
-    }
+    strips = [Strip(channel, error_lines(shown, names, i)) for i, channel in enumerate(run.states[:4])]
     text += f"Recorded minus estimated, with models identified in {condition_label(run.identify_on)} only. "
     if any(c.name == "current" for c in run.states) and shown.key.condition == "load":
         text += (
             "What is left of the current is the load's torque, in units of current: a slow wave as the load turns. Less "
             "oscillation on it is a better torque estimate."
         )
-    return overview_and_zoom(run, [(episode_title(shown.key), shown, lines)], 1.35), text
+    return overview_and_zoom(run, [(episode_title(shown.key), shown, strips)], 1.35), text
 
 
 def other_episode(run: RunFolder) -> Shown:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ....data.population import natural_key
 from ....uncertainty import OutlierModel, OutlierScore
-from ...canvas import Axes, Figure, grid, note, units_axis
+from ...canvas import Axes, Figure, grid, name_units, note, units_axis
 from ...names import condition_label, form_label, number
 from ...run_folder import RunFolder
 from ...theme import Tone
@@ -53,7 +53,7 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
         low, high = referred_range(score)
         axes.plot([place, place], [low, high], color=tone.light, lw=3.5, alpha=0.3, solid_capstyle="butt")
-        axes.plot(place, score.score_db, "o", ms=6 if score.outlier else 4, color=tone.light)
+        name_units(axes.plot(place, score.score_db, "o", ms=6 if score.outlier else 4, color=tone.light)[0], [score.unit])
         if score.outlier:
             note(axes, score.unit, (place, score.score_db), (7, 4), xycoords="data", va="bottom", color=tone.light)
     if np.isfinite(model.threshold_db):

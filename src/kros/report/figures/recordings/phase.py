@@ -6,7 +6,7 @@ import numpy as np
 
 from ....data.population import OUTLIERS
 from ....identify import PhaseCalibration
-from ...canvas import Figure, grid, units_axis
+from ...canvas import Figure, grid, name_units, units_axis
 from ...names import minus
 from ...run_folder import RunFolder
 from ...theme import Tone
@@ -51,8 +51,9 @@ def phase_figure(calibration: PhaseCalibration, filed: list[str] | None = None) 
     places = np.arange(len(units))
     inside = np.array([u not in (filed or []) for u in units])
     for (row, label), panel in zip(rows, axes[:, 0], strict=True):
-        panel.plot(places[inside], row[inside], "o", ms=4, color=Tone.BLUE.light, mec="none")
-        panel.plot(places[~inside], row[~inside], "o", ms=5, mfc="none", mec=Tone.BLUE.light, mew=1.2)
+        for chosen, look in ((inside, {"ms": 4, "mec": "none"}), (~inside, {"ms": 5, "mfc": "none", "mew": 1.2})):
+            (drawn,) = panel.plot(places[chosen], row[chosen], "o", color=Tone.BLUE.light, **look)
+            name_units(drawn, [u for u, own in zip(units, chosen, strict=True) if own])
         panel.set_ylabel(label)
     axes[0, 0].set_ylim(-12, 372)
     axes[0, 0].set_yticks([0, 90, 180, 270, 360])

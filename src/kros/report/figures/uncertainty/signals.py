@@ -33,7 +33,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
             size = models.output_scale[i]
             nominal, chosen = (_signals(own, A, B, batch) for A, B in ((models.A[row], models.B[row]), (own.A, own.B)))
             freqs, dt = _centres(chosen, batch.sample_period_s), batch.sample_period_s
-            lines_of_units(panel, freqs, _density(chosen, chosen.energies.energy, i, dt) / size, Tone.BLUE.light, "units")
+            lines_of_units(panel, freqs, _density(chosen, chosen.energies.energy, i, dt) / size, Tone.BLUE.light, "units", chosen.unit_ids)
             panel.plot(freqs, _density(chosen, chosen.cover.energy, i, dt) / size, color=Tone.INK.light, lw=1.8, label="cover")
             unit = _density(nominal, nominal.cover.energy, i, dt) / size
             panel.plot(freqs, unit, "--", color=Tone.ORANGE.light, lw=1.2, label="cover, model of the nominal unit")

@@ -53,7 +53,8 @@ def _residuals(axes: Axes, found: VariationAndNoise) -> None:
     freqs, band = found.freqs_hz, decibel(found.band)
     axes.fill_between(freqs, band.min(axis=0), band.max(axis=0), color=Tone.GOLD.light, alpha=0.3, lw=0)
     others = np.arange(len(found.residual)) != found.nominal
-    lines_of_units(axes, freqs, decibel(found.residual[others]), Tone.BLUE.light, "units against the nominal")
+    names = [u for k, u in enumerate(found.unit_ids) if k != found.nominal]
+    lines_of_units(axes, freqs, decibel(found.residual[others]), Tone.BLUE.light, "units against the nominal", names)
     axes.plot(freqs, decibel(found.residual.max(axis=0)), color=Tone.BLUE.light, lw=1.5, label="largest")
     axes.plot(freqs, np.median(band, axis=0), color=Tone.GOLD.light, lw=1.5, ls="--", label="finite recordings alone")
     frequency_axis(axes, freqs, "", 4)

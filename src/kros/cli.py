@@ -244,9 +244,10 @@ def export_c(
     track: Annotated[str | None, typer.Option(metavar="NAME", help="Parameter that a phase-locked loop follows.")] = None,
 ) -> None:
     """Write an observer as C99 source with a self-test."""
-    from .study.commands.export import export_run
+    from .study.commands.export import export_run, numerical_error
 
     path = export_run(run_folder, out, name, observer, precision=precision, track=track)
+    _say(numerical_error(path))
     _say(f"C source in {path}; start with {path / 'README.md'}")
 
 

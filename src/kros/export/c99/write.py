@@ -16,6 +16,8 @@ from ...core.errors import ConfigError
 from ...data.writers import whole_folder
 from ...observer import Observer
 from ...observer.file import observer_content
+from .accuracy import Accuracy, HeldOut
+from .compiled import find_compiler
 from .golden import Golden
 from .numbers import LoadOutput, Source
 
@@ -34,6 +36,7 @@ def export_c(
     study: Mapping[str, Any] | None = None,
     track: str | None = None,
     load: LoadOutput | None = None,
+    held_out: HeldOut | None = None,
 ) -> Path:
     """Write an observer as C99 source with a self-test, a project and a description.
 
@@ -52,6 +55,8 @@ def export_c(
         A lifting parameter that follows the machine by a phase-locked loop (`PhaseLockedLoop`).
     load : LoadOutput, optional
         Load torque and total current with their levels, as outputs of their own.
+    held_out : HeldOut, optional
+        Recordings on which the numerical error is measured, where there is a compiler; the manifest and the description name it.
 
     Returns
     -------
@@ -67,6 +72,9 @@ def export_c(
     if precision not in _TOLERANCE:
         raise ConfigError(f"Export to C: precision should be 'double' or 'float', found {precision!r}.")
     files = c_files(observer, name, precision, track, load)
+    if held_out is not None and find_compiler() is not None:
+        accuracy = Accuracy.of(files, observer, held_out, track)
+        files = c_files(observer, name, precision, track, load, accuracy)
     if study is not None:
         files["study.json"] = json_bytes(study).decode()
     with whole_folder(Path(out)) as folder:
@@ -83,7 +91,14 @@ def require_identifier(name: str) -> None:
         )
 
 
-def c_files(observer: Observer, name: str, precision: str, track: str | None = None, load: LoadOutput | None = None) -> dict[str, str]:
+def c_files(
+    observer: Observer,
+    name: str,
+    precision: str,
+    track: str | None = None,
+    load: LoadOutput | None = None,
+    accuracy: Accuracy | None = None,
+) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -112,6 +127,7 @@ def c_files(observer: Observer, name: str, precision: str, track: str | None = N
         "operations": numbers - sum(map(len, context["filter_gain"])) + 7 * watched,
         "largest_angle": largest,
         "tolerance": tolerance,
+        "accuracy": None if accuracy is None else accuracy.content(),
         "library": " and ".join(f"`{f}`" for f in functions) or "nothing",
         "units": ", ".join(f"{k} {v}" for k, v in units_of_measure(observer).items()),
     }
@@ -136,6 +152,7 @@ def c_files(observer: Observer, name: str, precision: str, track: str | None = N
         **({} if track is None else {"tracked": track}),
         "sample_period_s": observer.sample_period_s,
         "state_bytes": state_bytes,
+        "numerical_error": context["accuracy"],
         "observer": observer.name,
         "kros": version("kros"),
         "source": "sha256:" + hashlib.sha256(deployed).hexdigest(),

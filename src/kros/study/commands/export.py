@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
 
-from ...core.artifacts import load_artifact
-from ...core.errors import ConfigError
-from ...export import LoadOutput, export_c, export_fmu
+from ...core.artifacts import load_artifact, read_json
+from ...core.errors import ConfigError, KrosError
+from ...data import EpisodeBatch
+from ...data.survey import RecordingFacts
+from ...design.validation import spread
+from ...evaluate import as_arriving
+from ...export import HeldOut, LoadOutput, export_c, export_fmu
 from ...motor_drive import AngleLoad
 from ...observer import Observer
-from ..config import Stage
+from ..config import Stage, StudyConfig
 from ..engine.run_folder import open_finished
+from ..engine.store import Store
+from ..stages.read import open_source
+from .recordings import load_calibration
+
+log = logging.getLogger(__name__)
 
 DEPLOYED, LOAD = "deployed", "load"
+_EPISODES, _SAMPLES = 8, 20_000  # that the numerical error is measured on
 
 
 def export_run(
@@ -36,7 +47,7 @@ def export_run(
     ConfigError
         When there is no such observer, or no such run.
     """
-    with open_finished(run, Stage.READ, Stage.SYNTHESIZE) as (config, store):
+    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         names = (DEPLOYED, *load_artifact(store.path("observers"), "observers")[0]["names"])
         loads = {f"{kind}/{LOAD}": f"{kind}.json" for kind in ("koopman", "linear") if store.holds(LOAD, f"{kind}.json")}
         if observer not in (*names, *loads):
@@ -48,7 +59,37 @@ def export_run(
         limit = np.inf if config.load.limit is None else config.load.limit
         level = AngleLoad(config.load.level_s, chosen.sample_period_s, limit=limit)
         load = LoadOutput(level, current=config.load.current) if observer in loads else None
-        return export_c(chosen, out, name, precision, config.dump(), track, load)
+        return export_c(chosen, out, name, precision, config.dump(), track, load, held_out(config, store, chosen))
+
+
+def held_out(config: StudyConfig, store: Store, observer: Observer) -> HeldOut | None:
+    """Return some of a run's held-out recordings; None where they are gone, or are not as they were."""
+    facts, calibration = RecordingFacts.load(store.path("population")), load_calibration(store)
+    try:
+        population = open_source(config)
+        units = {
+            u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in population.unit_ids
+        }
+        batch = EpisodeBatch.read(population, spread([k for k in facts.test if k.unit in units], _EPISODES), parameters=units)
+    except (KrosError, KeyError) as error:
+        log.warning("Numerical error: not measured, since the run's recordings cannot be read: %s", error)
+        return None
+    batch = batch.head(min(int(batch.lengths.min()), _SAMPLES))
+    y = as_arriving(batch, observer.sensor, population.states).measurements(observer.measured)
+    states = np.full((*y.shape[:2], len(observer.recorded)), np.nan)  # recordings hold no load
+    for i, name in enumerate(observer.recorded):
+        if name in population.states:
+            states[..., i] = batch.states[..., population.states.index(name)]
+    return HeldOut(y, batch.inputs, states, batch.parameters)
+
+
+def numerical_error(folder: Path) -> str:
+    """Return in words what an export's manifest says of it."""
+    found = read_json(folder / "manifest.json")["numerical_error"]
+    if found is None:
+        return "numerical error: not measured"
+    loss = ", ".join(f"{name} {value:+.3f} %" for name, value in found["loss_percent"].items() if value is not None)
+    return f"numerical error on {found['samples']} held-out samples: {found['difference']:.0e} of the estimates' size; estimation errors {loss}"
 
 
 def identifier(text: str) -> str:

@@ -46,36 +46,42 @@ def fit_monitor(observer: Observer, training: TrainingSet, rate: float) -> Monit
     -------
     Monitor or None
     """
-    own: dict[str, list[tuple[Array, npt.NDArray[np.bool_], Array]]] = {}
+    own: dict[tuple[str, str], list[tuple[Array, npt.NDArray[np.bool_], Array]]] = {}
     settle = settling(observer)
     for batch in _batches(training):
         y = batch.measurements(observer.measured)
         nu, judged = run_innovations(observer, y, batch.inputs, observer.own(batch.parameters), settle)
-        for i, (unit, n) in enumerate(zip(batch.units, batch.lengths, strict=True)):
-            own.setdefault(unit, []).append((nu[:n, i], judged[:n, i], y[:n, i]))
-    episodes = [e for of_unit in own.values() for e in of_unit if e[1].any()]
-    own = {unit: [e for e in of_unit if e[1].any()] for unit, of_unit in own.items() if any(e[1].any() for e in of_unit)}
-    if len(own) < LEAST_SCORES:
-        log.info("%s has no monitor: its bound needs training episodes of %d units, found %d.", observer.name, LEAST_SCORES, len(own))
+        for i, (key, n) in enumerate(zip(batch.keys, batch.lengths, strict=True)):
+            if judged[:n, i].any():
+                own.setdefault((key.unit, key.condition), []).append((nu[:n, i], judged[:n, i], y[:n, i]))
+    episodes, units = [e for found in own.values() for e in found], list(dict.fromkeys(unit for unit, _ in own))
+    if len(units) < LEAST_SCORES:
+        log.info("%s has no monitor: its bound needs training episodes of %d units, found %d.", observer.name, LEAST_SCORES, len(units))
         return None
     size = np.sqrt(np.mean([np.mean(np.minimum(nu[judged] ** 2, 1e300), axis=0) for nu, judged, _ in episodes], axis=0))
     if not np.isfinite(size).all() or np.any(size <= 0):
         return None
     filters = octaves()
-    free = Monitor(filters, 1 / MEMORY, settle, size, np.ones((len(size), len(filters))), rate, len(own))
-    peaks, profile, courses = [], [], []
-    for of_unit in own.values():
-        found = [free.mean_squares(nu[:, None], judged[:, None])[:, 0] for nu, judged, _ in of_unit]
+    free = Monitor(filters, 1 / MEMORY, settle, size, np.ones((len(size), len(filters))), rate, units=len(units))
+    peaks: dict[tuple[str, str], float] = {}
+    profile, courses = [], []
+    for group, of_group in own.items():
+        found = [free.mean_squares(nu[:, None], judged[:, None])[:, 0] for nu, judged, _ in of_group]
         levels = [free.level(f) for f in found]
-        peaks.append(max(float(level.max()) for level in levels))
+        peaks[group] = max(float(level.max()) for level in levels)
         profile.append(np.log10(np.maximum(np.max([f.max(axis=0) for f in found], axis=0), 1e-30)))
         courses += levels
-    bound, shape = float(prediction_bound(np.array(peaks), rate)), np.mean(profile, axis=0)
+    conditions = list(dict.fromkeys(condition for _, condition in own))
+    bound = float(prediction_bound(np.array([max(peaks.get((u, c), -np.inf) for c in conditions) for u in units]), rate))
+    own_peaks = {c: [peaks[u, c] for u in units if (u, c) in peaks] for c in conditions}
+    enough = len(conditions) > 1
+    bounds = {c: float(prediction_bound(np.array(p), rate)) - bound for c, p in own_peaks.items() if enough and len(p) >= LEAST_SCORES}
+    shape = np.mean(profile, axis=0)
     limits = 10 ** (shape - shape.mean() + bound / 10)
     step = np.sqrt(np.nanmean([np.nanmean(np.diff(y, axis=0) ** 2, axis=0) for _, _, y in episodes], axis=0))
     moving = sum(int(np.count_nonzero(j[1:] & (np.abs(np.diff(y, axis=0)) > MOVING * step).any(axis=-1))) for _, j, y in episodes)
     alarms = sum(int(np.count_nonzero(np.diff((level > bound).astype(int)) == 1)) for level in courses)
-    return replace(free, limits=limits, hours=moving * observer.sample_period_s / 3600, alarms=alarms)
+    return replace(free, limits=limits, bounds=bounds, hours=moving * observer.sample_period_s / 3600, alarms=alarms)
 
 
 def monitor_facts(monitor: Monitor) -> dict[str, Any]:

@@ -266,7 +266,10 @@ def _monitor(found: Any, measured: int, where: str) -> Monitor | None:
         key: matrix([found[key]] if key == "size" else found[key], shape, f"{where}: monitor.{key}") for key, shape in shapes.items()
     }
     plain_ones = {key: value for key, value in found.items() if key not in shapes}
-    for key, value in plain_ones.items():
+    _require(isinstance(found.get("bounds", {}), dict), f"{where}: monitor.bounds should be an object", found.get("bounds"))
+    for key, value in [*plain_ones.items(), *found.get("bounds", {}).items()]:
+        if key == "bounds":
+            continue
         _require(_is_finite(value), f"{where}: monitor.{key} should be a finite number", value)
     return Monitor.from_content(plain_ones | numbers | {"size": numbers["size"][0]})
 

@@ -16,13 +16,13 @@ all that the monitor remembers is held.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError
+from ..core.errors import ConfigError, DataError
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -48,6 +48,8 @@ class Monitor:
         Mean squares whose product is the bound.
     false_alarm_rate : float
         Probability that one more good machine exceeds the bound while it is moved as much as those in training.
+    bounds : mapping of str to float
+        What the level of a machine in each recorded condition is held against, dB over the bound of all conditions: it may be told in which it is.
     units : int
         Machines that the bound was found on.
     hours : float
@@ -67,6 +69,7 @@ class Monitor:
     size: Array
     limits: Array
     false_alarm_rate: float
+    bounds: Mapping[str, float] = field(default_factory=dict)
     units: int = 0
     hours: float = 0.0
     alarms: int = 0
@@ -85,6 +88,8 @@ class Monitor:
             )
         if np.any(self.size <= 0) or np.any(self.limits <= 0) or not 0 < self.forget <= 1 or self.settle < 0:
             raise DataError("Monitor of an observer: size and limits should be positive, forget within 0 and 1, settle at least 0.")
+        if not np.isfinite(list(self.bounds.values())).all():
+            raise DataError("Monitor of an observer: the bounds of conditions should be finite numbers of dB.")
 
     def content(self) -> dict[str, Any]:
         """Return what an observer's file holds of it."""
@@ -128,9 +133,26 @@ class Monitor:
             found[:, machine] = np.concatenate([np.zeros((1, *squares.shape[1:])), squares])[latest]
         return found
 
-    def level(self, mean_squares: Array) -> Array:
-        """Return the mean level over the bound in dB, shape (...), of mean squares of shape (..., q, bands)."""
-        return np.asarray(10 * np.log10(np.maximum(mean_squares, 1e-30) / self.limits).mean(axis=(-2, -1)))
+    def level(self, mean_squares: Array, condition: str | None = None) -> Array:
+        """Return the mean level over the bound in dB, shape (...), of mean squares of shape (..., q, bands), in one condition or any."""
+        return np.asarray(10 * np.log10(np.maximum(mean_squares, 1e-30) / self.limits).mean(axis=(-2, -1))) - self.bound(condition)
+
+    def bound(self, condition: str | None) -> float:
+        """Return the bound of a condition, dB over that of all; None is any.
+
+        Raises
+        ------
+        ConfigError
+        """
+        if condition is not None and condition not in self.bounds:
+            raise ConfigError(
+                f"Monitor of an observer: the condition {condition!r} is unknown; known are {', '.join(self.bounds) or 'none'}."
+            )
+        return 0.0 if condition is None else float(self.bounds[condition])
+
+    def product(self, condition: str | None) -> float:
+        """Return the product of all bands' mean squares over their limits that a machine in a condition may have."""
+        return float(10 ** (self.bound(condition) * self.limits.size / 10))
 
 
 def octaves(count: int = 6, quality: float = 1.4) -> Array:
@@ -173,7 +195,18 @@ class Watch:
         self._filters: list[list[float]] = monitor.filters.tolist()
         self._limits = (1 / monitor.limits).tolist()
         self._monitor = monitor
+        self.condition = None
         self.reset()
+
+    @property
+    def condition(self) -> str | None:
+        """Condition that the machine is in; None where that is not known."""
+        return self._condition
+
+    @condition.setter
+    def condition(self, name: str | None) -> None:
+        """Change the bound from the next sample that is judged on."""
+        self._condition, self._bound = name, self._monitor.product(name)
 
     def reset(self) -> None:
         """Forget everything."""
@@ -206,9 +239,9 @@ class Watch:
                 memory[1] = -b * v - a2 * band
                 memory[2] += forget * (band * band - memory[2])
                 product *= memory[2] * limit
-        self.outside = product > 1.0
+        self.outside = product > self._bound
 
     @property
     def level_db(self) -> float:
         """Mean level of the bands over its bound, dB; far below zero before anything was judged."""
-        return float(self._monitor.level(np.array([[band[2] for band in channel] for channel in self._memory])))
+        return float(self._monitor.level(np.array([[band[2] for band in channel] for channel in self._memory]), self._condition))

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from machines import LIMITS, MACHINES, apart, drive, in_python, replaced, samples
+from machines import LIMITS, MACHINES, apart, drive, in_python, replaced, samples, watched
 
 from kros.core.errors import ConfigError, DataError
 from kros.export import CompiledObserver, HeldOut, LoadOutput, export_c, find_compiler
@@ -31,6 +31,24 @@ def test_same_estimates_and_the_same_status_under_faults(kind, tmp_path):
         found, bits = compiled.run(y, u)
         np.testing.assert_array_equal(bits, status)
         assert apart(found, wanted) < close
+
+
+@needs_compiler
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_a_machine_that_is_told_its_condition(precision, tmp_path):
+    observer, (y, u) = MACHINES["monitor"](), samples(800, faults=False)
+    folder = export_c(observer, tmp_path / "c", "drive", precision)
+    compiled = CompiledObserver.build(folder, flags=(*STRICT, "-Wno-unused-function"))
+    outside = []
+    for condition in (None, *observer.monitor.bounds):
+        wanted, found = in_python(observer, y, u, condition=condition)[1], compiled.run(y, u, condition=condition)[1]
+        np.testing.assert_array_equal(found, wanted)
+        outside.append(int(np.count_nonzero(wanted & 8)))
+    assert outside[1] < outside[0] < outside[2]
+    with pytest.raises(ConfigError, match="condition 'loaded' is unknown"):
+        compiled.run(y, u, condition="loaded")
+    with pytest.raises(ConfigError, match="condition 'loaded' is unknown"):
+        in_python(observer, y, u, condition="loaded")
 
 
 @needs_compiler
@@ -89,7 +107,7 @@ def test_a_thousand_turns_cost_no_accuracy(precision, tmp_path):
 @needs_compiler
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_everything_compiles_without_a_warning(precision, tmp_path):
-    folder = export_c(drive(delay=2, **LIMITS), tmp_path / "c", "drive", precision)
+    folder = export_c(watched(drive(delay=2, **LIMITS)), tmp_path / "c", "drive", precision)
     size = (
         'extern int printf(const char *, ...);\n#include "drive.h"\nint main(void) { printf("%d", (int)sizeof(drive_state)); return 0; }\n'
     )
@@ -130,7 +148,7 @@ def test_the_numerical_error_on_held_out_recordings(tmp_path):
 @pytest.mark.skipif(shutil.which("cppcheck") is None, reason="cppcheck is not on the PATH")
 def test_misra_deviations_are_those_that_the_documentation_lists(tmp_path):
     outputs = LoadOutput(AngleLoad(2.0, 1e-3, limit=0.3), load="velocity")
-    folder = export_c(drive(**LIMITS), tmp_path / "c", "drive", "float", track="phase", load=outputs)
+    folder = export_c(watched(drive(**LIMITS)), tmp_path / "c", "drive", "float", track="phase", load=outputs)
     sources = ("drive.c", "drive_selftest.c", "example_main.c")
     command = ["cppcheck", "-q", "--addon=misra", "--std=c99", "--enable=style", *sources]
     said = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)

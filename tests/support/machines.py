@@ -95,7 +95,7 @@ def moving(observer):
 def watched(observer, bound=1.0):
     """With a monitor that is exceeded now and then by what `samples` does."""
     filters = octaves()
-    monitor = Monitor(filters, 0.02, 50, np.array([0.7]), bound * np.full((1, len(filters)), 0.02), 0.02)
+    monitor = Monitor(filters, 0.02, 50, np.array([0.7]), bound * np.full((1, len(filters)), 0.02), 0.02, {"with load": 1.0, "*/": -8.0})
     return replace(observer, monitor=monitor)
 
 
@@ -110,8 +110,9 @@ def samples(count, turns=0.0, faults=True):
     return y, u
 
 
-def in_python(observer, y, u, track=None):
+def in_python(observer, y, u, track=None, condition=None):
     running = observer.start(y[0])
+    running.condition = condition
     if track is not None:
         running.track(track)
     found = [(np.asarray(running.step(*sample)), int(running.status)) for sample in zip(y, u, strict=True)]

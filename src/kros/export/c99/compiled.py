@@ -50,7 +50,7 @@ class CompiledObserver:
 
     def __init__(self, folder: Path, library: Path) -> None:
         manifest = json.loads((Path(folder) / "manifest.json").read_text())
-        self.name, self.states = manifest["name"], tuple(manifest["states"])
+        self.name, self.states, self.conditions = manifest["name"], tuple(manifest["states"]), tuple(manifest.get("conditions", ()))
         self.parameters, self.state_bytes = tuple(manifest["parameters"]), int(manifest["state_bytes"])
         self._q, self._m = len(manifest["measured"]), len(manifest["inputs"])
         self._real = np.float32 if manifest["precision"] == "float" else np.float64
@@ -84,13 +84,17 @@ class CompiledObserver:
         """Run the golden vectors; 0 where they agree."""
         return int(self._c[f"{self.name}_selftest"]())
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, float] | None = None) -> tuple[Array, npt.NDArray[Any]]:
+    def run(
+        self, y: Array, u: Array, parameters: Mapping[str, float] | None = None, condition: str | None = None
+    ) -> tuple[Array, npt.NDArray[Any]]:
         """Estimate one recording, sample by sample.
 
         Parameters
         ----------
         y, u : ndarray, shape (n_samples, q), (n_samples, m)
         parameters : mapping of str to float, optional
+        condition : str, optional
+            Recorded condition that the machine is in, as far as the monitor knows it.
 
         Returns
         -------
@@ -104,6 +108,10 @@ class CompiledObserver:
                 f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m}), found {y.shape} and {u.shape}."
             )
         machine = self.start(y[0], parameters)
+        if condition is not None:
+            if condition not in self.conditions:
+                raise ConfigError(f"Compiled observer {self.name}: the condition {condition!r} is unknown; known are {self.conditions}.")
+            self._c[f"{self.name}_in_condition"](_at(machine), ctypes.c_uint32(1 + self.conditions.index(condition)))
         x_hat, status = np.empty((len(y), len(self.states))), np.empty(len(y), dtype=np.uint32)
         self._run(_at(machine), ctypes.c_long(len(y)), *(_at(array) for array in (y, u, x_hat, status)))
         return x_hat, status

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -215,6 +216,8 @@ class Source:
             "largest": self.precision.literal(LARGEST),
             "one": self.precision.literal(1.0),
             "settle": own.settle,
+            "conditions": [_comment(c) for c in own.bounds],
+            "products": [self.precision.literal(own.product(c)) for c in (None, *own.bounds)],
             "recovery": RECOVERY,
         }
 
@@ -274,6 +277,11 @@ def _uncorrected(observer: Observer) -> Array:
     A = observer.A.copy()
     A[:, list(observer.measured)] -= observer.into @ observer.controller.D
     return A
+
+
+def _comment(text: str) -> str:
+    """Return a name as it may stand in a comment of C."""
+    return re.sub(r"[^\w .@-]", "_", text) or "_"
 
 
 def _filled(values: Array | None, count: int, otherwise: float) -> Array:

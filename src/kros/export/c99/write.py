@@ -153,6 +153,7 @@ def c_files(
         "sample_period_s": observer.sample_period_s,
         "state_bytes": state_bytes,
         "numerical_error": context["accuracy"],
+        **({"conditions": list(observer.monitor.bounds)} if observer.monitor is not None and observer.monitor.bounds else {}),
         "observer": observer.name,
         "kros": version("kros"),
         "source": "sha256:" + hashlib.sha256(deployed).hexdigest(),
@@ -176,7 +177,8 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     reals = context["n"] + context["order"] + context["history"] + len(context["parameters"]) + context["delay"] * context["m"]
     reals += context["n"] + context["order"] + 2 if context["tracked"] else 0
     reals += context["q"] * context["monitor"]["bands"] * 3 if context["monitor"] else 0
-    words = context["m"] + (1 if context["delay"] else 0) + (1 if context["monitor"] else 0) + (1 if context["start"] else 0) + 1
+    words = context["m"] + sum(bool(context[name]) for name in ("delay", "monitor", "start")) + 1
+    words += 1 if context["monitor"] and context["monitor"]["conditions"] else 0
     size = 8 * doubles + real * reals + 4 * words
     align = 8 if doubles or real == 8 else 4
     return -(-size // align) * align

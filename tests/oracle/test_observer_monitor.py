@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from machines import DT, LIMITS, drive, samples, watched
+from machines import DT, LIMITS, drive, moving, samples, watched
 
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
@@ -28,9 +28,9 @@ def levels(observer, y, u):
     return np.array(found), np.array(status)
 
 
-@pytest.mark.parametrize("kind", [{}, {"delay": 2, **LIMITS}])
-def test_one_machine_is_watched_as_many_at_once(kind):
-    observer, (y, u) = watched(drive(**kind)), samples(800)
+@pytest.mark.parametrize("machine", [drive(), drive(delay=2, **LIMITS), moving(drive())])
+def test_one_machine_is_watched_as_many_at_once(machine):
+    observer, (y, u) = watched(machine), samples(800)
     found, status = levels(observer, y, u)
     innovation, judged = run_innovations(observer, y[:, None], u[:, None], settle=observer.monitor.settle)
     wanted = observer.monitor.level(observer.monitor.mean_squares(innovation, judged))[:, 0]

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..data import EpisodeBatch
+from ..data.population import EpisodeKey
 from ..evaluate import as_shown
 from ..observer import Observer, run_innovations
 from ..observer.monitor import Monitor, octaves
@@ -24,7 +25,7 @@ from .validation import TrainingSet, spread
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-UNITS, EPISODES, TOGETHER = 60, 12, 72  # most units, most episodes of each, and episodes in memory
+UNITS, EPISODES, TOGETHER = 60, 3, 60  # most units, most episodes of each in every condition, and episodes in memory
 MEMORY = 1000  # samples that mean squares remember
 FORGOTTEN = 1e-3  # of a start, when innovations are judged
 SETTLE = (100, 1000)
@@ -111,10 +112,11 @@ def settling(observer: Observer) -> int:
 
 def _batches(training: TrainingSet) -> Iterator[EpisodeBatch]:
     """Read some episodes of some units, as the sensor shows them."""
-    by_unit: dict[str, list[int]] = {}
-    for place, key in enumerate(training.keys):
-        by_unit.setdefault(key.unit, []).append(place)
-    keys = [training.keys[i] for unit in spread(list(by_unit), UNITS) for i in spread(by_unit[unit], EPISODES)]
+    groups: dict[tuple[str, str], list[EpisodeKey]] = {}
+    for key in training.keys:
+        groups.setdefault((key.unit, key.condition), []).append(key)
+    units = set(spread(list(dict.fromkeys(unit for unit, _ in groups)), UNITS))
+    keys = [key for (unit, _), own in groups.items() if unit in units for key in spread(own, EPISODES)]
     for start in range(0, len(keys), TOGETHER):
         batch = EpisodeBatch.read(training.population, keys[start : start + TOGETHER], None, training.parameters)
         yield as_shown(batch, training.sensor, training.population.states)

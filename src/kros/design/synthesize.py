@@ -181,8 +181,7 @@ def synthesize(
     failed = {found.name: found.facts["reason"] for found in results if found.observer is None}
     if name in failed:
         raise SynthesisError(f"{name} could not be made: {failed[name]}")
-    made = certified(tasks, results, uncertain.models, work or Work())[0][name]
-    return watched(made, uncertain.models, told, among.false_alarm_rate)
+    return certified(tasks, results, uncertain.models, work or Work())[0][name]
 
 
 def synthesize_all(

@@ -184,10 +184,11 @@ def run_innovations(
     moving = (_pending(samples.starts, d) == d) & ~samples.starts if d else np.ones((n_samples, batch), dtype=bool)
     innovation = np.zeros(samples.y.shape)
     steps.begin(samples.y[0])
+    steps.begin(samples.y[0], samples.starts[0], samples.u[0])
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(n_samples):
             if anew[k] and k:
-                steps.begin(samples.y[k], samples.starts[k])
+                steps.begin(samples.y[k], samples.starts[k], samples.u[k])
             innovation[k] = steps.innovation(samples.y[k])[0]
             steps.step(samples.y[k], samples.u[k - d], missing[k] if gone[k] else None, moving[k] if d else None)
     starts = samples.starts.copy()

@@ -5,7 +5,7 @@ import pytest
 
 from kros.core.errors import DataError, DimensionError
 from kros.evaluate import Kind, draw_interval, interval_rows, mean_intervals, severity_of_growth, unit_interval
-from kros.report.disturbances import curves, severity_text, shown_observers
+from kros.report.disturbances import Curve, curves, needed, shown_observers
 from kros.report.error_tables import error_table
 
 
@@ -39,9 +39,10 @@ def test_curves_begin_without_disturbance_and_take_one_condition():
 
 
 def test_severities_are_told_in_the_unit_of_their_axis():
-    assert severity_text(Kind.GAP, 0.25, 0.01) == "250"
-    assert severity_text(Kind.DROPPED, 0.01, 0.05) == "< 5.0"
-    assert severity_text(Kind.BIAS, np.inf, 1e-6) == "–"
+    rising = {"v": Curve(np.array([0, 0.25, 0.5]), np.array([1.0, 2.0, 4.0]))}
+    at_once = {"v": Curve(np.array([0, 0.05]), np.array([1.0, 9.0]))}
+    own = {Kind.GAP: rising, Kind.DROPPED: at_once, Kind.BIAS: {"v": Curve(np.array([0, 1.0]), np.ones(2))}}
+    assert needed(own, (), tuple(own), dict.fromkeys(own, "{}")) == ["250", "less than 5.0"]
 
 
 def test_the_figure_shows_the_kind_of_model_that_is_handed_over():

@@ -101,10 +101,10 @@ def test_sensor_and_dropouts_are_those_that_double_the_error() -> None:
         for kind, s, e in tried
     ]
     found = metrics(robustness=rows)
-    assert sensor_text(found, NAME, ()) == "noise 0.10 %; delay < 1"
+    assert sensor_text(found, NAME, ()) == "noise 0.10 %; delay less than 1"
     assert sensor_text(found, "learned", ()) == dropout_text(found, "learned", trust_of({}), ()) == "not tried"
     lossy = trust_of({"dropout_rate": 0.05, "dropout_certified": True})
-    assert dropout_text(found, NAME, lossy, ()) == "certified at 5 %; no rate tried doubles it"
+    assert dropout_text(found, NAME, lossy, ()) == "certified at 5 %; none that was tried doubles the error"
     assert set(trusts(found)) == {NAME, "linear/worst_case_h2", "koopman/open_loop"}
 
 

@@ -95,12 +95,6 @@ def look(name: str) -> Look:
     return _LOOKS.get(split_observer(name)[1], Look(Tone.GREY.light, ":"))
 
 
-def severity_text(kind: Kind, severity: float, smallest: float) -> str:
-    """Return a severity for people, in the unit of its axis; "<" the smallest one that was tried, a dash where there is none."""
-    text = number(max(severity, smallest) * AXES[kind].factor, 2)
-    return f"< {text}" if severity < smallest else text
-
-
 def doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str]) -> tuple[float, float] | None:
     """Return the severity at which the error doubles, a geometric mean over the states that are not measured, and the smallest severity that was tried.
 
@@ -114,20 +108,25 @@ def doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str
     return severity_of_growth(hidden[0].severities, errors), float(hidden[0].severities[1])
 
 
-def needed_sensor(metrics: Mapping[str, Any], measured: Sequence[str]) -> list[str]:
-    """Return the sentence that says what sensor and timing the deployed observer needs; none where the study did not try."""
-    study = metrics["study"]
-    own = curves(metrics.get("robustness", []), study["identify_on"]).get(study.get("deployed"), {})
-    parts = []
-    for kind, words in _NEEDS.items():
+def needed(own: Mapping[Kind, Mapping[str, Curve]], measured: Sequence[str], kinds: Sequence[Kind], words: Mapping[Kind, str]) -> list[str]:
+    """Return in words, with a place for the severity, where an observer's error doubles; kinds that do not double it are left out."""
+    texts = []
+    for kind in kinds:
         found = doubling(kind, own.get(kind, {}), measured)
         if found is not None and np.isfinite(found[0]):
             at = max(found)
             value = f"{at:.2g}" if kind is Kind.DELAY else number(at * AXES[kind].factor, 2)
-            text = f"less than {value}" if found[0] < found[1] else value
-            parts.append(words.format(text, "" if at == 1 else "s"))
+            texts.append(words[kind].format(f"less than {value}" if found[0] < found[1] else value))
+    return texts
+
+
+def needed_sensor(metrics: Mapping[str, Any], measured: Sequence[str]) -> list[str]:
+    """Return the sentence that says what sensor and timing the deployed observer needs; none where the study did not try."""
+    study = metrics["study"]
+    own = curves(metrics.get("robustness", []), study["identify_on"]).get(study.get("deployed"), {})
     if not own:
         return []
+    parts = needed(own, measured, tuple(_NEEDS), _NEEDS)
     sensor = "sensor that is declared" if study.get("sensor") else "recordings' own sensor"
     if not parts:
         return [f"No noise, resolution, bias, delay or loss of samples that was tried beyond the {sensor} doubles its error."]
@@ -139,6 +138,6 @@ _NEEDS = {
     Kind.NOISE: "noise of {} % of the largest value",
     Kind.QUANTISATION: "a resolution of {} %",
     Kind.BIAS: "a bias of {} %",
-    Kind.DELAY: "a delay of {} sample{} that it is not told of",
+    Kind.DELAY: "a delay of {} sample(s) that it is not told of",
     Kind.DROPPED: "{} % of the samples lost",
 }

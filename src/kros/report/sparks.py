@@ -12,7 +12,7 @@ from .names import number
 from .theme import Tone
 
 _WIDTH, _HEIGHT, _LEFT, _TOP, _BOTTOM = 380, 120, 52, 18, 18
-_BUCKETS = 110
+_BUCKETS = 90
 
 Line = tuple[Array, Tone, float]
 

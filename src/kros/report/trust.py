@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from ..evaluate import Kind
-from .disturbances import AXES, Curve, curves, doubling
+from .disturbances import curves, needed
 from .error_tables import ErrorTable
 from .names import BASELINES, number, split_observer
 
 Facts = Mapping[str, Any]
-_SENSOR = (Kind.NOISE, Kind.QUANTISATION, Kind.BIAS, Kind.DELAY)
 
 
 @dataclass(frozen=True)
@@ -98,36 +97,26 @@ def mean_error(table: ErrorTable, name: str, channels: Sequence[str]) -> float:
     return float(np.exp(np.mean(np.log(np.maximum(known, 1e-300))))) if known and len(known) == len(values) else float("inf")
 
 
-def needed(
-    own: Mapping[Kind, Mapping[str, Curve]], measured: Sequence[str], kinds: Sequence[Kind] = _SENSOR
-) -> dict[Kind, tuple[float, bool]]:
-    """Return the severity at which an observer's error doubles, and whether it does so below all that was tried; kinds that do not double it are absent."""
-    found = {kind: doubling(kind, own.get(kind, {}), measured) for kind in kinds}
-    return {kind: (max(d), d[0] < d[1]) for kind, d in found.items() if d is not None and np.isfinite(d[0])}
-
-
 def sensor_text(metrics: Facts, name: str, measured: Sequence[str]) -> str:
-    """Return what sensor and timing an observer needs, short; a dash where that was not tried."""
+    """Return what sensor and timing an observer needs, short."""
     own = curves(metrics.get("robustness", []), metrics["study"]["identify_on"]).get(name)
-    if own is None:
-        return "not tried"
-    parts = [f"{_SHORT[kind]} {_below(kind, *at)}" for kind, at in needed(own, measured).items()]
-    return "; ".join(parts) or "any that was tried"
+    return "not tried" if own is None else "; ".join(needed(own, measured, tuple(_SENSOR), _SENSOR)) or "any that was tried"
 
 
 def dropout_text(metrics: Facts, name: str, trust: Trust, measured: Sequence[str]) -> str:
     """Return which losses an observer tolerates: certified where a rate is declared, and as tried."""
     told = [] if trust.dropouts is None else [f"{'certified' if trust.dropouts[1] else 'not certified'} at {100 * trust.dropouts[0]:g} %"]
     own = curves(metrics.get("robustness", []), metrics["study"]["identify_on"]).get(name)
-    if own is not None and Kind.DROPPED in own:
-        at = needed(own, measured, (Kind.DROPPED,)).get(Kind.DROPPED)
-        told.append("no rate tried doubles it" if at is None else f"doubles at {_below(Kind.DROPPED, *at)}")
+    if own is not None:
+        told += needed(own, measured, tuple(_LOSSES), _LOSSES) or ["none that was tried doubles the error"]
     return "; ".join(told) or "not tried"
 
 
-def _below(kind: Kind, severity: float, below_all: bool) -> str:
-    text = f"{severity:.2g}" if kind is Kind.DELAY else f"{number(severity * AXES[kind].factor, 2)} %"
-    return f"< {text}" if below_all else text
-
-
-_SHORT = {Kind.NOISE: "noise", Kind.QUANTISATION: "resolution", Kind.BIAS: "bias", Kind.DELAY: "delay"}
+_SENSOR = {
+    Kind.NOISE: "noise {} %",
+    Kind.QUANTISATION: "resolution {} %",
+    Kind.BIAS: "bias {} %",
+    Kind.DELAY: "delay {}",
+    Kind.PHASE: "phase {} rad",
+}
+_LOSSES = {Kind.DROPPED: "doubles at {} %", Kind.GAP: "doubles with gaps of {} ms"}

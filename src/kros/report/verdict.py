@@ -9,8 +9,8 @@ from ..data.population import DEFAULT_CONDITION
 from .caveats import conditions_apart, confounded_text
 from .disturbances import needed_sensor
 from .error_tables import ErrorTable, error_table, left_out_tables
-from .names import BASELINES, channel_units, condition_label, form_label, minus, number, observer_label, split_observer
-from .sections.outliers import flagged_text, undecided_text
+from .names import BASELINES, channel_units, condition_label, form_label, joined, minus, number, observer_label, split_observer
+from .trust import trust_of
 
 Metrics = Mapping[str, Any]
 
@@ -28,7 +28,6 @@ def findings(metrics: Metrics, measured: tuple[str, ...] = ()) -> list[str]:
         *needed_sensor(metrics, measured),
         *_left_out(metrics, measured),
         *_next_unit(metrics),
-        *_flagged(metrics),
     ]
 
 
@@ -62,9 +61,8 @@ def _deployed(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
     units = channel_units(metrics)
     parts = [_channel(table, name, c, units.get(c, "")) for c in known]
     shown = ", as the declared sensor shows them," if metrics["study"].get("sensor") else ""
-    sentences.append(f"{source} estimates {_join(parts)} on held-out episodes{shown} of units that are not the nominal one, in the mean.")
-    sentences += [*_open_loop(table, name, known), *_rivals(table, name, known)]
-    return sentences + _better(table, name, known)
+    sentences.append(f"{source} estimates {joined(parts)} on held-out episodes{shown} of units that are not the nominal one, in the mean.")
+    return [*sentences, *_open_loop(table, name, known), *_rivals(table, name, known)]
 
 
 def _left_out(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
@@ -81,7 +79,7 @@ def _left_out(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
     ]
     if not parts:
         return []
-    text = f"Designed without the unit it runs on, the same kind of observer estimates {_join(parts)}, in the mean (empirical)."
+    text = f"Designed without the unit it runs on, the same kind of observer estimates {joined(parts)}, in the mean (empirical)."
     return [text, *_rivals(tables[0], name, list(cells))]
 
 
@@ -98,21 +96,8 @@ def _next_unit(metrics: Metrics) -> list[str]:
     home = "" if found["condition"] == DEFAULT_CONDITION else f" ({condition_label(found['condition'])})"
     level, n = f"{100 * found['confidence']:g}", found["reserve"]
     return [
-        f"With {level} % confidence it estimates {_join(parts)} or better on the next unit of the batch{home}: {n} units took part in nothing."
+        f"With {level} % confidence it estimates {joined(parts)} or better on the next unit of the batch{home}: {n} units took part in nothing."
     ]
-
-
-def _better(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
-    """Observers other than baselines that do clearly better in some channel, by name."""
-    parts = []
-    for channel in channels:
-        own = table.cells[name][channel].mean
-        means = {o: cells[channel].mean for o, cells in table.cells.items() if channel in cells and split_observer(o)[1] not in BASELINES}
-        known = {o: mean for o, mean in means.items() if mean is not None}
-        best = min(known, key=lambda o: known[o], default=None)
-        if own is not None and best is not None and known[best] < 0.95 * own and channel in table.ranked:
-            parts.append(f"“{observer_label(best)}” in {channel.replace('_', ' ')} ({number(known[best])} %)")
-    return [f"Better in the mean: {_join(parts)}."] if parts else []
 
 
 def _channel(table: ErrorTable, name: str, channel: str, unit: str) -> str:
@@ -131,7 +116,7 @@ def _open_loop(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
     if any(value is None for value in theirs.values()):
         return ["Open loop, the nominal model alone, diverges on some units."]
     parts = [f"{c.replace('_', ' ')} {number(v)} %{_ratio(table.cells[name][c].mean, v)}" for c, v in theirs.items() if v is not None]
-    return [f"Open loop, the nominal model alone, gives {_join(parts)}."]
+    return [f"Open loop, the nominal model alone, gives {joined(parts)}."]
 
 
 def _rivals(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
@@ -144,7 +129,7 @@ def _rivals(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
             best = min(theirs, key=lambda o: theirs[o])
             ratio = _ratio(table.cells[name][channel].mean, theirs[best])
             parts.append(f"{channel.replace('_', ' ')} “{observer_label(best)}”, {number(theirs[best])} %{ratio}")
-    return [f"The best baseline is for {_join(parts)}."] if parts else []
+    return [f"The best baseline is for {joined(parts)}."] if parts else []
 
 
 def _ratio(own: float | None, theirs: float) -> str:
@@ -177,31 +162,19 @@ def _covered(metrics: Metrics) -> list[str]:
 def _certificate(metrics: Metrics) -> list[str]:
     name = metrics["study"].get("deployed") or ""
     entry, sentences = metrics.get("observers", {}).get(name, {}), []
-    if name and all(split_observer(n)[1] in BASELINES for n in metrics.get("observers", {})):
-        sentences.append("No robust observer could be designed for this population; Synthesis says why.")
     if entry.get("worst_case_h2") is not None:
         gap = entry.get("gap_percent")
         near = f", at most {number(gap)} % above what any correction of this kind can reach" if gap is not None else ""
         sentences.append(f"Its error is certified for all plants inside the uncertain set{near}.")
+    trust = trust_of(entry)
+    if trust.signals:
+        bounds = joined([f"{state.replace('_', ' ')} {number(value)} %" for state, value in trust.signals.items()])
+        sentences.append(f"For all signals with the power that was recorded its RMS errors are at most {bounds} of the largest value.")
     if entry.get("relift_certified") is not None:
-        which = "A second certificate" if entry.get("worst_case_h2") is not None else "A certificate"
+        which = "Another certificate" if sentences else "A certificate"
         sentences.append(
             f"{which} covers it as it runs, re-lifted at every step, on any machine."
             if entry["relift_certified"]
             else "No certificate could be found for it as it runs, re-lifted at every step."
         )
     return sentences
-
-
-def _flagged(metrics: Metrics) -> list[str]:
-    if "outliers" not in metrics:
-        return []
-    flagged = [r for r in metrics["outliers"] if r["outlier"]]
-    if not flagged and not metrics["outliers"]:
-        return ["There are too few units to look for outliers."]
-    text = f"Flagged as not belonging to the batch: {flagged_text(flagged)}." if flagged else "No unit is flagged as an outlier."
-    return [text, *undecided_text(metrics["outliers"])]
-
-
-def _join(parts: list[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

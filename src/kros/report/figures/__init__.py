@@ -46,7 +46,6 @@ FIGURES: dict[str, Row] = {
     "forms_entrywise": Row("Six uncertainty forms, entry by entry", "uncertainty.forms_entrywise"),
     "weights_entrywise": Row("Weights entry by entry", "uncertainty.weights_entrywise"),
     "synthesis": Row("Plant, weights and correction filters", "synthesis.bode"),
-    "certificates": Row("Certified worst cases", "synthesis.certificates"),
     "members": Row("Random members of the uncertain set", "synthesis.members"),
     "errors": Row("Errors of all observers", "observers.errors"),
     "left_out": Row("Units that were left out", "observers.left_out"),

@@ -16,7 +16,6 @@ SEE = {
     "forms_entrywise": "Every thin line lies below the thick one: entries alone make a form look smaller than it is.",
     "weights_entrywise": "Black lines lie above all blue ones: entries are bounded, which is less than bounding the perturbation.",
     "synthesis": "Where the weights are low the correction may be small; where they are high it has to follow the measurements.",
-    "certificates": "The further left a disc, the smaller the error that is certified; at its tick no correction can do better.",
     "members": "Nothing may lie right of the black line, the certified bound; the nearer to it, the less the bound gives away.",
     "errors": "Observers are in the order of their errors, the best on top; the deployed one is in bold.",
     "left_out": "Discs as far left as rings say that an observer works as well on a machine that it never saw.",

@@ -6,9 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ..content import Cell, Cells, Section, Table
-from ..figures.recordings.phase import GOOD
-from ..names import minus, number
+from ..content import Section
+from ..names import minus
 from ..run_folder import RunFolder
 
 
@@ -22,13 +21,6 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "unit has its own. It is found in closed form from constant-velocity segments, forward and reverse apart, and the half turn that this leaves open is "
         f"settled for the whole population at once. Mean lag of the loop: {minus(format(math.degrees(calibration.lag_rad), '.1f'))}°."
     )
-    rows: list[Cells] = []
-    for unit, found in calibration.units.items():
-        weak = found.concentration < GOOD
-        concentration = Cell(number(found.concentration, 4), strong=weak, note="low" if weak else "")
-        phase, lag = (minus(f"{math.degrees(value):.1f}") for value in (found.phase_rad, found.lag_rad))
-        rows.append([unit, phase, lag, concentration, str(found.n_segments)])
     missing = [row["unit"] for row in metrics.get("units", []) if row["status"] == "not calibrated"]
     paragraphs = [text] + ([f"Not calibrated, and left out of what follows: {', '.join(missing)}."] if missing else [])
-    table = Table(["unit", "phase (°)", "lag (°)", "concentration", "segments"], rows, "Phase of every unit", folded=True)
-    return Section("calibration", "Phase calibration", paragraphs, [table], ["phase"])
+    return Section("calibration", "Phase calibration", paragraphs, figures=["phase"])

@@ -33,7 +33,6 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         ("Certificate", _certificate(trust)),
         ("It assumes", _assumed(run, name)),
         ("It is void", _void(trust, metrics)),
-        ("Monitor", _monitor(metrics)),
     ]
     card = [("Observer", [f"{observer_label(name)}, {name}, in observers/deployed.json."]), *made, *proof]
     return Section("deployment", "Deployment card", card=[(term, told) for term, told in card if told])
@@ -69,7 +68,7 @@ def _made(run: RunFolder, observer: Observer, metrics: Mapping[str, Any], units:
                 for c, own in limits.items()
             ],
         ),
-        ("Sensor", needed_sensor(metrics, measured)),
+        ("Sensor", [*_assumed_sensor(observer, units), *needed_sensor(metrics, measured)]),
         ("Cost of a step", [_cost(observer)]),
         (
             "Run it",
@@ -78,10 +77,20 @@ def _made(run: RunFolder, observer: Observer, metrics: Mapping[str, Any], units:
     ]
 
 
+def _assumed_sensor(observer: Observer, units: Mapping[str, str]) -> list[str]:
+    """Say what the observer was told of its sensors, the resolution that was found included."""
+    told = []
+    for name, own in observer.about.get("sensor", {}).items():
+        known = [f"{key.replace('_', ' ')} {number(value)}" for key, value in own.items() if value]
+        told += [f"{axis_label(name, units.get(name, ''))}: {', '.join(known)}"] if known else []
+    return [f"Assumed of {'; '.join(told)}."] if told else []
+
+
 def _delay(observer: Observer) -> list[str]:
     late = observer.runtime.delay
     taken = f"measurements count as {late} sample{'s' if late > 1 else ''} late" if late else "measurements count as of their own sample"
-    return [f"An estimate is for the next sample, from data up to this one; {taken}."]
+    start = "at rest or in motion" if observer.start_in_motion is not None else "as from rest"
+    return [f"An estimate is for the next sample, from data up to this one; {taken}. It starts at the first measurement, {start}."]
 
 
 def _parameters(run: RunFolder, observer: Observer) -> list[str]:
@@ -147,6 +156,12 @@ def _void(trust: Trust, metrics: Mapping[str, Any]) -> list[str]:
     return told
 
 
-def _monitor(metrics: Mapping[str, Any]) -> list[str]:
-    """Say at what rate the running observer raises a false alarm; nothing where no envelope was made."""
-    return ["Status bit 8 tells that the innovation has left the population's envelope."] if metrics.get("monitor") else []
+def _monitor(observer: Observer) -> list[str]:
+    """Say what the running observer tells of the machine, and at which rates it is wrong; nothing where it has no envelope."""
+    own = observer.monitor
+    if own is None:
+        return []
+    return [
+        f"Status bit 8 is set while the innovation is outside the envelope of {own.units} units. One more good unit exceeds it with a probability of "
+        f"{100 * own.false_alarm_rate:g} %; in {number(own.hours)} h of motion in training it was exceeded {own.alarms} times."
+    ]

@@ -50,8 +50,9 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     assumptions = record["certificates"].get(deployed, {}).get("assumptions", [])
     conditions = [f"Assumed for “{observer_label(deployed)}”: {'; '.join(assumptions)}."] if deployed and assumptions else []
     signals = _signals(observers, deployed)
-    tables = [table, *signals, *_units(deployed, record["rows"].get(deployed, []), record.get("signals", {}).get(deployed, {}))]
-    return Section("relift", "Certified as it runs", [_TEXT, _BOUND, *([_SIGNALS] if signals else []), *conditions, *failed], tables)
+    return Section(
+        "relift", "Certified as it runs", [_TEXT, _BOUND, *([_SIGNALS] if signals else []), *conditions, *failed], [table, *signals]
+    )
 
 
 def _row(name: str, entry: Mapping[str, Any], rows: Rows) -> list[Cell | str]:
@@ -82,22 +83,3 @@ def _signals(observers: Mapping[str, Mapping[str, Any]], deployed: str | None) -
         *([("", 1)] if lossy else []),
     ]
     return [Table(head, rows, "Bounds on RMS errors for signals like those recorded", groups, emphasised=where(observers, deployed))]
-
-
-def _units(deployed: str | None, rows: Rows, signals: Mapping[str, Any]) -> list[Table]:
-    if deployed is None or not rows:
-        return []
-    keys = ("gain_bound", "bound", "error")
-    cells = [[row["unit"], number(row["residual"]), *(number(100 * row[key]) for key in keys)] for row in rows]
-    head = ["unit", "residual", "bound by the gain (%)", "bound (%)", "error (%)"]
-    found = [Table(head, cells, f"Every unit, “{observer_label(deployed)}”; residual relative to the population's.", folded=True)]
-    if signals:
-        sizes, by_unit = signals["sizes"], zip(signals["units"], signals["bounds"], signals["errors"], strict=True)
-        cells = [
-            [unit, *(number(v and 100 * v / size) for j, size in enumerate(sizes) for v in (bounds[j], errors[j]))]
-            for unit, bounds, errors in by_unit
-        ]
-        groups = [("", 1), *((state, 2) for state in signals["states"])]
-        caption = f"Every unit, “{observer_label(deployed)}”: bound for signals of its powers, and error, % of the largest value"
-        found.append(Table(["unit", *["bound", "error"] * len(sizes)], cells, caption, groups, folded=True))
-    return found

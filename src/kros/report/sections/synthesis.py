@@ -34,7 +34,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     )
     emphasised = where(observers, metrics["study"].get("deployed"))
     table = Table([_HEAD[i] for i in kept], [[row[i] for i in kept] for row in rows], caption, emphasised=emphasised)
-    return Section("synthesis", "Synthesis", [_TEXT], [table], ["synthesis", "certificates"])
+    return Section("synthesis", "Synthesis", [_TEXT], [table], ["synthesis"])
 
 
 def _row(name: str, entry: Mapping[str, Any]) -> list[Cell | str]:

@@ -17,7 +17,8 @@ _COLUMNS = (
     "For the set: “plants”, a bound on the error's H2 norm for every plant between the weights around the nominal unit; “signals”, a bound on its RMS for all "
     "signals with the power in every band of frequency that was recorded. As it runs: a bound with the state re-lifted at every step, from the model's "
     "one-step residual to the error, for any machine. Dropouts and sensor: the severity at which the error doubles on held-out episodes, geometric mean over "
-    "the states that are not measured, “<” the mildest that was tried; noise, resolution and bias in percent of the largest value, delay in samples."
+    "the states that are not measured; “less than” is the mildest that was tried. Noise, resolution and bias are in percent of the largest value, delays in "
+    "samples; gaps take a tenth of the time, whatever their length."
 )
 _ASSUMED = (
     "The units recorded stand for those to come: nothing here is about another batch, or about wear.",
@@ -36,7 +37,8 @@ _RECOMPUTED = (
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     """Return claims, assumptions, recomputations and the table; None where no observer was made."""
-    found, deployed = trusts(metrics), metrics["study"].get("deployed")
+    deployed = metrics["study"].get("deployed")
+    found = dict(sorted(trusts(metrics).items(), key=lambda item: item[0] != deployed))
     if not found:
         return None
     rows: list[Cells] = [
@@ -68,7 +70,7 @@ def _assumed(run: RunFolder, deployed: str | None) -> list[str]:
 
 def _members(metrics: Mapping[str, Any]) -> list[str]:
     return [
-        f"{row['members']} random members of the set of plants were simulated with “{observer_label(row['observer'])}”: the largest error is "
+        f"{row['members']} random members of the set of plants were drawn for “{observer_label(row['observer'])}”: the largest H2 norm of its error is "
         f"{number(row['largest'])}, the certified bound {number(row['bound'])}."
         for row in metrics.get("monte_carlo", {}).get("sets", [])[:1]
     ]

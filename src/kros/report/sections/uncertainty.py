@@ -39,7 +39,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     high = [n for n, e in entries.items() if (e["peak_db"].get(e["form"]) or 0) >= 0]
     paragraphs = [text, *([_PAPER] if tall else []), *([_HIGH.format(names=", ".join(model_label(n) for n in high))] if high else [])]
     paragraphs += [*confounded_text(metrics), *small_set_text(metrics), *noise_text(entries)]
-    tables = [_peaks(entries), *_noise(entries), _weights(entries)]
+    tables = [_peaks(entries), _weights(entries)]
     return Section("uncertainty", "Uncertainty", paragraphs, tables, ["forms", "signal_set", "variation", "weights", "weight_orders"])
 
 
@@ -59,17 +59,6 @@ def noise_text(entries: Mapping[str, Any]) -> list[str]:
     if high:
         text += f"For {', '.join(high)} most of it is the recordings' length: record longer, or more episodes, before calling it a difference between machines."
     return [text.strip()]
-
-
-def _noise(entries: Mapping[str, Any]) -> list[Table]:
-    rows: list[Cells] = []
-    for name, entry in entries.items():
-        if "noise_share" in entry:
-            share = entry["noise_share"]
-            at_peak = Cell(number(100 * share["at_peak"], 2), strong=share["at_peak"] >= MANY)
-            rows.append([model_label(name), at_peak, number(share["peak_hz"]), number(100 * share["median"], 2)])
-    head = ["model", "where units differ most (%)", "that is at (Hz)", "median over frequency (%)"]
-    return [Table(head, rows, "Share of the squared residual that finite recordings explain.")] if rows else []
 
 
 def _peaks(entries: Mapping[str, Any]) -> Table:

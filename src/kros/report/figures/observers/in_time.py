@@ -27,7 +27,7 @@ def draw(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
             strips.append(Strip(run.states[i], error_lines(episode, names, i)))
         blocks.append((shorten(f"{role}: unit {episode.key.unit}, episode {episode.key.episode}", 46), episode, strips))
     text += f"Estimated from {' and '.join(c.name for c in run.states if c.measured)} alone; grey: as recorded; errors are recorded minus estimated. "
-    text += "All begin at the first measurement with everything else at zero or at rest; errors of that start are cut off."
+    text += "Errors of the start, before an observer has found the state, are cut off."
     return overview_and_zoom(run, blocks, 0.95), text
 
 

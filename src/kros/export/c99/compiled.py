@@ -85,7 +85,12 @@ class CompiledObserver:
         return int(self._c[f"{self.name}_selftest"]())
 
     def run(
-        self, y: Array, u: Array, parameters: Mapping[str, float] | None = None, condition: str | None = None
+        self,
+        y: Array,
+        u: Array,
+        parameters: Mapping[str, float] | None = None,
+        condition: str | None = None,
+        machine: npt.NDArray[np.uint8] | None = None,
     ) -> tuple[Array, npt.NDArray[Any]]:
         """Estimate one recording, sample by sample.
 
@@ -95,6 +100,8 @@ class CompiledObserver:
         parameters : mapping of str to float, optional
         condition : str, optional
             Recorded condition that the machine is in, as far as the monitor knows it.
+        machine : ndarray, optional
+            What `start` returned, to go on from; it is moved on. A new one by default.
 
         Returns
         -------
@@ -107,22 +114,22 @@ class CompiledObserver:
             raise DimensionError(
                 f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m}), found {y.shape} and {u.shape}."
             )
-        machine = self.start(y[0], parameters)
-        if condition is not None:
-            if condition not in self.conditions:
-                raise ConfigError(f"Compiled observer {self.name}: the condition {condition!r} is unknown; known are {self.conditions}.")
-            self._c[f"{self.name}_in_condition"](_at(machine), ctypes.c_uint32(1 + self.conditions.index(condition)))
+        machine = self.start(y[0], parameters, condition) if machine is None else machine
         x_hat, status = np.empty((len(y), len(self.states))), np.empty(len(y), dtype=np.uint32)
         self._run(_at(machine), ctypes.c_long(len(y)), *(_at(array) for array in (y, u, x_hat, status)))
         return x_hat, status
 
-    def start(self, y: Array, parameters: Mapping[str, float] | None = None) -> npt.NDArray[np.uint8]:
+    def start(self, y: Array, parameters: Mapping[str, float] | None = None, condition: str | None = None) -> npt.NDArray[np.uint8]:
         """Return the state of a machine that starts at a measurement, shape (q,), as the C source keeps it."""
         machine, real = np.zeros(self.state_bytes, dtype=np.uint8), ctypes.c_float if self._real is np.float32 else ctypes.c_double
         self._c[f"{self.name}_init"](_at(machine))
         for name, value in (parameters or {}).items():
             self._c[f"{self.name}_set_{name}"](_at(machine), real(value))
         self._reset(_at(machine), _at(np.ascontiguousarray(y, dtype=float)))
+        if condition is not None:
+            if condition not in self.conditions:
+                raise ConfigError(f"Compiled observer {self.name}: the condition {condition!r} is unknown; known are {self.conditions}.")
+            self._c[f"{self.name}_in_condition"](_at(machine), ctypes.c_uint32(1 + self.conditions.index(condition)))
         return machine
 
 

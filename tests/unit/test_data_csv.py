@@ -287,3 +287,50 @@ def test_restricted_to_one_unit(folder: Path) -> None:
     one = population.select(units=["a"])
     assert len(one.source.recordings.places) == 2  # type: ignore[attr-defined]
     np.testing.assert_array_equal(one.read(one.episodes[0]), population.read(one.episodes[0]))
+
+
+def test_a_list_of_recordings_says_condition_and_group(tmp_path: Path) -> None:
+    for i in range(4):
+        write(tmp_path / f"rec_{i}.csv", samples(i))
+    (tmp_path / "protocol.csv").write_text(
+        "file,unit,condition,group,tester\nrec_0,a,cold,,me\nrec_1,a,warm,,me\nrec_2.csv,b,cold,outliers,you\nrec_3,b,warm,outliers,you\n"
+    )
+    table = mapping(files=r"^rec_(?P<episode>\d)\.csv", lookup="protocol.csv")
+    population = read_csv_folder(tmp_path, table)
+    assert [(k.unit, k.condition, k.episode) for k in population.episodes] == [
+        ("a", "cold", "0"),
+        ("a", "warm", "1"),
+        ("b", "cold", "2"),
+        ("b", "warm", "3"),
+    ]
+    assert [(u.id, u.group) for u in population.units] == [("a", ""), ("b", "outliers")]
+    write(tmp_path / "rec_4.csv", samples(4))
+    with pytest.raises(DataError, match=r"protocol\.csv: there is no row for the file 'rec_4\.csv'"):
+        read_csv_folder(tmp_path, table)
+
+
+def test_a_list_of_recordings_by_what_paths_say(folder: Path) -> None:
+    (folder / "units.csv").write_text("unit;condition;group\na;cold;\nb;cold;outliers\nb;warm;outliers\n")
+    population = read_csv_folder(folder, mapping(lookup="units.csv"))
+    assert [(u.id, u.group) for u in population.units] == [("a", ""), ("b", "outliers")]
+
+
+def test_pieces_are_the_recording_in_parts(tmp_path: Path) -> None:
+    write(tmp_path / "a.csv", samples(0))
+    whole = read_csv_folder(tmp_path, mapping(files="(?P<unit>a)"))
+    parts = read_csv_folder(tmp_path, mapping(files="(?P<unit>a)", pieces=3))
+    assert [k.episode for k in parts.episodes] == ["0.1", "0.2", "0.3"]
+    np.testing.assert_array_equal(np.concatenate([parts.read(k) for k in parts.episodes]), whole.read(whole.episodes[0]))
+    write(tmp_path / "a.csv", samples(1))
+    np.testing.assert_allclose(parts.read(parts.episodes[0])[:, 1], samples(1)[:16, 2])
+
+
+@pytest.mark.parametrize("text", ["31.12.2023 23:59:59,5", "2023-12-31T23:59:59.500Z", "12/31/2023 23:59:59.5"])
+def test_timestamps_over_the_turn_of_a_year(tmp_path: Path, text: str) -> None:
+    order = {"3": "dmy", "2": "ymd", "1": "mdy"}[text[0]]
+    turned = {"dmy": "01.01.2024 00:00:00,", "ymd": "2024-01-01T00:00:00.", "mdy": "01/01/2024 00:00:00."}[order]
+    rows = [f"{text};1;2", *(f"{turned}{'0' if k == 0 else '5'}{'Z' if order == 'ymd' else ''};{k};{k * k}" for k in range(2))]
+    (tmp_path / "a.csv").write_text("\n".join(["t;pos;volt", *rows]))
+    population = read_csv_folder(tmp_path, mapping(files="a", delimiter=";", timestamp=order))
+    assert population.sample_period_s == 0.5
+    assert population.read(population.episodes[0]).shape == (3, 2)

@@ -61,7 +61,7 @@ class Lookup:
 
 
 def read_lookup(source: Path, name: str, mapping: CsvMapping) -> Lookup:
-    """Read a list of recordings, written with the delimiter and the encoding of the recordings, or with a comma.
+    """Read a list of recordings, delimited by commas, semicolons or tabs, in UTF-8 or in the encoding of the recordings.
 
     Raises
     ------
@@ -71,12 +71,12 @@ def read_lookup(source: Path, name: str, mapping: CsvMapping) -> Lookup:
     path = source / name
     with opened(path, mapping.encoding) as file:
         content = b"".join(iter(file.readline, b""))
-    encoding = mapping.encoding if "0".encode(mapping.encoding) == b"0" else "utf-8"
     try:
-        text = content.decode(encoding).removeprefix("\ufeff")
-    except UnicodeDecodeError as error:
-        raise DataError(f"Reading {path}: is not in {encoding} ({error}); write it as the recordings are written.") from error
-    delimiter = mapping.delimiter if mapping.delimiter in text.partition("\n")[0] else ","
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode(mapping.encoding, errors="replace")
+    header = text.partition("\n")[0]
+    delimiter = max(",;\t", key=header.count)
     rows = [
         {str(k).strip(): str(v or "").strip() for k, v in row.items()} for row in csv.DictReader(io.StringIO(text), delimiter=delimiter)
     ]

@@ -5,9 +5,10 @@ can be described before anything is read, and does it to one recording at a time
 In TOML a step is a table with its name under `step`: ``[[data.prepare]] step = "trim" start = 1000``.
 """
 
+from .events import ByDirection, Cut
 from .filtered import Differentiate, Resample
 from .parsing import parse_steps
-from .pointwise import Offset, Scale, Shift, Trim
+from .pointwise import Offset, Scale, Shift, Tare, Trim
 from .step import Step
 
-__all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim", "parse_steps"]
+__all__ = ["ByDirection", "Cut", "Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Tare", "Trim", "parse_steps"]

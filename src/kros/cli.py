@@ -7,7 +7,6 @@ Exit codes: 0 done; 1 failed; 2 wrong usage or bad input, and then nothing was w
 from __future__ import annotations
 
 import json
-import logging
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from .core.errors import ConfigError
-from .edge import NOT_MET, EdgeGroup
+from .edge import NOT_MET, EdgeGroup, log_to_stderr
 
 app = typer.Typer(
     name="kros",
@@ -23,6 +22,7 @@ app = typer.Typer(
     help="From recordings of a batch of machines to one robust observer for all of them.",
     no_args_is_help=True,
     add_completion=False,
+    rich_markup_mode=None,  # markup would take [data] for a colour
 )
 
 Quiet = Annotated[bool, typer.Option("--json", help="Print metrics.json and nothing else on standard output.")]
@@ -43,13 +43,22 @@ def _say(text: str, quiet: bool = False) -> None:
         typer.echo(text)
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        from . import __version__
+
+        typer.echo(f"kros {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
 def main(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens to standard error.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error in place of a message.")] = False,
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version and nothing else.")] = False,
 ) -> None:
     """Set up logging."""
-    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    log_to_stderr(verbose)
 
 
 @app.command()
@@ -230,7 +239,7 @@ def estimate(
         _say(f"  unit {unit}: parameters {source}")
 
 
-export = typer.Typer(help="An observer for machines: source code.", no_args_is_help=True)
+export = typer.Typer(help="An observer for machines: source code.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(export, name="export")
 
 
@@ -279,10 +288,21 @@ def report(run_folder: Annotated[Path, typer.Argument(metavar="RUN")]) -> None:
 @app.command()
 def figures(run_folder: Annotated[Path, typer.Argument(metavar="RUN")], out: Path) -> None:
     """Write the report's figures as PNG and PDF."""
+    from .study.engine.progress import make_progress
     from .study.stages.report import write_figures
 
-    names = write_figures(run_folder, out)
+    with make_progress(False) as progress:
+        names = write_figures(run_folder, out, progress)
     _say(f"{len(names)} figures in {out}")
+
+
+@app.command("list")
+def list_(run_folder: Annotated[Path, typer.Argument(metavar="RUN")]) -> None:
+    """Say what a run holds: stages, observers by name and how well they do."""
+    from .study.commands.listing import list_run
+
+    for line in list_run(run_folder):
+        typer.echo(line)
 
 
 @app.command()

@@ -7,10 +7,13 @@ with the way to its traceback (``kros --debug``).
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
+import re
+import signal
 import sys
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TextIO
 
 import typer
 from typer.core import TyperGroup
@@ -30,21 +33,24 @@ class EdgeGroup(TyperGroup):
         """Run a command."""
         if ctx.params.get("debug"):
             return super().invoke(ctx)
-        with edge():
+        with edge(ctx):
             return super().invoke(ctx)
 
 
 @contextlib.contextmanager
-def edge() -> Iterator[None]:
-    """Turn any exception into one message on standard error and an exit code."""
+def edge(ctx: Any = None) -> Iterator[None]:
+    """Turn any exception into one message on standard error and an exit code; `ctx` knows which command it is."""
     from .study.engine.stop import Stopped, stoppable
 
     try:
         with stoppable():
             yield
     except Stopped as stopped:
-        typer.echo(f"kros: stopped by {stopped}; the same command goes on where this one ended.", err=True)
+        typer.echo(f"kros: stopped by {stopped}; {_afterwards(ctx)}", err=True)
         raise typer.Exit(SIGNALLED + stopped.signal) from stopped
+    except KeyboardInterrupt as stopped:
+        typer.echo(f"\nkros: stopped by Ctrl-C; {_afterwards(ctx)}", err=True)
+        raise typer.Exit(SIGNALLED + signal.SIGINT) from stopped
     except _PASSED:
         raise
     except BrokenPipeError:
@@ -54,6 +60,43 @@ def edge() -> Iterator[None]:
         _silence_if_broken()
         typer.echo(f"kros: {message(error)}".encode(errors="backslashreplace").decode(), err=True)
         raise typer.Exit(BAD_INPUT if isinstance(error, _BAD_INPUT) else FAILED) from error
+
+
+def _afterwards(ctx: Any) -> str:
+    resumes = ctx is None or ctx.invoked_subcommand in (None, "run", "demo")
+    return "the same command goes on where this one ended." if resumes else "nothing half done is left; run the same command again."
+
+
+class OnceHandler(logging.StreamHandler[TextIO]):
+    """Writes every message in one line, and once."""
+
+    def __init__(self) -> None:
+        super().__init__(sys.stderr)
+        self._said: set[str] = set()
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return one line."""
+        text = record.getMessage()
+        if record.name == "py.warnings":  # file, line, category and the line of source are of no use here
+            text = re.sub(r"^.*?:\d+: (?:\w+: )?", "", text.strip().partition("\n")[0])
+        return f"{record.levelname.lower()}: {' '.join(text.split())}"
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record that was not written before."""
+        line = self.format(record)
+        if record.levelno < logging.WARNING or line not in self._said:
+            self._said.add(line)
+            super().emit(record)
+
+
+def log_to_stderr(verbose: bool) -> None:
+    """Send log and warnings to standard error, a line each; warnings and errors alone unless `verbose`."""
+    if logging.getLogger().handlers:
+        return  # somebody else listens
+    handler = OnceHandler()
+    handler.addFilter(lambda record: verbose or record.name != "kros.data.survey")  # alerts stand behind the run
+    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
+    logging.captureWarnings(True)
 
 
 def message(error: Exception) -> str:

@@ -116,7 +116,10 @@ def test_recordings_arrive_late_at_an_observer_that_was_told_so_and_nothing_is_a
         ({"position": {"noise": -1.0}}, "sensor.position.noise"),
         ({"position": {"noise": float("inf")}}, "finite"),
         ({"position": {"dropout": 1.0}}, "less than 1"),
-        ({"position": {"nois": 1.0}}, "unknown key; known are noise, resolution, bias, delay_samples, jitter_samples, dropout"),
+        (
+            {"position": {"nois": 1.0}},
+            r"unknown key; did you mean 'noise'\? known are noise, resolution, bias, delay_samples, jitter_samples, dropout",
+        ),
     ],
 )
 def test_what_cannot_be_a_sensor_is_refused(sensor, reason, tmp_path):

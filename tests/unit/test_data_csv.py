@@ -212,7 +212,7 @@ def test_another_rate(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"file": "x"}, "unknown key 'file'; known keys are files, channel, time"),
+        ({"file": "x"}, r"unknown key 'file'; did you mean 'files'\? known keys are files, channel, time"),
         ({"channel": [{"name": "x", "role": "state", "column": "pos", "measurd": True}]}, r"channel\[0\]: unknown key 'measurd'"),
         (
             {"channel": [{"name": "x", "role": "output", "column": "pos"}]},

@@ -7,7 +7,7 @@ from typing import Any, Self, TypeVar, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from .errors import ConfigError
-from .files import shortened
+from .files import did_you_mean, shortened
 
 T = TypeVar("T")
 
@@ -38,7 +38,8 @@ class Settings(BaseModel):
     @classmethod
     def _explain(cls, error: Any) -> str:
         if error["type"] == "extra_forbidden":
-            return f"unknown key; known are {', '.join(cls._names_in(error['loc'][:-1]))}"
+            known = cls._names_in(error["loc"][:-1])
+            return f"unknown key{did_you_mean(error['loc'][-1], known) or ';'} known are {', '.join(known)}"
         found = error.get("input")
         return f"{error['msg'].lower()}, found {shortened(repr(found))}" if not isinstance(found, dict) else str(error["msg"]).lower()
 

@@ -10,6 +10,7 @@ from enum import Enum
 from typing import Any, TypeVar
 
 from ..core.errors import ConfigError
+from ..core.files import did_you_mean
 
 T = TypeVar("T")
 
@@ -35,7 +36,7 @@ def build(kind: type[T], table: Mapping[str, Any], where: str) -> T:
     known = [f.name for f in fields]
     unknown = [key for key in table if key not in known]
     if unknown:
-        raise ConfigError(f"{where}: unknown key {unknown[0]!r}; known keys are {', '.join(known)}.")
+        raise ConfigError(f"{where}: unknown key {unknown[0]!r}{did_you_mean(unknown[0], known) or ';'} known keys are {', '.join(known)}.")
     missing = [
         f.name for f in fields if f.name not in table and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
     ]

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
+from ..core.files import did_you_mean
 from ..data.population import Population, split_episodes
 from ..lifting import Formula, Lifting, concatenate, family
 from .calibration import PhaseSpec
@@ -91,7 +92,8 @@ def resolve_phase(declared: CalibrationSettings, population: Population, lifting
     for name in (spec.angle, spec.reference, spec.measured):
         if name not in channels:
             raise ConfigError(
-                f"Calibration: there is no channel {name!r} in {', '.join(channels)}; set calibrate.angle, .reference and .measured."
+                f"Calibration: there is no channel {name!r} in {', '.join(channels)}{did_you_mean(name, channels) or ';'} set "
+                "calibrate.angle, .reference and .measured."
             )
     return spec
 

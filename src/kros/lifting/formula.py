@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
+from ..core.files import did_you_mean
 from .c_code import c_code
 from .evaluation import FUNCTIONS, Evaluator, compile_expression
 from .limits import MAX_EXPONENT, MAX_LENGTH, TooCostlyError, finite, require_size, settled
@@ -211,7 +212,7 @@ class _Reader:
             return sp.Symbol(name, real=True)
         if name == "pi":
             return sp.pi
-        raise self._error(f"unknown name {name!r}; known are {', '.join(self.names)} and pi.")
+        raise self._error(f"unknown name {name!r}{did_you_mean(name, self.names) or ';'} known are {', '.join(self.names)} and pi.")
 
     def _earlier(self, name: str, index: ast.expr) -> Any:
         import sympy as sp

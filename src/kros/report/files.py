@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import re
+import time
 from collections.abc import Iterator
 from html import escape
 from pathlib import Path
@@ -13,8 +14,9 @@ from urllib.parse import unquote
 
 from ..core.artifacts import write_bytes
 from ..core.errors import ConfigError
+from ..core.work import Progress, Silent
 from .canvas import settle
-from .figures import draw_all
+from .figures import FIGURES, draw_all
 from .run_folder import RunFolder
 from .theme import Tone, style
 
@@ -29,7 +31,7 @@ _FAMILY = re.compile(r"(?<=px )'DejaVu Sans'(?:, [^;\"]*)?|(?<=font-family: )'?D
 _SHORTER = re.compile(r"\s*([A-Z])\s*|(\.\d)\d+")
 
 
-def write_figures(run: Path, out: Path) -> list[str]:
+def write_figures(run: Path, out: Path, progress: Progress | None = None) -> list[str]:
     """Write every figure of a run as PNG (200 dots an inch) and PDF.
 
     Parameters
@@ -38,6 +40,8 @@ def write_figures(run: Path, out: Path) -> list[str]:
         Run folder; figures whose artifacts it does not have are left out and logged.
     out : Path
         Folder for the files; made where it is missing.
+    progress : Progress, optional
+        Told of every figure.
 
     Returns
     -------
@@ -52,14 +56,17 @@ def write_figures(run: Path, out: Path) -> list[str]:
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Figures to {out}: is a file; name a folder.")
-    names = []
+    names, progress, began = [], progress or Silent(), time.perf_counter()
+    progress.start("figures", len(FIGURES))
     for drawn in draw_all(RunFolder(Path(run))):
+        progress.advance()
         if drawn.figure is None:
             log.warning("figure %s is left out: %s", drawn.name, drawn.reason)
             continue
         for suffix, encode in (("png", to_png), ("pdf", to_pdf)):
             write_bytes(out / f"{drawn.name}.{suffix}", encode(drawn.figure))
             names.append(f"{drawn.name}.{suffix}")
+    progress.finish("figures", time.perf_counter() - began, skipped=False)
     return names
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError
-from ...core.files import require_regular
+from ...core.files import did_you_mean, require_regular
 from ..checks import check_names
 from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Role, Unit
 from ..prepare import assemble
@@ -188,6 +188,8 @@ def _position(path: Path, fields: list[str], column: Column | None) -> int:
             raise DataError(f"Reading {path}: column {column} is asked for, found {len(fields)} columns; correct the mapping or the file.")
         return column - 1
     if fields.count(str(column)) != 1:
-        problem = "is missing" if column not in fields else f"occurs {fields.count(str(column))} times"
-        raise DataError(f"Reading {path}: column {column!r} {problem}, found {fields}; correct the mapping or the file.")
+        problem = (
+            f"is missing{did_you_mean(column, fields) or ','}" if column not in fields else f"occurs {fields.count(str(column))} times,"
+        )
+        raise DataError(f"Reading {path}: column {column!r} {problem} found {fields}; correct the mapping or the file.")
     return fields.index(str(column))

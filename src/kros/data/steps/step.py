@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from ...core.errors import ConfigError
+from ...core.files import did_you_mean
 from ..population import Channel
 from ..recording import Recording
 from ..scaling import Scalings
@@ -48,5 +49,7 @@ class Step:
         known = [c.name for c in channels]
         for name in names:
             if name not in known:
-                raise ConfigError(f"Step {self.step!r} asks for channel {name!r}; there are {known}; correct the name.")
+                raise ConfigError(
+                    f"Step {self.step!r} asks for channel {name!r}{did_you_mean(name, known) or ';'} there are {known}; correct the name."
+                )
         return [known.index(name) for name in names]

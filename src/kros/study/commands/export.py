@@ -9,6 +9,7 @@ import numpy as np
 
 from ...core.artifacts import load_artifact, read_json
 from ...core.errors import ConfigError, KrosError
+from ...core.files import did_you_mean
 from ...data import EpisodeBatch
 from ...data.survey import RecordingFacts
 from ...design.validation import spread
@@ -51,7 +52,9 @@ def export_run(
         names = (DEPLOYED, *load_artifact(store.path("observers"), "observers")[0]["names"])
         loads = {f"{kind}/{LOAD}": f"{kind}.json" for kind in ("koopman", "linear") if store.holds(LOAD, f"{kind}.json")}
         if observer not in (*names, *loads):
-            raise ConfigError(f"Run {run}: has no observer {observer!r}; known are {', '.join((*names, *loads))}.")
+            raise ConfigError(
+                f"Run {run}: has no observer {observer!r}{did_you_mean(observer, (*names, *loads)) or ';'} known are {', '.join((*names, *loads))}."
+            )
         path = store.path(LOAD, loads[observer]) if observer in loads else store.path("observers", f"{observer}.json")
         chosen, name = Observer.load(path), name or identifier(config.name)
         if fmi is not None:

@@ -131,13 +131,10 @@ def _surveyed(config: StudyConfig, work: Work) -> tuple[Population, RecordingFac
     population = open_source(config)
     try:
         check_population(population, allow_single=True)
-        logging.getLogger("kros.data").setLevel(logging.ERROR)  # alerts are among the findings
         kept, facts = survey(population, identify_on=config.data.identify_on, on_nan=config.data.on_nan, work=work)
         return kept, facts, ""
     except DataError as error:
         return population, None, str(error)
-    finally:
-        logging.getLogger("kros.data").setLevel(logging.NOTSET)
 
 
 def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingProposal:

@@ -3,26 +3,65 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from threading import Event, Lock, Thread
 from typing import Any
 
 from ...core.work import Progress, Silent
 
+EVERY_S = 10.0  # without a line, after which people wonder whether anything happens
+
 
 class Lines:
-    """One line a finished stage."""
+    """One line a finished stage, and one every ten seconds where nothing else is said."""
+
+    def __init__(self, every_s: float = EVERY_S) -> None:
+        self._every_s, self._lock, self._over = every_s, Lock(), Event()
+        self._stage, self._done, self._began = "", 0, 0.0
+        self._total: int | None = None
+        self._thread = Thread(target=self._beat, name="says how far it is", daemon=True)
+        self._said = time.monotonic()
+        self._thread.start()
 
     def start(self, stage: str, total: int | None) -> None:
-        """Say nothing until it is done."""
+        """Remember what runs."""
+        with self._lock:
+            self._stage, self._total, self._done, self._began = stage, total, 0, time.monotonic()
 
     def advance(self) -> None:
-        """Say nothing until it is done."""
+        """Count."""
+        with self._lock:
+            self._done += 1
 
     def finish(self, stage: str, seconds: float, skipped: bool) -> None:
         """Write one line."""
-        sys.stderr.write(f"{stage:<12} {'unchanged' if skipped else f'{seconds:6.1f} s'}\n")
-        sys.stderr.flush()
+        with self._lock:
+            self._stage = ""
+            self._say(f"{stage:<12} {'unchanged' if skipped else f'{seconds:6.1f} s'}")
+
+    def close(self) -> None:
+        """Say nothing more."""
+        self._over.set()
+        self._thread.join()
+
+    def _beat(self) -> None:
+        while not self._over.wait(max(self._said + self._every_s - time.monotonic(), 0.01)):
+            with self._lock:
+                if time.monotonic() - self._said < self._every_s:
+                    continue
+                if self._stage:
+                    count = f" {self._done} of {self._total}," if self._total else ""
+                    self._say(f"  {self._stage} ...{count} {time.monotonic() - self._began:.0f} s")
+                else:
+                    self._said = time.monotonic()
+
+    def _say(self, line: str) -> None:
+        self._said = time.monotonic()
+        with suppress(OSError, ValueError):  # nobody may be listening any more
+            sys.stderr.write(f"{line}\n")
+            sys.stderr.flush()
 
 
 class Bars:
@@ -58,7 +97,11 @@ def make_progress(quiet: bool, asks: bool = False) -> Iterator[Progress]:
     if quiet or asks:
         yield Silent()
     elif not sys.stderr.isatty():
-        yield Lines()
+        lines = Lines()
+        try:
+            yield lines
+        finally:
+            lines.close()
     else:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from ...core.artifacts import read_json
+from ...core.work import Progress
 from ..config import Stage
 from ..engine.context import Context
 from ..engine.executors import open_executor
@@ -38,9 +39,9 @@ def render_run(folder: Path, workers: int = 1) -> Path:
         return store.path(REPORT)
 
 
-def write_figures(folder: Path, out: Path) -> list[str]:
+def write_figures(folder: Path, out: Path, progress: Progress | None = None) -> list[str]:
     """Write the figures of a finished run as PNG and PDF."""
     from ... import report
 
     with open_finished(folder, *_SHOWN):
-        return report.write_figures(folder, out)
+        return report.write_figures(folder, out, progress)

@@ -1,0 +1,97 @@
+"""What people type and read: version, help, names that are nearly right, progress where there is no terminal, Ctrl-C, a list of a run."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+
+import pytest
+
+import kros as package
+from kros.core.errors import ConfigError
+from kros.edge import OnceHandler
+from kros.study.config import validate_config
+from kros.study.engine.progress import Lines
+from kros.study.engine.store import Store
+
+
+def test_version_and_module():
+    said = subprocess.run([sys.executable, "-m", "kros", "--version"], capture_output=True, text=True, check=True)
+    assert said.stdout == f"kros {package.__version__}\n"
+
+
+@pytest.mark.parametrize(("command", "part"), [("check", "a TOML with [data]"), ("estimate", "a TOML with [data]"), ("run", "KEY=VALUE")])
+def test_help_keeps_its_brackets(kros, command, part):
+    found = kros(command, "--help")
+    assert found.exit_code == 0
+    assert part in " ".join(found.output.split())
+
+
+@pytest.mark.parametrize(
+    ("tables", "hint"),
+    [({"identify": {"alpa": 1}}, "'alpha'"), ({"data": {"source": ".", "exlude": []}}, "'exclude'"), ({"evalute": {}}, "'evaluate'")],
+)
+def test_keys_that_are_nearly_right(tmp_path, tables, hint):
+    with pytest.raises(ConfigError, match=rf"did you mean {hint}\? known are"):
+        validate_config({"data": {"source": "."}, **tables}, tmp_path)
+
+
+def test_commands_that_are_nearly_right(kros):
+    assert "Did you mean 'figures'?" in kros("figurs", "x").output
+
+
+def test_a_line_is_written_while_a_stage_takes_long(capsys):
+    lines = Lines(every_s=0.05)
+    lines.start("synthesize", 4)
+    lines.advance()
+    deadline = time.monotonic() + 10
+    said = ""
+    while "synthesize ... 1 of 4" not in said and time.monotonic() < deadline:
+        time.sleep(0.01)
+        said += capsys.readouterr().err
+    lines.finish("synthesize", 1.25, skipped=False)
+    lines.close()
+    assert "  synthesize ... 1 of 4, 0 s\n" in said
+    assert capsys.readouterr().err.endswith("synthesize      1.2 s\n")
+
+
+def test_warnings_are_said_once_in_one_line(capsys):
+    handler = OnceHandler()
+    logger = logging.Logger("kros.somewhere")
+    logger.addHandler(handler)
+    for _ in range(3):
+        logger.warning("unit %s\nis odd", "a")
+    logger.warning("unit b is odd")
+    shown = warnings.formatwarning("a bound is loose", UserWarning, "/x/y.py", 7, "line of code")
+    handler.handle(logging.LogRecord("py.warnings", logging.WARNING, "", 0, "%s", (shown,), None))
+    assert capsys.readouterr().err.splitlines() == ["warning: unit a is odd", "warning: unit b is odd", "warning: a bound is loose"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+def test_ctrl_c_says_how_to_go_on(tmp_path):
+    wait = "import kros.study.commands.demo as d, time; d.run_demo = lambda *a, **k: (print('runs', flush=True), time.sleep(60))"
+    code = f"{wait}; from kros.cli import app; app()"
+    command = [sys.executable, "-c", code, "demo", "--out", str(tmp_path / "demo")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "runs\n"
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert said.strip() == "kros: stopped by Ctrl-C; the same command goes on where this one ended."
+
+
+def test_a_run_that_has_not_ended_is_listed(kros, study, tmp_path):
+    assert kros("run", study(), "--out", tmp_path / "run", "--until", "read", "--workers", 1).exit_code == 0
+    assert "stages done: read" in kros("list", tmp_path / "run").output
+    Store(tmp_path / "run").discard("metrics.json")  # as where it was stopped
+    found = kros("list", tmp_path / "run")
+    assert found.exit_code == 0, found.output
+    assert "stages done: read" in found.output
+    assert "the same command of kros run goes on with it" in found.output
+    assert kros("list", tmp_path).exit_code == 2

@@ -25,7 +25,10 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     )
     six = _compared(tables[0], metrics, run.measured_states)
     rows = [
-        [Cell(joined(roles), note=observer_label(name)), *_errors(tables[0], name, metrics, run.measured_states)]
+        [
+            Cell(joined(roles), note="" if observer_label(name) in roles else observer_label(name)),
+            *_errors(tables[0], name, metrics, run.measured_states),
+        ]
         for name, roles in six.items()
     ]
     deployed = metrics["study"].get("deployed")
@@ -38,7 +41,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     )
     notes = baseline_notes(metrics.get("observers", {}))
     every = _all(tables, metrics, run.measured_states)
-    return Section("observers", "Observers", [text, *([" ".join(notes)] if notes else [])], [first, every], ["observers_in_time"])
+    return Section("observers", "Observers", [text], [first, every], ["observers_in_time"], notes=notes)
 
 
 def estimates(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:

@@ -23,6 +23,7 @@
     for (const header of table.tHead.rows[table.tHead.rows.length - 1].cells) {
       const button = document.createElement("button");
       button.append(...header.childNodes);
+      button.setAttribute("aria-label", header.dataset.label);
       header.append(button);
       button.onclick = () => sort(header, table);
     }

@@ -122,25 +122,27 @@ def rms(values: np.ndarray) -> np.ndarray:
 
 
 def against_python(observer: Observer, track: str | None, data: HeldOut, given: argparse.Namespace) -> Iterator[str]:
-    """Yield one line: differences of both precisions with faults, status, loss without faults."""
-    own, rounds = observer.own(data.parameters), max(1, -(-given.steps // data.y[..., 0].size))
-    apart, unlike, steps = {"double": 0.0, "float": 0.0}, {"double": 0, "float": 0}, 0
-    for seed in range(rounds):
-        y, u = faulty(data, seed)
+    """Yield one line: differences of both precisions without and with faults, status, and what single precision loses."""
+    own, steps, seed = observer.own(data.parameters), 0, 0
+    clean, apart, unlike, loss = {}, {"double": 0.0, "float": 0.0}, {"double": 0, "float": 0}, np.zeros(1)
+    met = UNCERTIFIED | (LIMIT if observer.runtime.lower is not None or observer.runtime.correction is not None else 0)
+    while steps < given.steps:
+        y, u = (data.y, data.u) if not steps else faulty(data, seed)
         wanted, bits = in_python(observer, y, u, own, track), sample_status(observer, y, u)
-        steps += bits.size
-        met = UNCERTIFIED | (LIMIT if observer.runtime.lower is not None or observer.runtime.correction is not None else 0)
         for precision in apart:
             found, status = in_c(observer, y, u, own, track, precision)
-            apart[precision] = max(apart[precision], float(np.max(rms(found - wanted) / np.std(wanted, axis=(0, 1)))))
+            far = float(np.max(rms(found - wanted) / np.std(wanted, axis=(0, 1))))
+            if not steps:
+                clean[precision] = far
+                loss = 100 * (rms(found - data.states) / rms(wanted - data.states) - 1)
+            apart[precision] = max(apart[precision], far)
             unlike[precision] += np.count_nonzero((status | met) != (bits | met))
-    wanted = in_python(observer, data.y, data.u, own, track)
-    found, _ = in_c(observer, data.y, data.u, own, track, "float")
-    loss = 100 * (rms(found - data.states) / rms(wanted - data.states) - 1)
+        steps, seed = steps + bits.size, seed + 1
     some = min(20_000, len(data.y))
     yield (
-        f"{steps} steps: double {apart['double']:.0e}, float {apart['float']:.0e} of RMS; status that differs {unlike['double']}, {unlike['float']}, "
-        f"sample by sample {one_by_one(observer, track, data, some)} of {some}; float's error {loss.max():+.3f} %"
+        f"{steps} steps: double {clean['double']:.0e}, float {clean['float']:.0e} of RMS, with faults {apart['double']:.0e}, {apart['float']:.0e}; "
+        f"status that differs {unlike['double']}, {unlike['float']}, sample by sample {one_by_one(observer, track, data, some)} of {some}; "
+        f"float's error {loss.max():+.3f} %"
     )
 
 

@@ -12,6 +12,7 @@ from machines import LIMITS, MACHINES, apart, drive, in_python, replaced, sample
 
 from kros.core.errors import ConfigError, DataError
 from kros.export import CompiledObserver, HeldOut, LoadOutput, export_c, find_compiler
+from kros.export.c99.board import missing_tools
 from kros.motor_drive import AngleLoad
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Werror", "-pedantic")
@@ -143,6 +144,15 @@ def test_the_numerical_error_on_held_out_recordings(tmp_path):
     assert abs(found["loss_percent"]["velocity"]) < 0.1
     assert found["loss_percent"]["current"] is None
     assert not list(folder.glob("*.so"))
+
+
+@pytest.mark.skipif(bool(missing_tools()), reason="the tools for a Cortex-M4F are not on the PATH")
+def test_the_selftest_passes_on_a_board(tmp_path):
+    found = json.loads((export_c(replaced(), tmp_path / "c", "drive", "float", on_board=True) / "manifest.json").read_text())
+    assert found["cortex_m4f"]["selftest"] == 0
+    assert found["cortex_m4f"]["state"] == found["state_bytes"]
+    assert found["cortex_m4f"]["flash"] < 8192
+    assert found["cortex_m4f"]["instructions_a_step"] < 3000
 
 
 @pytest.mark.skipif(shutil.which("cppcheck") is None, reason="cppcheck is not on the PATH")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from ...data.writers import whole_folder
 from ...observer import Observer
 from ...observer.file import observer_content
 from .accuracy import Accuracy, HeldOut
+from .board import OnBoard, missing_tools
 from .compiled import find_compiler
 from .golden import Golden
 from .numbers import LoadOutput, Source
@@ -37,6 +39,7 @@ def export_c(
     track: str | None = None,
     load: LoadOutput | None = None,
     held_out: HeldOut | None = None,
+    on_board: bool = False,
 ) -> Path:
     """Write an observer as C99 source with a self-test, a project and a description.
 
@@ -57,6 +60,8 @@ def export_c(
         Load torque and total current with their levels, as outputs of their own.
     held_out : HeldOut, optional
         Recordings on which the numerical error is measured, where there is a compiler; the manifest and the description name it.
+    on_board : bool
+        Whether flash, stack and instructions of a Cortex-M4F are measured, where there are its compiler and QEMU.
 
     Returns
     -------
@@ -72,9 +77,10 @@ def export_c(
     if precision not in _TOLERANCE:
         raise ConfigError(f"Export to C: precision should be 'double' or 'float', found {precision!r}.")
     files = c_files(observer, name, precision, track, load)
-    if held_out is not None and find_compiler() is not None:
-        accuracy = Accuracy.of(files, observer, held_out, track)
-        files = c_files(observer, name, precision, track, load, accuracy)
+    accuracy = Accuracy.of(files, observer, held_out, track) if held_out is not None and find_compiler() is not None else None
+    board = OnBoard.of(files, name) if on_board and not missing_tools() else None
+    if accuracy is not None or board is not None:
+        files = c_files(observer, name, precision, track, load, accuracy, board)
     if study is not None:
         files["study.json"] = json_bytes(study).decode()
     with whole_folder(Path(out)) as folder:
@@ -98,6 +104,7 @@ def c_files(
     track: str | None = None,
     load: LoadOutput | None = None,
     accuracy: Accuracy | None = None,
+    board: OnBoard | None = None,
 ) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -117,6 +124,7 @@ def c_files(
     }
     state_bytes = _state_bytes(context)
     numbers = sum(len(row) for key in ("model", "correction", "into", "controller", "filter_gain") for row in context[key] or ())
+    numbers += 0 if context["tracked"] is None else sum(len(row) for key in ("model", "correction") for row in context["tracked"][key])
     begins = 0 if observer.start_in_motion is None else observer.start_in_motion.gain.size + observer.start_in_motion.corrections.size
     watched = 0 if observer.monitor is None else observer.monitor.limits.size
     largest = None if observer.seen is None else f"{1.5 * float(observer.seen.measured.max()):.6g}"
@@ -128,6 +136,7 @@ def c_files(
         "largest_angle": largest,
         "tolerance": tolerance,
         "accuracy": None if accuracy is None else accuracy.content(),
+        "board": None if board is None else asdict(board),
         "library": " and ".join(f"`{f}`" for f in functions) or "nothing",
         "units": ", ".join(f"{k} {v}" for k, v in units_of_measure(observer).items()),
     }
@@ -153,6 +162,7 @@ def c_files(
         "sample_period_s": observer.sample_period_s,
         "state_bytes": state_bytes,
         "numerical_error": context["accuracy"],
+        "cortex_m4f": context["board"],
         **({"conditions": list(observer.monitor.bounds)} if observer.monitor is not None and observer.monitor.bounds else {}),
         "observer": observer.name,
         "kros": version("kros"),

@@ -1,11 +1,14 @@
 /* A Cortex-M4F under QEMU (mps2-an386): start, self-test, and what a step costs, printed by semihosting. */
-#include "observer.h"
+#include HEADER
+
+#define JOINED(name, part) name##part
+#define OF(name, part) JOINED(name, part) /* name and part with macros read */
 
 #define SYSTICK ((volatile uint32_t *)0xE000E010)
 #define STEPS 1000
 
 extern unsigned _sidata, _sdata, _edata, _sbss, _ebss, _estack;
-static observer_state observer;
+static OF(NAME, _state) observer;
 
 static void semihost(int operation, const void *argument)
 {
@@ -31,21 +34,21 @@ static void number(const char *name, uint32_t value)
 
 __attribute__((noinline)) static void measure(void) /* apart from reset: its first instructions use the floating-point unit */
 {
-    observer_real y[OBSERVER_MEASURED] = { 0 }, u[OBSERVER_INPUTS] = { 0 }, x_hat[OBSERVER_STATES];
+    OF(NAME, _real) y[OF(UPPER, _MEASURED)] = { 0 }, u[OF(UPPER, _INPUTS) + 1] = { 0 }, x_hat[OF(UPPER, _STATES)];
     uint32_t before, after;
     int k;
-    number("selftest", (uint32_t)observer_selftest());
+    number("selftest", (uint32_t)OF(NAME, _selftest)());
     number("state_bytes", (uint32_t)sizeof(observer));
-    observer_init(&observer);
-    observer_reset(&observer, y);
+    OF(NAME, _init)(&observer);
+    OF(NAME, _reset)(&observer, y);
     SYSTICK[1] = 0xFFFFFF;
     SYSTICK[2] = 0;
     SYSTICK[0] = 5; /* counts the processor's clock, 25 MHz: with one instruction a nanosecond, 40 instructions a tick */
     before = SYSTICK[2];
     for (k = 0; k < STEPS; k++) {
-        y[0] = 5e-4f * (observer_real)k;
+        y[0] = 5e-4f * (OF(NAME, _real))k;
         u[0] = y[0];
-        (void)observer_step(&observer, y, u, x_hat);
+        (void)OF(NAME, _step)(&observer, y, u, x_hat);
     }
     after = SYSTICK[2];
     number("instructions_a_step", ((before - after) & 0xFFFFFFu) * 40u / STEPS);

@@ -8,11 +8,11 @@ from machines import DT, LIMITS, drive, moving, samples, watched
 
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
-from kros.design.monitor import fit_monitor, monitor_facts, poisson_interval
+from kros.design.monitor import fit_monitor, monitor_facts, poisson_interval, steady, weighted
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import Monitor, Observer, SampleStatus, in_sizes, octaves, run_innovations
-from kros.observer.monitor import RECOVERY
+from kros.observer.monitor import RECOVERY, WEIGHT
 from kros.plants import HarmonicDrivePopulation
 from kros.synthesis import Injection
 from kros.uncertainty.outliers.tail import prediction_bound
@@ -48,7 +48,7 @@ def test_bands_pass_the_power_that_their_filters_say():
     np.testing.assert_allclose(w[np.abs(response).argmax(axis=1)] / (2 * np.pi), 0.256 / 2.0 ** np.arange(6), atol=1e-5)
     np.testing.assert_allclose(np.abs(response).max(axis=1), 1, rtol=1e-6)
     noise = rng.normal(size=(400_000, 1, 1))
-    monitor = Monitor(filters, 1e-5, 0, np.ones(1), np.ones((1, 6)), 0.02)
+    monitor = Monitor(filters, 1e-5, 0, np.ones(1), np.ones((1, 6)), np.array([[16, 0, 0, 0, 0, 0]]), 0.02)
     powers = monitor.mean_squares(noise, np.ones((400_000, 1), dtype=bool))[-1, 0, 0]
     np.testing.assert_allclose(powers, np.mean(np.abs(response) ** 2, axis=1) * (1 - (1 - 1e-5) ** 400_000), rtol=0.05)
 
@@ -85,14 +85,26 @@ def test_what_cannot_be_a_monitor_is_refused():
         {"size": np.full(1, np.nan)},
         {"forget": 0.0},
         {"filters": np.ones((3, 2))},
+        {"weights": np.array([[8, 8, 1]])},
+        {"weights": np.array([[8.5, 7.5, 0]])},
     ):
         with pytest.raises(DataError, match="Monitor of an observer"):
             Monitor(
-                **({"filters": filters, "forget": 0.1, "settle": 9, "size": np.ones(1), "limits": np.ones((1, 3))} | wrong),
+                **(
+                    {
+                        "filters": filters,
+                        "forget": 0.1,
+                        "settle": 9,
+                        "size": np.ones(1),
+                        "limits": np.ones((1, 3)),
+                        "weights": np.array([[8, 8, 0]]),
+                    }
+                    | wrong
+                ),
                 false_alarm_rate=0.1,
             )
     with pytest.raises(DimensionError, match="monitor of 1 measurements"):
-        replace(drive(), monitor=Monitor(filters, 0.1, 9, np.ones(2), np.ones((2, 3)), 0.1))
+        replace(drive(), monitor=Monitor(filters, 0.1, 9, np.ones(2), np.ones((2, 3)), np.full((2, 3), [4, 4, 0]), 0.1))
 
 
 def test_poisson_interval_is_that_of_the_tables():
@@ -124,3 +136,22 @@ def test_the_bound_is_that_of_one_more_unit():
     assert not (levels(own, y, u)[1] & SampleStatus.UNCERTIFIED).any()
     assert (levels(own, shaken, u)[1] & SampleStatus.UNCERTIFIED).any()
     assert fit_monitor(observer, replace(training, keys=training.keys[:4]), 0.05) is None
+
+
+def test_weights_are_those_of_the_steadiest_mean():
+    """Of two noisy bands that move against each other and one that is alike in all units: against a search over all weights."""
+    rng = np.random.default_rng(2)
+    draws = rng.normal(size=(60, 2, 1)) * [[1.0, -0.8, 0.0, 2.0]] + 0.3 * rng.normal(size=(60, 2, 4)) * [1, 1, 0.01, 1]
+    largest = {(str(i), c): 10.0 * k + draws[i, k][None] for i in range(60) for k, c in enumerate(("a", "b"))}
+    found = steady(largest)
+    assert found.shape == (1, 4)
+    samples = np.concatenate([draws[:, k] - draws[:, k].mean(axis=0) for k in range(2)])
+    covariance = samples.T @ samples / 118
+    variance = np.diag(covariance)
+    wanted = 0.3 * covariance + 0.7 * np.diag(variance) + np.diag(np.maximum(0.5 * np.median(variance) - variance, 0))
+    tried = rng.dirichlet(np.ones(4), size=200_000)
+    best = tried[np.einsum("ki,ij,kj->k", tried, wanted, tried).argmin()]
+    np.testing.assert_allclose(found[0], best, atol=0.03)
+    whole = weighted(found)
+    assert whole.sum() == WEIGHT
+    assert np.abs(whole - WEIGHT * found).max() <= 1

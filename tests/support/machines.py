@@ -94,8 +94,9 @@ def moving(observer):
 
 def watched(observer, bound=1.0):
     """With a monitor that is exceeded now and then by what `samples` does."""
-    filters = octaves()
-    monitor = Monitor(filters, 0.02, 50, np.array([0.7]), bound * np.full((1, len(filters)), 0.02), 0.02, {"with load": 1.0, "*/": -8.0})
+    filters, weights = octaves(), np.array([[4, 3, 3, 0, 3, 3]])
+    limits = bound * np.full(weights.shape, 0.02)
+    monitor = Monitor(filters, 0.02, 50, np.array([0.7]), limits, weights, 0.02, {"with load": 1.0, "*/": -8.0})
     return replace(observer, monitor=monitor)
 
 

@@ -8,7 +8,7 @@ long. Where the observer was designed on the same units, new ones have larger in
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
 from ..evaluate import as_shown
 from ..observer import Observer, run_innovations
-from ..observer.monitor import Monitor, octaves
+from ..observer.monitor import WEIGHT, Monitor, octaves
 from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
 from .validation import TrainingSet, spread
 
@@ -29,6 +29,7 @@ UNITS, EPISODES, TOGETHER = 60, 3, 60  # most units, most episodes of each in ev
 MEMORY = 1000  # samples that mean squares remember
 FORGOTTEN = 1e-3  # of a start, when innovations are judged
 SETTLE = (100, 1000)
+SHRINK, QUIETEST = 0.7, 0.5  # of covariances to their diagonal; of the median variance
 MOVING = 0.1  # of the RMS step of a measurement: less is rest
 
 
@@ -63,26 +64,61 @@ def fit_monitor(observer: Observer, training: TrainingSet, rate: float) -> Monit
     if not np.isfinite(size).all() or np.any(size <= 0):
         return None
     filters = octaves()
-    free = Monitor(filters, 1 / MEMORY, settle, size, np.ones((len(size), len(filters))), rate, units=len(units))
-    peaks: dict[tuple[str, str], float] = {}
-    profile, courses = [], []
-    for group, of_group in own.items():
-        found = [free.mean_squares(nu[:, None], judged[:, None])[:, 0] for nu, judged, _ in of_group]
-        levels = [free.level(f) for f in found]
-        peaks[group] = max(float(level.max()) for level in levels)
-        profile.append(np.log10(np.maximum(np.max([f.max(axis=0) for f in found], axis=0), 1e-30)))
-        courses += levels
+    even = np.ones((len(size), len(filters)))
+    free = Monitor(filters, 1 / MEMORY, settle, size, even, weighted(even), rate, units=len(units))
+    squares = {group: [free.mean_squares(nu[:, None], j[:, None])[:, 0] for nu, j, _ in found] for group, found in own.items()}
+    largest = {group: 10 * np.log10(np.maximum(np.max([p.max(axis=0) for p in found], axis=0), 1e-30)) for group, found in squares.items()}
+    weights = weighted(steady(largest))
+    courses = {group: [_decibels(p, weights) for p in found] for group, found in squares.items()}
+    peaks = {group: max(float(level.max()) for level in found) for group, found in courses.items()}
     conditions = list(dict.fromkeys(condition for _, condition in own))
     bound = float(prediction_bound(np.array([max(peaks.get((u, c), -np.inf) for c in conditions) for u in units]), rate))
-    own_peaks = {c: [peaks[u, c] for u in units if (u, c) in peaks] for c in conditions}
-    enough = len(conditions) > 1
-    bounds = {c: float(prediction_bound(np.array(p), rate)) - bound for c, p in own_peaks.items() if enough and len(p) >= LEAST_SCORES}
-    shape = np.mean(profile, axis=0)
-    limits = 10 ** (shape - shape.mean() + bound / 10)
+    of = {c: np.array([peaks[u, c] for u in units if (u, c) in peaks]) for c in conditions}
+    bounds = {c: float(prediction_bound(p, rate)) - bound for c, p in of.items() if len(conditions) > 1 and len(p) >= LEAST_SCORES}
+    shape = np.mean(list(largest.values()), axis=0)
+    limits = 10 ** ((shape - (shape * weights).sum() / WEIGHT + bound) / 10)
     step = np.sqrt(np.nanmean([np.nanmean(np.diff(y, axis=0) ** 2, axis=0) for _, _, y in episodes], axis=0))
     moving = sum(int(np.count_nonzero(j[1:] & (np.abs(np.diff(y, axis=0)) > MOVING * step).any(axis=-1))) for _, j, y in episodes)
-    alarms = sum(int(np.count_nonzero(np.diff((level > bound).astype(int)) == 1)) for level in courses)
-    return replace(free, limits=limits, bounds=bounds, hours=moving * observer.sample_period_s / 3600, alarms=alarms)
+    alarms = sum(int(np.count_nonzero(np.diff((level > bound).astype(int)) == 1)) for found in courses.values() for level in found)
+    return replace(free, limits=limits, weights=weights, bounds=bounds, hours=moving * observer.sample_period_s / 3600, alarms=alarms)
+
+
+def steady(largest: Mapping[tuple[str, str], Array]) -> Array:
+    """Return weights of levels, shape (q, bands), whose mean differs least from unit to unit of a condition; they are not negative and sum to one.
+
+    Covariances are shrunk to the diagonal, since units are few, and no variance counts less than half the median one: a band that holds nothing but
+    the noise of a sensor is the same in all units, whatever is wrong with them.
+
+    Parameters
+    ----------
+    largest : mapping of (unit, condition) to ndarray, shape (q, bands)
+        Levels in dB.
+    """
+    from scipy.optimize import nnls
+
+    by_condition: dict[str, list[Array]] = {}
+    for (_, condition), levels in largest.items():
+        by_condition.setdefault(condition, []).append(levels.ravel())
+    apart = np.concatenate([np.array(levels) - np.mean(levels, axis=0) for levels in by_condition.values()])
+    covariance = apart.T @ apart / max(len(apart) - len(by_condition), 1)
+    variance = np.diag(covariance)
+    floor = max(QUIETEST * float(np.median(variance)), 1e-12)
+    covariance = (1 - SHRINK) * covariance + np.diag(SHRINK * variance + np.maximum(floor - variance, 0.0))
+    root, large = np.linalg.cholesky(covariance).T, 1e3 * float(np.sqrt(np.trace(covariance)))
+    found, _ = nnls(np.vstack([root, np.full((1, len(root)), large)]), np.append(np.zeros(len(root)), large))
+    return np.asarray((found / found.sum()).reshape(next(iter(largest.values())).shape))
+
+
+def weighted(shares: Array) -> Array:
+    """Return whole numbers that sum to `WEIGHT`, in proportion to shares as nearly as can be."""
+    exact = WEIGHT * shares.ravel() / shares.sum()
+    whole = np.floor(exact)
+    whole[np.argsort(whole - exact, kind="stable")[: WEIGHT - int(whole.sum())]] += 1
+    return whole.reshape(shares.shape)
+
+
+def _decibels(mean_squares: Array, weights: Array) -> Array:
+    return np.asarray((10 * np.log10(np.maximum(mean_squares, 1e-30)) * weights).sum(axis=(-2, -1)) / WEIGHT)
 
 
 def monitor_facts(monitor: Monitor) -> dict[str, Any]:

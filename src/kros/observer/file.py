@@ -260,8 +260,13 @@ def _monitor(found: Any, measured: int, where: str) -> Monitor | None:
     if found is None:
         return None
     _known(found, Monitor.__dataclass_fields__, f"{where}: monitor")
-    rows = {key: len(found[key]) if isinstance(found[key], list) else 0 for key in ("filters", "limits")}
-    shapes = {"filters": (rows["filters"], 3), "limits": (measured, rows["filters"]), "size": (1, measured)}
+    rows = {key: len(found[key]) if isinstance(found[key], list) else 0 for key in ("filters",)}
+    shapes = {
+        "filters": (rows["filters"], 3),
+        "limits": (measured, rows["filters"]),
+        "weights": (measured, rows["filters"]),
+        "size": (1, measured),
+    }
     numbers = {
         key: matrix([found[key]] if key == "size" else found[key], shape, f"{where}: monitor.{key}") for key, shape in shapes.items()
     }

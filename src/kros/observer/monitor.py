@@ -1,13 +1,13 @@
-r"""The monitor: whether a machine still moves as the population does, by the mean level of the innovation over octaves.
+r"""The monitor: whether a machine still moves as the population does, by the level of the innovation over octaves.
 
 The innovation :math:`\nu = y - C\hat x` of every measured channel goes through band-pass filters an octave apart, and the mean square of each band is
 remembered exponentially, :math:`p \leftarrow p + g\,(b^2 - p)`. The machine is outside the population's envelope while
 
-.. math:: \prod_{c,b} p_{cb} / \ell_{cb} > 1,
+.. math:: \prod_{c,b} \max(p_{cb} / \ell_{cb},\ 0.01)^{k_{cb}} > 1,
 
-that is while the mean of the bands' levels in decibels exceeds its bound. A mean over octaves weighs a quiet band like a loud one, and what differs
-from machine to machine in one band alone averages out: on simulated drives it found badly assembled ones two to four times as often as a threshold
-for every band. A product needs no logarithm on the machine.
+that is while a weighted mean of the bands' levels in decibels exceeds its bound. The weights are whole numbers that sum to `WEIGHT`: those of the mean
+that differs least from good machine to good machine (`design.monitor`). What differs in one band alone averages out: on simulated drives such a mean found
+badly assembled ones four times as often as a threshold for every band. A product needs no logarithm on the machine.
 
 A sample that was missing, invalid or beyond a limit is not judged, nor are those in which the observer forgets it, or its start: while they go by,
 all that the monitor remembers is held.
@@ -28,6 +28,8 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 LARGEST = 1e3  # sizes of the innovation, beyond which more says nothing
 RECOVERY = 4  # samples that are not judged after one that is not good
+WEIGHT = 16  # of all bands together
+QUIET = 0.01  # of its limit: a band that is more quiet says no more
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +47,9 @@ class Monitor:
     size : ndarray, shape (q,)
         What innovations are divided by: their RMS in training.
     limits : ndarray, shape (q, bands)
-        Mean squares whose product is the bound.
+        Mean squares at the bound.
+    weights : ndarray, shape (q, bands)
+        Whole numbers, how often a band counts.
     false_alarm_rate : float
         Probability that one more good machine exceeds the bound while it is moved as much as those in training.
     bounds : mapping of str to float
@@ -68,6 +72,7 @@ class Monitor:
     settle: int
     size: Array
     limits: Array
+    weights: Array
     false_alarm_rate: float
     bounds: Mapping[str, float] = field(default_factory=dict)
     units: int = 0
@@ -75,19 +80,28 @@ class Monitor:
     alarms: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("filters", "size", "limits"):
+        for name in ("filters", "size", "limits", "weights"):
             value = np.asarray(getattr(self, name), dtype=float)
             object.__setattr__(self, name, value)
             if not np.isfinite(value).all():
                 raise DataError(f"Monitor of an observer: {name} should hold finite numbers.")
         bands, q = len(self.filters), len(np.atleast_1d(self.size))
-        if self.filters.shape != (bands, 3) or self.size.shape != (q,) or self.limits.shape != (q, bands) or not bands:
+        if (
+            self.filters.shape != (bands, 3)
+            or self.size.shape != (q,)
+            or {self.limits.shape, self.weights.shape} != {(q, bands)}
+            or not bands
+        ):
             raise DataError(
-                f"Monitor of an observer: filters (bands, 3), size (q) and limits (q, bands) do not fit together, found {self.filters.shape}, "
-                f"{self.size.shape} and {self.limits.shape}."
+                f"Monitor of an observer: filters (bands, 3), size (q), limits and weights (q, bands) do not fit together, found "
+                f"{self.filters.shape}, {self.size.shape}, {self.limits.shape} and {self.weights.shape}."
             )
         if np.any(self.size <= 0) or np.any(self.limits <= 0) or not 0 < self.forget <= 1 or self.settle < 0:
             raise DataError("Monitor of an observer: size and limits should be positive, forget within 0 and 1, settle at least 0.")
+        if np.any(self.weights != np.round(self.weights)) or np.any(self.weights < 0) or self.weights.sum() != WEIGHT:
+            raise DataError(
+                f"Monitor of an observer: weights should be whole numbers of at least 0 that sum to {WEIGHT}, found {self.weights}."
+            )
         if not np.isfinite(list(self.bounds.values())).all():
             raise DataError("Monitor of an observer: the bounds of conditions should be finite numbers of dB.")
 
@@ -134,8 +148,9 @@ class Monitor:
         return found
 
     def level(self, mean_squares: Array, condition: str | None = None) -> Array:
-        """Return the mean level over the bound in dB, shape (...), of mean squares of shape (..., q, bands), in one condition or any."""
-        return np.asarray(10 * np.log10(np.maximum(mean_squares, 1e-30) / self.limits).mean(axis=(-2, -1))) - self.bound(condition)
+        """Return the level over the bound in dB, shape (...), of mean squares of shape (..., q, bands), in one condition or any."""
+        levels = 10 * np.log10(np.maximum(mean_squares / self.limits, QUIET))
+        return np.asarray((levels * self.weights).sum(axis=(-2, -1)) / WEIGHT) - self.bound(condition)
 
     def bound(self, condition: str | None) -> float:
         """Return the bound of a condition, dB over that of all; None is any.
@@ -151,8 +166,8 @@ class Monitor:
         return 0.0 if condition is None else float(self.bounds[condition])
 
     def product(self, condition: str | None) -> float:
-        """Return the product of all bands' mean squares over their limits that a machine in a condition may have."""
-        return float(10 ** (self.bound(condition) * self.limits.size / 10))
+        """Return the product that a machine in a condition may have."""
+        return float(10 ** (self.bound(condition) * WEIGHT / 10))
 
 
 def octaves(count: int = 6, quality: float = 1.4) -> Array:
@@ -194,6 +209,7 @@ class Watch:
         self._inverse = (1 / monitor.size).tolist()
         self._filters: list[list[float]] = monitor.filters.tolist()
         self._limits = (1 / monitor.limits).tolist()
+        self._weights: list[list[int]] = monitor.weights.astype(int).tolist()
         self._monitor = monitor
         self.condition = None
         self.reset()
@@ -227,21 +243,27 @@ class Watch:
             self._wait -= 1
             return
         product, forget = 1.0, self._forget
-        for value, inverse, channel, limits in zip(innovation, self._inverse, self._memory, self._limits, strict=True):
+        for value, inverse, channel, limits, weights in zip(
+            innovation, self._inverse, self._memory, self._limits, self._weights, strict=True
+        ):
             v = value * inverse
             if not v < LARGEST:
                 v = LARGEST
             elif v < -LARGEST:
                 v = -LARGEST
-            for (b, a1, a2), memory, limit in zip(self._filters, channel, limits, strict=True):
+            for (b, a1, a2), memory, limit, weight in zip(self._filters, channel, limits, weights, strict=True):
                 band = b * v + memory[0]
                 memory[0] = memory[1] - a1 * band
                 memory[1] = -b * v - a2 * band
                 memory[2] += forget * (band * band - memory[2])
-                product *= memory[2] * limit
+                share = memory[2] * limit
+                if share < QUIET:
+                    share = QUIET
+                for _ in range(weight):
+                    product *= share
         self.outside = product > self._bound
 
     @property
     def level_db(self) -> float:
-        """Mean level of the bands over its bound, dB; far below zero before anything was judged."""
+        """Level of the innovation over its bound, dB; far below zero before anything was judged."""
         return float(self._monitor.level(np.array([[band[2] for band in channel] for channel in self._memory]), self._condition))

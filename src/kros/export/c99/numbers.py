@@ -13,7 +13,7 @@ from ...core.errors import ConfigError
 from ...lifting.c_code import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
-from ...observer.monitor import LARGEST, RECOVERY
+from ...observer.monitor import LARGEST, QUIET, RECOVERY
 from ...observer.samples import LONGEST
 from ...observer.screen import Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
@@ -212,6 +212,8 @@ class Source:
             "filters": self.matrix(own.filters),
             "inverse_size": self.numbers(1 / own.size),
             "inverse_limit": self.matrix(1 / own.limits),
+            "weights": own.weights.astype(int).tolist(),
+            "quiet": self.precision.literal(QUIET),
             "forget": self.precision.literal(own.forget),
             "largest": self.precision.literal(LARGEST),
             "one": self.precision.literal(1.0),

@@ -235,8 +235,8 @@ def estimate(
 
     found = estimate_recordings(run_folder, data, out, parameter or (), track)
     _say(f"estimates of {found.episodes} episodes in {out}")
-    for unit, source in found.parameters.items():
-        _say(f"  unit {unit}: parameters {source}")
+    for line in found.lines():
+        _say(f"  {line}")
 
 
 export = typer.Typer(help="An observer for machines: source code.", no_args_is_help=True, rich_markup_mode=None)

@@ -47,7 +47,7 @@ def parse_on_nan(value: OnNan | str) -> OnNan:
         raise ConfigError(f"data.on_nan should be one of {[p.value for p in OnNan]}, found {value!r}; correct it.") from error
 
 
-def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel]) -> None:
+def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False) -> None:
     """Check one episode's samples.
 
     Parameters
@@ -55,6 +55,8 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
     values : ndarray, shape (n_samples, n_channels)
     key : EpisodeKey
     channels : sequence of Channel
+    gaps : bool
+        Whether samples may be NaN or infinite.
 
     Raises
     ------
@@ -73,7 +75,7 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
         raise DataError(
             f"{title(key)}: at least {MIN_SAMPLES} samples are needed, found {len(values)}; leave the episode out or record longer."
         )
-    if not np.isfinite(values).all():
+    if not gaps and not np.isfinite(values).all():
         check_finite(values, key, channels)
     _check_moving(values, key, channels)
 

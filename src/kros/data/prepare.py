@@ -48,6 +48,8 @@ class PreparedSource:
     steps : tuple of Step
     tolerance : float
         Largest deviation of one time step, in sampling periods.
+    gaps : bool
+        Whether samples may be missing; see `with_gaps`.
     """
 
     recordings: Recordings | EvenRecordings
@@ -56,6 +58,7 @@ class PreparedSource:
     reference: EpisodeKey
     steps: tuple[Step, ...] = ()
     tolerance: float = TIME_TOLERANCE
+    gaps: bool = False
 
     def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
         """Return one prepared episode, shape (n_samples, n_channels)."""
@@ -66,7 +69,7 @@ class PreparedSource:
         for step in self.steps:
             recording = step.apply(recording, channels, period)
             channels, period = step.channels_after(channels), step.period_after(period)
-        check_episode(recording.values, key, channels)
+        check_episode(recording.values, key, channels, gaps=self.gaps)
         return recording.values
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> PreparedSource:
@@ -123,6 +126,12 @@ def assemble(
         ),
         steps,
     )
+
+
+def with_gaps(population: Population) -> Population:
+    """Return recordings as a machine gives them: samples that are NaN or infinite are kept, for an observer that knows what to do with them."""
+    source = population.source
+    return replace(population, source=replace(source, gaps=True)) if isinstance(source, PreparedSource) else population
 
 
 def prepare(population: Population, steps: Iterable[Step]) -> Population:

@@ -117,7 +117,7 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
     Parameters
     ----------
     angle, reference, measured : ndarray, shape (n_samples,)
-        In any units of measure; the speed of a segment is that of the angle.
+        In any units of measure; the speed of a segment is that of the angle. NaN where a sample is missing, which ends a segment.
     dt : float, s
     spec : PhaseSpec
 
@@ -125,6 +125,8 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
     -------
     list of Segment
     """
+    there = np.isfinite(angle) & np.isfinite(reference) & np.isfinite(measured)
+    angle, reference, measured = (np.where(there, signal, 0.0) for signal in (angle, reference, measured))
     top = np.max(np.abs(reference))
     if top == 0:
         return []

@@ -27,6 +27,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 from .data import ObserverData
 from .screen import screened
+from .simulate import run_observer
 from .step import Flags, Steps
 
 Array = npt.NDArray[np.float64]
@@ -174,3 +175,27 @@ def track_parameter(
                 loop.begin(starts[k])
             values[name] = loop.step(steps, y[k], u[k], missing[k] if missing[k].any() else None)
     return Tracked(estimates, followed)
+
+
+def least_innovation(
+    observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, float], name: str, candidates: npt.ArrayLike
+) -> float:
+    """Return the value of a parameter for which the observer's innovation is smallest over episodes of one machine, among some candidates.
+
+    Parameters
+    ----------
+    observer : ObserverData
+    y : ndarray, shape (n_samples, batch, q)
+        NaN where a measurement is missing.
+    u : ndarray, shape (n_samples, batch, m)
+    parameters : mapping of str to float
+        Of the others.
+    name : str
+    candidates : array_like, shape (n,)
+    """
+    values, batch = np.asarray(candidates, dtype=float), y.shape[1]
+    y, u = (np.tile(signal, (1, len(values), 1)) for signal in (y, u))
+    own = {k: np.full(batch * len(values), v) for k, v in observer.own(parameters).items()} | {name: np.repeat(values, batch)}
+    error = ((y - run_observer(observer, y, u, own)[..., list(observer.measured)]) / measurement_sizes(observer)) ** 2
+    missed = np.nansum(np.where(np.isfinite(error), error, np.nan).reshape(len(y), len(values), -1), axis=(0, 2))
+    return float(values[np.argmin(missed)])

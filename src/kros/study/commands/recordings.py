@@ -34,7 +34,12 @@ def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -
     else:
         section = section.model_copy(update={"source": data})
     reader = None if section.reader == ARRAYS else section.reader
-    return read(section.source, reader, prepare=section.prepare, mapping=section.csv, optional=optional)
+    try:
+        return read(section.source, reader, prepare=section.prepare, mapping=section.csv, optional=optional)
+    except (ConfigError, DataError) as error:
+        if not data.is_dir() or data.suffix == ".toml":
+            raise
+        raise type(error)(f"{error} Recordings of another kind than the run's are named by a TOML with [data], as in a study.") from error
 
 
 def hidden_states(observer: Observer) -> tuple[str, ...]:
@@ -43,7 +48,7 @@ def hidden_states(observer: Observer) -> tuple[str, ...]:
 
 
 def check_channels(population: Population, observer: Observer, *, field_recordings: bool = False) -> None:
-    """Refuse recordings whose channels or sampling period are not those of the run; in the field states that are not measured may be absent."""
+    """Refuse recordings whose channels, units of measure or sampling period are not those of the run; in the field hidden states may be absent."""
     expected, found = (observer.recorded, observer.inputs), (population.states, population.inputs)
     needed = (*(observer.lifting.states[i] for i in observer.measured), *observer.inputs)
     missing = [name for name in needed if name not in (*population.states, *population.inputs)]
@@ -54,6 +59,13 @@ def check_channels(population: Population, observer: Observer, *, field_recordin
         )
     if expected != found and not field_recordings:
         raise DataError(f"Channels: the run has states and inputs {expected}, the recordings {found}; read them the same way.")
+    own = observer.about.get("units_of_measure", {})
+    for channel in population.channels:
+        if channel.unit and own.get(channel.name, channel.unit) not in ("", channel.unit):
+            raise DataError(
+                f"Channels: {channel.name} is in {own[channel.name]!r} in the run and in {channel.unit!r} in the recordings; declare a scale step, or leave "
+                "the unit out where it is only written differently."
+            )
     if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=1e-6):
         raise DataError(
             f"Sampling period: the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} s; declare a resample step."

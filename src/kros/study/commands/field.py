@@ -1,0 +1,187 @@
+"""The deployed observer on recordings from the field: parameters of every unit, where they come from, and estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import ConfigError, IdentificationError
+from ...data import EpisodeBatch, Population
+from ...data.population import EpisodeKey
+from ...data.prepare import with_gaps
+from ...evaluate import as_arriving
+from ...observer import Observer, run_observer, track_parameter
+from ...observer.samples import SampleStatus
+from ...observer.screen import sample_status
+from ...observer.tracking import PhaseLockedLoop, least_innovation
+from ..config import StudyConfig
+from ..engine.store import Store
+from .recordings import UnitValues, check_channels, hidden_states, identify_on, load_calibration, open_data, parse_given, unit_values
+
+Array = npt.NDArray[np.float64]
+_BATCH, _PHASES, _SEEN_S = 64, 24, 20.0
+
+
+@dataclass(frozen=True)
+class FieldEpisodes:
+    """Some episodes: what arrived, shape (n_samples, batch, q), and estimates of the recorded states, shape (n_samples, batch, n_recorded).
+
+    `followed` is the parameter that was used, shape (n_samples, batch), None where no unit's is followed; `status` the bits of the samples.
+    """
+
+    batch: EpisodeBatch
+    y: Array
+    estimates: Array
+    followed: Array | None
+    status: npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class FieldRecordings:
+    """Recordings that need no hidden channels, with all that the observer needs to run on them.
+
+    Parameters
+    ----------
+    observer : Observer
+    population : Population
+    values : mapping of unit to mapping of str to float
+        Lifting parameters, or where a loop starts that follows one.
+    sources : mapping of unit to str
+        Where they come from, in words; empty where the lifting has none.
+    followed : frozenset of str
+        Units for which `name` is followed.
+    name : str, optional
+        The parameter that a phase-locked loop follows.
+    """
+
+    observer: Observer
+    population: Population
+    values: dict[str, dict[str, float]]
+    sources: dict[str, str]
+    followed: frozenset[str]
+    name: str | None
+
+    @classmethod
+    def open(cls, config: StudyConfig, store: Store, data: Path, given: Collection[str] = (), track: str | None = None) -> FieldRecordings:
+        """Open what `data` names, and settle the parameters of every unit.
+
+        What is given comes first, then what the unit's own recordings show by the study's calibration, then what the run found. Where none of these
+        is there, a phase-locked loop follows the parameter, and starts where the observer's innovation is smallest.
+
+        Raises
+        ------
+        ConfigError
+            When a parameter is none of the observer's.
+        DataError
+            When measured channels or inputs are missing, or in another unit of measure.
+        IdentificationError
+            When a parameter is neither given, nor to be found, nor to be followed.
+        """
+        if not store.holds("observers", "deployed.json"):
+            raise ConfigError(f"Run {store.folder}: has no deployed observer; run the study at least until synthesize.")
+        observer = Observer.load(store.path("observers", "deployed.json"))
+        known = observer.lifting.parameters
+        if track is not None and track not in known:
+            raise ConfigError(f"--track {track}: the observer's parameters are {', '.join(known) or 'none'}.")
+        population = with_gaps(open_data(config, data, hidden_states(observer)))
+        check_channels(population, observer, field_recordings=True)
+        calibration = load_calibration(store)
+        units = unit_values(population, calibration, identify_on(store), parse_given(given, population.unit_ids, known))
+        phase = None if calibration is None else calibration.spec.parameter
+        return cls(observer, population, *_settled(units, observer, population, track, phase))
+
+    def episodes(self, keys: tuple[EpisodeKey, ...] | None = None) -> Iterator[FieldEpisodes]:
+        """Run the observer, some episodes at a time."""
+        keys = self.population.episodes if keys is None else keys
+        for start in range(0, len(keys), _BATCH):
+            yield self._run(keys[start : start + _BATCH])
+
+    def _run(self, keys: tuple[EpisodeKey, ...]) -> FieldEpisodes:
+        observer = self.observer
+        batch, y, u = arriving(observer, self.population, keys, {u: {**observer.parameters, **own} for u, own in self.values.items()})
+        followed = None if self.name is None else np.tile(batch.parameters[self.name], (len(y), 1))
+        rows = [i for i, key in enumerate(keys) if key.unit in self.followed]
+        others = [i for i in range(len(keys)) if i not in rows]
+        own, n = observer.own(batch.parameters), len(observer.recorded)
+        found = np.empty((*y.shape[:2], n))
+        if others:
+            found[:, others] = run_observer(observer, y[:, others], u[:, others], {k: np.asarray(v)[others] for k, v in own.items()})[
+                ..., :n
+            ]
+        if rows and followed is not None and self.name is not None:
+            tracked = track_parameter(observer, y[:, rows], u[:, rows], {k: np.asarray(v)[rows] for k, v in own.items()}, self.name)
+            found[:, rows], followed[:, rows] = tracked.estimates[..., :n], tracked.values
+        return FieldEpisodes(batch, y, found, followed, sample_status(observer, y, u))
+
+
+def arriving(
+    observer: Observer,
+    population: Population,
+    keys: tuple[EpisodeKey, ...],
+    values: dict[str, dict[str, float]],
+    samples: int | None = None,
+) -> tuple[EpisodeBatch, Array, Array]:
+    """Return episodes with measurements as they arrive, shape (n_samples, batch, q), and inputs, shape (n_samples, batch, m)."""
+    batch = EpisodeBatch.read(population, keys, samples, values)
+    measured = [population.states.index(observer.lifting.states[i]) for i in observer.measured]
+    y = as_arriving(batch, observer.sensor, population.states).measurements(measured)
+    return batch, y, batch.inputs[..., [population.inputs.index(name) for name in observer.inputs]]
+
+
+def count_status(found: FieldEpisodes, counts: dict[str, dict[str, int]]) -> None:
+    """Add to the number of samples of every unit that are missing, invalid or beyond their limits."""
+    for i, key in enumerate(found.batch.keys):
+        own, bits = counts.setdefault(key.unit, {}), found.status[: found.batch.lengths[i], i]
+        for bit in SampleStatus:
+            if number := int(np.count_nonzero(bits & bit)):
+                own[str(bit.name)] = own.get(str(bit.name), 0) + number
+
+
+def _settled(
+    units: UnitValues, observer: Observer, population: Population, track: str | None, phase: str | None
+) -> tuple[dict[str, dict[str, float]], dict[str, str], frozenset[str], str | None]:
+    """Return the values, sources and the units whose parameter is followed, with its name; refuse what is not known."""
+    sources, followed = dict(units.sources), set()
+    values = {unit: dict(own) for unit, own in units.values.items()}
+    unknown = {unit: [p for p in observer.lifting.parameters if p not in own] for unit, own in values.items()}
+    name = track or next((p for missing in unknown.values() for p in missing), "")
+    for unit, missing in unknown.items():
+        if track is None and not missing:
+            continue
+        if set(missing) - {name} or not _trackable(observer, name):
+            reason = units.reasons.get(unit, "it was not calibrated.")
+            raise IdentificationError(
+                f"Parameter {', '.join(missing) or name} of unit {unit}: {reason} It cannot be followed by a phase-locked loop either, which needs one unknown "
+                f"parameter and an observer without delays; give it, --parameter {unit}.{name}=VALUE."
+            )
+        source = f"value that is {sources.get(unit)}"
+        if name in missing and name == phase:
+            values[unit][name], source = _start(observer, population, unit, values[unit], name), "value of the smallest innovation"
+        elif name in missing:
+            source = "value of the nominal unit"
+        sources[unit] = f"tracked from the {source}"
+        followed.add(unit)
+    return values, sources, frozenset(followed), name if followed else None
+
+
+def _trackable(observer: Observer, name: str) -> bool:
+    try:
+        PhaseLockedLoop(observer, name, 1)
+    except ConfigError:
+        return False
+    return True
+
+
+def _start(observer: Observer, population: Population, unit: str, own: dict[str, float], name: str) -> float:
+    """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
+    samples, keys, seen = round(_SEEN_S / population.sample_period_s), population.keys(unit), 0
+    chosen: list[EpisodeKey] = []
+    for key in keys[:_BATCH]:
+        if seen < samples:
+            chosen, seen = [*chosen, key], seen + len(population.read(key))
+    _, y, u = arriving(observer, population, tuple(chosen), {unit: own}, samples)
+    return least_innovation(observer, y, u, {**observer.parameters, **own}, name, np.arange(_PHASES) * 2 * np.pi / _PHASES)

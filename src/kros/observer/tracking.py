@@ -178,7 +178,13 @@ def track_parameter(
 
 
 def least_innovation(
-    observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, float], name: str, candidates: npt.ArrayLike
+    observer: ObserverData,
+    y: Array,
+    u: Array,
+    lengths: npt.NDArray[np.int64],
+    parameters: Mapping[str, float],
+    name: str,
+    candidates: npt.ArrayLike,
 ) -> float:
     """Return the value of a parameter for which the observer's innovation is smallest over episodes of one machine, among some candidates.
 
@@ -188,14 +194,17 @@ def least_innovation(
     y : ndarray, shape (n_samples, batch, q)
         NaN where a measurement is missing.
     u : ndarray, shape (n_samples, batch, m)
+    lengths : ndarray, shape (batch,)
+        Of the episodes, whose first quarter does not count: they may start in motion.
     parameters : mapping of str to float
         Of the others.
     name : str
     candidates : array_like, shape (n,)
     """
-    values, batch = np.asarray(candidates, dtype=float), y.shape[1]
+    values, batch, k = np.asarray(candidates, dtype=float), y.shape[1], np.arange(len(y))[:, None]
+    counted = np.isfinite(y) & ((k >= lengths // 4) & (k < lengths))[..., None]
     y, u = (np.tile(signal, (1, len(values), 1)) for signal in (y, u))
-    own = {k: np.full(batch * len(values), v) for k, v in observer.own(parameters).items()} | {name: np.repeat(values, batch)}
+    own = {p: np.full(batch * len(values), v) for p, v in observer.own(parameters).items()} | {name: np.repeat(values, batch)}
     error = ((y - run_observer(observer, y, u, own)[..., list(observer.measured)]) / measurement_sizes(observer)) ** 2
-    missed = np.nansum(np.where(np.isfinite(error), error, np.nan).reshape(len(y), len(values), -1), axis=(0, 2))
-    return float(values[np.argmin(missed)])
+    counted = np.tile(counted, (1, len(values), 1))
+    return float(values[np.argmin(np.where(counted, error, 0.0).reshape(len(y), len(values), -1).sum(axis=(0, 2)))])

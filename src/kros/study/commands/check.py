@@ -21,13 +21,16 @@ from ..config import Stage, StudyConfig
 from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
-from .recordings import check_channels, identify_on, load_calibration, open_data, training_keys, unit_parameters
+from .field import FieldRecordings
+from .innovation import innovation_line, score_innovations
+from .recordings import check_channels, hidden_states, identify_on, load_calibration, open_data, training_keys, unit_parameters
 
 
 def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]:
     """Identify the units of some recordings as the study did, and score each against the study's population.
 
-    A unit that took part in the study, by its name or by its recordings, is left out of what it is compared with.
+    A unit that took part in the study, by its name or by its recordings, is left out of what it is compared with. Where hidden channels were not
+    recorded, the deployed observer's innovation is scored instead, and ``score`` is None (`score_innovations`).
 
     Returns
     -------
@@ -35,7 +38,8 @@ def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]
         One row a unit and condition that the study knows: ``unit, condition, score, threshold, outlier, status, detectable, freq_hz`` and more
         (see `kros.uncertainty.outliers.population.score_row`), and ``left_out``, units of the study that it was not compared with.
     """
-    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (config, store):
+    stages = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE, Stage.EVALUATE)
+    with open_finished(run, *stages) as (config, store):
         return scored(config, store, data, workers)
 
 
@@ -47,10 +51,14 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[
         raise ConfigError(
             f"Run {store.folder}: has no outlier scores to compare with; run the study until quantify, with at least three units."
         )
-    population = open_data(config, data)
+    observer = Observer.load(store.path("observers", "deployed.json")) if store.holds("observers", "deployed.json") else None
+    population = open_data(config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
-    if store.holds("observers", "deployed.json"):
-        check_channels(population, Observer.load(store.path("observers", "deployed.json")))
+    if observer is not None:
+        check_channels(population, observer, field_recordings=True)
+        if missing := [name for name in observer.recorded if name not in population.states]:
+            return in_order(score_innovations(config, store, FieldRecordings.open(config, store, data), missing))
+        check_channels(population, observer)
     rows: list[dict[str, Any]] = []
     with open_executor(workers) as executor:
         for folder in folders:
@@ -59,8 +67,14 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[
                 rows += score_condition(store, population, models, OutlierModel.load(folder), executor)
     if not rows:
         raise DataError(
-            f"Checking {data}: the recordings have the conditions {', '.join(population.conditions)}, and the run knows none of them."
+            f"Checking {data}: the recordings have the conditions {', '.join(population.conditions)}, and the run has models of "
+            f"{', '.join(ModelSet.load(store.path('models', folder.name)).condition for folder in folders)} alone; name the condition, as in the study."
         )
+    return in_order(rows)
+
+
+def in_order(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows of scores by condition and unit, in JSON's types."""
     return [plain(row) for row in sorted(rows, key=lambda r: (r["condition"], r["unit"]))]
 
 
@@ -95,6 +109,8 @@ def factors_of(store: Store, condition: str) -> EpisodeFactors:
 
 def check_line(row: dict[str, Any]) -> str:
     """Return a row of `check_units` for people at a terminal."""
+    if "missing" in row:
+        return innovation_line(row)
     threshold = "none, too few units" if row["threshold"] is None else f"{row['threshold']:.2f} dB"
     line = f"{row['unit']}  {row['condition']}  score {row['score']:.2f} dB (threshold {threshold})"
     line += f"  {row['status'].upper() if row['outlier'] else row['status']}"

@@ -183,5 +183,6 @@ def _start(observer: Observer, population: Population, unit: str, own: dict[str,
     for key in keys[:_BATCH]:
         if seen < samples:
             chosen, seen = [*chosen, key], seen + len(population.read(key))
-    _, y, u = arriving(observer, population, tuple(chosen), {unit: own}, samples)
-    return least_innovation(observer, y, u, {**observer.parameters, **own}, name, np.arange(_PHASES) * 2 * np.pi / _PHASES)
+    batch, y, u = arriving(observer, population, tuple(chosen), {unit: own}, samples)
+    candidates = np.arange(_PHASES) * 2 * np.pi / _PHASES
+    return least_innovation(observer, y, u, batch.lengths, {**observer.parameters, **own}, name, candidates)

@@ -1,0 +1,175 @@
+"""`kros estimate` and `kros check` as a field engineer calls them: a folder of CSV or Parquet with measured channels and inputs, and nothing else."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from kros.data import Channel, Population, Role, from_arrays, write_parquet
+from kros.plants import PLANTS
+
+SEEN = ("position", "target_position", "target_velocity")
+TOML = """
+[data]
+source = "{source}"
+reader = "csv"
+[data.csv]
+files = '(?P<unit>[a-z0-9]+)_(?P<condition>[a-z]+)_(?P<episode>[0-9]+)[.]csv'
+time = "t"
+channel = [
+  {{ name = "position", role = "state", measured = true, unit = "{unit}", column = "position" }},
+  {{ name = "target_position", role = "input", column = "target_position" }},
+  {{ name = "target_velocity", role = "input", column = "target_velocity" }},
+]
+"""
+
+
+@pytest.fixture(scope="module")
+def machines() -> Population:
+    """Two drives that the study never saw, and a badly assembled one."""
+    settings: dict[str, Any] = {"n_units": 2, "n_episodes": 2, "seconds": 10.0, "seed": 78, "conditions": ("noload",), "outlier": True}
+    return PLANTS["harmonic-drive"](**settings).simulate().population
+
+
+@pytest.fixture
+def field(machines: Population, tmp_path: Path) -> Callable[..., Path]:
+    """Write what a logger in the field records, perhaps changed; returns DATA."""
+
+    def write(change: Callable[[np.ndarray], np.ndarray] = np.asarray, unit: str = "rad") -> Path:
+        columns = [[c.name for c in machines.channels].index(name) for name in SEEN]
+        (tmp_path / "logged").mkdir()
+        for key in machines.episodes:
+            values = change(machines.read(key)[:, columns])
+            rows = np.column_stack([1e-3 * np.arange(len(values)), values])
+            path = tmp_path / "logged" / f"m{key.unit}_{key.condition}_{key.episode}.csv"
+            np.savetxt(path, rows, delimiter=",", header=",".join(["t", *SEEN]), comments="", fmt="%.17g")
+        (tmp_path / "field.toml").write_text(TOML.format(source="logged", unit=unit))
+        return tmp_path / "field.toml"
+
+    return write
+
+
+def one_direction(values: np.ndarray) -> np.ndarray:
+    """The longest stretch without motion in reverse: the phase cannot be calibrated there."""
+    forward = np.concatenate([[False], values[:, 2] >= -1e-9, [False]])
+    edges = np.flatnonzero(np.diff(forward.astype(int)))
+    start, stop = max(zip(edges[::2], edges[1::2], strict=True), key=lambda e: e[1] - e[0])
+    return values[start:stop]
+
+
+def with_holes(values: np.ndarray) -> np.ndarray:
+    values = values.copy()
+    values[3000:3010, 0] = np.nan
+    values[5000, 1] = np.inf
+    return values
+
+
+def table(path: Path) -> tuple[list[str], np.ndarray]:
+    with path.open() as file:
+        rows = list(csv.reader(file))
+    return rows[0], np.array([row[4:] for row in rows[1:]], dtype=float)
+
+
+def test_csv_and_parquet_say_the_same_with_units_and_sources(kros, demo, field, tmp_path, machines) -> None:
+    data, columns = field(), ["position_hat", "velocity_hat", "current_hat"]
+    for out in ("x.csv", "x.parquet"):
+        result = kros("estimate", demo, data, tmp_path / out)
+        assert result.exit_code == 0, result.output
+        assert result.output.count("parameters calibrated on the derivative of position") == 3
+    names, values = table(tmp_path / "x.csv")
+    found = pq.read_table(tmp_path / "x.parquet")
+    assert names == found.column_names == ["unit", "condition", "episode", "k", *columns]
+    np.testing.assert_array_equal(values, np.column_stack([found[c].to_numpy() for c in columns]))
+    facts = json.loads((tmp_path / "x.csv-metadata.json").read_text())
+    assert facts["columns"] == {"position_hat": "rad", "velocity_hat": "rad/s", "current_hat": "1"}
+    assert {c: found.schema.field(c).metadata[b"unit"].decode() for c in columns} == facts["columns"]
+    assert json.loads(found.schema.metadata[b"parameters"]) == facts["parameters"]
+    assert {p["source"] for p in facts["parameters"].values()} == {"calibrated on the derivative of position"}
+    whole = machines.read(machines.episodes[2])[:, :3]  # the first good drive's first episode
+    at = sum(len(machines.read(key)) for key in machines.episodes[:2])
+    error = np.sqrt(np.mean((values[at : at + len(whole)] - whole) ** 2, axis=0)) / np.abs(whole).max(axis=0)
+    assert error[1] < 1e-3
+    assert error[2] < 0.15
+    # The same from kros's own format, without hidden channels.
+    own = {k.unit: [machines.read(e)[:, [0, 3, 4]] for e in machines.keys(k.unit)] for k in machines.episodes}
+    channels = (Channel("position", Role.STATE, "rad", True), *(Channel(n, Role.INPUT) for n in SEEN[1:]))
+    write_parquet(from_arrays(own, channels, 1e-3), tmp_path / "native")
+    assert kros("estimate", demo, tmp_path / "native", tmp_path / "n.csv").exit_code == 0
+    np.testing.assert_allclose(table(tmp_path / "n.csv")[1], values, rtol=1e-6, atol=1e-9)
+
+
+def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation_is_smallest(kros, demo, field, tmp_path) -> None:
+    result = kros("estimate", demo, field(), tmp_path / "whole.csv")
+    calibrated = json.loads((tmp_path / "whole.csv-metadata.json").read_text())["parameters"]
+    for file in (tmp_path / "logged").iterdir():
+        np.savetxt(file, _cut(file), delimiter=",", header=",".join(["t", *SEEN]), comments="", fmt="%.17g")
+    result = kros("estimate", demo, tmp_path / "field.toml", tmp_path / "x.csv")
+    assert result.exit_code == 0, result.output
+    assert result.output.count("parameters tracked from the value of the smallest innovation") == 3
+    names, values = table(tmp_path / "x.csv")
+    assert names[-1] == "phase"
+    facts = json.loads((tmp_path / "x.csv-metadata.json").read_text())
+    assert facts["columns"]["phase"] == "rad"
+    for unit, own in facts["parameters"].items():
+        apart = np.angle(np.exp(1j * (own["phase"] - calibrated[unit]["phase"])))
+        assert abs(apart) < 2 * np.pi / 24  # a step of the candidates
+    assert (
+        kros("estimate", demo, tmp_path / "field.toml", tmp_path / "y.csv", "--parameter", "m001001.phase=1.2").output.count("given") == 1
+    )
+    assert np.isfinite(values).all()
+
+
+def _cut(file: Path) -> np.ndarray:
+    values = one_direction(np.loadtxt(file, delimiter=",", skiprows=1)[:, 1:])
+    return np.column_stack([1e-3 * np.arange(len(values)), values])
+
+
+def test_missing_samples_are_taken_and_counted(kros, demo, field, tmp_path) -> None:
+    result = kros("estimate", demo, field(with_holes), tmp_path / "x.parquet")
+    assert result.exit_code == 0, result.output
+    assert result.output.count("20 samples MISSING; 2 samples INVALID_INPUT") == 3  # of two episodes each
+    assert all(np.isfinite(pq.read_table(tmp_path / "x.parquet")[c].to_numpy()).all() for c in ("velocity_hat", "current_hat"))
+
+
+def test_what_does_not_fit_is_said(kros, demo, field, tmp_path) -> None:
+    data, out = field(unit="deg"), tmp_path / "x.csv"
+
+    def refused(*words: str, data: Path = data, more: tuple[str, ...] = ()) -> None:
+        result = kros("estimate", demo, data, out, *more)
+        assert result.exit_code == 2, result.output
+        assert all(word in result.stderr for word in words), result.stderr
+        assert not out.exists()
+
+    refused("position", "'rad'", "'deg'", "scale")
+    refused("looks like csv", "TOML with [data]", data=tmp_path / "logged")
+    text = data.read_text().replace("deg", "rad")
+    data.write_text(text.replace('{ name = "target_velocity", role = "input", column = "target_velocity" },', ""))
+    refused("target_velocity is missing")
+    data.write_text(text.replace('time = "t"', "sample_period_s = 0.002"))
+    refused("0.001 s", "0.002 s")
+    data.write_text(text)
+    refused("UNIT.NAME=VALUE", more=("--parameter", "nobody.phase=1"))
+    refused("parameters are phase", more=("--track", "lag"))
+
+
+def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> None:
+    """The simulator knows which drive is badly assembled."""
+    data = field()
+    result = kros("check", demo, data, "--json")
+    rows = {row["unit"]: row for row in json.loads(result.stdout)}
+    assert list(rows) == ["m000000", "m001001", "m001002"]
+    for row in rows.values():
+        assert row["score"] is None
+        assert row["missing"] == ["velocity", "current"]
+        assert (row["innovation_db"] > row["innovation_threshold_db"]) == row["outlier"] == (row["status"] == "outlier")
+    assert [row["outlier"] for row in rows.values()] == [True, False, False]
+    assert result.exit_code == 3
+    lines = kros("check", demo, data).stdout.splitlines()
+    assert all("without velocity, current" in line and "dB over the study's units" in line for line in lines)

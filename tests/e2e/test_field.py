@@ -119,7 +119,7 @@ def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation
     assert facts["columns"]["phase"] == "rad"
     for unit, own in facts["parameters"].items():
         apart = np.angle(np.exp(1j * (own["phase"] - calibrated[unit]["phase"])))
-        assert abs(apart) < 2 * np.pi / 24  # a step of the candidates
+        assert abs(apart) < 0.6  # motion in one direction cannot tell a phase from a lag
     assert (
         kros("estimate", demo, tmp_path / "field.toml", tmp_path / "y.csv", "--parameter", "m001001.phase=1.2").output.count("given") == 1
     )
@@ -168,8 +168,8 @@ def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> No
     for row in rows.values():
         assert row["score"] is None
         assert row["missing"] == ["velocity", "current"]
-        assert (row["innovation_db"] > row["innovation_threshold_db"]) == row["outlier"] == (row["status"] == "outlier")
+        assert (row["level_db"] > 0) == row["outlier"] == (row["status"] == "outlier")
     assert [row["outlier"] for row in rows.values()] == [True, False, False]
     assert result.exit_code == 3
     lines = kros("check", demo, data).stdout.splitlines()
-    assert all("without velocity, current" in line and "dB over the study's units" in line for line in lines)
+    assert all("without velocity, current" in line and "dB over the monitor's bound" in line for line in lines)

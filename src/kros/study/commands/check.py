@@ -22,7 +22,7 @@ from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
 from .field import FieldRecordings
-from .innovation import innovation_line, score_innovations
+from .innovation import monitored, monitored_line
 from .recordings import check_channels, hidden_states, identify_on, load_calibration, open_data, training_keys, unit_parameters
 
 
@@ -30,7 +30,7 @@ def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]
     """Identify the units of some recordings as the study did, and score each against the study's population.
 
     A unit that took part in the study, by its name or by its recordings, is left out of what it is compared with. Where hidden channels were not
-    recorded, the deployed observer's innovation is scored instead, and ``score`` is None (`score_innovations`).
+    recorded, the deployed observer's monitor judges instead, and ``score`` is None (`monitored`).
 
     Returns
     -------
@@ -38,8 +38,7 @@ def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]
         One row a unit and condition that the study knows: ``unit, condition, score, threshold, outlier, status, detectable, freq_hz`` and more
         (see `kros.uncertainty.outliers.population.score_row`), and ``left_out``, units of the study that it was not compared with.
     """
-    stages = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE, Stage.EVALUATE)
-    with open_finished(run, *stages) as (config, store):
+    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (config, store):
         return scored(config, store, data, workers)
 
 
@@ -56,8 +55,8 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[
     check_population(population, allow_single=True)
     if observer is not None:
         check_channels(population, observer, field_recordings=True)
-        if missing := [name for name in observer.recorded if name not in population.states]:
-            return in_order(score_innovations(config, store, FieldRecordings.open(config, store, data), missing))
+        if any(name not in population.states for name in observer.recorded):
+            return in_order(monitored(FieldRecordings.open(config, store, data)))
         check_channels(population, observer)
     rows: list[dict[str, Any]] = []
     with open_executor(workers) as executor:
@@ -110,7 +109,7 @@ def factors_of(store: Store, condition: str) -> EpisodeFactors:
 def check_line(row: dict[str, Any]) -> str:
     """Return a row of `check_units` for people at a terminal."""
     if "missing" in row:
-        return innovation_line(row)
+        return monitored_line(row)
     threshold = "none, too few units" if row["threshold"] is None else f"{row['threshold']:.2f} dB"
     line = f"{row['unit']}  {row['condition']}  score {row['score']:.2f} dB (threshold {threshold})"
     line += f"  {row['status'].upper() if row['outlier'] else row['status']}"

@@ -17,7 +17,7 @@ from ...core.errors import ConfigError
 from ...data.population import EpisodeKey
 from ..config import Stage
 from ..engine.run_folder import open_finished
-from .field import FieldRecordings, count_status
+from .field import FieldRecordings
 
 Array = npt.NDArray[np.float64]
 Write = Callable[[EpisodeKey, Array], None]
@@ -74,12 +74,12 @@ def estimate_recordings(run: Path, data: Path, out: Path, given: Collection[str]
         recordings = FieldRecordings.open(config, store, data, given, track)
         samples: dict[str, dict[str, int]] = {}
         with writer(out, facts_of(recordings)) as write:
-            for found in recordings.episodes():
-                behind = () if found.followed is None else (found.followed[..., None],)
-                columns = np.concatenate([found.estimates, *behind], axis=-1)
+            for found in recordings.batches():
+                estimates, followed = recordings.estimates(found)
+                columns = estimates if followed is None else np.concatenate([estimates, followed[..., None]], axis=-1)
                 for i, key in enumerate(found.batch.keys):
                     write(key, columns[: found.batch.lengths[i], i])
-                count_status(found, samples)
+                recordings.count_status(found, samples)
     return Estimated(len(recordings.population.episodes), recordings.sources, samples)
 
 

@@ -1,4 +1,4 @@
-"""The deployed observer on recordings from the field: parameters of every unit, where they come from, and estimates."""
+"""The deployed observer on recordings from the field: what arrives, parameters of every unit and where they come from, estimates."""
 
 from __future__ import annotations
 
@@ -27,17 +27,16 @@ _BATCH, _PHASES, _SEEN_S = 64, 24, 20.0
 
 
 @dataclass(frozen=True)
-class FieldEpisodes:
-    """Some episodes: what arrived, shape (n_samples, batch, q), and estimates of the recorded states, shape (n_samples, batch, n_recorded).
-
-    `followed` is the parameter that was used, shape (n_samples, batch), None where no unit's is followed; `status` the bits of the samples.
-    """
+class Arriving:
+    """Some episodes as they arrive: measurements y, shape (n_samples, batch, q), and inputs u, shape (n_samples, batch, m)."""
 
     batch: EpisodeBatch
     y: Array
-    estimates: Array
-    followed: Array | None
-    status: npt.NDArray[np.uint8]
+    u: Array
+
+    def parameters(self, observer: Observer, rows: list[int]) -> dict[str, Array]:
+        """Return the lifting parameters of some episodes."""
+        return {name: np.asarray(values, dtype=float)[rows] for name, values in observer.own(self.batch.parameters).items()}
 
 
 @dataclass(frozen=True)
@@ -94,28 +93,44 @@ class FieldRecordings:
         phase = None if calibration is None else calibration.spec.parameter
         return cls(observer, population, *_settled(units, observer, population, track, phase))
 
-    def episodes(self, keys: tuple[EpisodeKey, ...] | None = None) -> Iterator[FieldEpisodes]:
-        """Run the observer, some episodes at a time."""
-        keys = self.population.episodes if keys is None else keys
+    def batches(self, keys: tuple[EpisodeKey, ...] | None = None) -> Iterator[Arriving]:
+        """Read episodes, some at a time."""
+        keys, values = keys or self.population.episodes, {u: {**self.observer.parameters, **own} for u, own in self.values.items()}
         for start in range(0, len(keys), _BATCH):
-            yield self._run(keys[start : start + _BATCH])
+            yield arriving(self.observer, self.population, keys[start : start + _BATCH], values)
 
-    def _run(self, keys: tuple[EpisodeKey, ...]) -> FieldEpisodes:
-        observer = self.observer
-        batch, y, u = arriving(observer, self.population, keys, {u: {**observer.parameters, **own} for u, own in self.values.items()})
-        followed = None if self.name is None else np.tile(batch.parameters[self.name], (len(y), 1))
-        rows = [i for i, key in enumerate(keys) if key.unit in self.followed]
-        others = [i for i in range(len(keys)) if i not in rows]
-        own, n = observer.own(batch.parameters), len(observer.recorded)
-        found = np.empty((*y.shape[:2], n))
+    def estimates(self, found: Arriving) -> tuple[Array, Array | None]:
+        """Run the observer.
+
+        Returns
+        -------
+        estimates : ndarray, shape (n_samples, batch, n_recorded)
+        followed : ndarray, shape (n_samples, batch), optional
+            The parameter that was used, where some unit's is followed.
+        """
+        observer, units, n = self.observer, found.batch.units, len(self.observer.recorded)
+        estimates = np.empty((*found.y.shape[:2], n))
+        others, rows = ([i for i, unit in enumerate(units) if (unit in self.followed) is wanted] for wanted in (False, True))
         if others:
-            found[:, others] = run_observer(observer, y[:, others], u[:, others], {k: np.asarray(v)[others] for k, v in own.items()})[
+            estimates[:, others] = run_observer(observer, found.y[:, others], found.u[:, others], found.parameters(observer, others))[
                 ..., :n
             ]
-        if rows and followed is not None and self.name is not None:
-            tracked = track_parameter(observer, y[:, rows], u[:, rows], {k: np.asarray(v)[rows] for k, v in own.items()}, self.name)
-            found[:, rows], followed[:, rows] = tracked.estimates[..., :n], tracked.values
-        return FieldEpisodes(batch, y, found, followed, sample_status(observer, y, u))
+        if self.name is None:
+            return estimates, None
+        followed = np.tile(found.batch.parameters[self.name], (len(found.y), 1))
+        if rows:
+            tracked = track_parameter(observer, found.y[:, rows], found.u[:, rows], found.parameters(observer, rows), self.name)
+            estimates[:, rows], followed[:, rows] = tracked.estimates[..., :n], tracked.values
+        return estimates, followed
+
+    def count_status(self, found: Arriving, counts: dict[str, dict[str, int]]) -> None:
+        """Add to the number of samples of every unit that are missing, invalid or beyond their limits."""
+        status = sample_status(self.observer, found.y, found.u)
+        for i, (unit, length) in enumerate(zip(found.batch.units, found.batch.lengths, strict=True)):
+            own = counts.setdefault(unit, {})
+            for bit in SampleStatus:
+                if number := int(np.count_nonzero(status[:length, i] & bit)):
+                    own[str(bit.name)] = own.get(str(bit.name), 0) + number
 
 
 def arriving(
@@ -124,21 +139,12 @@ def arriving(
     keys: tuple[EpisodeKey, ...],
     values: dict[str, dict[str, float]],
     samples: int | None = None,
-) -> tuple[EpisodeBatch, Array, Array]:
-    """Return episodes with measurements as they arrive, shape (n_samples, batch, q), and inputs, shape (n_samples, batch, m)."""
+) -> Arriving:
+    """Read episodes, perhaps cut to some samples, with lifting parameters by unit."""
     batch = EpisodeBatch.read(population, keys, samples, values)
     measured = [population.states.index(observer.lifting.states[i]) for i in observer.measured]
     y = as_arriving(batch, observer.sensor, population.states).measurements(measured)
-    return batch, y, batch.inputs[..., [population.inputs.index(name) for name in observer.inputs]]
-
-
-def count_status(found: FieldEpisodes, counts: dict[str, dict[str, int]]) -> None:
-    """Add to the number of samples of every unit that are missing, invalid or beyond their limits."""
-    for i, key in enumerate(found.batch.keys):
-        own, bits = counts.setdefault(key.unit, {}), found.status[: found.batch.lengths[i], i]
-        for bit in SampleStatus:
-            if number := int(np.count_nonzero(bits & bit)):
-                own[str(bit.name)] = own.get(str(bit.name), 0) + number
+    return Arriving(batch, y, batch.inputs[..., [population.inputs.index(name) for name in observer.inputs]])
 
 
 def _settled(
@@ -178,11 +184,12 @@ def _trackable(observer: Observer, name: str) -> bool:
 
 def _start(observer: Observer, population: Population, unit: str, own: dict[str, float], name: str) -> float:
     """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
-    samples, keys, seen = round(_SEEN_S / population.sample_period_s), population.keys(unit), 0
+    samples, seen = round(_SEEN_S / population.sample_period_s), 0
     chosen: list[EpisodeKey] = []
-    for key in keys[:_BATCH]:
+    for key in population.keys(unit)[:_BATCH]:
         if seen < samples:
             chosen, seen = [*chosen, key], seen + len(population.read(key))
-    batch, y, u = arriving(observer, population, tuple(chosen), {unit: own}, samples)
-    candidates = np.arange(_PHASES) * 2 * np.pi / _PHASES
-    return least_innovation(observer, y, u, batch.lengths, {**observer.parameters, **own}, name, candidates)
+    found, step = arriving(observer, population, tuple(chosen), {unit: own}, samples), 2 * np.pi / _PHASES
+    asked = (observer, found.y, found.u, found.batch.lengths, {**observer.parameters, **own}, name)
+    coarse = least_innovation(*asked, np.arange(_PHASES) * step)
+    return float(np.mod(least_innovation(*asked, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))

@@ -22,7 +22,7 @@ from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
 from .field import FieldRecordings
-from .innovation import monitored, monitored_line
+from .innovation import level_text, monitored, monitored_line
 from .recordings import check_channels, hidden_states, identify_on, load_calibration, open_data, training_keys, unit_parameters
 
 
@@ -36,7 +36,8 @@ def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]
     -------
     list of dict
         One row a unit and condition that the study knows: ``unit, condition, score, threshold, outlier, status, detectable, freq_hz`` and more
-        (see `kros.uncertainty.outliers.population.score_row`), and ``left_out``, units of the study that it was not compared with.
+        (see `kros.uncertainty.outliers.population.score_row`), ``left_out``, units of the study that it was not compared with, and where the deployed
+        observer has a monitor its ``level_db``, which flags nothing where there is a score.
     """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (config, store):
         return scored(config, store, data, workers)
@@ -46,18 +47,21 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[
     """Score the units of some recordings against a run that is open."""
     kept = [name.split("/") for name in sorted(store.files())]
     folders = [store.path(*parts[:2]) for parts in kept if len(parts) == 3 and (parts[0], parts[2]) == ("outliers", "outlier_model.json")]
+    observer = Observer.load(store.path("observers", "deployed.json")) if store.holds("observers", "deployed.json") else None
+    population = open_data(config, data, hidden_states(observer) if observer else ())
+    check_population(population, allow_single=True)
+    watched = []
+    if observer is not None:
+        check_channels(population, observer, field_recordings=True)
+        hidden = any(name not in population.states for name in observer.recorded)
+        watched = monitored(FieldRecordings.open(config, store, data)) if hidden or observer.monitor is not None else []
+        if hidden:
+            return in_order(watched)
+        check_channels(population, observer)
     if not folders:
         raise ConfigError(
             f"Run {store.folder}: has no outlier scores to compare with; run the study until quantify, with at least three units."
         )
-    observer = Observer.load(store.path("observers", "deployed.json")) if store.holds("observers", "deployed.json") else None
-    population = open_data(config, data, hidden_states(observer) if observer else ())
-    check_population(population, allow_single=True)
-    if observer is not None:
-        check_channels(population, observer, field_recordings=True)
-        if any(name not in population.states for name in observer.recorded):
-            return in_order(monitored(FieldRecordings.open(config, store, data)))
-        check_channels(population, observer)
     rows: list[dict[str, Any]] = []
     with open_executor(workers) as executor:
         for folder in folders:
@@ -69,7 +73,8 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[
             f"Checking {data}: the recordings have the conditions {', '.join(population.conditions)}, and the run has models of "
             f"{', '.join(ModelSet.load(store.path('models', folder.name)).condition for folder in folders)} alone; name the condition, as in the study."
         )
-    return in_order(rows)
+    levels = {(row["unit"], row["condition"]): {key: row[key] for key in ("level_db", "level_rate")} for row in watched}
+    return in_order([row | levels.get((row["unit"], row["condition"]), {}) for row in rows])
 
 
 def in_order(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -113,6 +118,8 @@ def check_line(row: dict[str, Any]) -> str:
     threshold = "none, too few units" if row["threshold"] is None else f"{row['threshold']:.2f} dB"
     line = f"{row['unit']}  {row['condition']}  score {row['score']:.2f} dB (threshold {threshold})"
     line += f"  {row['status'].upper() if row['outlier'] else row['status']}"
+    if row.get("level_db") is not None:
+        line += f", innovation {level_text(row)}"
     if row["outlier"]:
         return line
     seen = (

@@ -49,6 +49,11 @@ def highest_levels(recordings: FieldRecordings, monitor: Monitor, found: Arrivin
     return levels
 
 
+def level_text(row: dict[str, Any]) -> str:
+    """Return where the level of the innovation is."""
+    return f"{abs(row['level_db']):.2f} dB {'over' if row['level_db'] > 0 else 'below'} the monitor's bound"
+
+
 def monitored_line(row: dict[str, Any]) -> str:
     """Return a row of `monitored` for people at a terminal."""
     line = f"{row['unit']}  {row['condition']}  {row['status'].upper() if row['outlier'] else row['status']}: "
@@ -56,6 +61,6 @@ def monitored_line(row: dict[str, Any]) -> str:
     if row["level_db"] is None:
         line += "the deployed observer has no monitor, or no sample can be judged"
     else:
-        line += f"innovation {row['level_db']:+.2f} dB over the monitor's bound, which {100 * row['level_rate']:.3g} % of good units exceed"
+        line += f"innovation {level_text(row)}, which {100 * row['level_rate']:.3g} % of good units exceed"
     line += "".join(f"; {count} samples {bit}" for bit, count in row["samples"].items())
     return line + (f"; parameters {row['parameters']}" if row["parameters"] else "")

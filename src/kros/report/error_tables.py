@@ -140,7 +140,9 @@ def _left_out_cell(rows: Rows, band_db: float | None) -> ErrorCell:
     if len(values) > 1:
         low, high = unit_interval(values)
         interval = (float(low), float(high))
-    return ErrorCell(float(np.mean(values)), known[worst], worst, interval, units=units, band_db=band_db)
+    rms = [float(v) for r in rows if (v := r.get("rms")) is not None]
+    mean_rms = float(np.mean(rms)) if len(rms) == len(rows) else None
+    return ErrorCell(float(np.mean(values)), known[worst], worst, interval, rms=mean_rms, units=units, band_db=band_db)
 
 
 def _band_db(rows: Rows, papers: Rows) -> float | None:

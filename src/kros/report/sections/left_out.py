@@ -7,7 +7,7 @@ from typing import Any
 
 from ..content import Cell, Section, Table, where
 from ..error_tables import PAPER, ErrorCell, ErrorTable, left_out_tables
-from ..names import in_condition, minus, number, observer_label
+from ..names import axis_label, channel_units, in_condition, minus, number, observer_label
 from ..run_folder import RunFolder
 
 
@@ -28,14 +28,22 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     )
     paragraphs = [text, certified, *(f"Fold {int(n) + 1} failed: {reason}" for n, reason in found["failed"].items())]
     study = metrics["study"]
+    units = channel_units(metrics)
     tables = [
-        _table(table, found["observers"], folds, run.measured_states, study.get("deployed"))
+        _table(table, found["observers"], folds, run.measured_states, study.get("deployed"), units)
         for table in left_out_tables(found["rows"], study["identify_on"])
     ]
     return Section("left-out", "On units that were left out", paragraphs, tables, ["left_out"])
 
 
-def _table(table: ErrorTable, facts: Mapping[str, Mapping[str, Any]], folds: int, measured: Sequence[str], deployed: str | None) -> Table:
+def _table(
+    table: ErrorTable,
+    facts: Mapping[str, Mapping[str, Any]],
+    folds: int,
+    measured: Sequence[str],
+    deployed: str | None,
+    units: Mapping[str, str],
+) -> Table:
     channels = [c for c in table.channels if c not in measured] or list(table.channels)
     powers = any(cell.band_db is not None for cells in table.cells.values() for cell in cells.values())
     rows = []
@@ -47,20 +55,22 @@ def _table(table: ErrorTable, facts: Mapping[str, Mapping[str, Any]], folds: int
         for channel in channels:
             row += _cells(table, channel, cells.get(channel, ErrorCell()), powers)
         rows.append(row)
-    head = ["mean", "95 %", "worst", *(["band (dB)"] if powers else [])]
+    head = ["mean (%)", "worst (%)", *(["band (dB)"] if powers else [])]
     titles = [c.replace("_", " ") + ("" if c in table.ranked else " (not ranked)") for c in channels]
-    groups = [("", 2), ("certified", 2), *((title, len(head)) for title in titles)]
-    caption = f"Errors on units that were left out, percent of the largest value{in_condition(table.condition)}. Best in bold."
+    groups = [("", 2), ("certified", 2), *((title, 1 + len(head)) for title in titles)]
+    caption = f"Errors on units that were left out{in_condition(table.condition)}: RMS, and percent of the largest value with the mean's 95 % interval."
     if powers:
         caption += f" Band: power of the error around the gearbox frequency, relative to “{observer_label(PAPER)}”."
-    head = ["observer", "states", "as it runs", "for the set", *(head * len(channels))]
-    return Table(head, rows, caption, groups, emphasised=where(table.cells, deployed))
+    of_channels = [title for c in channels for title in (axis_label("RMS", units.get(c, "")), *head)]
+    head = ["observer", "states", "as it runs", "for the set", *of_channels]
+    return Table(head, rows, caption, groups, emphasised=where(table.cells, deployed), sortable=True)
 
 
 def _cells(table: ErrorTable, channel: str, cell: ErrorCell, powers: bool) -> list[Cell | str]:
     extra = ["–" if cell.band_db is None else minus(f"{cell.band_db:.1f}")] if powers else []
     if cell.mean is None:
-        return ["diverged" if cell.diverged else "–", "–", "–", *extra]
-    interval = "–" if cell.interval is None else "–".join(map(number, cell.interval))
-    mean, worst = (Cell(number(getattr(cell, what)), strong=getattr(cell, what) == table.best(channel, what)) for what in ("mean", "worst"))
-    return [mean, interval, worst, *extra]
+        return ["–", "diverged" if cell.diverged else "–", "–", *extra]
+    notes = {"mean": "–".join(number(v, 2) for v in cell.interval)} if cell.interval else {}
+    values = {what: getattr(cell, what) for what in ("mean", "worst")}
+    cells = [Cell(number(v), strong=v == table.best(channel, w), note=notes.get(w, ""), value=v) for w, v in values.items()]
+    return [Cell(number(cell.rms), value=cell.rms), *cells, *extra]

@@ -26,7 +26,7 @@ from .outliers import score_card, score_names, undecided_text
 
 log = logging.getLogger(__name__)
 Row = Mapping[str, Any]
-_MOST = 100  # units that get a panel with pictures; more would make the page too large
+_MOST, _ROWS = 100, 400  # units that get a panel with pictures, and a row; more would make the page too large
 
 
 @dataclass
@@ -73,8 +73,9 @@ def _known(run: RunFolder, metrics: Row) -> dict[str, _Known]:
 def _table(run: RunFolder, metrics: Row, found: Mapping[str, _Known], hidden: Sequence[str], panels: set[str]) -> Table:
     home, units = metrics["study"]["identify_on"], channel_units(metrics)
     conditions = list(dict.fromkeys(r["condition"] for r in metrics.get("outliers", [])))
+    cut = "Every unit" if len(found) <= _ROWS else f"{_ROWS} of {len(found)} units, those flagged first; metrics.json has all"
     rows: list[Cells] = []
-    for unit, known in found.items():
+    for unit, known in list(found.items())[:_ROWS]:
         status = "flagged" if any(r["outlier"] for r in known.scores) else known.own.get("status", "ok")
         row: list[Cell | str] = [Cell(unit, href=_key(unit) if _key(unit) in panels else ""), Cell(status, strong=status != "ok")]
         errors = {r["channel"]: r for r in known.errors if r["condition"] == home}
@@ -94,7 +95,7 @@ def _table(run: RunFolder, metrics: Row, found: Mapping[str, _Known], hidden: Se
         *([("outlier score", len(conditions))] if conditions else []),
     ]
     last = [*(["residual"] if any(k.bound for k in found.values()) else []), *(["phase (°)"] if run.calibrated else [])]
-    caption = f"Every unit{in_condition(home)}; % of the largest value, the residual relative to the population's"
+    caption = f"{cut}{in_condition(home)}; % of the largest value, the residual relative to the population's"
     return Table([*head, *last], rows, caption, [*groups, *([("", len(last))] if last else [])], sortable=True)
 
 

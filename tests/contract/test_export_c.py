@@ -16,6 +16,7 @@ from kros.export.c99.board import missing_tools
 from kros.motor_drive import AngleLoad
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Werror", "-pedantic")
+TRAPPED = ("-fsanitize=undefined", "-fsanitize-undefined-trap-on-error", "-Wno-unused-function", "-O0")
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler is on the PATH")
 
 
@@ -27,7 +28,7 @@ def test_same_estimates_and_the_same_status_under_faults(kind, tmp_path):
     assert len(set(status)) >= 4
     for precision, close in (("double", 1e-9), ("float", 1e-4)):
         folder = export_c(observer, tmp_path / precision, "drive", precision)
-        compiled = CompiledObserver.build(folder, flags=(*STRICT, "-Wno-unused-function"))
+        compiled = CompiledObserver.build(folder, flags=(*STRICT, *TRAPPED))
         assert compiled.selftest() == 0
         found, bits = compiled.run(y, u)
         np.testing.assert_array_equal(bits, status)
@@ -121,6 +122,10 @@ def test_everything_compiles_without_a_warning(precision, tmp_path):
     assert {line.split()[-1] for line in symbols.splitlines() if " U " in line} <= {"sin", "cos", "floor", "sinf", "cosf"}
     subprocess.run(["cc", "drive.c.o", "drive_selftest.c.o", "example_main.c.o", "-lm", "-o", "example"], cwd=folder, check=True)
     subprocess.run(["./example"], cwd=folder, check=True)
+    sources = ("drive.c", "drive_selftest.c", "example_main.c")
+    sanitized = ["cc", *STRICT, "-fsanitize=address,undefined", *sources, "-lm", "-o", "sanitized"]
+    if subprocess.run(sanitized, cwd=folder, check=False, capture_output=True).returncode == 0:  # not every compiler comes with the library
+        subprocess.run(["./sanitized"], cwd=folder, check=True)
     subprocess.run(["cc", "size.c", "-o", "size"], cwd=folder, check=True)
     printed = subprocess.run(["./size"], cwd=folder, check=True, capture_output=True, text=True).stdout
     assert f'"state_bytes": {printed},' in (folder / "manifest.json").read_text()

@@ -132,7 +132,7 @@ def c_files(
     context |= {
         "state_bytes": state_bytes,
         "constant_bytes": (numbers + begins + 4 * watched) * (4 if precision == "float" else 8),
-        "operations": numbers - sum(map(len, context["filter_gain"])) + 7 * watched,
+        "operations": numbers - sum(map(len, context["filter_gain"])) + context["delay"] * sum(map(len, context["model"])) + 7 * watched,
         "largest_angle": largest,
         "tolerance": tolerance,
         "accuracy": None if accuracy is None else accuracy.content(),

@@ -24,7 +24,7 @@ from ..readers.csvfile import Dialect, read_columns
 from ..readers.parquet_table import parquet_columns, parquet_head
 from .dialect import TableHead, look_at
 from .examine import Examined, examine
-from .filenames import infer_names
+from .filenames import infer_names, quoted
 from .measures import SECONDS
 from .roles import UNKNOWN, Column, Part, describe, propose, time_columns, time_scale
 
@@ -336,7 +336,7 @@ def _opened(source: Path, mapping: dict[str, Any], excluded: dict[str, str]) -> 
 
 
 def _exclusion(excluded: dict[str, str]) -> dict[str, Any]:
-    return {"exclude": f"^(?:{'|'.join(re.escape(name) for name in excluded)})$"} if excluded else {}
+    return {"exclude": f"^(?:{'|'.join(quoted(name) for name in excluded)})$"} if excluded else {}
 
 
 def _relative(population: Population, source: Path, key: EpisodeKey) -> str:

@@ -170,7 +170,7 @@ def _contiguous(roles: list[str | None], columns: list[tuple[str, ...]]) -> list
     return roles
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
     """Return a text as an expression, without escapes that nobody needs."""
     return re.sub(r"\\([^\w\s.^$*+?{}\[\]|()\\])|\\ ", lambda m: m[1] or " ", re.escape(text))
 
@@ -184,14 +184,14 @@ def _pattern(rows: list[list[str]], marks: list[list[str]], roles: list[str | No
             end += 1
         values = {"".join(_joined(row, mark, i, end)) for row, mark in zip(rows, marks, strict=True)}
         if roles[i] is None:
-            text += _quoted(rows[0][i])
+            text += quoted(rows[0][i])
         elif roles[i] == "other":
             text += r"[^/]+?"
         else:
             text += f"(?P<{roles[i]}>{_class_of(values, end > i)})"
         if end + 1 < n:
             between = {mark[end] for mark in marks}
-            text += _quoted(between.pop()) if len(between) == 1 else r"[/_\-. ]+"
+            text += quoted(between.pop()) if len(between) == 1 else r"[/_\-. ]+"
         i = end + 1
     return text + ending + "$"
 

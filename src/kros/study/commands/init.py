@@ -21,6 +21,7 @@ from ...data.survey import UNLOADED, RecordingFacts, survey
 from ...identify import PhaseSpec
 from ...identify.calibrate import calibrate
 from ...identify.periodic import PeriodicTerm, periodic_term
+from ...identify.presets import HARMONIC_DRIVE
 from ..config import StudyConfig, validate_config
 from ..stages.read import FEWEST, open_source
 from .study_text import study_text
@@ -139,7 +140,7 @@ def _surveyed(config: StudyConfig, work: Work) -> tuple[Population, RecordingFac
 
 def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingProposal:
     """Return lifted functions where recordings ask for them: the periodic term of an angle, with the phase of every unit where it can be calibrated."""
-    if population.metadata.get("plant") is not None:
+    if population.metadata.get("plant") == HARMONIC_DRIVE:
         return LiftingProposal(why="these recordings say which plant they are of, and its own lifting is taken")
     angles = [c.name for c in population.channels if c.role is Role.STATE and c.measured and _may_be_angle(c.name, c.unit)]
     keys = [k for u in facts.pooled[:6] for k in facts.keys("train", u, facts.identify_on)[:3]]

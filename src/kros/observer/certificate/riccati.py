@@ -32,6 +32,7 @@ _LOG_RANGE = (
     -5.0,
     20.0,
 )  # of what is above the least multiplier; closer to it, a peak between frequencies of the grid would break the proof
+_NOTHING = 1e-12
 _STEPS = (1.001, 1.003, 1.01, 1.03, 1.1, 1.3, 2.0)
 _SPARE = 0.25  # share of the distance to one that the extra output may take
 _TOLERANCE = 1e-8
@@ -58,7 +59,8 @@ def riccati_proposals(system: ErrorSystem) -> Iterator[Proposal]:
     if not np.isfinite(least):
         return
     how = "Riccati equation with a multiplier for every slope" if len(multipliers) else "Riccati equation of the bounded-real lemma"
-    least = max(least, np.finfo(float).tiny)
+    size = float(np.linalg.norm(system.B) * np.linalg.norm(system.C))
+    least = max(least, _NOTHING * size, np.finfo(float).tiny)  # where nothing arrives, any small gain will do
     for factor in _STEPS:
         # Multipliers that grow with the gain leave the error less weight, and the disturbance too: room for what the grid did not see.
         R = lyapunov_factor(system, multipliers * factor, least * factor)

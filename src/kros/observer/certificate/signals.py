@@ -190,8 +190,11 @@ def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
     """Return the proven gains from what the channels act on, divided by sizes, to what they add to every one of n errors; infinite where none is."""
     if not len(acted):
         return np.zeros(n)
+    if not np.isfinite(acted).all():
+        return np.full(n, np.inf)
     rest = system.mismatch()
-    rest = replace(rest, B=rest.B * acted, D=rest.D * acted)
+    top = float(acted.max())  # without it gains underflow where channels hardly act
+    rest = replace(rest, B=rest.B * (acted / top), D=rest.D * (acted / top))
     found = np.full(n, np.inf)
     for j in range(n):
         for others in _OTHERS:
@@ -200,7 +203,7 @@ def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
             found[j] = quick_gain(replace(rest, C=weight * rest.C))
             if np.isfinite(found[j]):
                 break
-    return found
+    return found * top
 
 
 def _signals(certificate: ReliftCertificate, observer: ObserverData, seen: Course) -> tuple[Array, ErrorSystem]:

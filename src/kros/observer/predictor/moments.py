@@ -41,6 +41,7 @@ DELAYS = 40
 THIN, SKIP = 4, 300
 SHORT = 25  # internal states forget within this part of an episode by default
 _RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 1e-5, 0.5, 0.01, 1e-13
+_AT_REST = 0.05  # of the usual movement in a sample
 _REWEIGHTED = 3
 _CHANGES, _EXPLAINS = (2, 10, 50), 1.05  # samples; growth of the error
 
@@ -319,8 +320,13 @@ def skipped(length: int) -> int:
 
 
 def followed_inputs(inputs: Array, y: Array) -> tuple[Array, tuple[int, ...]]:
-    """Return the part M of the measurement that the inputs explain, shape (q, m), and the inputs that no measurement follows."""
+    """Return the part M of the measurement that the inputs explain, shape (q, m), and the inputs that no measurement follows.
+
+    M is zero where inputs leave much of a measurement: it does not follow them then, but adds them up, say.
+    """
     static = _static(inputs, y)
+    left = _centred(y - inputs @ static.T).std(axis=0)
+    static = np.where((left < _FOLLOWS * _centred(y).std(axis=0))[:, None], static, 0.0)
     share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
     return static, tuple(int(j) for j in np.flatnonzero(share.max(axis=0) < _FOLLOWS))
 
@@ -336,7 +342,9 @@ def _static(inputs: Array, y: Array) -> Array:
     A lag that depends on the speed would bias M by little, but start every run with an error that the differences of the past magnify. An input that
     explains nothing beside its changes is left out.
     """
-    if np.all(y[0].std(axis=0) > _APART * _centred(y).std(axis=0)):
+    steps = np.sqrt(np.mean(np.diff(y, axis=0) ** 2, axis=(0, 1)))
+    at_rest = np.all(np.sqrt(np.mean((y[1] - y[0]) ** 2, axis=0)) <= _AT_REST * steps)
+    if at_rest and np.all(y[0].std(axis=0) > _APART * _centred(y).std(axis=0)):
         return least_squares(_centred(inputs[:1]), _centred(y[:1]), rcond=1e-9).T
     m, longest = inputs.shape[-1], max(_CHANGES)
     changes = [inputs[longest::THIN] - inputs[longest - d : len(inputs) - d : THIN] for d in _CHANGES]
@@ -369,7 +377,11 @@ def _basis_states(basis: Basis, z: Array, rows: npt.NDArray[np.intp], slow: int)
     from scipy.signal import lfilter
 
     delayed = [z[np.maximum(rows - j, 0)] for j in range(1, basis.delays + 1)]
-    lags = [lfilter([0.0, np.sqrt(1 - p**2)], [1.0, -p], z[:, :slow], axis=0)[rows] for p in basis.poles]
+    first = z[:1, :slow]  # what came before is taken to have been constant, as for delays
+    lags = [
+        (lfilter([0.0, np.sqrt(1 - p**2)], [1.0, -p], z[:, :slow] - first, axis=0) + np.sqrt(1 - p**2) / (1 - p) * first)[rows]
+        for p in basis.poles
+    ]
     return np.concatenate([*delayed, *lags], axis=1)
 
 

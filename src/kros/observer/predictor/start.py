@@ -20,12 +20,14 @@ from ..runtime import Runtime
 from ..simulate import run_observer
 from ..start import Start
 from ..step import Steps
+from .free_start import in_motion
 from .moments import followed_inputs, skipped
 
 Array = npt.NDArray[np.float64]
 COUNT = 16  # innovations with gains of their own
 _WINDOWS = 2000
 _ROUNDS = 3  # an observer that starts better has forgotten its start earlier
+_SILENT = 0.05  # of what it says in motion
 _RIDGE = 1e-6  # relative to mean squares
 
 
@@ -70,6 +72,12 @@ def with_start(
     for _ in range(_ROUNDS):
         known = run_observer(replace(alone, start_in_motion=start), y, u, own)[window].reshape(count + 1, -1, len(hidden))
         gain = regressed(moving, np.where(hidden, known[0] - rest, 0.0)) @ seen
+        if not shows_motion(
+            gain @ np.concatenate([y[0], u[0]], axis=-1).T,
+            (known[0] - rest).T,
+            batch.states[:length][..., hidden[: batch.states.shape[-1]]],
+        ):
+            gain = np.zeros_like(gain)
         start = Start(gain, np.zeros((0, len(hidden), len(at))))
         steps = Steps([replace(alone, start_in_motion=start)], len(rest), {**alone.parameters, **repeated})
         steps.begin(y_w[0], u=u_w[0])
@@ -81,6 +89,18 @@ def with_start(
             steps.x[0] += innovation @ corrections[k].T
         start = Start(gain, corrections)
     return replace(observer, start_in_motion=start)
+
+
+def shows_motion(said: Array, known: Array, truth: Array) -> bool:
+    """Whether the first sample tells a machine in motion from one at rest: where recordings start at rest, it says nothing there.
+
+    `said`, shape (n, batch), is what it says at the starts of recordings, `known`, shape (n, windows), what there is to say in motion.
+    """
+    if in_motion(truth):
+        return True
+    size = np.sqrt(np.mean(known**2, axis=1))
+    share = np.sqrt(np.mean(said**2, axis=1)) / np.where(size > 0, size, np.inf)
+    return bool(share.max() <= _SILENT)
 
 
 def regressed(seen: Array, missed: Array) -> Array:

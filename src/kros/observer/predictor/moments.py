@@ -33,6 +33,7 @@ from ...core.norms import gramian
 from ...data import EpisodeBatch
 from ...lifting import Lifting
 from ...synthesis.residual_shaped.shaping_filter import Basis
+from .free_start import in_motion
 
 Array = npt.NDArray[np.float64]
 Model = tuple[Array, Array, Array]
@@ -41,7 +42,6 @@ DELAYS = 40
 THIN, SKIP = 4, 300
 SHORT = 25  # internal states forget within this part of an episode by default
 _RIDGE, _FOLLOWS, _APART, _NEGLIGIBLE = 1e-5, 0.5, 0.01, 1e-13
-_AT_REST = 0.05  # of the usual movement in a sample
 _REWEIGHTED = 3
 _CHANGES, _EXPLAINS = (2, 10, 50), 1.05  # samples; growth of the error
 
@@ -125,7 +125,7 @@ class PastMoments:
                 f"found {len(hidden)} and {lengths.min()}."
             )
         y = batch.measurements(measured, arrived=False)
-        static, free = followed_inputs(inputs, y)
+        static, free = followed_inputs(inputs, y, states[..., hidden])
         z = _channels(lifting, tuple(measured), static, free, batch)
         ends = lengths if until is None else np.minimum(np.asarray(until), lengths)
         own = [(key.unit, key.condition) for key in batch.keys]
@@ -319,12 +319,13 @@ def skipped(length: int) -> int:
     return min(SKIP, length // 4)
 
 
-def followed_inputs(inputs: Array, y: Array) -> tuple[Array, tuple[int, ...]]:
+def followed_inputs(inputs: Array, y: Array, truth: Array) -> tuple[Array, tuple[int, ...]]:
     """Return the part M of the measurement that the inputs explain, shape (q, m), and the inputs that no measurement follows.
 
-    M is zero where inputs leave much of a measurement: it does not follow them then, but adds them up, say.
+    `truth` are the hidden states: whether they are at rest at first says how M is found. M is zero where inputs leave much of a
+    measurement: it does not follow them then, but adds them up, say.
     """
-    static = _static(inputs, y)
+    static = _static(inputs, y, in_motion(truth))
     left = _centred(y - inputs @ static.T).std(axis=0)
     static = np.where((left < _FOLLOWS * _centred(y).std(axis=0))[:, None], static, 0.0)
     share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
@@ -336,15 +337,13 @@ def _centred(values: Array) -> Array:
     return np.asarray(rows - rows.mean(axis=0))
 
 
-def _static(inputs: Array, y: Array) -> Array:
-    """M, shape (q, m): on the first samples, where machines rest, if they start in different places; else beside what changes of the inputs explain.
+def _static(inputs: Array, y: Array, moving: bool) -> Array:
+    """M, shape (q, m): on the first samples, where machines rest there, if they start in different places; else beside what changes of the inputs explain.
 
     A lag that depends on the speed would bias M by little, but start every run with an error that the differences of the past magnify. An input that
     explains nothing beside its changes is left out.
     """
-    steps = np.sqrt(np.mean(np.diff(y, axis=0) ** 2, axis=(0, 1)))
-    at_rest = np.all(np.sqrt(np.mean((y[1] - y[0]) ** 2, axis=0)) <= _AT_REST * steps)
-    if at_rest and np.all(y[0].std(axis=0) > _APART * _centred(y).std(axis=0)):
+    if not moving and np.all(y[0].std(axis=0) > _APART * _centred(y).std(axis=0)):
         return least_squares(_centred(inputs[:1]), _centred(y[:1]), rcond=1e-9).T
     m, longest = inputs.shape[-1], max(_CHANGES)
     changes = [inputs[longest::THIN] - inputs[longest - d : len(inputs) - d : THIN] for d in _CHANGES]

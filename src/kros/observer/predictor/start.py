@@ -55,9 +55,10 @@ def with_start(
     y, u = batch.measurements(at, arrived=False)[:length], batch.inputs[:length]
     if not hidden.any() or last <= first or not np.isfinite(y).all():
         return observer
+    truth = batch.states[:length][..., hidden[: batch.states.shape[-1]]]
     own = {name: np.asarray(values) for name, values in observer.own(batch.parameters).items()}
     if static is None:
-        static, free = followed_inputs(u, y)
+        static, free = followed_inputs(u, y, truth)
     seen = np.zeros((len(at) + len(free), len(at) + u.shape[-1]))  # from [y; u] to what is zero at rest
     seen[: len(at)] = np.hstack([np.eye(len(at)), -static])
     seen[range(len(at), len(seen)), [len(at) + j for j in free]] = 1.0
@@ -72,11 +73,7 @@ def with_start(
     for _ in range(_ROUNDS):
         known = run_observer(replace(alone, start_in_motion=start), y, u, own)[window].reshape(count + 1, -1, len(hidden))
         gain = regressed(moving, np.where(hidden, known[0] - rest, 0.0)) @ seen
-        if not shows_motion(
-            gain @ np.concatenate([y[0], u[0]], axis=-1).T,
-            (known[0] - rest).T,
-            batch.states[:length][..., hidden[: batch.states.shape[-1]]],
-        ):
+        if not shows_motion(gain @ np.concatenate([y[0], u[0]], axis=-1).T, (known[0] - rest).T, truth):
             gain = np.zeros_like(gain)
         start = Start(gain, np.zeros((0, len(hidden), len(at))))
         steps = Steps([replace(alone, start_in_motion=start)], len(rest), {**alone.parameters, **repeated})

@@ -125,6 +125,7 @@ def test_the_card_says_what_an_engineer_needs_and_what_voids_the_certificate(tmp
         "relift_certified": True,
         "relift_gain": 2.0,
     }
+    entry["monitor"] = {"false_alarm_rate": 0.02, "units": 38, "hours": 0.5, "alarms": 1, "alarms_per_hour": [0.05, 11.0]}
     found = metrics(observers={NAME: entry}, study={"channels": {"angle": "rad", "torque": "Nm", "velocity": "rad/s"}})
     section = deployment.section(RunFolder(tmp_path), found)
     assert section is not None
@@ -138,6 +139,7 @@ def test_the_card_says_what_an_engineer_needs_and_what_voids_the_certificate(tmp
     assert "velocity 1.50 % of the largest value" in card["Certificate"]
     assert card["It assumes"] == "any value of phase."
     assert card["It is void"].startswith("When a loop is closed on the estimate")
+    assert "of 38 units. One more good unit leaves it with a probability of 2 %, and 2.00 times an hour of motion" in card["Monitor"]
     assert "On c, whose recorded signals are outside" in card["It is void"]
     assert deployment.section(RunFolder(tmp_path), metrics(study={"deployed": None})) is None
 

@@ -29,7 +29,7 @@ def best_last(cells: Mapping[str, Mapping[str, ErrorCell]], channels: Sequence[s
 
 def row_panels(channels: Sequence[str], order: Sequence[str], deployed: str | None) -> tuple[Figure, Array]:
     """Return a figure and its panels; the deployed observer in bold."""
-    figure, axes = grid(1, len(channels), 0.36 * len(order) + 0.75, sharey=True)
+    figure, axes = grid(1, len(channels), 0.27 * len(order) + 0.75, sharey=True)
     for panel, channel in zip(axes[0], channels, strict=True):
         panel.set_title(channel.replace("_", " "))
         panel.grid(visible=False, axis="y")

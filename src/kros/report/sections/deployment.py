@@ -33,6 +33,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         ("Certificate", _certificate(trust)),
         ("It assumes", _assumed(run, name)),
         ("It is void", _void(trust, metrics)),
+        ("Monitor", _monitor(metrics.get("observers", {}).get(name, {}).get("monitor"))),
     ]
     card = [("Observer", [f"{observer_label(name)}, {name}, in observers/deployed.json."]), *made, *proof]
     return Section("deployment", "Deployment card", card=[(term, told) for term, told in card if told])
@@ -156,12 +157,17 @@ def _void(trust: Trust, metrics: Mapping[str, Any]) -> list[str]:
     return told
 
 
-def _monitor(observer: Observer) -> list[str]:
+def _monitor(found: Mapping[str, Any] | None) -> list[str]:
     """Say what the running observer tells of the machine, and at which rates it is wrong; nothing where it has no envelope."""
-    own = observer.monitor
-    if own is None:
+    if not found:
         return []
+    text = (
+        f"Status bit 8 is set while the innovation is outside the envelope of {found['units']} units. One more good unit leaves it with a probability of "
+        f"{100 * found['false_alarm_rate']:g} %"
+    )
+    low, high = found["alarms_per_hour"]
+    if low is None:
+        return [f"{text}."]
     return [
-        f"Status bit 8 is set while the innovation is outside the envelope of {own.units} units. One more good unit exceeds it with a probability of "
-        f"{100 * own.false_alarm_rate:g} %; in {number(own.hours)} h of motion in training it was exceeded {own.alarms} times."
+        f"{text}, and {number(found['alarms'] / found['hours'])} times an hour of motion (95 % interval {number(low, 2)} to {number(high, 2)})."
     ]

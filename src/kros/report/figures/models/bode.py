@@ -19,7 +19,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     nominal = str(run.choice["nominal"]) if run.has("uncertainty/choice.json") else None
     text = (
         f"Frequency responses of all {len(models.unit_ids)} {model_label(models.name)} models, every state over every input, each signal over its largest "
-        "value. The spread of the lines is what the uncertainty model has to cover."
+        "value."
     )
     return bode_figure(models, nominal), text
 

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+START = 50  # samples in which an observer finds out what it does not know at first
 _SEGMENT = 512  # samples of a Welch segment, as in the paper
 _TOGETHER = 6  # episodes whose spectra are computed at once: their segments stay in the cache, five times as fast as all at once
 _TURNED = 256  # samples of all signals that are put in order at once: they stay in the cache
@@ -22,6 +23,8 @@ class ErrorSummary:
     rms : ndarray, shape (batch, n)
     percent : ndarray, shape (batch, n)
         ``100 rms(x_hat - x) / max|x|`` of every episode.
+    start_percent, rest_percent : ndarray, shape (batch, n)
+        The same of its first `START` samples and of those behind, over the largest value of the whole episode.
     spectra : ndarray, shape (batch, n_freqs, n)
         Welch's power spectral density of the error.
     freqs_hz : ndarray, shape (n_freqs,)
@@ -29,6 +32,8 @@ class ErrorSummary:
 
     rms: Array
     percent: Array
+    start_percent: Array
+    rest_percent: Array
     spectra: Array
     freqs_hz: Array
 
@@ -63,7 +68,12 @@ def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt:
             for rows in np.split(episodes, range(_TOGETHER, len(episodes), _TOGETHER)):
                 freqs, density = error_spectrum(error[rows, :, :length], dt, axis=-1)
                 spectra[rows] = np.swapaxes(density, 1, 2)
-    return ErrorSummary(rms, _of_range(rms, truth, lengths), spectra, freqs)
+        begun = np.minimum(START, lengths)
+        first = error_rms(estimate[:START], truth[:START], begun)
+        behind = np.maximum(rms**2 * lengths[:, None] - first**2 * begun[:, None], 0.0)
+        rest = np.sqrt(behind / np.maximum(lengths - START, 1)[:, None])
+    percents = (_of_range(values, truth, lengths) for values in (rms, first, rest))
+    return ErrorSummary(rms, *percents, spectra, freqs)
 
 
 def _signals(estimate: Array, truth: Array) -> Array:

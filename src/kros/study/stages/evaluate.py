@@ -285,6 +285,7 @@ def error_rows(
                 continue
             row = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition, "channel": channel}
             row |= {"rms": summary.rms[chosen, j].mean(), "error_percent": summary.percent[chosen, j].mean()}
+            row |= {f"{part}_error_percent": getattr(summary, f"{part}_percent")[chosen, j].mean() for part in ("start", "rest")}
             row |= {} if power is None else {"gearbox_band_power": power[chosen, j].mean()}
             rows.append(row | true_entry(outcome.true, chosen, j))
     return rows

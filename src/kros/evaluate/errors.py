@@ -70,10 +70,10 @@ def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt:
                 spectra[rows] = np.swapaxes(density, 1, 2)
         begun = np.minimum(START, lengths)
         first = error_rms(estimate[:START], truth[:START], begun)
-        behind = np.maximum(rms**2 * lengths[:, None] - first**2 * begun[:, None], 0.0)
-        rest = np.sqrt(behind / np.maximum(lengths - START, 1)[:, None])
-    percents = (_of_range(values, truth, lengths) for values in (rms, first, rest))
-    return ErrorSummary(rms, *percents, spectra, freqs)
+        left = np.maximum(rms**2 * lengths[:, None] - first**2 * begun[:, None], 0.0)
+        rest = np.sqrt(left / np.maximum(lengths - START, 1)[:, None])
+    percent, start, behind = (_of_range(values, truth, lengths) for values in (rms, first, rest))
+    return ErrorSummary(rms, percent, start, behind, spectra, freqs)
 
 
 def _signals(estimate: Array, truth: Array) -> Array:

@@ -66,7 +66,9 @@ def said(result, code, *words):
     ],
     ids=lambda value: type(value).__name__,
 )
-@pytest.mark.parametrize("command", ["run", "report", "check", "estimate", "figures", "convert", "simulate", "demo", "doctor"])
+@pytest.mark.parametrize(
+    "command", ["run", "report", "check", "estimate", "figures", "convert", "simulate", "demo", "doctor", "init", "list"]
+)
 def test_any_exception_becomes_one_message(kros, tmp_path, monkeypatch, command, error, words):
     def fail(*_, **__):
         raise error
@@ -81,8 +83,10 @@ def test_any_exception_becomes_one_message(kros, tmp_path, monkeypatch, command,
         "simulate": "kros.study.commands.demo.simulate_to",
         "demo": "kros.study.commands.demo.run_demo",
         "doctor": "kros.study.commands.doctor.diagnose",
+        "init": "kros.study.commands.init.init_study",
+        "list": "kros.study.commands.listing.list_run",
     }
-    arguments = {"run": 1, "report": 1, "check": 2, "estimate": 3, "figures": 2, "convert": 2, "simulate": 1}
+    arguments = {"run": 1, "report": 1, "check": 2, "estimate": 3, "figures": 2, "convert": 2, "simulate": 1, "init": 1, "list": 1}
     monkeypatch.setattr(places[command], fail)
     said(kros(command, *[tmp_path / f"{i}" for i in range(arguments.get(command, 0))]), 1, *words)
     debugged = kros("--debug", command, *[tmp_path / f"{i}" for i in range(arguments.get(command, 0))])

@@ -20,8 +20,8 @@ from ...core.files import did_you_mean
 from ...core.work import Work
 from ..population import EpisodeKey, Population
 from ..readers.csv_folder import csv_files, read_csv_folder
-from ..readers.csvfile import Dialect, read_columns
-from ..readers.parquet_table import parquet_columns, parquet_head
+from ..readers.csvfile import Dialect, first_fields, read_columns
+from ..readers.parquet_table import parquet_columns, parquet_fields, parquet_head
 from .dialect import TableHead, look_at
 from .examine import Examined, examine
 from .filenames import infer_names, quoted
@@ -150,8 +150,7 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str
     own, strange = {}, []
     for relative, path in paths:
         try:
-            there = _head_of(path)
-            fits = set(head.fields) - {""} <= set(there.fields) and there.dialect == head.dialect
+            fits = _fits(path, head)
         except DataError:
             fits = False
         if fits:
@@ -159,6 +158,15 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str
         else:
             strange.append(relative)
     return head, own, strange
+
+
+def _fits(path: Path, head: TableHead) -> bool:
+    """Tell whether a file has the columns of the others, where they have them."""
+    wanted = set(head.fields) - {""}
+    if path.suffix != ".parquet":
+        there = first_fields(path, head.dialect)
+        return len(there) == len(head.fields) if not head.dialect.header else wanted <= set(there)
+    return wanted <= set(parquet_fields(path))
 
 
 def _head_of(path: Path) -> TableHead:

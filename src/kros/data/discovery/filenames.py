@@ -126,7 +126,11 @@ def _roles(rows: list[list[str]], marks: list[list[str]]) -> tuple[list[str | No
             if repeated:
                 roles[repeated[0]] = UNIT
         for i in left:
-            if roles[i] is None:
+            before = UNIT in roles[i + 1 :] and not any(roles[i + 1 : roles.index(UNIT, i + 1)])
+            if roles[i] is None and before:
+                numbered = all(re.search(r"\d", v) for v in columns[i])  # batch2/motor7: the batch is part of the name
+                roles[i] = UNIT if numbered else CONDITION if CONDITION not in roles else EPISODE
+            elif roles[i] is None:
                 few = len(set(columns[i])) <= 4 and not any(v.isdigit() for v in columns[i])
                 roles[i] = CONDITION if few and CONDITION not in roles and i != varying[-1] else EPISODE
     return _contiguous(roles, columns), sure

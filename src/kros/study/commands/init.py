@@ -17,6 +17,7 @@ from ...data import Population, Role, check_population, detect_reader
 from ...data.discovery import Column, Discovery, Part, Wanted, discover
 from ...data.discovery.discover import Ask
 from ...data.discovery.roles import is_commanded, kind_of
+from ...data.readers.opening import LOOKS
 from ...data.survey import UNLOADED, RecordingFacts, survey
 from ...identify import PhaseSpec
 from ...identify.calibrate import calibrate
@@ -86,7 +87,11 @@ def init_study(source: Path, out: Path, wanted: Wanted, ask: Ask | None, progres
     work = Work(progress=progress)
     data: dict[str, Any] = {"source": _source(source, out), "reader": "csv"}
     reader, found = detect_reader(source), None
-    if reader in ("parquet", "motor-drive-raw") and wanted == Wanted():
+    if reader in ("parquet", "motor-drive-raw"):
+        if wanted != Wanted():
+            raise ConfigError(
+                f"Looking at {source}: it {LOOKS[reader]}, which says what channels are; leave out --measured, --input, --files and --period."
+            )
         data["reader"] = reader
     else:
         found = discover(source, wanted, ask, work)

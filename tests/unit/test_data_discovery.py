@@ -1,0 +1,105 @@
+"""What names of files, headers and first lines of strangers' recordings are taken for."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from kros.core.errors import DataError
+from kros.data.discovery.dialect import look_at
+from kros.data.discovery.filenames import infer_names
+from kros.data.discovery.measures import identifier, split_header
+from kros.data.discovery.roles import kind_of, time_scale
+
+UNITS, EPISODES = range(1, 4), range(1, 4)
+
+
+def names(template: str, **other: object) -> list[str]:
+    """Paths of three units and episodes, in conditions where the template has one."""
+    conditions = ("load", "noload") if "{c" in template else ("",)
+    return [template.format(u=u, c=c, e=e, letter="ABC"[u - 1], **other) for u in UNITS for c in conditions for e in EPISODES]
+
+
+@pytest.mark.parametrize(
+    ("template", "first", "sure"),
+    [
+        ("unit_{u:02d}/{c}/run{e}.csv", ("01", "load", "run1"), True),
+        ("drive{u}_{c}_trial_{e:03d}.csv.gz", ("drive1", "load", "001"), True),
+        ("Antrieb {u} Leerlauf Messung {e}.CSV", ("1", None, "1"), True),
+        ("SN1004{u}-{e}.txt", ("SN10041", None, "1"), False),
+        ("{letter}/2024-05-0{e}_10bar.csv", ("A", None, "01"), False),
+        ("design_{letter}.0__2022081{e}_trajectory_0{e}.csv", ("A.0", None, "20220811_trajectory_01"), True),
+        ("2024010{u}T120000_00{u}_{c}/x_{e:03d}.csv", ("001", "load", "001"), False),
+    ],
+)
+def test_names_of_files(template, first, sure):
+    paths = names(template)
+    found = infer_names(paths)
+    groups = re.search(found.pattern, paths[0])
+    assert groups is not None
+    assert tuple(groups.groupdict().get(g) for g in ("unit", "condition", "episode")) == first
+    assert len({tuple(m.groupdict().items()) for p in paths if (m := re.search(found.pattern, p))}) == len(paths)
+    assert found.sure is sure
+
+
+def test_conditions_groups_and_single_machines():
+    assert "(?P<condition>" in infer_names([f"rig{u}_{p}bar.csv" for u in UNITS for p in (3, 5)]).pattern
+    assert "(?P<group>" in infer_names([f"{'outliers' if u == 3 else 'good'}/m{u}_{e}.csv" for u in UNITS for e in EPISODES]).pattern
+    batches = infer_names([f"batch{b}/motor{u}/run{e}.csv" for b in (1, 2) for u in UNITS for e in EPISODES])
+    assert re.search(batches.pattern, "batch1/motor2/run3.csv")["unit"] == "batch1/motor2"
+    single = infer_names([f"qube_20240101T12{e}{e}00_43{e}_7{e}.csv" for e in EPISODES])
+    assert "(?P<unit>" not in single.pattern
+    assert infer_names(["only.csv"]).pattern == r"^only\.csv$"
+
+
+@pytest.mark.parametrize(
+    ("header", "name", "unit"),
+    [
+        ("Position [mm]", "Position", "mm"),
+        ("Drehzahl (1/min)", "Drehzahl", "1/min"),
+        ("i/A", "i", "A"),
+        ("Weg in mm", "Weg", "mm"),
+        ("time_ms", "time", "ms"),
+        ("pos_x", "pos_x", ""),
+        ("v_A", "v_A", ""),
+        ("tau_max", "tau_max", ""),
+    ],
+)
+def test_units_of_measure_in_headers(header, name, unit):
+    found = split_header(header)
+    assert (found.name, found.unit) == (name, unit)
+
+
+def test_names_of_channels_may_stand_in_formulas():
+    assert identifier("Öldruck 2") == "oeldruck_2"
+    assert identifier("2nd axis [°]") == "c2nd_axis"
+    assert identifier("q", ["q"]) == "q_2"
+    assert [kind_of(n) for n in ("motor_speed", "IstDrehzahl", "tau_meas1", "pos_filt", "foo")] == [
+        "velocity",
+        "velocity",
+        "torque",
+        "position",
+        "",
+    ]
+    assert kind_of("x", "bar") == "pressure"
+
+
+def test_scale_of_time():
+    assert time_scale("ms", 1.0)[0] == 1e-3
+    assert [time_scale("", step)[0] for step in (0.001, 1.0, 2000.0, 1e6)] == [1.0, 1e-3, 1e-6, 1e-9]
+
+
+def test_lines_before_the_numbers(tmp_path: Path):
+    path = tmp_path / "a.csv"
+    path.write_text("; Bench 4\n# rate 1000 Hz\ntime;speed\n[s];[rpm]\nfloat;float\n0,001;1,5\n0,002;2,5\n0,003;2,5\n")
+    head = look_at(path)
+    assert head.fields == ("time", "speed")
+    assert head.units == ("[s]", "[rpm]")
+    assert (head.dialect.delimiter, head.dialect.decimal, head.dialect.skip_rows, head.dialect.unit_rows) == (";", ",", 2, 2)
+    path.write_text("1;2\n3;4\n5;6\n")
+    assert not look_at(path).dialect.header
+    path.write_text("once upon a time\nthere was; a table\n")
+    with pytest.raises(DataError, match=r"a\.csv: no rows of numbers were found in its first 2 lines"):
+        look_at(path)

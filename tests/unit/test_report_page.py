@@ -434,7 +434,12 @@ field.value = "kalman no"; field.dispatchEvent(new Event("input"));
 const kept = [...table.tBodies[0].rows].filter(row => !row.hidden).map(row => row.textContent.toLowerCase());
 const unnamed = [...page.querySelectorAll("svg[role=img], nav, input, button")].filter(
   one => !(one.getAttribute("aria-label") || one.textContent.trim() || one.closest("label")));
-return { overflow: page.documentElement.scrollWidth - width, cut: cut.map(one => one.getAttribute("aria-label")),
+const mark = page.querySelector("figure use[data-unit]");
+mark.scrollIntoView({ block: "center", inline: "center" });
+const box = mark.getBoundingClientRect(), at = { clientX: box.x + box.width / 2, clientY: box.y + box.height / 2 };
+mark.closest("svg").dispatchEvent(new frame.PointerEvent("pointermove", at));
+const tip = page.querySelector(".tip");
+return { tip: tip.hidden ? "" : tip.textContent, overflow: page.documentElement.scrollWidth - width, cut: cut.map(one => one.textContent.trim().slice(0, 60)),
   first, second, kept, unnamed: unnamed.length, units: page.querySelectorAll("svg [data-unit]").length };
 """
 
@@ -451,6 +456,7 @@ def test_page_in_a_browser(page: str, tmp_path: Path) -> None:
         assert 0 < len(seen["kept"]) < len(seen["first"])
         assert all("kalman" in text and "no" in text for text in seen["kept"])
         assert seen["units"] > 0
+        assert seen["tip"] in UNITS
     assert printed_pages(page, tmp_path) <= 12
 
 

@@ -17,8 +17,8 @@ _SECONDS, _METHOD, _MOST = 5.0, "worst_case_h2", 24
 
 
 def draw(run: RunFolder) -> tuple[Figure, str]:
-    """Draw a row for every hidden state and a column for every kind of model that has a worst-case observer."""
-    names = best_models(name for name in run.models if f"{name}/{_METHOD}" in run.observers_record["names"])
+    """Draw a row for every hidden state, of the Koopman model where it has a worst-case observer."""
+    names = best_models(name for name in run.models if f"{name}/{_METHOD}" in run.observers_record["names"])[-1:]
     if not names:
         raise NotShownError("no worst-case H2 observer was designed, for whose model the residuals would be shown")
     hidden, states = run.hidden_states, [c.name for c in run.states]

@@ -336,6 +336,12 @@ class Lifting:
     def _input_derivatives(self) -> Columns:
         return Columns.of([formula.derivative(name) for formula in self.input_formulas for name in self.window.names])
 
+    @cached_property
+    def _read_states(self) -> tuple[tuple[int, str], ...]:
+        """Places and names of the present states that functions read: an observer may have many of which they do not know."""
+        used = {name for formula in self.formulas + self.input_formulas for name in formula.used}
+        return tuple((i, name) for i, name in enumerate(self.states) if name in used)
+
     def _windows(self, x: npt.ArrayLike) -> Array:
         x = np.asarray(x, dtype=float)
         names = self.window.names
@@ -350,7 +356,7 @@ class Lifting:
         if missing:
             raise DimensionError(f"Lifting: parameter values for {missing} are missing, found {sorted(given)}; calibrate the unit first.")
         values = {name: np.asarray(given[name], dtype=float) for name in self.parameters}
-        values.update({name: x[..., i] for i, name in enumerate(self.states)})
+        values.update({name: x[..., i] for i, name in self._read_states})
         if earlier is not None:
             values.update({name: earlier[..., i] for i, name in enumerate(self.window.earlier)})
         elif self.window.depths:

@@ -15,7 +15,7 @@ from .data import ObserverData
 from .monitor import Watch
 from .samples import LONGEST, Held, SampleStatus, Screened
 from .screen import Screen
-from .step import Steps
+from .step import Steps, places
 from .tracking import SETTLE_S, PhaseLockedLoop
 
 Array = npt.NDArray[np.float64]
@@ -62,7 +62,9 @@ class RunningObserver:
         self._screen = Screen.of(observer)
         self._steps, self._ahead = Steps([observer], 1, {}), Steps([observer], 1, {})
         self._places = {name: i for i, name in enumerate(observer.lifting.states)}
-        self._at = list(observer.measured)
+        self._measured, self._at = tuple(observer.lifting.states[i] for i in observer.measured), places(observer.measured)
+        self._limits = observer.runtime if observer.runtime.binding else None
+        self._filter_gain: Array | None = None
         self._unknown = np.ones((1, len(observer.measured)), dtype=bool)
         self._loop: PhaseLockedLoop | None = None
         self._watch = None if observer.monitor is None else Watch(observer.monitor)
@@ -82,7 +84,8 @@ class RunningObserver:
     @parameters.setter
     def parameters(self, values: Mapping[str, float]) -> None:
         """Change all of them."""
-        self._parameters = self._steps.values = self._ahead.values = _Checked(self.observer, values)
+        self._parameters = _Checked(self.observer, values)
+        self._steps.values = self._ahead.values = self._parameters.plain
 
     def track(self, name: str, settle_s: float = SETTLE_S) -> None:
         """Let one of the parameters follow the machine from now on; see `PhaseLockedLoop`, and `parameters` for its value.
@@ -127,6 +130,7 @@ class RunningObserver:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
         first = self._judge(self._measurement(y), np.zeros(len(self.observer.inputs)))
         self._status, self._held = SampleStatus(int(first.status[0, 0])), Held.nothing(1, len(self.observer.inputs))
+        self._known: Array | None = None
         self._fresh = bool(np.isfinite(first.y).any())
         if self._watch is not None:
             self._watch.reset()
@@ -151,7 +155,9 @@ class RunningObserver:
         if len(self._inputs) < o.runtime.delay:
             return self.estimate
         nu = self._steps.innovation(self._judge(self._measurement(y), np.zeros(len(o.inputs))).y[0])[0, 0]
-        return self._forward(o.runtime.relifted(self._steps.x[0, 0] + o.filter_gain @ nu))
+        if self._filter_gain is None:
+            self._filter_gain = o.filter_gain
+        return self._forward(o.runtime.relifted(self._steps.x[0, 0] + self._filter_gain @ nu))
 
     def step(self, y: npt.ArrayLike, u: npt.ArrayLike) -> Estimate:
         """Take what arrives and the input at k, return the estimate for k + 1.
@@ -176,15 +182,16 @@ class RunningObserver:
         measurement, known = self._take(self._measurement(y), self._input(u))
         self._inputs.append(known)
         if len(self._inputs) > self.observer.runtime.delay:
-            missing, steps, taken = ~np.isfinite(measurement), self._steps, self._inputs.popleft()
-            absent = missing if missing.any() else None
+            steps, taken, absent = self._steps, self._inputs.popleft(), None
+            if self._known is None and not (there := np.isfinite(measurement)).all():
+                absent = ~there
             if self._watch is not None:
                 self._watch.take((measurement[0] - steps.x[0, 0, self._at]).tolist(), not self._status)
             if self._loop is None:
                 steps.step(measurement, taken, absent)
             else:
                 self.parameters[self._loop.name] = float(self._loop.step(steps, measurement, taken, absent)[0])
-            if self.observer.runtime.binds(steps.x[0, 0], steps.correction):
+            if self._limits is not None and self._limits.binds(steps.x[0, 0], steps.correction):
                 self._status |= SampleStatus.LIMIT
         if self._watch is not None and self._watch.outside:
             self._status |= SampleStatus.UNCERTIFIED
@@ -194,7 +201,16 @@ class RunningObserver:
         return self._screen.take(y[None, None], u[None, None], held)
 
     def _take(self, y: Array, u: Array) -> tuple[Array, Array]:
-        """Judge a sample, and start again where that is due; the first sample is the one that the observer started at."""
+        """Judge a sample, and start again where that is due; the first sample is the one that the observer started at.
+
+        `_known` is the last input where that and what came before were good: then nothing is held, and a sample that is good takes the short way.
+        """
+        before, self._known = self._known, None
+        if before is not None:
+            if self._screen.measured.pass_one(y.tolist()) and self._screen.inputs.pass_one(u.tolist()):
+                self._known, self._status = u, SampleStatus.GOOD
+                return y[None], u[None]
+            self._held = Held.good(before[None])
         samples = self._judge(y, u, self._held)
         self._status, self._held = SampleStatus(int(samples.status[0, 0])), samples.held
         first, self._fresh = self._fresh, False
@@ -204,16 +220,18 @@ class RunningObserver:
                 self._begin(samples.y[0], samples.u[0])
         elif samples.starts[0, 0]:
             self._begin(samples.y[0], samples.u[0])
+        if not (self._status or self._held.stale[0] or self._held.since.any()):
+            self._known = samples.u[0, 0]
         return samples.y[0], samples.u[0]
 
     def _measurement(self, y: npt.ArrayLike) -> Array:
-        return self._shaped(y, "measurements", [self.observer.lifting.states[i] for i in self.observer.measured])
+        return self._shaped(y, "measurements", self._measured)
 
     def _input(self, u: npt.ArrayLike) -> Array:
         return self._shaped(u, "inputs", self.observer.inputs)
 
     def _shaped(self, values: npt.ArrayLike, what: str, names: Sequence[str]) -> Array:
-        array = np.atleast_1d(np.asarray(values, dtype=float))
+        array = np.array(values, dtype=float, ndmin=1)  # a copy: the caller may use its memory again
         if array.shape != (len(names),):
             raise DimensionError(
                 f"Running observer {self.observer.name}: expected the {len(names)} {what} {', '.join(names)}, shape ({len(names)},), "
@@ -232,27 +250,27 @@ class RunningObserver:
         return self._given(ahead.x[0, 0])
 
     def _given(self, x: Array) -> Estimate:
-        return Estimate(self._places, self.observer.runtime.clip_estimate(x.copy()))
+        return Estimate(self._places, x.copy() if self._limits is None else self._limits.clip_estimate(x.copy()))
 
 
 class _Checked(MutableMapping[str, float]):
-    """Parameters of one machine; what the lifting does not know, or cannot use, does not get in."""
+    """Parameters of one machine; what the lifting does not know, or cannot use, does not get in. `plain` holds what did."""
 
     def __init__(self, observer: ObserverData, values: Mapping[str, float]) -> None:
         self._observer = observer
-        self._values = observer.values(values, ())
+        self.plain = observer.values(values, ())
 
     def __getitem__(self, name: str) -> float:
-        return float(self._values[name])
+        return float(self.plain[name])
 
     def __setitem__(self, name: str, value: float) -> None:
-        self._values = self._observer.values({**self._values, name: value}, ())
+        self.plain.update(self._observer.values({**self.plain, name: value}, ()))
 
     def __delitem__(self, name: str) -> None:
         raise ConfigError(f"Running observer {self._observer.name}: the parameter {name!r} cannot be taken away; change its value.")
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
+        return iter(self.plain)
 
     def __len__(self) -> int:
-        return len(self._values)
+        return len(self.plain)

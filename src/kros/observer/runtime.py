@@ -104,6 +104,11 @@ class Runtime:
         """Whether a step meets limits."""
         return self.correction is not None or (self.relift and any(side is not None for side in (self.lower, self.upper)))
 
+    @property
+    def binding(self) -> bool:
+        """Whether there is any limit that an estimate or a correction may meet."""
+        return any(limit is not None for limit in (self.correction, self.lower, self.upper))
+
     def limited_states(self, n: int) -> list[int]:
         """Return which of n states have limits."""
         sides = [np.isfinite(side) for side in (self.lower, self.upper) if side is not None]

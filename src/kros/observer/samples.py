@@ -63,6 +63,11 @@ class Held:
         """Return what is known before the first sample."""
         return cls(np.zeros((batch, m)), np.full((batch, m), LONGEST + 1), np.ones(batch, dtype=bool))
 
+    @classmethod
+    def good(cls, inputs: Array) -> Held:
+        """Return what is known after good samples, inputs of shape (batch, m) the last ones."""
+        return cls(inputs, np.zeros(inputs.shape, dtype=int), np.zeros(len(inputs), dtype=bool))
+
 
 @dataclass(frozen=True, eq=False)
 class Screened:

@@ -20,7 +20,9 @@ does to an observer that watches tracking errors grows with every sample, and a 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -60,6 +62,15 @@ class Bounds:
     def pass_all(self, values: Array) -> bool:
         """Whether all samples, shape (..., channels), are good as they are."""
         return bool(np.all((values >= np.maximum(self.lower, self.least)) & (values <= np.minimum(self.upper, self.most))))
+
+    @cached_property
+    def good(self) -> list[tuple[float, float]]:
+        """Between which values a sample of every channel is good as it is."""
+        return list(zip(np.maximum(self.lower, self.least).tolist(), np.minimum(self.upper, self.most).tolist(), strict=True))
+
+    def pass_one(self, values: Sequence[float]) -> bool:
+        """Whether one sample is good as it is, as `pass_all` for many: a comparison with what is not a number is false."""
+        return all(least <= value <= most for value, (least, most) in zip(values, self.good, strict=True))
 
     def judge(self, values: Array) -> tuple[Array, Flags, Flags]:
         """Return samples within their limits, which of them are plausible, and which are beyond a limit or their range."""
@@ -137,8 +148,7 @@ def _bit(wrong: Flags, bit: SampleStatus) -> Bits:
 def _as_they_are(y: Array, u: Array, before: Held) -> Screened:
     starts = np.zeros(y.shape[:2], dtype=bool)
     starts[0] = before.stale
-    after = Held(u[-1], np.zeros(u.shape[1:], dtype=int), np.zeros(y.shape[1], dtype=bool))
-    return Screened(y, u, np.zeros(y.shape[:2], np.uint8), starts, after)
+    return Screened(y, u, np.zeros(y.shape[:2], np.uint8), starts, Held.good(u[-1]))
 
 
 def _starts(lost: Flags, complete: Flags, stale: Flags) -> tuple[Flags, Flags]:

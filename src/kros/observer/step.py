@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -36,11 +37,12 @@ class Steps:
         self.observers, self.lifting, self.values = observers, lifting, values
         self.map = np.stack([_padded(o, order) for o in observers])
         self._column = np.zeros((len(observers), self.map.shape[2], batch))
-        self._following = np.empty((len(observers), n + order, batch))
-        row = np.swapaxes(self._column, 1, 2)
+        self._next = np.empty((len(observers), n + order, batch))
+        row, self._following = np.swapaxes(self._column, 1, 2), np.swapaxes(self._next, 1, 2)
+        self._next_x, self._next_c = self._following[..., :n], self._following[..., n:]
         self.x, self._lifted = row[..., :n], row[..., :n_lifted]
         self._x_c, self._u = row[..., n_lifted : n_lifted + order], row[..., n_lifted + order : n_lifted + order + m]
-        self._y, self._at = row[..., n_lifted + order + m :], list(observer.measured)
+        self._y, self._at = row[..., n_lifted + order + m :], places(observer.measured)
         self._plain = not (lifting.history or lifting.input_functions)
         self._earlier = np.zeros((len(observers), batch, len(lifting.window.earlier)))
         self._fresh = np.ones(batch, dtype=bool)
@@ -85,8 +87,7 @@ class Steps:
         moving : ndarray of bool, shape (batch,), optional
             Machines that take the sample; all by default.
         """
-        lifting, n = self.lifting, self.x.shape[2]
-        following_earlier = None
+        lifting, following_earlier = self.lifting, None
         if self._plain:
             lifting.lift_into(self._lifted, self.values)
             self._u[...] = u
@@ -100,22 +101,24 @@ class Steps:
         self._y[...] = y
         if missing is not None:  # what is predicted stands for what is missing, so that it corrects nothing
             np.copyto(self._y, self.x[..., self._at], where=missing)
-        np.matmul(self.map, self._column, out=self._following)
-        following = np.swapaxes(self._following, 1, 2)
+        np.matmul(self.map, self._column, out=self._next)
         if self._start is not None and self._starting:
-            following[0, :, :n] += self._start.correction(self._since, (self._y - self.x[..., self._at])[0])
+            self._next_x[0] += self._start.correction(self._since, (self._y - self.x[..., self._at])[0])
             self._since += True if moving is None else moving
             self._starting = bool(self._since.min() < len(self._start))
         if self._limits is not None:
-            self._limit(following)
-        where = True if moving is None else moving[:, None]
-        np.copyto(self.x, following[..., :n], where=where)
-        np.copyto(self._x_c, following[..., n:], where=where)
+            self._limit()
+        if moving is None:
+            self.x[...] = self._next_x
+            self._x_c[...] = self._next_c
+        else:
+            np.copyto(self.x, self._next_x, where=moving[:, None])
+            np.copyto(self._x_c, self._next_c, where=moving[:, None])
         if following_earlier is not None:
-            np.copyto(self._earlier, following_earlier, where=where)
+            np.copyto(self._earlier, following_earlier, where=True if moving is None else moving[:, None])
             self._fresh &= False if moving is None else ~moving
 
-    def _limit(self, following: Array) -> None:
+    def _limit(self) -> None:
         """Keep corrections and estimates within their limits."""
         assert self._limits is not None
         observer, n = self.observers[0], self.x.shape[2]
@@ -123,8 +126,14 @@ class Steps:
         if self._limits.correction is not None:
             self.correction = self._x_c @ K.C.T + (self._y - self.x[..., self._at]) @ K.D.T
             clipped = self._limits.clip_correction(self.correction)
-            following[..., :n] += (clipped - self.correction) @ observer.into[:n].T
-        following[..., :n] = self._limits.relifted(following[..., :n])
+            self._next_x += (clipped - self.correction) @ observer.into[:n].T
+        self._next_x[...] = self._limits.relifted(self._next_x)
+
+
+def places(measured: Sequence[int]) -> Any:
+    """Return an index of measured states: a slice where they follow one another, which costs no gather."""
+    first, count = measured[0] if measured else 0, len(measured)
+    return slice(first, first + count) if list(measured) == list(range(first, first + count)) else np.array(measured)
 
 
 def _padded(observer: ObserverData, order: int) -> Array:

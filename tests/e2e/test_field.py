@@ -169,6 +169,7 @@ def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> No
         assert row["score"] is None
         assert row["missing"] == ["velocity", "current"]
         assert (row["level_db"] > 0) == row["outlier"] == (row["status"] == "outlier")
+        assert len(row["bands_db"]["position"]) == 6
     assert [row["outlier"] for row in rows.values()] == [True, False, False]
     assert result.exit_code == 3
     lines = kros("check", demo, data).stdout.splitlines()

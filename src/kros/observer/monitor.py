@@ -149,8 +149,16 @@ class Monitor:
 
     def level(self, mean_squares: Array, condition: str | None = None) -> Array:
         """Return the level over the bound in dB, shape (...), of mean squares of shape (..., q, bands), in one condition or any."""
-        levels = 10 * np.log10(np.maximum(mean_squares / self.limits, QUIET))
-        return np.asarray((levels * self.weights).sum(axis=(-2, -1)) / WEIGHT) - self.bound(condition)
+        return np.asarray((self.band_levels(mean_squares) * self.weights).sum(axis=(-2, -1)) / WEIGHT) - self.bound(condition)
+
+    def band_levels(self, mean_squares: Array) -> Array:
+        """Return the level of every band over its limit in dB, shape (..., q, bands)."""
+        return np.asarray(10 * np.log10(np.maximum(mean_squares / self.limits, QUIET)))
+
+    def centres_hz(self, sample_period_s: float) -> Array:
+        """Return the centre frequencies of the bands, shape (bands,)."""
+        _, a1, a2 = self.filters.T
+        return np.asarray(np.arccos(-a1 / (1 + a2)) / (2 * np.pi * sample_period_s))
 
     def bound(self, condition: str | None) -> float:
         """Return the bound of a condition, dB over that of all; None is any.

@@ -37,7 +37,7 @@ def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]
     list of dict
         One row a unit and condition that the study knows: ``unit, condition, score, threshold, outlier, status, detectable, freq_hz`` and more
         (see `kros.uncertainty.outliers.population.score_row`), ``left_out``, units of the study that it was not compared with, and where the deployed
-        observer has a monitor its ``level_db``, which flags nothing where there is a score.
+        observer has a monitor its ``level_db`` and ``bands_db``, which flags nothing where there is a score.
     """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (config, store):
         return scored(config, store, data, workers)
@@ -73,7 +73,7 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[
             f"Checking {data}: the recordings have the conditions {', '.join(population.conditions)}, and the run has models of "
             f"{', '.join(ModelSet.load(store.path('models', folder.name)).condition for folder in folders)} alone; name the condition, as in the study."
         )
-    levels = {(row["unit"], row["condition"]): {key: row[key] for key in ("level_db", "level_rate")} for row in watched}
+    levels = {(row["unit"], row["condition"]): {key: row[key] for key in ("level_db", "level_rate", "bands_db")} for row in watched}
     return in_order([row | levels.get((row["unit"], row["condition"]), {}) for row in rows])
 
 

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...observer import run_innovations
+import numpy as np
+import numpy.typing as npt
+
+from ...observer import Observer, run_innovations
 from ...observer.monitor import Monitor
 from ...uncertainty import Status
 from .field import Arriving, FieldRecordings
+
+Array = npt.NDArray[np.float64]
 
 
 def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
@@ -15,37 +20,50 @@ def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
 
     ``level_db`` is the highest level of the innovation over the monitor's bound, that of the condition where the monitor knows it: above zero the unit is
     an outlier, and a share ``level_rate`` of good ones is. It is None where the deployed observer has no monitor, or nothing could be judged.
+    ``bands_db`` says by measured channel and centre frequency in Hz where the highest residual power is, dB over the limit of the band.
     """
     population, observer = recordings.population, recordings.observer
     monitor, rows = observer.monitor, []
     for unit, condition, keys in population.groups():
         levels: list[float] = []
+        bands: list[Array] = []
         counts: dict[str, dict[str, int]] = {}
         samples = 0
         for found in recordings.batches(keys):
             samples += int(found.batch.lengths.sum())
             recordings.count_status(found, counts)
-            levels += [] if monitor is None else highest_levels(recordings, monitor, found, condition)
-        level = max(levels, default=None)
-        outlier = level is not None and level > 0
+            if monitor is not None:
+                for level, of_bands in highest_levels(recordings, monitor, found, condition):
+                    levels.append(level)
+                    bands.append(of_bands)
+        highest = max(levels, default=None)
+        outlier = highest is not None and highest > 0
         row: dict[str, Any] = {"unit": unit, "condition": condition, "score": None, "threshold": None, "outlier": outlier}
         row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "detectable": None, "episodes": len(keys)}
         row |= {"recorded_s": samples * population.sample_period_s, "left_out": []}
-        row |= {"missing": [name for name in observer.recorded if name not in population.states], "level_db": level}
+        row |= {"missing": [name for name in observer.recorded if name not in population.states], "level_db": highest}
         row |= {"level_rate": None if monitor is None else monitor.false_alarm_rate, "samples": counts.get(unit, {})}
+        row |= {"bands_db": by_band(observer, monitor, np.max(bands, axis=0)) if monitor is not None and bands else None}
         rows.append(row | {"parameters": recordings.sources.get(unit)})
     return rows
 
 
-def highest_levels(recordings: FieldRecordings, monitor: Monitor, found: Arriving, condition: str) -> list[float]:
-    """Return the highest level over the bound in every episode, dB; an episode in which nothing is judged has none."""
+def by_band(observer: Observer, monitor: Monitor, levels: Array) -> dict[str, dict[str, float]]:
+    """Return levels, shape (q, bands), by the name of the measured channel and the centre frequency in Hz."""
+    names, centres = [observer.lifting.states[i] for i in observer.measured], monitor.centres_hz(observer.sample_period_s)
+    return {name: {f"{hz:.3g}": float(v) for hz, v in zip(centres, row, strict=True)} for name, row in zip(names, levels, strict=True)}
+
+
+def highest_levels(recordings: FieldRecordings, monitor: Monitor, found: Arriving, condition: str) -> list[tuple[float, Array]]:
+    """Return the highest level over the bound in every episode, dB, and that of every band; an episode in which nothing is judged has none."""
     observer, every = recordings.observer, list(range(len(found.batch.keys)))
     nu, judged = run_innovations(observer, found.y, found.u, found.parameters(observer, every), monitor.settle)
-    own, levels = condition if condition in monitor.bounds else None, []
+    own = condition if condition in monitor.bounds else None
+    levels: list[tuple[float, Array]] = []
     for i, length in enumerate(found.batch.lengths):
         if judged[:length, i].any():
             squares = monitor.mean_squares(nu[:length, [i]], judged[:length, [i]])
-            levels.append(float(monitor.level(squares, own).max()))
+            levels.append((float(monitor.level(squares, own).max()), monitor.band_levels(squares.max(axis=(0, 1)))))
     return levels
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .error_tables import ErrorTable, error_table
+from .error_tables import ErrorTable, home_table
 from .names import condition_label, model_label, number, observer_label, split_observer
 from .sections.uncertainty import MANY
 
@@ -58,11 +58,10 @@ def _where(row: Mapping[str, Any]) -> str:
 def _observer(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str]:
     """Say whether the deployed observer should be used."""
     name = metrics["study"]["deployed"]
-    tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
-    if not tables or name not in tables[0].cells:
+    table = home_table(metrics)
+    if table is None:
         return []
-    table = tables[0]
-    hidden = [c for c in table.channels if c not in measured and c in table.cells[name]] or list(table.cells[name])
+    hidden = table.hidden(measured, name)
     if any(table.cells[name][c].mean is None for c in hidden):
         return [
             f"Do not use “{observer_label(name)}”: its estimates diverge. Look at Models first: free runs there should not diverge either."

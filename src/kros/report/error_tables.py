@@ -69,6 +69,11 @@ class ErrorTable:
     cells: Mapping[str, Mapping[str, ErrorCell]]
     ranked: frozenset[str]
 
+    def hidden(self, measured: Sequence[str], observer: str | None = None) -> list[str]:
+        """Return the channels that are not measured and that an observer estimates, or any does; all of them where everything is measured."""
+        known = [c for c in self.channels if observer is None or c in self.cells[observer]]
+        return [c for c in known if c not in measured] or known
+
     def best(self, channel: str, what: str) -> float | None:
         """Return the smallest ``nominal``, ``mean`` or ``worst`` of a channel; None where every observer diverged, or in a channel that is not ranked."""
         if channel not in self.ranked:
@@ -85,6 +90,12 @@ def error_table(rows: Rows, identify_on: str) -> list[ErrorTable]:
         return _cell(found, intervals.get((observer, condition, channel)))
 
     return _tables(rows, identify_on, cell)
+
+
+def home_table(metrics: Mapping[str, Any]) -> ErrorTable | None:
+    """Return the errors in the condition that was identified on, where the deployed observer was evaluated there."""
+    tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
+    return tables[0] if tables and metrics["study"].get("deployed") in tables[0].cells else None
 
 
 def left_out_tables(rows: Rows, identify_on: str) -> list[ErrorTable]:

@@ -9,7 +9,7 @@ from typing import Any
 from .advice import better_observer, no_better_than_open_loop
 from .caveats import confounded_text, small_set_text
 from .content import Alert, Level
-from .error_tables import ErrorTable, error_table, left_out_tables
+from .error_tables import home_table, left_out_tables
 from .names import BASELINES, channel_units, joined, number, observer_label, readable_unit, split_observer
 from .sections.outliers import flagged_text, undecided_text
 from .trust import trust_of
@@ -45,17 +45,6 @@ def summary(metrics: Metrics, measured: Sequence[str] = ()) -> Summary:
     return Summary(light, _sentence(metrics, measured, light, alerts), _figures(metrics, measured), alerts)
 
 
-def home_table(metrics: Metrics) -> ErrorTable | None:
-    """Return the errors in the condition that was identified on, where the deployed observer was evaluated there."""
-    tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
-    return tables[0] if tables and metrics["study"].get("deployed") in tables[0].cells else None
-
-
-def hidden_channels(table: ErrorTable, name: str, measured: Sequence[str]) -> list[str]:
-    """Return what an observer estimates and nobody measures; all that it estimates where everything is measured."""
-    return [c for c in table.channels if c not in measured and c in table.cells[name]] or list(table.cells[name])
-
-
 def _sentence(metrics: Metrics, measured: Sequence[str], light: Level, alerts: Sequence[Alert]) -> str:
     name, table = metrics["study"].get("deployed"), home_table(metrics)
     if light is Level.STOP:
@@ -63,7 +52,7 @@ def _sentence(metrics: Metrics, measured: Sequence[str], light: Level, alerts: S
     if name is None or table is None:
         return "No observer has been evaluated yet."
     source = f"From {joined(measured)} alone it" if measured else "It"
-    hidden = joined([c.replace("_", " ") for c in hidden_channels(table, name, measured)])
+    hidden = joined([c.replace("_", " ") for c in table.hidden(measured, name)])
     text = f"“{observer_label(name)}” can be deployed. {source} estimates {hidden} on machines like the {metrics['study']['units']} recorded ones."
     return text if light is Level.GO else f"{text} {len(alerts)} {'point' if len(alerts) == 1 else 'points'} to look at first."
 
@@ -73,7 +62,7 @@ def _figures(metrics: Metrics, measured: Sequence[str]) -> list[Figure]:
     name, table, units = metrics["study"].get("deployed"), home_table(metrics), channel_units(metrics)
     found = []
     if name is not None and table is not None:
-        for channel in hidden_channels(table, name, measured)[:2]:
+        for channel in table.hidden(measured, name)[:2]:
             cell = table.cells[name][channel]
             percent = f"{number(cell.mean)} % of the largest value"
             worst = f"worst unit {cell.worst_unit}: {number(cell.worst)} %"
@@ -99,16 +88,16 @@ def find_alerts(metrics: Metrics, measured: Sequence[str] = ()) -> list[Alert]:
 
 
 def _stops(metrics: Metrics, measured: Sequence[str]) -> list[Alert]:
-    study, observers = metrics["study"], metrics.get("observers", {})
+    study = metrics["study"]
     name, table = study.get("deployed"), home_table(metrics)
     texts = []
     if name is None:
         return [Alert(Level.STOP, "The run stopped before an observer was made.", "making")]
-    if table is not None and any(table.cells[name][c].mean is None for c in hidden_channels(table, name, measured)):
+    if table is not None and any(table.cells[name][c].mean is None for c in table.hidden(measured, name)):
         texts.append(
             (f"The estimates of “{observer_label(name)}” diverge on held-out episodes: do not use it. See Models first.", "models")
         )
-    elif table is not None and no_better_than_open_loop(table, name, hidden_channels(table, name, measured)):
+    elif table is not None and no_better_than_open_loop(table, name, table.hidden(measured, name)):
         texts.append(
             ("The observer is no better than its model alone: correction from these measurements brings nothing here.", "observers")
         )
@@ -125,8 +114,6 @@ def _stops(metrics: Metrics, measured: Sequence[str]) -> list[Alert]:
                 "robustness",
             )
         )
-    if observers and all(split_observer(n)[1] in BASELINES for n in observers):
-        texts.append(("No robust observer could be designed for this population; Synthesis says why.", "synthesis"))
     return [Alert(Level.STOP, *text) for text in texts]
 
 
@@ -142,12 +129,14 @@ def _looks(metrics: Metrics, measured: Sequence[str]) -> list[Alert]:
     if name is None:
         return [Alert(Level.LOOK, *text) for text in texts]
     model, trust, table = split_observer(name)[0], trust_of(metrics.get("observers", {}).get(name, {})), home_table(metrics)
-    if table is not None and (better := better_observer(table, name, hidden_channels(table, name, measured))):
+    if table is not None and (better := better_observer(table, name, table.hidden(measured, name))):
         texts.append((f"“{observer_label(better)}” is more accurate in all that is not measured.", "observers"))
     if trust.running is False:
         texts.append(("No certificate covers the observer as it runs.", "trust"))
     if trust.outside:
         texts.append((f"Outside the set of recorded signals that the observer is certified for: {joined(trust.outside)}.", "trust"))
+    if (observers := metrics.get("observers")) and all(split_observer(n)[1] in BASELINES for n in observers):
+        texts.append(("No robust observer could be designed for this population; Synthesis says why.", "synthesis"))
     weight = metrics.get("uncertainty", {}).get(model, {}).get("weight", {})
     if weight.get("cover_max") is not None and weight["cover_max"] > 1:
         texts.append(("The weights do not cover all units that they were made from.", "uncertainty"))

@@ -8,7 +8,7 @@ from typing import Any
 from ..data.population import DEFAULT_CONDITION
 from .caveats import conditions_apart, confounded_text
 from .disturbances import needed_sensor
-from .error_tables import ErrorTable, error_table, left_out_tables
+from .error_tables import ErrorTable, home_table, left_out_tables
 from .names import BASELINES, channel_units, condition_label, form_label, joined, minus, number, observer_label, split_observer
 from .trust import trust_of
 
@@ -49,11 +49,10 @@ def _deployed(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
     if name is None:
         return ["The run stopped before an observer was made."]
     sentences = [f"The deployed observer is “{observer_label(name)}”."]
-    tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
-    if not tables or name not in tables[0].cells:
+    table = home_table(metrics)
+    if table is None:
         return [*sentences, "It has not been evaluated."]
-    table = tables[0]
-    hidden = [c for c in table.channels if c not in measured and c in table.cells[name]] or list(table.cells[name])
+    hidden = table.hidden(measured, name)
     source = f"From {' and '.join(measured)} alone it" if measured else "It"
     known = [c for c in hidden if table.cells[name][c].mean is not None]
     if not known:

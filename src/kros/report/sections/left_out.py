@@ -44,7 +44,7 @@ def _table(
     deployed: str | None,
     units: Mapping[str, str],
 ) -> Table:
-    channels = [c for c in table.channels if c not in measured] or list(table.channels)
+    channels = table.hidden(measured)
     powers = any(cell.band_db is not None for cells in table.cells.values() for cell in cells.values())
     rows = []
     for observer, cells in table.cells.items():

@@ -76,7 +76,7 @@ def baseline_notes(observers: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def _compared(table: ErrorTable, metrics: Mapping[str, Any], measured: Sequence[str]) -> dict[str, list[str]]:
     """Return the few observers that answer most questions, each with the roles it is compared in."""
-    deployed, channels = metrics["study"].get("deployed"), _hidden(table, measured)
+    deployed, channels = metrics["study"].get("deployed"), table.hidden(measured)
 
     def tuned() -> str | None:
         names = [n for n in table.cells if split_observer(n)[1] == "kalman_tuned"]
@@ -110,23 +110,19 @@ def _all(tables: Sequence[ErrorTable], metrics: Mapping[str, Any], measured: Seq
     return Table(head, rows, caption, [("", 2), *_groups(tables[0], measured)], folded=True, emphasised=chosen, sortable=True)
 
 
-def _hidden(table: ErrorTable, measured: Sequence[str]) -> list[str]:
-    return [c for c in table.channels if c not in measured] or list(table.channels)
-
-
 def _head(table: ErrorTable, metrics: Mapping[str, Any], measured: Sequence[str]) -> list[str]:
     units = channel_units(metrics)
-    of_channels = [title for c in _hidden(table, measured) for title in (axis_label("RMS", units.get(c, "")), "mean (%)", "worst (%)")]
+    of_channels = [title for c in table.hidden(measured) for title in (axis_label("RMS", units.get(c, "")), "mean (%)", "worst (%)")]
     return [*of_channels, "for the set", "as it runs"]
 
 
 def _groups(table: ErrorTable, measured: Sequence[str]) -> list[tuple[str, int]]:
-    return [*((c.replace("_", " "), 3) for c in _hidden(table, measured)), ("certified", 2)]
+    return [*((c.replace("_", " "), 3) for c in table.hidden(measured)), ("certified", 2)]
 
 
 def _errors(table: ErrorTable, name: str, metrics: Mapping[str, Any], measured: Sequence[str], interval: bool = False) -> list[Cell | str]:
     trust = trusts(metrics)[name]
-    channels = [cell for c in _hidden(table, measured) for cell in _cells(table, c, table.cells[name].get(c), interval)]
+    channels = [cell for c in table.hidden(measured) for cell in _cells(table, c, table.cells[name].get(c), interval)]
     return [*channels, trust.by_set, trust.as_it_runs.partition(",")[0]]
 
 

@@ -78,11 +78,15 @@ def init(
     from .study.engine.progress import make_progress
 
     wanted = Wanted(tuple(measured or ()), tuple(input_ or ()), files, period)
-    asked = _ask_parts if sys.stdin.isatty() and sys.stdout.isatty() else None
+    asked = _ask_parts if _on_terminal() else None
     with make_progress(False, asks=asked is not None) as progress:
         found = init_study(folder, out, wanted, asked, progress)
     for line in found.lines:
         typer.echo(line)
+
+
+def _on_terminal() -> bool:
+    return sys.stdin.isatty() and sys.stdout.isatty()
 
 
 def _ask_parts(columns: Any) -> Any:

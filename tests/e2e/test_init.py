@@ -11,7 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
+from typer.testing import CliRunner
 
+from kros.cli import app
 from kros.data import EpisodeKey, Population
 from kros.plants import DcMotorPopulation, PendulumPopulation
 from kros.study import load_config
@@ -165,6 +167,17 @@ def test_roles_are_taken_from_options_and_never_asked_without_a_terminal(kros, t
     assert result.exit_code == 2
     assert "exists; name another file" in result.output
     assert (tmp_path / "study.toml").read_bytes() == before
+
+
+def test_roles_are_asked_at_a_terminal(tmp_path, monkeypatch, motors):
+    folder = written(tmp_path / "recordings", motors, "plain")
+    monkeypatch.setattr("kros.cli._on_terminal", lambda: True)
+    result = CliRunner().invoke(app, ["init", str(folder), "--out", str(tmp_path / "study.toml")], input="position, velocity\n\n")
+    assert result.exit_code == 0, result.output
+    assert "Measured states [position]: " in result.output
+    assert "Inputs [voltage]: " in result.output
+    found = open_source(load_config(tmp_path / "study.toml"))
+    assert (found.measured, found.inputs) == (("position", "velocity"), ("voltage",))
 
 
 def test_one_recording_a_unit_is_cut_into_episodes(kros, tmp_path):

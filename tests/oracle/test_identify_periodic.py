@@ -58,3 +58,4 @@ def test_gravity_is_found_in_pendulums():
     term = periodic_term(pendulums, ["position"])
     assert term is not None
     assert term.ratio == 1
+    assert term.odd

@@ -24,7 +24,8 @@ _LAGS, _UNITS, _EPISODES, _SAMPLES = 3, 6, 3, 40_000
 _ABOVE = 15.0  # of a peak over the median around it; the largest of some thousand values of noise alone is about 8 times their median
 _EVERY_UNIT = 3.0  # of each unit's own peak over its own surroundings
 _SHARE = 0.002  # of the residual that a term has to explain
-_GRAVITY = 0.01  # the same for sin(angle), which other smooth terms resemble
+_GRAVITY, _LEAST_TRAVEL = 0.01, 0.5  # the same for sin(angle), which other smooth terms resemble, and the travel that it needs, rad
+_ODD = 0.9  # of what sine and cosine explain
 _WHOLE = 0.8  # of what the best ratio explains, that a whole number near it has to explain to be taken
 _BINS = 1 << 21
 
@@ -43,12 +44,15 @@ class PeriodicTerm:
         Of the residual of the linear model, that it explains in the state that it shows most in.
     above : float
         Peak over the median of the ratios around it; infinite for a ratio of one, which is not compared.
+    odd : bool
+        Whether the sine alone explains nearly as much as sine and cosine, as where the angle is counted from where a pendulum hangs.
     """
 
     angle: str
     ratio: float
     share: float
     above: float
+    odd: bool = False
 
 
 def periodic_term(population: Population, angles: Sequence[str], keys: Sequence[EpisodeKey] | None = None) -> PeriodicTerm | None:
@@ -85,7 +89,10 @@ def _of_angle(units: Sequence[Sequence[Array]], column: int, n_states: int, name
     if peak is not None and (share := max(_share(p, [peak[0]]) for p in parts)) > _SHARE:
         return PeriodicTerm(name, _refined(parts, peak[0], travel), share, peak[1])
     shares = [_share(p, [1.0]) for p in parts]
-    return PeriodicTerm(name, 1.0, float(np.mean(shares)), np.inf) if min(shares) > _GRAVITY and travel > 0.5 else None
+    if min(shares) < _GRAVITY or travel < _LEAST_TRAVEL:
+        return None
+    odd = np.mean([_share(p, [1.0], (np.sin,)) for p in parts]) > _ODD * np.mean(shares)
+    return PeriodicTerm(name, 1.0, float(np.mean(shares)), np.inf, bool(odd))
 
 
 def _residuals(episodes: Sequence[Array], column: int, n_states: int) -> tuple[Array, Array, Array]:
@@ -175,10 +182,10 @@ def _at(power: Array, ratios: Array, ratio: float, half: float) -> float:
     return float(near.max()) if near.size else 0.0
 
 
-def _share(part: tuple[Array, Array, Array], ratios: Sequence[float]) -> float:
+def _share(part: tuple[Array, Array, Array], ratios: Sequence[float], functions: Sequence[np.ufunc] = (np.sin, np.cos)) -> float:
     """Return the share of the residual of one unit that sines and cosines explain beside the regressors, the largest over the states."""
     residuals, angle, basis = part
-    pair = np.concatenate([(np.sin(r * angle), np.cos(r * angle)) for r in ratios]).T
+    pair = np.stack([f(r * angle) for r in ratios for f in functions], axis=1)
     pair -= basis @ (basis.T @ pair)
     u, s, _ = np.linalg.svd(pair, full_matrices=False)
     u = u[:, s > 1e-8 * np.sqrt(len(angle))]

@@ -111,10 +111,14 @@ def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None,
     wanted = wanted or Wanted()
     files = {relative: path for path, relative in csv_files(source)}
     if wanted.files is not None:
-        files = {relative: path for relative, path in files.items() if re.search(wanted.files, relative)}
+        files = {relative: path for relative, path in files.items() if _expression(wanted.files).search(relative)}
+    if not files and wanted.files is not None:
+        raise DataError(f"Looking at {source}: no file matches --files {wanted.files!r}; correct the expression, or leave it out.")
     if not files:
+        others = Counter(p.suffix.lower() for p in source.rglob("*") if p.is_file() and p.suffix).most_common(1)
+        instead = f"save its {others[0][1]} {others[0][0]} files as CSV or Parquet" if others else "check the folder"
         raise DataError(
-            f"Looking at {source}: there are no files of recordings (.csv, .tsv, .txt, .dat, .parquet, or these with .gz); check the folder."
+            f"Looking at {source}: there are no files of recordings (.csv, .tsv, .txt, .dat, .parquet, or these with .gz); {instead}."
         )
     head, own, strange = _alike(files)
     names = infer_names(list(own))
@@ -132,6 +136,13 @@ def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None,
         relative: f"its columns are others than those of {next(iter(own))}" for relative in strange if re.search(mapping["files"], relative)
     }
     return _examined(source, mapping, notes, columns, excluded, strange, work)
+
+
+def _expression(text: str) -> re.Pattern[str]:
+    try:
+        return re.compile(text)
+    except re.error as error:
+        raise ConfigError(f"--files {text!r}: is not a regular expression ({error}); correct it.") from error
 
 
 def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str]]:

@@ -154,7 +154,7 @@ def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingPro
         return LiftingProposal()
     if term.ratio == 1:
         why = f"sin({term.angle}), as of gravity, explains {100 * term.share:.2g} % of what a linear model of one step leaves"
-        return LiftingProposal({"functions": [f"sin({term.angle})", f"cos({term.angle})"]}, {}, why)
+        return LiftingProposal({"functions": [f"{f}({term.angle})" for f in (("sin",) if term.odd else ("sin", "cos"))]}, {}, why)
     why = (
         f"what a linear model of one step leaves repeats {term.ratio:g} times a turn of {term.angle!r} ({term.above:.0f} times what is left at ratios "
         f"around; {100 * term.share:.2g} % of the residual)"

@@ -1,7 +1,7 @@
 # Everything is built in .venv from the two lock files; nothing outside this folder changes.
 # A Python other than the newest found:  make install PYTHON=/path/to/python3.12
 
-.PHONY: help install demo test coverage check bench embedded docs lock clean
+.PHONY: help install demo test coverage check bench embedded docs dist lock clean
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 
@@ -53,6 +53,14 @@ embedded: $(INSTALLED)  ## run an exported observer on a Cortex-M4F under QEMU, 
 docs: $(INSTALLED_DEV)  ## build the documentation in docs/_build/html
 	$(BIN)/python -m sphinx -W --keep-going -n -q -b html docs docs/_build/html
 	@echo "The documentation is in docs/_build/html/index.html"
+
+dist: $(INSTALLED)  ## build wheel and sdist in dist/, and try the wheel in a fresh environment
+	rm -rf dist build/tried build/tried-demo
+	$(BIN)/python -m hatchling build -d dist
+	$(CLEAN_ENV) $(BIN)/python -m venv build/tried
+	$(CLEAN_ENV) build/tried/bin/python -m pip --disable-pip-version-check install -q --require-hashes -r requirements.lock
+	$(CLEAN_ENV) build/tried/bin/python -m pip --disable-pip-version-check install -q --no-deps dist/*.whl
+	cd build && tried/bin/python -m kros --version && tried/bin/kros demo --units 4 --episodes 4 --seconds 10 --out tried-demo
 
 lock:  ## write both lock files anew from pyproject.toml
 	@uv=$$(command -v uv) || { $(FIND_PYTHON); $(CLEAN_ENV) "$$python" -m venv build/uv && build/uv/bin/python -m pip install -q uv && uv=build/uv/bin/uv; }; \

@@ -104,7 +104,7 @@ class RunningObserver:
 
     @property
     def level_db(self) -> float | None:
-        """Level of the innovation over the bound of the population, dB: above zero the machine is outside; None without a monitor."""
+        """Level of the innovation over the bound of the population in dB; above zero the machine is outside, None without a monitor."""
         return None if self._watch is None else self._watch.level_db
 
     @property

@@ -173,3 +173,14 @@ def test_what_cannot_be_followed_is_refused():
         track_parameter(observer(), y, u, name="angle")
     with pytest.raises(ConfigError, match="a delay of 2"):
         track_parameter(observer(runtime=Runtime(2)), y, u)
+
+
+def test_a_caller_may_use_its_arrays_again():
+    """Inputs wait for late measurements, and the last good one stands for those that are missing."""
+    y, u = (part[:60, 0].copy() for part in recordings())
+    u[30:33] = np.nan
+    fresh, again = (observer(runtime=Runtime(2)).start(y[0]) for _ in range(2))
+    place = np.empty(u.shape[1])
+    for k in range(len(y)):
+        place[...] = u[k]
+        np.testing.assert_array_equal(np.asarray(again.step(y[k], place)), np.asarray(fresh.step(y[k], u[k])))

@@ -169,6 +169,29 @@ def test_roles_are_taken_from_options_and_never_asked_without_a_terminal(kros, t
     assert (tmp_path / "study.toml").read_bytes() == before
 
 
+def test_headers_twice_times_rounded_and_lines_behind_the_numbers(kros, tmp_path, motors):
+    def folder(name: str, header: str, digits: int, behind: str = "") -> Path:
+        for key in motors.episodes[:8]:
+            path = tmp_path / name / key.unit / f"run_{key.episode}.csv"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            rows = enumerate(motors.read(key).tolist())
+            lines = [",".join([f"{motors.sample_period_s * k:.{digits}f}", *(f"{x:.12g}" for x in row)]) for k, row in rows]
+            path.write_text("\n".join([header, *lines, behind]))
+        return tmp_path / name
+
+    doubled = folder("doubled", "time,position,velocity,velocity,u", 6)
+    result = kros("init", doubled, "--out", tmp_path / "study.toml")
+    assert result.exit_code == 0, result.output
+    np.testing.assert_allclose(
+        open_source(load_config(tmp_path / "study.toml")).read(motors.episodes[0])[:, 2], motors.read(motors.episodes[0])[:, 2]
+    )
+    rounded = folder("rounded", "time,position,velocity,current,u", 2)
+    assert "'time' stands still or runs back in places" in kros("init", rounded, "--out", tmp_path / "rounded.toml").output
+    assert kros("init", rounded, "--out", tmp_path / "rounded.toml", "--period", motors.sample_period_s).exit_code == 0
+    ended = folder("ended", "time,position,velocity,current,u", 6, "End of file\n")
+    assert "Expected 5 columns, got 1: End of file" in kros("init", ended, "--out", tmp_path / "ended.toml").output
+
+
 def test_roles_are_asked_at_a_terminal(tmp_path, monkeypatch, motors):
     folder = written(tmp_path / "recordings", motors, "plain")
     monkeypatch.setattr("kros.cli._on_terminal", lambda: True)

@@ -334,3 +334,9 @@ def test_timestamps_over_the_turn_of_a_year(tmp_path: Path, text: str) -> None:
     population = read_csv_folder(tmp_path, mapping(files="a", delimiter=";", timestamp=order))
     assert population.sample_period_s == 0.5
     assert population.read(population.episodes[0]).shape == (3, 2)
+
+
+def test_milliseconds_since_1970_lose_nothing(tmp_path: Path) -> None:
+    rows = [f"{1716000000000 + 2 * k},{k},{k * k}" for k in range(9)]
+    (tmp_path / "a.csv").write_text("\n".join(["t,pos,volt", *rows]))
+    assert read_csv_folder(tmp_path, mapping(files="a", time_scale=1e-3)).sample_period_s == 0.002

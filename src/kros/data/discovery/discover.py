@@ -131,7 +131,7 @@ def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None,
     mapping |= timing[0]
     notes |= timing[1]
     columns = _decided(columns, wanted, ask)
-    mapping["channel"] = [_channel(c, head.dialect) for c in columns if c.part in (Part.MEASURED, Part.STATE, Part.INPUT)]
+    mapping["channel"] = [_channel(c) for c in columns if c.part in (Part.MEASURED, Part.STATE, Part.INPUT)]
     excluded = {
         relative: f"its columns are others than those of {next(iter(own))}" for relative in strange if re.search(mapping["files"], relative)
     }
@@ -200,14 +200,19 @@ def _columns(
     described: list[Column] = []
     for i, (header, unit) in enumerate(zip(head.fields, head.units, strict=True)):
         column = describe(header or f"column {i + 1}", unit, [c.name for c in described])
-        described.append(column if head.dialect.header else replace(column, header=str(i + 1)))
-    numeric = [i for i in range(len(described)) if head.is_numeric(i) and head.fields.count(head.fields[i]) == 1 and head.fields[i]]
+        if not head.dialect.header:
+            column = replace(column, header=str(i + 1), number=i + 1)
+        elif head.fields.count(header) > 1:
+            column = replace(column, number=i + 1)
+        described.append(column)
+    numeric = [i for i in range(len(described)) if head.is_numeric(i) and head.fields[i]]
     texts = [i for i in range(len(described)) if head.timestamp(i) is not None]
     paths = list(own.values())
     samples = [_numbers(path, head, numeric) for path in paths[:: max(1, len(paths) // SAMPLED)]]
     samples = [s for s in samples if s.shape[1] > 2]
     if not samples:
-        raise DataError(f"Looking at {source}: the files looked at have no three rows of numbers; check the folder.")
+        _read(paths[0], head, numeric)  # says why not, where it cannot be read
+        raise DataError(f"Looking at {source}: the files looked at have fewer than three rows of numbers; check the folder.")
     chosen = [described[i] for i in numeric]
     keys: dict[str, Any] = {}
     notes: dict[str, str] = {}
@@ -218,17 +223,21 @@ def _columns(
         at = candidates[0]
         unit = chosen[at].unit if chosen[at].unit.lower() in SECONDS else ""
         scale, why = time_scale(unit, float(np.median(np.diff(samples[0][at]))))
-        keys["time"] = _reference(described[numeric[at]], head.dialect)
+        keys["time"] = described[numeric[at]].reference
         if scale != 1:
             keys["time_scale"] = scale
             notes["time_scale"] = why
         chosen[at] = replace(chosen[at], part=Part.TIME)
     elif texts:
-        keys |= {"time": _reference(described[texts[-1]], head.dialect), "timestamp": head.timestamp(texts[-1])}
+        keys |= {"time": described[texts[-1]].reference, "timestamp": head.timestamp(texts[-1])}
         described[texts[-1]] = replace(described[texts[-1]], part=Part.TIME)
     else:
         found = ", ".join(repr(c.header) for c in described)
-        raise DataError(f"Looking at {source}: no column increases like time, found {found}; give the sampling period, --period SECONDS.")
+        called = next((c.header for c in described if c.kind == "time"), None)
+        problem = (
+            "no column increases like time" if called is None else f"{called!r} stands still or runs back in places, as rounded times do"
+        )
+        raise DataError(f"Looking at {source}: {problem}, found the columns {found}; give the sampling period, --period SECONDS.")
     proposed = propose(chosen, samples)
     for place, column in zip(numeric, proposed, strict=True):
         described[place] = column
@@ -238,23 +247,23 @@ def _columns(
 
 def _numbers(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
     """Read the numeric columns of a file, shape (n_columns, n_rows); no rows where it cannot be read."""
-    names = [f"#{i}" for i in range(len(head.fields))]
     try:
-        if path.suffix == ".parquet":
-            return parquet_columns(path, [head.fields[i] for i in columns])
-        return read_columns(path, names, [names[i] for i in columns], head.dialect)
+        return _read(path, head, columns)
     except DataError:
         return np.zeros((len(columns), 0))
 
 
-def _reference(column: Column, dialect: Dialect) -> str | int:
-    return column.header if dialect.header else int(column.header)
+def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
+    if path.suffix == ".parquet":
+        return parquet_columns(path, [head.fields[i] for i in columns])
+    names = [f"{field or 'column'} #{i + 1}" for i, field in enumerate(head.fields)]
+    return read_columns(path, names, [names[i] for i in columns], head.dialect)
 
 
-def _channel(column: Column, dialect: Dialect) -> dict[str, Any]:
+def _channel(column: Column) -> dict[str, Any]:
     table: dict[str, Any] = {"name": column.name}
-    if not dialect.header or column.header != column.name:
-        table["column"] = _reference(column, dialect)
+    if column.reference != column.name:
+        table["column"] = column.reference
     table["role"] = "input" if column.part is Part.INPUT else "state"
     if column.part is Part.MEASURED:
         table["measured"] = True
@@ -322,6 +331,9 @@ def _examined(
     findings = [f"{len(strange)} files are not like the others and left alone: {_some(strange)}"] if strange else []
     population = _opened(source, mapping, excluded)
     found = examine(population, work)
+    if not found.counts:
+        key, why = next(iter(found.wrong.items()), (found.nan[0] if found.nan else "", "no number in some samples"))
+        raise DataError(f"Looking at {source}: none of {len(population.episodes)} episodes can be used; {key}: {why}.")
     period = population.sample_period_s
     few = {group: n for group, n in found.counts.items() if n < 2}
     if few and 2 * len(few) > len(found.counts) and found.shortest >= PIECES * SHORTEST_PIECE:

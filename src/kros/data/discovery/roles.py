@@ -68,6 +68,8 @@ class Column:
     part : Part
     why : str
         What the proposal rests on.
+    number : int, optional
+        Of the column, from 1, where its header does not name it alone.
     """
 
     header: str
@@ -77,6 +79,12 @@ class Column:
     kind: str = ""
     part: Part = Part.LEFT_OUT
     why: str = ""
+    number: int | None = None
+
+    @property
+    def reference(self) -> str | int:
+        """How a mapping names the column."""
+        return self.header if self.number is None else self.number
 
 
 def describe(header: str, unit: str, taken: Collection[str]) -> Column:

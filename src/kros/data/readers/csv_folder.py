@@ -55,7 +55,8 @@ class CsvRecordings(Recordings):
         if self.time_scale is None:
             return Recording(key, np.ascontiguousarray(columns.T))
         scale = 1.0 if self.timestamp is not None else self.time_scale
-        return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0] * scale)
+        since = columns[0] - columns[0, :1]  # before scaling: milliseconds since 1970 are whole numbers, seconds are not
+        return Recording(key, np.ascontiguousarray(columns[1:].T), since * scale)
 
     def _columns(self, path: Path, place: FilePlace) -> npt.NDArray[np.float64]:
         if path.suffix == ".parquet":

@@ -213,7 +213,7 @@ def column_lines(columns: Sequence[Column]) -> list[str]:
     lines = []
     for part in Part:
         for column in (c for c in columns if c.part is part):
-            came = f"column {column.header!r}" if column.header != column.name else ""
+            came = f"column {column.reference!r}" if column.reference != column.name else ""
             why = f"({column.why})" if part is Part.LEFT_OUT else ""
             lines.append(f"  {part.value:<9} {names[column]:<{width}}  {came}  {why}".rstrip())
     return lines

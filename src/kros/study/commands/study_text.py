@@ -77,7 +77,7 @@ def _mapping(found: Discovery) -> Iterator[str]:
             "# Columns that were left out; a channel of the role state is estimated, one of the role input is known at run time.",
         )
     for column in spare:
-        table = {"name": column.name, "column": column.header, "role": "state", **({"unit": column.unit} if column.unit else {})}
+        table = {"name": column.name, "column": column.reference, "role": "state", **({"unit": column.unit} if column.unit else {})}
         yield from ("", *(f"# {line}" for line in ("[[data.csv.channel]]", *_channel(table, column))))
 
 

@@ -18,7 +18,7 @@ from ...evaluate import as_shown
 from ...observer import run_observer
 from ..content import Cell, Cells, Panel, Section, Table
 from ..figures.recordings.phase import GOOD
-from ..names import axis_label, channel_units, condition_label, in_condition, minus, number, observer_label
+from ..names import axis_label, channel_units, condition_label, in_condition, minus, number, observer_label, readable_unit
 from ..run_folder import Array, NotShownError, RunFolder
 from ..sparks import spark
 from ..theme import Tone
@@ -155,7 +155,7 @@ def _errors(rows: Sequence[Row], units: Mapping[str, str]) -> Table:
         [
             r["channel"].replace("_", " "),
             condition_label(r["condition"]),
-            axis_label(number(r["rms"]), units.get(r["channel"], "")),
+            f"{number(r['rms'])} {readable_unit(units.get(r['channel'], ''))}".strip(),
             "diverged" if r["error_percent"] is None else number(r["error_percent"]),
         ]
         for r in rows

@@ -86,6 +86,18 @@ def test_leaving_a_unit_out_is_as_if_it_had_not_been_recorded(made):
         np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
 
 
+def test_no_unit_counts_for_more_than_its_error_is_like(made):
+    _, x, u, phase = made
+    wound = x.copy()
+    wound[..., 4:, 1] += 50 * size(x[..., 1]) * np.cumsum(np.random.default_rng(4).normal(size=x[..., 4:, 1].shape), axis=0)
+    past, clean = (PastMoments.of(LIFTING, (0,), batch_of(v, u, DT, phase, units=UNITS), Basis(20)) for v in (wound, x))
+    alone, given = clean.regression(without=["c"]), {past.conditions[0]: 1.0}
+    rows = [i for i, unit in enumerate(past.units) if unit != "c"]
+    errors = [past.errors(found[0])[rows].mean() for found in (alone, past.regression(weights=given), past.regression())]
+    assert errors[1] < 1.1 * errors[0]
+    assert errors[2] > 10 * errors[0]
+
+
 def test_a_linear_system_gets_the_kalman_predictor():
     rng = np.random.default_rng(3)
     F, G, Q = np.array([[1.0, 0.1], [-0.3, 0.8]]), np.array([[0.0], [1.0]]), np.diag([1e-3, 4e-2])

@@ -7,7 +7,7 @@ from batches import batch_of
 from kros.lifting import Lifting
 from kros.observer import Observer, PastMoments, identify_predictor, run_observer
 from kros.observer.predictor import tune_predictor
-from kros.observer.predictor.tuning import _slowing
+from kros.observer.predictor.tuning import _slowing, _Tuning
 from kros.observer.tuning.blocks import blocks_of, joined
 from kros.synthesis import Injection, kalman
 from kros.synthesis.residual_shaped.shaping_filter import Basis
@@ -116,3 +116,30 @@ def test_what_slows_the_slowest_pole_is_the_derivative_of_the_spectral_radius(se
         moved[i, j] += step
         change = (np.abs(np.linalg.eigvals(moved)).max() - radius) / step
         assert _slowing(F)[i, j] == pytest.approx(change, rel=1e-4, abs=1e-5)
+
+
+def test_the_gradient_of_all_samples_is_that_of_differences():
+    x, u = ripple(np.array([1.0, 2.0, 0.5, 1.0]), n_samples=400)
+    batch = batch_of(x + 0.3, u, DT, units=list("aabb"))
+    past = PastMoments.of(Lifting(("p", "v"), ("sin(5*p)",)), (0,), batch, Basis(5))
+    tuning = _Tuning(past, batch, 1.0, 0.4, {batch.keys[0].condition: 1.0})
+    F, G, H = joined(blocks_of(*past.model(4)))
+    n, blocks, step = len(F), blocks_of(F, G, H), 1e-6
+    into = np.eye(n + G.shape[1])
+    point = tuning.at(blocks)
+    found = tuning._gradient(blocks, None, (tuning.share / point.errors)[tuning.group] * tuning.each[:, None], into)
+    assert len(point.errors) == 2  # units count by the logarithms of their own errors
+    F, G, H = joined(blocks)
+    whole = np.hstack([F, G])
+    for k in [*range(0, whole.size, 3), *range(whole.size, whole.size + H.size)]:
+        moved = [np.concatenate([whole.ravel(), H.ravel()]) for _ in range(2)]
+        moved[0][k] -= step
+        moved[1][k] += step
+        errors = []
+        for values in moved:
+            W, h = values[: whole.size].reshape(whole.shape), values[whole.size :].reshape(H.shape)
+            error = recursion((W[:, :n], W[:, n:], h), tuning.z, tuning.rest)[0] - tuning.truth
+            square = np.zeros((2, 1))
+            np.add.at(square, tuning.group, np.mean(error**2, axis=-1).T * tuning.each[:, None])
+            errors.append(np.sum(tuning.share * np.log(square)) / 2)
+        assert found[k] == pytest.approx(-(errors[1] - errors[0]) / (2 * step), rel=1e-4, abs=1e-6 * np.abs(found).max())

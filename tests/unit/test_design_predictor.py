@@ -9,7 +9,7 @@ import pytest
 from kros.data.population import EpisodeKey
 from kros.design.certificates import certify_running
 from kros.design.methods.design import design
-from kros.design.methods.predictor import on_the_circle
+from kros.design.methods.predictor import Plan, on_the_circle
 from kros.design.methods.residual_shaped import TUNED, tuned
 from kros.design.methods.tuned import held_out, tuned_where_better
 from kros.design.settings import PredictorSettings, SynthesisSettings
@@ -157,6 +157,17 @@ def test_tuning_is_kept_where_nothing_speaks_against_it(tuning, made):
     lost = replace(start, A=A, controller=replace(start.controller, D=A[:, :1]))
     assert tuned_where_better(own, judge, start, lambda seen, o: lost)[0] is start
     assert relift_certificate(start, mismatch=False).certified
+
+
+def test_what_is_tuned_is_judged_by_what_counts(tuning, made):
+    observer, data = made[1].observer, tuning.read()
+    keys = [replace(key, condition="cold" if i % 3 == 0 else "warm") for i, key in enumerate(data.batch.keys)]
+    mixed = replace(data, batch=replace(data.batch, keys=tuple(keys)))
+    (found,) = Plan(None, None, [2.0, 1.0], {"cold": 1.0, "warm": 0.5}).score(mixed, [observer])
+    error = observer.run(data.batch.states[..., :1], data.batch.inputs, data.parameters)[..., 1:3] - data.batch.states[..., 1:3]
+    logs = np.log(np.sqrt(np.mean(error**2, axis=0)))
+    cold, warm = (logs[[key.condition == c for key in keys]].mean(axis=0) for c in ("cold", "warm"))
+    assert found == pytest.approx(100 * np.exp((cold + 0.5 * warm) @ [2.0, 1.0] / 4.5))
 
 
 def test_a_correction_filter_is_tuned_the_same_way(tuning):

@@ -44,8 +44,8 @@ class PredictorSettings(Settings):
 
     Its memory, order and the weight of every condition are chosen on training episodes of units that are left out in turn, and then it is tuned: with
     effort "full" among longer memories and more states, on five times as many recordings and by more steps than with "quick". `states` and tuning `steps`,
-    on so many `episodes` of every unit and condition, may be given. `others` is how much errors in conditions besides that of synthesis count: on simulated
-    drives with and without a load, training on the unloaded condition alone was as good in the loaded velocity and better in everything else.
+    on so many `episodes` of every unit and condition, may be given. `others` is how much errors in every condition besides that of synthesis
+    count; with zero these conditions are left out of everything.
     `importance` weights the logarithmic errors of states that are not measured, by name; one where none is given.
     """
 
@@ -53,7 +53,7 @@ class PredictorSettings(Settings):
     states: int | None = Field(None, ge=1, description="states besides the recorded ones; chosen where none is given")
     steps: int | None = Field(None, ge=0, description="most steps of tuning; by default 15 with full effort and 4 with quick")
     episodes: int = Field(2, ge=1)
-    others: float = Field(0.0, ge=0)
+    others: float = Field(1.0, ge=0)
     importance: dict[str, float] = Field(default_factory=dict)
 
     @field_validator("importance")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,8 +14,9 @@ import numpy.typing as npt
 
 from ...core.errors import KrosError, SynthesisError
 from ...data import EpisodeBatch
+from ...evaluate import error_rms
 from ...lifting import Lifting
-from ...observer import Observer, PastMoments, Runtime, conditioned, driven_coordinates, relift_certificate, with_limits
+from ...observer import Observer, PastMoments, Runtime, conditioned, driven_coordinates, relift_certificate, run_observer, with_limits
 from ...observer.limits import sides
 from ...observer.predictor import Recipe, choose, embedded, tune_predictor
 from ...observer.predictor.choice import AT_LIMITS
@@ -36,6 +38,7 @@ _SAMPLES, _EPISODES = 6000, 12  # that an observer is conditioned on, at most
 _SHARES = (1.0, 0.5)  # of the gain that is best, until a certificate covers it
 _CLOSE, _SHARE = 0.01, 0.001  # share of a limit that counts as at it, and how much of an episode has to be
 _NEAR = 0.03  # share of a limit that may have touched it, noise taken off
+_TINY = np.finfo(float).tiny
 _CIRCLE = {"sin": "cos", "cos": "sin"}
 
 
@@ -80,7 +83,7 @@ def design_predictor(task: DesignTask) -> DesignResult:
         plan = Plan.of(task, effort, data.on_time.batch)
         start, facts = plan.observer(task, data), dict[str, Any]()
         if steps := effort.steps if task.predictor.steps is None else task.predictor.steps:
-            kept, facts = tuned_where_better(task, data, start, lambda seen, _: plan.observer(task, seen, steps), settle)
+            kept, facts = tuned_where_better(task, data, start, lambda seen, _: plan.observer(task, seen, steps), settle, plan.score)
         else:
             kept = settle(data.part(firsts(data.batch)), start)
     except (KrosError, np.linalg.LinAlgError) as error:
@@ -107,11 +110,12 @@ def recordings(task: DesignTask, effort: Effort) -> TrainingSet:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a predictor is made by: moments of the recordings and the recipe that units which were left out have chosen."""
+    """What a predictor is made by: moments of the recordings, the recipe that units which were left out have chosen, and what counts how much."""
 
     past: PastMoments
     recipe: Recipe
     importance: list[float]
+    emphasis: dict[str, float]
 
     @classmethod
     def of(cls, task: DesignTask, effort: Effort, batch: EpisodeBatch) -> Plan:
@@ -125,12 +129,12 @@ class Plan:
         importance, until = importance_of(task), before_limits(task, batch)
         past = PastMoments.of(on_the_circle(models.lifting), models.measured, batch, every, until)
         internal = effort.internal if asked.states is None else (asked.states,)
-        emphasis: dict[str, Any] = {first: 1.0, **dict.fromkeys(others, asked.others)}
+        counts = {first: 1.0, **dict.fromkeys(others, asked.others)}
         free = np.array([name not in task.limits for i, name in enumerate(models.lifting.states) if i not in models.measured])
-        emphasis |= {limited(c): AT_LIMITS * count * free for c, count in emphasis.items() if limited(c) in past.conditions}
+        at_limits = {limited(c): AT_LIMITS * count * free for c, count in counts.items() if limited(c) in past.conditions}
         rows = firsts(batch)
-        recipe = choose(past, batch.take(rows), emphasis, importance, delays, lags, internal, until[rows])
-        return cls(past.restricted(recipe.basis), recipe, importance)
+        recipe = choose(past, batch.take(rows), {**counts, **at_limits}, importance, delays, lags, internal, until[rows])
+        return cls(past.restricted(recipe.basis), recipe, importance, counts)
 
     def observer(self, task: DesignTask, data: ValidationSet, steps: int = 0) -> Observer:
         """Return the observer, tuned by some steps on recordings, that of the moments without any."""
@@ -145,6 +149,18 @@ class Plan:
             made = [with_limits(one, *sides(task.limits, one.recorded)) for one in made]
         without = dropout_error_percent(made, task.training.first_of_units().read(), models.sample_period_s)
         return with_start(made[int(np.argmin(without))], few, self.past.static, self.past.free)
+
+    def score(self, data: ValidationSet, observers: Sequence[Observer]) -> npt.NDArray[np.float64]:
+        """Return errors of observers in percent of the range as the recipe counts them: geometric means over hidden states, units and conditions."""
+        keys, measured, found = data.batch.keys, observers[0].measured, []
+        share = np.array([self.emphasis.get(key.condition, 0.0) / [k.condition for k in keys].count(key.condition) for key in keys])
+        weights, hidden = np.outer(share, self.importance), [i for i in range(data.batch.states.shape[-1]) if i not in measured]
+        for observer in observers:
+            values = data.parameters if observer.lifting.parameters else None
+            estimate = run_observer(observer, data.measurements(measured), data.batch.inputs, values)
+            rms = error_rms(estimate[..., hidden], data.batch.states[..., hidden], data.batch.lengths)
+            found.append(float(np.sum(weights * np.log(np.maximum(np.where(np.isfinite(rms), rms, np.inf), _TINY))) / weights.sum()))
+        return 100 * np.exp(found)
 
     def facts(self, task: DesignTask) -> dict[str, Any]:
         """Return what the records say."""

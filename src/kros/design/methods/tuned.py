@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ...core.errors import DataError, KrosError
 from ...data.population import EpisodeKey
@@ -16,6 +17,7 @@ from ..task import DesignTask
 from ..validation import ValidationSet, hidden_mean
 
 log = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
 
 
 def tuned_where_better(
@@ -24,6 +26,7 @@ def tuned_where_better(
     start: Observer,
     tune: Callable[[ValidationSet, Observer], Observer],
     settle: Callable[[ValidationSet, Observer], Observer] = lambda _, observer: observer,
+    score: Callable[[ValidationSet, Sequence[Observer]], Array] | None = None,
 ) -> tuple[Observer, dict[str, Any]]:
     """Tune an observer on most training episodes, and return what is better on the others.
 
@@ -40,6 +43,9 @@ def tuned_where_better(
         From episodes and an observer to a better one.
     settle : callable
         What is done to the observer that is kept, with the first episodes of all units.
+    score : callable, optional
+        From the episodes that tuning did not see and observers to errors, shape (observer,): what was tuned for. By default the geometric mean of the
+        hidden states' mean errors.
 
     Returns
     -------
@@ -57,7 +63,9 @@ def tuned_where_better(
     except (KrosError, np.linalg.LinAlgError) as error:
         log.info("%s stays as it was: %s", task.name, error)
         return settle(first, start), {"tuned": False}
-    before, after = hidden_mean(unseen.percent_of_all([start, tuned]), start.measured).tolist()
+    pair = [start, tuned]
+    errors = hidden_mean(unseen.percent_of_all(pair), start.measured) if score is None else score(unseen, pair)
+    before, after = errors.tolist()
     without = dropout_error_percent([start, tuned], first, task.models.sample_period_s)
     settled = settle(first, tuned)
     better = after <= before and bool(without[1] < DIVERGED or without[0] >= DIVERGED)

@@ -153,7 +153,7 @@ def _orders(
 
 
 def _held_out(past: PastMoments, emphasis: Mapping[str, Array], missed: Callable[[list[str], list[int]], Array]) -> Array:
-    """Weighted mean over conditions of the logarithm of the root mean square error on units that are left out, shape (h, ...) as a row of `missed`."""
+    """Mean over units, weighted over conditions, of logarithms of root mean square errors on units left out, shape (h, ...) as a row of `missed`."""
     names = list(dict.fromkeys(past.units))
     folds = [names[i::FOLDS] for i in range(min(FOLDS, len(names)))]
     found: dict[int, Array] = {}
@@ -166,7 +166,7 @@ def _held_out(past: PastMoments, emphasis: Mapping[str, Array], missed: Callable
         own = [found[i] for i, other in enumerate(past.conditions) if other == condition and np.isfinite(found[i]).all()]
         if own:
             shape = (-1,) + (1,) * (own[0].ndim - 1)
-            total = total + counts.reshape(shape) * np.log(np.mean(own, axis=0)) / 2
+            total = total + counts.reshape(shape) * np.mean(np.log(own), axis=0) / 2
             weights = weights + counts.reshape(shape)
     return np.asarray(total / weights)
 

@@ -12,6 +12,7 @@ Anal. 10 (1973) 413-432; L. Kaufman, "A variable projection method for solving s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -53,18 +54,31 @@ class FreeStart:
             powers = np.concatenate([powers, powers @ (powers[-1] @ F)])
         return cls(powers[:n_samples], np.einsum("hn,knm->hkm", H, powers[:n_samples]), weights)
 
+    @cached_property
+    def _inverse(self) -> Array:
+        return self._inverted(1)
+
+    def _inverted(self, every: int) -> Array:
+        """From weighted errors to starts, shape (n, h * n_samples / every)."""
+        rows = self.seen[:, ::every] * np.sqrt(self.weights)[:, None, None]
+        return np.asarray(np.linalg.pinv(rows.reshape(-1, rows.shape[-1]), rcond=_ALIKE))
+
     def fitted(self, missed: Array, every: int = 1) -> Array:
         """Return the starts d, shape (n, ..., batch), that take the most from errors, shape (..., h, batch, n_samples / every)."""
-        root = np.sqrt(self.weights)[:, None]
-        rows = (self.seen[:, ::every] * root[..., None]).reshape(-1, self.seen.shape[-1])
-        weighted = np.moveaxis(missed * root[:, None], -3, -2)
-        inverse = np.linalg.pinv(rows, rcond=_ALIKE)
+        weighted = np.moveaxis(missed * np.sqrt(self.weights)[:, None, None], -3, -2)
+        inverse = self._inverse if every == 1 else self._inverted(every)
         return np.asarray(np.moveaxis(weighted.reshape(*weighted.shape[:-2], -1) @ inverse.T, -1, 0))
 
     def without(self, missed: Array, every: int = 1) -> Array:
         """Return what the best starts leave of errors, of the same shape."""
         left = missed - np.einsum("hkn,n...b->...hbk", self.seen[:, ::every], self.fitted(missed, every), optimize=True)
         return np.asarray(left)
+
+    def back(self, weighted: Array) -> Array:
+        """Return what `without`, transposed, makes of errors, shape (h, batch, n_samples): their products with all that starts can do become zero."""
+        inverse = self._inverse.reshape(-1, *self.seen.shape[:2]) * np.sqrt(self.weights)[:, None]
+        felt = np.einsum("hkn,hbk->nb", self.seen, weighted, optimize=True)
+        return np.asarray(weighted - np.einsum("nhk,nb->hbk", inverse, felt, optimize=True))
 
     def moved(self, starts: Array) -> Array:
         """Return what starts d, shape (n, batch), add to the states, shape (n, batch, n_samples)."""

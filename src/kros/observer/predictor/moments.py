@@ -207,8 +207,9 @@ class PastMoments:
             Units that take no part.
         deviation : float
         weights : mapping of str to array_like, shape (h,) or a number, optional
-            How much the error in every condition counts, relative to what is left of it there: the sum of logarithms of mean square errors, weighted
-            by these, is made small. Without them all rows count alike.
+            How much the error in every condition counts: the sum over units of logarithms of mean square errors, weighted by these, is made small, so
+            that units on which more is left count relative to that. Those on which less is left than on the median unit of the condition count as
+            this one: a short row cannot buy its own error with all others'. Without weights all rows count alike.
 
         Returns
         -------
@@ -227,10 +228,10 @@ class PastMoments:
             share = np.array([np.broadcast_to(np.asarray(weights.get(c, 0.0)), power.shape[1:]) / own.count(c) for c in own])
         share = share / share.sum(axis=0)
         found = self._solved(rows, share, deviation)
-        for _ in range(_REWEIGHTED if weights is not None and len(set(own)) > 1 else 0):
+        for _ in range(_REWEIGHTED if weights is not None else 0):
             missed = self.errors(found[0])[rows]
-            by_condition = {c: missed[[i for i, other in enumerate(own) if other == c]].mean(axis=0) for c in set(own)}
-            relative = share / np.maximum([by_condition[c] for c in own], _NEGLIGIBLE * power.mean(axis=0))
+            median = {c: np.median(missed[[i for i, other in enumerate(own) if other == c]], axis=0) for c in set(own)}
+            relative = share / np.maximum(missed, [median[c] for c in own])
             found = self._solved(rows, relative / relative.sum(axis=0), deviation)
         return found
 

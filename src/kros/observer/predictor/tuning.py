@@ -2,7 +2,7 @@ r"""Tuning of linear models for hidden states: all coefficients, dynamics includ
 
 The estimates are ``x_h = H (q I - F)^-1 G z`` with z as recorded (`PastMoments.channels`): no observer has to be run for a step. The criterion is
 
-.. math:: \sum_{i, c} s_{ic} \log \bigl( \operatorname{mean}_{u \in c} \overline{e_{iu}^2} \bigr)^{1/2},
+.. math:: \sum_{i, c} s_{ic} \operatorname{mean}_{u \in c} \log \bigl( \overline{e_{iu}^2} \bigr)^{1/2},
 
 with :math:`\overline{e_{iu}^2}` the mean square error of hidden state i on unit u in condition c. Every episode counts twice, with the lifted
 functions larger and smaller by a share: machines on which they act more or less than on the mean machine look like that, and an observer that relied on
@@ -32,6 +32,8 @@ from .moments import PastMoments, Weights, hidden_of
 
 _DAMPING = Damping(1e-7, 1e-3, 1e4, 4.0)
 _THIN, _SIDE_BY_SIDE = 8, 4  # episodes: keeps derivatives in some ten megabytes
+_ROWS = 20  # samples for every coefficient that curvature is taken from: all samples make the gradient, so that it decides how fast, not where to
+_TINY = np.finfo(float).tiny
 _ALIKE = 1e-13  # share of a direction below which rounding decides
 _BOUND, _AT_BOUND = 1e4, 1 - 1e-6  # a pole at its bound stays there instead of ending the search
 
@@ -91,7 +93,7 @@ def tune_predictor(
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A model in blocks, and its mean square errors, shape (condition, h)."""
+    """A model in blocks, and its mean square errors, shape (group, h)."""
 
     blocks: list[Block]
     errors: Array
@@ -107,23 +109,35 @@ class _Tuning:
         hidden = hidden_of(past.lifting, past.measured)
         seen, truth = past.channels(batch), batch.states[..., hidden]
         z, truth = (np.ascontiguousarray(np.moveaxis(a, 0, 2).swapaxes(0, 1)) for a in (seen, truth))
-        names = list(dict.fromkeys(key.condition for key in batch.keys)) if weights else [""]
-        group = np.array([names.index(key.condition) if weights else 0 for key in batch.keys])
+        own = [(key.unit, key.condition) if weights else ("", "") for key in batch.keys]
+        names = list(dict.fromkeys(own))
+        group, units = np.array([names.index(name) for name in own]), np.unique(batch.units, return_inverse=True)[1]
         lifted = slice(len(z) - len(past.lifting.functions), None)
         if deviation and past.lifting.functions:  # twice where machines deviate
             sign = np.where(np.arange(len(group)) % 2 == 0, deviation, -deviation)[:, None]
             both = [z.copy(), z.copy()]
             both[0][lifted] *= 1 + sign
             both[1][lifted] *= 1 - sign
-            z, truth, group = np.concatenate(both, axis=1), np.concatenate([truth, truth], axis=1), np.tile(group, 2)
-        counts = np.array([np.broadcast_to(np.asarray((weights or {"": 1.0}).get(c, 0.0), dtype=float), len(hidden)) for c in names])
+            z, truth, group, units = (
+                np.concatenate(both, axis=1),
+                np.concatenate([truth, truth], axis=1),
+                np.tile(group, 2),
+                np.tile(units, 2),
+            )
+        conditions = [condition for _, condition in names]
+        counts = np.array(
+            [
+                np.broadcast_to(np.asarray((weights or {"": 1.0}).get(c, 0.0), dtype=float), len(hidden)) / conditions.count(c)
+                for c in conditions
+            ]
+        )
         share = np.broadcast_to(np.asarray(importance, dtype=float), len(hidden)) * counts / counts.sum(axis=0)
         self.z, self.truth, self.group, self.share, self.slowest = z, truth, group, share / share.sum(), 1.0
-        rows = list(zip(group.tolist(), np.resize(batch.units, len(group)).tolist(), strict=True))
-        units = [len({u for g, u in rows if g == own}) for own, _ in rows]
-        self.each = np.array(
-            [1 / (rows.count(row) * n) for row, n in zip(rows, units, strict=True)]
-        )  # all units of a condition count alike
+        rows = list(zip(group.tolist(), units.tolist(), strict=True))
+        self.each = _alike(rows)
+        first = [i for i in range(len(rows)) if not weights or i % len(own) == rows.index(rows[i])]
+        each = _alike([rows[i] for i in first])
+        self.curved = [(first[i : i + _SIDE_BY_SIDE], each[i : i + _SIDE_BY_SIDE]) for i in range(0, len(first), _SIDE_BY_SIDE)]
         self.rest = np.zeros(z.shape[:2])
         self.rest[lifted] = z[lifted, :, 0]
         self.free = in_motion(batch.states[..., hidden])
@@ -133,8 +147,9 @@ class _Tuning:
         """Run a model."""
         found = np.zeros(self.share.shape)
         with np.errstate(over="ignore", invalid="ignore"):
+            free = self._free(blocks)
             for part in self._parts():
-                np.add.at(found, self.group[part], np.mean(self._missed(blocks, part)[2] ** 2, axis=-1).T * self.each[part, None])
+                np.add.at(found, self.group[part], np.mean(self._missed(blocks, part, free)[2] ** 2, axis=-1).T * self.each[part, None])
             return _Point(blocks, found, mean_log(self.share.ravel(), found.ravel()))
 
     def steps(self, point: _Point) -> Callable[[float], _Point]:
@@ -147,24 +162,26 @@ class _Tuning:
 
         blocks, model = point.blocks, joined(point.blocks)
         n, outputs = len(model[0]), len(self.truth)
-        into, out = self._whitening(blocks)
-        width = into.shape[1]
         free = self._free(blocks)
-        weight = (self.share / point.errors)[self.group] * self.each[:, None]
-        H, g = np.zeros((n * (width + outputs),) * 2), np.zeros(n * (width + outputs))
-        for part in self._parts():
-            h, rest, missed = self._missed(blocks, part)
+        into, out = self._whitening(blocks, free)
+        width = into.shape[1]
+        weight = (self.share / np.maximum(point.errors, _TINY))[self.group]
+        parameters = n * (width + outputs)
+        every = max(1, int(self.truth[0, 0].size * sum(len(part) for part, _ in self.curved) * outputs / (_ROWS * parameters)))
+        H = np.zeros((parameters, parameters))
+        for part, each in self.curved:
+            h, rest, _ = self._missed(blocks, part, free)
             signals = np.tensordot(into.T, np.concatenate([h, self.z[:, part]]), 1)
             rest = np.tensordot(into.T, np.concatenate([rest, self.rest[:, part]]), 1)
-            inner = np.concatenate([b.responses(signals, rest, _THIN) for b in blocks])
+            inner = np.concatenate([b.responses(signals, rest, every) for b in blocks])
             if free is not None:
-                inner = free.without(inner, _THIN)
-            direct = np.zeros((outputs, *h[..., ::_THIN].shape[:1], outputs, *h[..., ::_THIN].shape[1:]))
-            direct[range(outputs), :, range(outputs)] = h[..., ::_THIN]
-            root = np.sqrt(weight[part].T)[..., None]
+                inner = free.without(inner, every)
+            direct = np.zeros((outputs, *h[..., ::every].shape[:1], outputs, *h[..., ::every].shape[1:]))
+            direct[range(outputs), :, range(outputs)] = h[..., ::every]
+            root = np.sqrt(weight[part].T * each / h[0, 0, ::every].size)[..., None]
             X = np.concatenate([(part_of * root).reshape(-1, root[..., 0].size * inner.shape[-1]) for part_of in (inner, direct)])
             H += X @ X.T
-            g += X @ (missed[..., ::_THIN] * root).ravel()
+        g = self._gradient(blocks, free, weight * self.each[:, None], into)
         turn = block_diag(np.kron(np.linalg.pinv(out).T, np.eye(width)), np.kron(np.eye(outputs), out))
         H, g, size = scaled(turn.T @ H @ turn, turn.T @ g)
         slows = np.hstack([_slowing(model[0]), np.zeros((n, len(self.z)))]) @ into
@@ -185,22 +202,46 @@ class _Tuning:
 
         return trial
 
-    def _whitening(self, blocks: Sequence[Block]) -> tuple[Array, Array]:
+    def _gradient(self, blocks: Sequence[Block], free: FreeStart | None, weight: Array, into: Array) -> Array:
+        """How fast the weighted squares fall with all coefficients, of all recordings and samples.
+
+        What a signal added to a state does to all later estimates is gathered by the blocks' transposes running backwards: no response is needed.
+        """
+        inner, direct = np.zeros((sum(len(b.F) for b in blocks), len(into))), np.zeros((len(self.truth), sum(len(b.F) for b in blocks)))
+        for part in self._parts():
+            h, rest, missed = self._missed(blocks, part, free)
+            missed = missed * (weight[part].T / missed.shape[-1])[..., None]
+            if free is not None:
+                missed = free.back(missed)
+            signals, resting = np.concatenate([h, self.z[:, part]]), np.concatenate([rest, self.rest[:, part]])
+            direct += np.tensordot(missed, h, ((1, 2), (1, 2)))
+            back = missed[..., ::-1]
+            gathered, before = [], []
+            for b in blocks:
+                later = Block(b.F.T, b.H.T, b.H).run(back, np.zeros(back.shape[:2]))[0]
+                gathered.append(later[..., ::-1])
+                last = np.tensordot(b.F.T, later[..., -1], 1) + np.tensordot(b.H.T, back[..., -1], 1)
+                before.append(np.linalg.solve(np.eye(len(b.F)) - b.F.T, last.reshape(len(b.F), -1)).reshape(last.shape))
+            inner += np.tensordot(np.concatenate(gathered), signals, ((1, 2), (1, 2)))
+            inner += np.tensordot(np.concatenate(before), resting, (1, 1))
+        return np.concatenate([(inner @ into).ravel(), direct.ravel()])
+
+    def _whitening(self, blocks: Sequence[Block], free: FreeStart | None) -> tuple[Array, Array]:
         """What makes all states and channels white along the recordings, and what makes the states so."""
         n = sum(len(b.F) for b in blocks)
         moments = np.zeros((n + len(self.z),) * 2)
         for part in self._parts():
-            flat = np.concatenate([self._missed(blocks, part)[0][..., ::_THIN], self.z[:, part, ::_THIN]]).reshape(len(moments), -1)
+            flat = np.concatenate([self._missed(blocks, part, free)[0][..., ::_THIN], self.z[:, part, ::_THIN]]).reshape(len(moments), -1)
             moments += flat @ flat.T
         moments *= _THIN / self.z[0].size
         return whitening(moments, _ALIKE), whitening(moments[:n, :n], _ALIKE)
 
-    def _missed(self, blocks: Sequence[Block], part: slice) -> tuple[Array, Array, Array]:
+    def _missed(self, blocks: Sequence[Block], part: slice | list[int], free: FreeStart | None) -> tuple[Array, Array, Array]:
         """States of all blocks on some episodes, their rest, and what the estimates miss."""
         runs = [b.run(self.z[:, part], self.rest[:, part]) for b in blocks]
         h, rest = np.concatenate([r[0] for r in runs]), np.concatenate([r[1] for r in runs])
         H = np.hstack([b.H for b in blocks])
-        if (free := self._free(blocks)) is not None:
+        if free is not None:
             h += free.moved(free.fitted(self.truth[:, part] - np.tensordot(H, h, 1)))
         return h, rest, self.truth[:, part] - np.tensordot(H, h, 1)
 
@@ -211,6 +252,12 @@ class _Tuning:
 
     def _parts(self) -> list[slice]:
         return [slice(i, i + _SIDE_BY_SIDE) for i in range(0, len(self.group), _SIDE_BY_SIDE)]
+
+
+def _alike(rows: Sequence[tuple[int, int]]) -> Array:
+    """Weights of recordings, of which each is of a group and a unit, so that all units of a group count alike, with sum one in every group."""
+    units = {group: len({u for g, u in rows if g == group}) for group, _ in rows}
+    return np.array([1 / (rows.count(row) * units[row[0]]) for row in rows])
 
 
 def _slowing(F: Array) -> Array:

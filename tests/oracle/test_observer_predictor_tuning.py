@@ -120,7 +120,7 @@ def test_what_slows_the_slowest_pole_is_the_derivative_of_the_spectral_radius(se
 
 def test_the_gradient_of_all_samples_is_that_of_differences():
     x, u = ripple(np.array([1.0, 2.0, 0.5, 1.0]), n_samples=400)
-    batch = batch_of(x + 0.3, u, DT, units=list("aabb"))
+    batch = batch_of(x + np.array([0.3, 0.0]), u, DT, units=list("aabb"))
     past = PastMoments.of(Lifting(("p", "v"), ("sin(5*p)",)), (0,), batch, Basis(5))
     tuning = _Tuning(past, batch, 1.0, 0.4, {batch.keys[0].condition: 1.0})
     F, G, H = joined(blocks_of(*past.model(4)))

@@ -101,5 +101,10 @@ def test_free_starts_are_the_ones_that_recordings_began_with():
     np.testing.assert_allclose(free.fitted(missed), d, rtol=1e-8, atol=1e-10)
     assert np.abs(free.without(missed)).max() < 1e-10
     np.testing.assert_allclose(np.einsum("hn,nbk->hbk", H, free.moved(d)), missed, atol=1e-12)
+    weighted = np.random.default_rng(8).normal(size=missed.shape)
+    assert np.sum(weighted * free.without(missed)) == pytest.approx(np.sum(free.back(weighted) * missed))
     assert in_motion(missed.transpose(2, 1, 0))
     assert not in_motion(np.concatenate([np.zeros((1, 4, 2)), missed.transpose(2, 1, 0)]))
+    held = missed.transpose(2, 1, 0).copy()
+    held[0, :, 0] = 0.0  # at rest, held by a current
+    assert not in_motion(held)

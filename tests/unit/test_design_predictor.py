@@ -163,11 +163,11 @@ def test_what_is_tuned_is_judged_by_what_counts(tuning, made):
     observer, data = made[1].observer, tuning.read()
     keys = [replace(key, condition="cold" if i % 3 == 0 else "warm") for i, key in enumerate(data.batch.keys)]
     mixed = replace(data, batch=replace(data.batch, keys=tuple(keys)))
-    (found,) = Plan(None, None, [2.0, 1.0], {"cold": 1.0, "warm": 0.5}).score(mixed, [observer])
+    (found,) = Plan(None, None, [2.0, 1.0], {"cold": (1.0, 1.0), "warm": (0.5, 0.0)}).score(mixed, [observer])
     error = observer.run(data.batch.states[..., :1], data.batch.inputs, data.parameters)[..., 1:3] - data.batch.states[..., 1:3]
     logs = np.log(np.sqrt(np.mean(error**2, axis=0)))
     cold, warm = (logs[[key.condition == c for key in keys]].mean(axis=0) for c in ("cold", "warm"))
-    assert found == pytest.approx(100 * np.exp((cold + 0.5 * warm) @ [2.0, 1.0] / 4.5))
+    assert found == pytest.approx(100 * np.exp((cold @ [2.0, 1.0] + warm[0]) / 4.0))
 
 
 def test_a_correction_filter_is_tuned_the_same_way(tuning):

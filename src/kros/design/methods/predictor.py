@@ -115,7 +115,7 @@ class Plan:
     past: PastMoments
     recipe: Recipe
     importance: list[float]
-    emphasis: dict[str, float]
+    emphasis: dict[str, tuple[float, ...]]
 
     @classmethod
     def of(cls, task: DesignTask, effort: Effort, batch: EpisodeBatch) -> Plan:
@@ -134,7 +134,8 @@ class Plan:
         at_limits = {limited(c): AT_LIMITS * count * free for c, count in counts.items() if limited(c) in past.conditions}
         rows = firsts(batch)
         recipe = choose(past, batch.take(rows), {**counts, **at_limits}, importance, delays, lags, internal, until[rows])
-        return cls(past.restricted(recipe.basis), recipe, importance, counts)
+        tuned = {c: tuple(count if share > 0 else 0.0 for share in recipe.weights[c]) for c, count in counts.items()}
+        return cls(past.restricted(recipe.basis), recipe, importance, tuned)
 
     def observer(self, task: DesignTask, data: ValidationSet, steps: int = 0) -> Observer:
         """Return the observer, tuned by some steps on recordings, that of the moments without any."""
@@ -142,7 +143,7 @@ class Plan:
         few = some(batch, asked.episodes if steps else 1)
         if steps:
             slowest, recipe = max(self.recipe.basis.poles), self.recipe
-            model, _ = tune_predictor(model, self.past, few, self.importance, recipe.deviation, slowest, steps, weights=recipe.weights)
+            model, _ = tune_predictor(model, self.past, few, self.importance, recipe.deviation, slowest, steps, weights=self.emphasis)
         made = [embedded(task.name, self.past, model, models.recorded_inputs, few, ridge) for ridge in _RIDGES]
         made = [replace(one, runtime=Runtime(task.runtime.delay), sensor=task.sensor) for one in made]
         if task.limits:
@@ -153,8 +154,9 @@ class Plan:
     def score(self, data: ValidationSet, observers: Sequence[Observer]) -> npt.NDArray[np.float64]:
         """Return errors of observers in percent of the range as the recipe counts them: geometric means over hidden states, units and conditions."""
         keys, measured, found = data.batch.keys, observers[0].measured, []
-        share = np.array([self.emphasis.get(key.condition, 0.0) / [k.condition for k in keys].count(key.condition) for key in keys])
-        weights, hidden = np.outer(share, self.importance), [i for i in range(data.batch.states.shape[-1]) if i not in measured]
+        hidden = [i for i in range(data.batch.states.shape[-1]) if i not in measured]
+        nothing, conditions = (0.0,) * len(hidden), [key.condition for key in keys]
+        weights = np.array([np.multiply(self.emphasis.get(c, nothing), self.importance) / conditions.count(c) for c in conditions])
         for observer in observers:
             values = data.parameters if observer.lifting.parameters else None
             estimate = run_observer(observer, data.measurements(measured), data.batch.inputs, values)

@@ -124,9 +124,9 @@ def _measured_rows(F: Array, G: Array, z: Array, y: Array, truth: Array, ridge: 
     for k in range(len(z) - 1):
         h[k + 1] = h[k] @ F.T + driven[k]
     if in_motion(truth):
-        weights = 1 / np.maximum(np.mean(truth**2, axis=(0, 1)), np.finfo(float).tiny)
-        free = FreeStart.of(F, np.eye(truth.shape[-1], len(F)), len(h), weights)
-        h += free.moved(free.fitted((truth - h[..., : truth.shape[-1]]).transpose(2, 1, 0))).transpose(2, 1, 0)
+        missed = (truth - h[..., : truth.shape[-1]]).transpose(2, 1, 0)
+        free = FreeStart.of(F, np.eye(truth.shape[-1], len(F)), len(h), FreeStart.by_size(missed))
+        h += free.moved(free.fitted(missed)).transpose(2, 1, 0)
     start = skipped(len(z))
     regressors = np.concatenate([h, z], axis=-1)[start:-1:THIN].reshape(-1, len(F) + z.shape[-1])
     change = np.diff(y, axis=0)[start::THIN].reshape(-1, y.shape[-1])

@@ -191,6 +191,6 @@ def estimates(model: Model, past: PastMoments, batch: EpisodeBatch) -> Array:
         h[k + 1] = h[k] @ own + driven[k]
     truth, found = batch.states[..., hidden_of(past.lifting, past.measured)], h @ H.T
     if in_motion(truth):
-        free = FreeStart.of(F, H, len(h), 1 / np.maximum(np.mean(truth**2, axis=(0, 1)), np.finfo(float).tiny))
-        found = truth - free.without((truth - found).transpose(2, 1, 0)).transpose(2, 1, 0)
+        missed = (truth - found).transpose(2, 1, 0)
+        found = truth - FreeStart.of(F, H, len(h), FreeStart.by_size(missed)).without(missed).transpose(2, 1, 0)
     return np.asarray(found)

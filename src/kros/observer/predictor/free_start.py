@@ -23,9 +23,12 @@ _ALIKE = 1e-9
 
 
 def in_motion(truth: Array) -> bool:
-    """Whether recordings of hidden states, shape (n_samples, ...), begin while machines move."""
-    power = np.mean(truth.reshape(len(truth), -1) ** 2, axis=1)
-    return bool(power[0] > _AT_REST**2 * power.mean())
+    """Whether recordings of hidden states, shape (n_samples, batch, h), begin while machines move: no state is near zero then.
+
+    A machine at rest may need a current to stay there, but has no velocity.
+    """
+    power = np.mean(truth**2, axis=1)
+    return bool(np.all(power[0] > _AT_REST**2 * power.mean(axis=0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +42,7 @@ class FreeStart:
     seen : ndarray, shape (h, n_samples, n)
         ``H F^k``.
     weights : ndarray, shape (h,)
-        Of the squares of the hidden states' errors.
+        Of the squares of the hidden states' errors: what is known to a ten thousandth must not pay for what is known to a tenth (`by_size`).
     """
 
     powers: Array
@@ -53,6 +56,11 @@ class FreeStart:
         while len(powers) < n_samples:
             powers = np.concatenate([powers, powers @ (powers[-1] @ F)])
         return cls(powers[:n_samples], np.einsum("hn,knm->hkm", H, powers[:n_samples]), weights)
+
+    @staticmethod
+    def by_size(missed: Array) -> Array:
+        """Return weights by which errors, shape (h, batch, n_samples), are of one size."""
+        return np.asarray(1 / np.maximum(np.mean(missed**2, axis=(1, 2)), np.finfo(float).tiny))
 
     @cached_property
     def _inverse(self) -> Array:

@@ -35,6 +35,7 @@ _THIN, _SIDE_BY_SIDE = 8, 4  # episodes: keeps derivatives in some ten megabytes
 _ROWS = 20  # samples for every coefficient that curvature is taken from: all samples make the gradient, so that it decides how fast, not where to
 _TINY = np.finfo(float).tiny
 _ALIKE = 1e-13  # share of a direction below which rounding decides
+_SIZED = 16  # episodes that say how large errors are
 _BOUND, _AT_BOUND = 1e4, 1 - 1e-6  # a pole at its bound stays there instead of ending the search
 
 
@@ -87,7 +88,10 @@ def tune_predictor(
     problem.slowest = max(own, 1 - SETTLED / len(batch.states) if slowest is None else slowest)
     if not problem.slowest < 1:
         raise DataError("Tuning a predictor: the model is not stable; start from one that is.")
-    found, criterion = search(problem.at(blocks_of(*model)), problem.steps, _DAMPING, iterations, least_gain, patience=2)
+    blocks = blocks_of(*model)
+    some = list(range(0, len(problem.group), -(-len(problem.group) // _SIZED)))
+    problem.weights = FreeStart.by_size(problem.missed(blocks, some, None)[2])
+    found, criterion = search(problem.at(blocks), problem.steps, _DAMPING, iterations, least_gain, patience=2)
     return joined(found.blocks), criterion
 
 
@@ -141,7 +145,7 @@ class _Tuning:
         self.rest = np.zeros(z.shape[:2])
         self.rest[lifted] = z[lifted, :, 0]
         self.free = in_motion(batch.states[..., hidden])
-        self.weights = 1 / np.maximum(np.mean(truth**2, axis=(1, 2)), np.finfo(float).tiny)
+        self.weights = np.ones(len(hidden))
 
     def at(self, blocks: list[Block]) -> _Point:
         """Run a model."""
@@ -149,7 +153,7 @@ class _Tuning:
         with np.errstate(over="ignore", invalid="ignore"):
             free = self._free(blocks)
             for part in self._parts():
-                np.add.at(found, self.group[part], np.mean(self._missed(blocks, part, free)[2] ** 2, axis=-1).T * self.each[part, None])
+                np.add.at(found, self.group[part], np.mean(self.missed(blocks, part, free)[2] ** 2, axis=-1).T * self.each[part, None])
             return _Point(blocks, found, mean_log(self.share.ravel(), found.ravel()))
 
     def steps(self, point: _Point) -> Callable[[float], _Point]:
@@ -170,7 +174,7 @@ class _Tuning:
         every = max(1, int(self.truth[0, 0].size * sum(len(part) for part, _ in self.curved) * outputs / (_ROWS * parameters)))
         H = np.zeros((parameters, parameters))
         for part, each in self.curved:
-            h, rest, _ = self._missed(blocks, part, free)
+            h, rest, _ = self.missed(blocks, part, free)
             signals = np.tensordot(into.T, np.concatenate([h, self.z[:, part]]), 1)
             rest = np.tensordot(into.T, np.concatenate([rest, self.rest[:, part]]), 1)
             inner = np.concatenate([b.responses(signals, rest, every) for b in blocks])
@@ -209,7 +213,7 @@ class _Tuning:
         """
         inner, direct = np.zeros((sum(len(b.F) for b in blocks), len(into))), np.zeros((len(self.truth), sum(len(b.F) for b in blocks)))
         for part in self._parts():
-            h, rest, missed = self._missed(blocks, part, free)
+            h, rest, missed = self.missed(blocks, part, free)
             missed = missed * (weight[part].T / missed.shape[-1])[..., None]
             if free is not None:
                 missed = free.back(missed)
@@ -231,13 +235,13 @@ class _Tuning:
         n = sum(len(b.F) for b in blocks)
         moments = np.zeros((n + len(self.z),) * 2)
         for part in self._parts():
-            flat = np.concatenate([self._missed(blocks, part, free)[0][..., ::_THIN], self.z[:, part, ::_THIN]]).reshape(len(moments), -1)
+            flat = np.concatenate([self.missed(blocks, part, free)[0][..., ::_THIN], self.z[:, part, ::_THIN]]).reshape(len(moments), -1)
             moments += flat @ flat.T
         moments *= _THIN / self.z[0].size
         return whitening(moments, _ALIKE), whitening(moments[:n, :n], _ALIKE)
 
-    def _missed(self, blocks: Sequence[Block], part: slice | list[int], free: FreeStart | None) -> tuple[Array, Array, Array]:
-        """States of all blocks on some episodes, their rest, and what the estimates miss."""
+    def missed(self, blocks: Sequence[Block], part: slice | list[int], free: FreeStart | None) -> tuple[Array, Array, Array]:
+        """Return states of all blocks on some episodes, their rest, and what the estimates miss."""
         runs = [b.run(self.z[:, part], self.rest[:, part]) for b in blocks]
         h, rest = np.concatenate([r[0] for r in runs]), np.concatenate([r[1] for r in runs])
         H = np.hstack([b.H for b in blocks])

@@ -39,6 +39,7 @@ _SHARES = (1.0, 0.5)  # of the gain that is best, until a certificate covers it
 _CLOSE, _SHARE = 0.01, 0.001  # share of a limit that counts as at it, and how much of an episode has to be
 _NEAR = 0.03  # share of a limit that may have touched it, noise taken off
 _TINY = np.finfo(float).tiny
+_AS_GOOD = 1.01  # ratio of errors that is no reason to do without a start in motion
 _CIRCLE = {"sin": "cos", "cos": "sin"}
 
 
@@ -149,7 +150,18 @@ class Plan:
         if task.limits:
             made = [with_limits(one, *sides(task.limits, one.recorded)) for one in made]
         without = dropout_error_percent(made, task.training.first_of_units().read(), models.sample_period_s)
-        return with_start(made[int(np.argmin(without))], few, self.past.static, self.past.free)
+        return self._started(task, replace(data, batch=some(data.batch, asked.episodes)), few, made[int(np.argmin(without))])
+
+    def _started(self, task: DesignTask, data: ValidationSet, few: EpisodeBatch, observer: Observer) -> Observer:
+        """Return the observer with a start in motion, unless recordings start better without: what is unknown where machines move may be known at rest.
+
+        Of several conditions that of synthesis alone is tried as well: where it is clear what holds a machine, nothing has to be corrected.
+        """
+        first = [i for i, key in enumerate(few.keys) if key.condition == task.training.keys[0].condition]
+        parts = [few] if len(first) == len(few.keys) else [few, few.take(first)]
+        tried = [*(with_start(observer, part, self.past.static, self.past.free) for part in parts), observer]
+        errors = self.score(data, tried)
+        return tried[int(np.flatnonzero(errors <= _AS_GOOD * errors.min())[0])] if np.isfinite(errors).any() else observer
 
     def score(self, data: ValidationSet, observers: Sequence[Observer]) -> npt.NDArray[np.float64]:
         """Return errors of observers in percent of the range as the recipe counts them: geometric means over hidden states, units and conditions."""
@@ -161,7 +173,8 @@ class Plan:
             values = data.parameters if observer.lifting.parameters else None
             estimate = run_observer(observer, data.measurements(measured), data.batch.inputs, values)
             rms = error_rms(estimate[..., hidden], data.batch.states[..., hidden], data.batch.lengths)
-            found.append(float(np.sum(weights * np.log(np.maximum(np.where(np.isfinite(rms), rms, np.inf), _TINY))) / weights.sum()))
+            with np.errstate(invalid="ignore"):  # not a number where it diverges in what does not count: refused as well
+                found.append(np.sum(weights * np.log(np.maximum(np.where(np.isfinite(rms), rms, np.inf), _TINY))) / weights.sum())
         return 100 * np.exp(found)
 
     def facts(self, task: DesignTask) -> dict[str, Any]:

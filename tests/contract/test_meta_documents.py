@@ -116,3 +116,34 @@ def test_the_drawn_ways_name_modules_that_are_there() -> None:
     drawn = re.findall(r">([a-z_/0-9]+\.py)<", (ROOT / "docs" / "two-ways.svg").read_text())
     assert len(drawn) <= 16
     assert [name for name in drawn if not (ROOT / "src" / "kros" / name).is_file()] == []
+
+
+def page_of_keys(monkeypatch: pytest.MonkeyPatch) -> str:
+    """The page of keys as it is built."""
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    return importlib.import_module("keys").fill((ROOT / "docs" / "keys.md").read_text(encoding="utf-8"))
+
+
+def test_every_key_of_a_study_is_on_the_page_of_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    page = page_of_keys(monkeypatch)
+    schema = kros.study.StudyConfig.model_json_schema()
+    tables = {name: schema["$defs"][text["$ref"].rsplit("/", 1)[1]] for name, text in schema["properties"].items() if "$ref" in text}
+    assert len(tables) == 12
+    for name, table in tables.items():
+        section = page.split(f"### `[{name}]`\n")[1].split("\n### ")[0]
+        rows = {row.split("`")[1]: [cell.strip() for cell in row.split(" | ")] for row in section.splitlines() if row.startswith("| `")}
+        assert list(rows) == list(table["properties"])
+        assert [key for key, cells in rows.items() if len(cells) != 4 or len(cells[3]) < 4] == [], "says nothing: add a description"
+
+
+def test_every_key_of_a_mapping_says_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = page_of_keys(monkeypatch).split("## A mapping")[1].split("## Preparation steps")[0].splitlines()
+    rows = [row for row in lines if row.startswith("| `")]
+    assert len(rows) == 28
+    assert [row for row in rows if row.endswith("|  |")] == []
+
+
+def test_the_page_of_keys_is_filled(monkeypatch: pytest.MonkeyPatch) -> None:
+    page = page_of_keys(monkeypatch)
+    assert "<!--" not in page
+    assert all(f"### `{step}`\n" in page for step in kros.data.steps.parsing.STEPS)

@@ -17,19 +17,23 @@ BASELINES = Literal["open_loop", "kalman_white", "kalman_tuned", "luenberger", "
 class SynthesisSettings(Settings):
     """Observer synthesis."""
 
-    methods: tuple[METHODS, ...] = ("mixed", "worst_case_h2", "residual_h2", "memory")
+    methods: tuple[METHODS, ...] = Field(
+        ("mixed", "worst_case_h2", "residual_h2", "memory"), description="ways to an observer, each for every kind of model"
+    )
     set: Literal["auto", "signals", "models", "form"] = Field(
         "auto",
         description="set that worst-case synthesis is for; auto: of signals or of the form, whichever does better on held-out episodes",
     )
-    injection: Literal["state", "input"] = "state"
+    injection: Literal["state", "input"] = Field(
+        "state", description="where corrections of worst_case_h2 enter; mixed is always the paper's"
+    )
     input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
-    penalty: float = Field(1e-3, gt=0)
+    penalty: float = Field(1e-3, gt=0, description="on the correction, relative to the error")
     max_states: int | None = Field(
         None, ge=0, description="most states of the filter of worst_case_h2; reduced and polished where it has more"
     )
     tune: bool = Field(False, description="whether residual_h2 is tuned on training episodes, which takes some seconds a kind of model")
-    time_limit_s: float = Field(60.0, gt=0)
+    time_limit_s: float = Field(60.0, gt=0, description="for the optimisation of mixed")
 
     @model_validator(mode="before")
     @classmethod
@@ -49,12 +53,16 @@ class PredictorSettings(Settings):
     `importance` weights the logarithmic errors of states that are not measured, by name; one where none is given.
     """
 
-    effort: Literal["full", "quick"] = "full"
+    effort: Literal["full", "quick"] = Field(
+        "full", description="full tries longer memories, more states, more recordings and more steps than quick"
+    )
     states: int | None = Field(None, ge=1, description="states besides the recorded ones; chosen where none is given")
     steps: int | None = Field(None, ge=0, description="most steps of tuning; by default 15 with full effort and 4 with quick")
-    episodes: int = Field(2, ge=1)
-    others: float = Field(1.0, ge=0)
-    importance: dict[str, float] = Field(default_factory=dict)
+    episodes: int = Field(2, ge=1, description="of every unit and condition that tuning uses")
+    others: float = Field(1.0, ge=0, description="how much errors count in conditions besides that of synthesis")
+    importance: dict[str, float] = Field(
+        default_factory=dict, description="weights of the logarithmic errors of hidden states, by name; one where none is given"
+    )
 
     @field_validator("importance")
     @classmethod
@@ -80,8 +88,11 @@ class ObserverSettings(Settings):
     ``learned`` and ``mean_profile`` need no model.
     """
 
-    baselines: tuple[BASELINES, ...] = get_args(BASELINES)
-    deployed: str | None = None
+    baselines: tuple[BASELINES, ...] = Field(get_args(BASELINES), description="observers to compare with")
+    deployed: str | None = Field(
+        None,
+        description="name of the observer that is deployed; by default the most accurate that has all certificates and tolerates dropouts",
+    )
     false_alarm_rate: float = Field(
         0.02, gt=0, lt=1, description="share of good machines that the monitor of the deployed observer may report"
     )

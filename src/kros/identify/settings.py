@@ -16,10 +16,15 @@ class LiftingSettings(Settings):
     `families` are tables, each with a ``kind``, whose formulas stand behind `functions`; `input_functions` are further inputs of the model.
     """
 
-    functions: tuple[str, ...] | None = None
-    families: tuple[dict[str, Any], ...] = ()
-    input_functions: tuple[str, ...] = ()
-    parameters: tuple[str, ...] | None = None
+    functions: tuple[str, ...] | None = Field(
+        None,
+        description="lifted functions of the states, as formulas; without any and without families those that suit the plant that the reader names",
+    )
+    families: tuple[dict[str, Any], ...] = Field((), description="tables with a kind each, whose formulas stand behind the functions")
+    input_functions: tuple[str, ...] = Field((), description="further inputs of the model, as formulas of states and inputs")
+    parameters: tuple[str, ...] | None = Field(
+        None, description="names in formulas that every unit has a value of its own for; by default phase, where a formula reads it"
+    )
 
     @field_validator("families")
     @classmethod
@@ -32,11 +37,13 @@ class LiftingSettings(Settings):
 class CalibrationSettings(Settings):
     """Phase calibration; ``None`` takes what suits the plant that the reader names."""
 
-    angle: str | None = None
-    ratio: float | None = Field(None, gt=0)
-    reference: str | None = None
-    measured: str | None = None
-    settle_s: float = Field(0.1, ge=0)
+    angle: str | None = Field(
+        None, description="state in the periodic function; by default that of the formula, such as position in sin(100*position + phase)"
+    )
+    ratio: float | None = Field(None, gt=0, description="periods a radian; by default that of the formula, here 100")
+    reference: str | None = Field(None, description="commanded speed, which is constant for a while in the segments that are used")
+    measured: str | None = Field(None, description="speed that follows it and shows the periodic error")
+    settle_s: float = Field(0.1, ge=0, description="left out at the start of every segment")
 
 
 class IdentifySettings(Settings):
@@ -48,11 +55,16 @@ class IdentifySettings(Settings):
     a prior that is never so weak that the peak residual exceeds `largest_residual`. Spectral radii stay below ``1 - margin``.
     """
 
-    alpha: float | Literal["auto"] = "auto"
-    alpha_factor: float = Field(4.0, ge=1)
-    refine: bool = True
-    largest_residual: float = Field(0.5, gt=0)
-    margin: float = Field(0.0, ge=0, lt=1)
+    alpha: float | Literal["auto"] = Field(
+        "auto",
+        description="regularisation, in channels divided by their ranges; a number is in the recordings' units of measure, as the paper's",
+    )
+    alpha_factor: float = Field(4.0, ge=1, description="how far alpha = auto is above the smallest coefficient that stabilises every model")
+    refine: bool = Field(True, description="models refined on their free-run error, beside those of the paper's recipe")
+    largest_residual: float = Field(
+        0.5, gt=0, description="peak residual around the best nominal unit that regularisation and refinement keep, where they can"
+    )
+    margin: float = Field(0.0, ge=0, lt=1, description="spectral radii of refined models stay below 1 - margin")
 
     @field_validator("alpha")
     @classmethod

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from ..core.errors import ConfigError
 from ..core.settings import Settings
@@ -19,8 +19,8 @@ Array = npt.NDArray[np.float64]
 class Limit(Settings):
     """Limits of one state in its unit of measure; written as ``0.35`` for both sides, ``[-0.2, 0.35]``, ``{upper = 0.35}``, or false for none."""
 
-    lower: float | None = None
-    upper: float | None = None
+    lower: float | None = Field(None, description="least value in the state's unit of measure")
+    upper: float | None = Field(None, description="largest value")
 
     @model_validator(mode="before")
     @classmethod

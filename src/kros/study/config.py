@@ -38,13 +38,15 @@ class Stage(str, Enum):
 class DataConfig(Settings):
     """Where the recordings are and how they are prepared; units that `exclude` names take no part in anything."""
 
-    source: Path
-    reader: str = "motor-drive-raw"
-    exclude: tuple[str, ...] = ()
-    identify_on: str | None = None
-    on_nan: Literal["error", "drop_episode"] = "error"
-    prepare: tuple[dict[str, Any], ...] = ()
-    csv: dict[str, Any] | None = None
+    source: Path = Field(description="folder of the recordings, relative to the study file")
+    reader: str = Field("motor-drive-raw", description="motor-drive-raw, csv or parquet")
+    exclude: tuple[str, ...] = Field((), description="units that take no part in anything")
+    identify_on: str | None = Field(
+        None, description="condition that models, uncertainty and synthesis are made of; noload where there is one, else the first"
+    )
+    on_nan: Literal["error", "drop_episode"] = Field("error", description="what an episode with a missing value is: an error, or left out")
+    prepare: tuple[dict[str, Any], ...] = Field((), description="preparation steps, in order")
+    csv: dict[str, Any] | None = Field(None, description="the mapping, for the reader csv")
 
     @field_validator("source")
     @classmethod
@@ -57,7 +59,9 @@ class DataConfig(Settings):
 class SplitConfig(Settings):
     """Which episodes are held out."""
 
-    test: tuple[str, ...] | None = None
+    test: tuple[str, ...] | None = Field(
+        None, description="names of the episodes held out; by default the last tenth of every unit and condition, at least one"
+    )
 
 
 class EvaluateConfig(Settings):
@@ -69,11 +73,16 @@ class EvaluateConfig(Settings):
     units in all conditions. `monte_carlo` is the number of random members of the certified set that observers are computed for; 0 leaves that out.
     """
 
-    folds: int = Field(0, ge=0)
-    reserve: int = Field(0, ge=0)
-    confidence: float = Field(0.95, gt=0, lt=1)
-    robustness: bool | Literal["all"] = True
-    monte_carlo: int = Field(100, ge=0)
+    folds: int = Field(
+        0, ge=0, description="folds of units that are left out in turn, the whole study being made on all others; 0 for none"
+    )
+    reserve: int = Field(0, ge=0, description="units that take part in nothing; their errors bound those of the next unit")
+    confidence: float = Field(0.95, gt=0, lt=1, description="of that bound")
+    robustness: bool | Literal["all"] = Field(
+        True,
+        description="disturbed measurements: of the deployed kind of model on a few units, or all observers on all units in all conditions",
+    )
+    monte_carlo: int = Field(100, ge=0, description="random members of the certified set that observers are computed for; 0 for none")
 
     @field_validator("folds")
     @classmethod
@@ -90,29 +99,31 @@ class LoadConfig(Settings):
     the first two that were recorded in the condition are taken; all others are judged on. `limit` is the current's.
     """
 
-    moment: float | None = None
-    inertia: float = Field(0.0, ge=0)
-    angle_rad: float = 0.0
-    condition: str = "load"
-    units: tuple[str, ...] = ()
-    angle: str = "position"
-    current: str = "current"
-    limit: float | None = Field(None, gt=0)
-    memories: int = Field(8, ge=0)
-    level_s: float = Field(10.0, gt=0)
+    moment: float | None = Field(
+        None, description="of the mounted mass over the torque constant, in units of current; without it nothing is done about load"
+    )
+    inertia: float = Field(0.0, ge=0, description="of the mounted mass over the torque constant")
+    angle_rad: float = Field(0.0, description="angle at which the moment is zero")
+    condition: str = Field("load", description="in which the load is mounted")
+    units: tuple[str, ...] = Field((), description="on which the load is known; by default the first two recorded in the condition")
+    angle: str = Field("position", description="state that is the angle")
+    current: str = Field("current", description="state that is the current")
+    limit: float | None = Field(None, gt=0, description="of the current, in its unit of measure")
+    memories: int = Field(8, ge=0, description="states of the load observer besides the recorded ones")
+    level_s: float = Field(10.0, gt=0, description="time constant of the leak against drift of the load's level")
 
 
 class RequireConfig(Settings):
     """Requirements whose violation ends the run with exit code 3."""
 
-    robust: bool = False
-    no_outliers: bool = False
+    robust: bool = Field(False, description="the deployed observer has a certificate")
+    no_outliers: bool = Field(False, description="no unit is flagged")
 
 
 class StudyConfig(Settings):
     """A whole study."""
 
-    name: str = "study"
+    name: str = Field("study", description="of the study")
     data: DataConfig
     split: SplitConfig = SplitConfig()
     lifting: LiftingSettings = LiftingSettings()

@@ -21,17 +21,17 @@ FORMS = Literal[
 class UncertaintySettings(Settings):
     """Uncertainty model and outlier scores."""
 
-    form: FORMS = "inverse_input_multiplicative"
+    form: FORMS = Field("inverse_input_multiplicative", description="of the uncertain set")
     nominal: str | None = Field(
         None, description='a unit, or "unit" for the best one; by default observers that are free to may have the mean of the units instead'
     )
-    structure: Literal["auto", "diagonal", "scalar", "entrywise"] = "auto"
-    n_freqs: int = Field(1000, ge=50)
-    max_order: int = Field(4, ge=1, le=8)
-    tolerance_db: float = Field(1.0, gt=0)
-    drop_outliers: bool = False
-    outlier_form: FORMS = "additive"
-    false_alarm_rate: float = Field(3e-3, gt=0, lt=1)
+    structure: Literal["auto", "diagonal", "scalar", "entrywise"] = Field("auto", description="of the weights")
+    n_freqs: int = Field(1000, ge=50, description="points of the frequency grid")
+    max_order: int = Field(4, ge=1, le=8, description="largest order of an entry of a weight")
+    tolerance_db: float = Field(1.0, gt=0, description="how far a weight may be above the bound of the residuals")
+    drop_outliers: bool = Field(False, description="units that are flagged take no part in models, weights and synthesis")
+    outlier_form: FORMS = Field("additive", description="of the residuals that outlier scores are made of")
+    false_alarm_rate: float = Field(3e-3, gt=0, lt=1, description="probability with which a unit like the others is flagged")
 
     @field_validator("structure", mode="before")
     @classmethod

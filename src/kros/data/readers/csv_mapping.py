@@ -30,10 +30,13 @@ class ChannelMapping:
     Parameters
     ----------
     name : str
+        Of the channel, in everything that follows.
     role : Role
+        What it is to the observer; a truth serves evaluation alone.
     column : str or int, optional
         Name in the header or number from 1; default: the channel's name.
     measured : bool
+        Whether a state is available at run time.
     unit : str
         Unit of measure after scaling.
     scale : float
@@ -84,6 +87,7 @@ class CsvMapping:
         Regular expression searched in the path relative to the folder (with ``/``); named groups `unit`, `condition`, `episode` and `group`
         say what a file is. A missing group gets a default. Files that do not match are left alone.
     channel : tuple of ChannelMapping
+        The channels, in any order.
     time : str or int, optional
         Column of time.
     unit : tuple of UnitMapping
@@ -97,6 +101,7 @@ class CsvMapping:
     exclude : str, optional
         Regular expression; paths in which it is found are left out.
     delimiter : str
+        Between columns; ``"\\t"`` for tabs.
     header : bool
         False where the first line holds numbers already; columns are then given by number.
     skip_rows : int

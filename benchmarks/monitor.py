@@ -3,10 +3,11 @@
     python benchmarks/monitor.py --loop stiff --seeds 40 --work /tmp/monitor
 
 One observer is designed for a loop, on a population of 12 drives of its own (seed 9041): identified, quantified, `--method` synthesised, kept in `--work`.
-Then every seed is a population of the same distribution: 12 drives, 3 episodes of 14 s with and without load each, that the monitor's bounds are found
-on by `fit_monitor`, as a study does; 12 further good drives recorded as much, which count false alarms; and one faulty drive of every kind and severity,
-which has ten seconds of motion in each condition to be found. Faults are those of the simulator: its badly assembled drive (`draw_outlier`; 1 is its
-default), all friction times a factor, all harmonics of the gearbox times a factor. Phases are the simulation's.
+Then every seed is a population of the same distribution: 12 drives, 6 episodes of 12 s with and without load each, that the monitor's bounds are found
+on by `fit_monitor`, as a study does; 12 further good drives, 2 episodes of 14 s each, which count false alarms; and one faulty drive of every kind and
+severity, which has ten seconds of motion in each condition to be found. New drives follow other trajectories than those of training. Faults are those of
+the simulator: its badly assembled drive (`draw_outlier`; 1 is its default), all friction times a factor, all harmonics of the gearbox times a factor.
+Phases are the simulation's.
 
 Printed are counts over all seeds; rates of false alarms with exact 95 % intervals (binomial a unit, Poisson an hour of motion), with the condition
 told and not told. `--own` judges further good drives against the monitor found on the very drives that the observer was designed on.
@@ -30,7 +31,9 @@ from kros.observer import Observer, run_innovations
 from kros.plants.harmonic_drive import DriveParameters, HarmonicDrivePopulation
 from kros.plants.harmonic_drive.parameters import concatenate, draw_outlier, draw_parameters
 
-DESIGN_SEED, UNITS, EPISODES, SECONDS, WITHIN_S, RATE = 9041, 12, 3, 14.0, 10.0, 0.02
+DESIGN_SEED, UNITS, EPISODES, SECONDS, WITHIN_S, RATE = 9041, 12, 6, 12.0, 10.0, 0.02
+NEW_EPISODES, NEW_SECONDS = 2, 14.0
+ELSEWHERE = 1_000_000  # seed of the motions of new drives beside that of training
 CONDITIONS = ("load", "noload")
 FRICTION = ("coulomb_torque", "breakaway_torque", "viscous_friction")
 FAULTS = {
@@ -71,9 +74,9 @@ def designed(loop: str, method: str, work: Path) -> tuple[Observer, TrainingSet]
     return Observer.load(folder / "observer.json"), TrainingSet.whole(models, models.models(method.split("/")[0]))
 
 
-def record(drives: DriveParameters, seed: int, loop: str, episodes: int) -> TrainingSet:
+def record(drives: DriveParameters, seed: int, loop: str, episodes: int, seconds: float = SECONDS) -> TrainingSet:
     """Simulate and return all episodes."""
-    simulated = Given(n_units=len(drives), n_episodes=episodes, seconds=SECONDS, seed=seed, loop=loop, drives=drives).simulate()
+    simulated = Given(n_units=len(drives), n_episodes=episodes, seconds=seconds, seed=seed, loop=loop, drives=drives).simulate()
     population, truth = simulated.population, simulated.truth
     phases = {unit: {"phase": float(phase)} for unit, phase in zip(truth.unit_ids, truth.phase_rad, strict=True)}
     return TrainingSet(population, population.episodes, phases)
@@ -139,7 +142,7 @@ def main() -> None:
         counts = {"any": Count(), "told": Count()}
         for start in range(0, args.own, 20):
             drives = draw_parameters(DESIGN_SEED, UNITS + start + 20, 1.0).take(slice(UNITS + start, None))
-            rows = levels(own, record(drives, args.first + start, args.loop, EPISODES))
+            rows = levels(own, record(drives, args.first + start, args.loop, NEW_EPISODES, NEW_SECONDS))
             counts["any"].add(rows, {})
             counts["told"].add(rows, dict(own.monitor.bounds))
         for name, count in counts.items():
@@ -154,20 +157,26 @@ def main() -> None:
             observer, monitor=fit_monitor(observer, record(good.take(slice(args.units)), seed, args.loop, EPISODES), args.rate)
         )
         bounds = dict(watched.monitor.bounds)
-        rows = levels(watched, record(good.take(slice(args.units, None)), seed, args.loop, EPISODES))
+        rows = levels(watched, record(good.take(slice(args.units, None)), ELSEWHERE + seed, args.loop, NEW_EPISODES, NEW_SECONDS))
         counts["any"].add(rows, {})
         counts["told"].add(rows, bounds)
         drives = faulty(seed, *kinds[0])
         for kind in kinds[1:]:
             drives = concatenate(drives, faulty(seed, *kind))
-        for unit, condition, level, motion in levels(watched, record(drives, seed, args.loop, 1)):
+        for unit, condition, level, motion in levels(watched, record(drives, ELSEWHERE + seed, args.loop, 1, NEW_SECONDS)):
             within = level[motion <= WITHIN_S].max()
             kind = kinds[int(unit)]
             found.setdefault((*kind, condition, "any"), []).append(within > 0)
             found.setdefault((*kind, condition, "told"), []).append(within > bounds[condition])
+        if (seed - args.first + 1) % 10 == 0:
+            show(args, seed - args.first + 1, counts, found)
+
+
+def show(args: argparse.Namespace, done: int, counts: dict[str, Count], found: dict[tuple, list[bool]]) -> None:
+    """Print what was found so far."""
     for name, count in counts.items():
         print(f"{args.loop} {args.method} {args.units} drives, rate {args.rate}, good drives, condition {name}: {count}")
-    print(f"found within {WITHIN_S:g} s of motion, of {args.seeds}: condition told / not told")
+    print(f"found within {WITHIN_S:g} s of motion, of {done}: condition told / not told")
     for kind, severities in FAULTS.items():
         for s in severities:
             texts = [f"{c} {sum(found[kind, s, c, 'told'])} / {sum(found[kind, s, c, 'any'])}" for c in CONDITIONS]

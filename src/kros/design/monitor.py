@@ -25,7 +25,7 @@ from .validation import TrainingSet, spread
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-UNITS, EPISODES, TOGETHER = 60, 3, 60  # most units, most episodes of each in every condition, and episodes in memory
+UNITS, EPISODES, TOGETHER = 60, 12, 60  # most units, most episodes of each in every condition, and episodes in memory
 MEMORY = 1000  # samples that mean squares remember
 FORGOTTEN = 1e-3  # of a start, when innovations are judged
 SETTLE = (100, 1000)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 
 Array = npt.NDArray[np.float64]
-Values = Mapping[str, Array]
+Values = dict[Any, Any]  # arrays by name, and what was made of them on the way
 Evaluator = Callable[[Values], Any]
 Shape = tuple[Any, ...]
 
@@ -66,20 +66,22 @@ class Columns:
             numbers: list[float] = []
             groups.setdefault(shape_of(expression, numbers), []).append((column, numbers))
         singles, blocks = [], []
+        shared: dict[tuple[Shape, tuple[float, ...]], Evaluator] = {}
         for shape, members in groups.items():
             if len(members) == 1:
-                singles.append((members[0][0], _assemble(shape, iter(members[0][1]))))
+                singles.append((members[0][0], _assemble_sharing(shape, members[0][1], shared)))
             else:
                 table = np.array([numbers for _, numbers in members]).T
                 blocks.append((_as_slice([column for column, _ in members]), _assemble(shape, iter(table))))
         return cls(tuple(singles), tuple(blocks))
 
-    def fill(self, values: Values, out: Array) -> None:
+    def fill(self, values: Mapping[str, Array], out: Array) -> None:
         """Write the columns, along the last axis of `out`."""
+        kept: Values = dict(values)
         for column, evaluator in self.singles:
-            out[..., column] = evaluator(values)
+            out[..., column] = evaluator(kept)
         if self.blocks:
-            wide = {name: value[..., None] for name, value in values.items()}
+            wide: Values = {name: value[..., None] for name, value in values.items()}
             for columns, evaluator in self.blocks:
                 out[..., columns] = evaluator(wide)
 
@@ -150,6 +152,29 @@ def _assemble(shape: Shape, numbers: Iterator[Any]) -> Evaluator:
         return lambda values: power(base(values))
     function, inner = FUNCTIONS[kind], _assemble(rest[0], numbers)
     return lambda values: function(inner(values))
+
+
+def _assemble_sharing(shape: Shape, numbers: list[float], shared: dict[tuple[Shape, tuple[float, ...]], Evaluator]) -> Evaluator:
+    """Assemble a function whose argument others may have, too, such as sine and cosine of an angle: it is then evaluated once."""
+    if shape[0] not in FUNCTIONS or shape[1][0] in ("symbol", "number"):
+        return _assemble(shape, iter(numbers))
+    key, function = (shape[1], tuple(numbers)), FUNCTIONS[shape[0]]
+    if key not in shared:
+        shared[key] = _once(_assemble(shape[1], iter(numbers)))
+    inner = shared[key]
+    return lambda values: function(inner(values))
+
+
+def _once(evaluator: Evaluator) -> Evaluator:
+    """Keep the result among the values that it was made of."""
+    key = object()
+
+    def evaluate(values: Values) -> Any:
+        if key not in values:
+            values[key] = evaluator(values)
+        return values[key]
+
+    return evaluate
 
 
 def _fold(combine: Callable[[Any, Any], Any], children: list[Evaluator]) -> Evaluator:

@@ -183,7 +183,7 @@ class RunningObserver:
         self._inputs.append(known)
         if len(self._inputs) > self.observer.runtime.delay:
             steps, taken, absent = self._steps, self._inputs.popleft(), None
-            if self._known is None and not (there := np.isfinite(measurement)).all():
+            if self._status and not (there := np.isfinite(measurement)).all():
                 absent = ~there
             if self._watch is not None:
                 self._watch.take((measurement[0] - steps.x[0, 0, self._at]).tolist(), not self._status)
@@ -203,12 +203,13 @@ class RunningObserver:
     def _take(self, y: Array, u: Array) -> tuple[Array, Array]:
         """Judge a sample, and start again where that is due; the first sample is the one that the observer started at.
 
-        `_known` is the last input where that and what came before were good: then nothing is held, and a sample that is good takes the short way.
+        `_known` is the last input where it was good and nothing is held: then a sample with good inputs takes the short way.
         """
         before, self._known = self._known, None
         if before is not None:
-            if self._screen.measured.pass_one(y.tolist()) and self._screen.inputs.pass_one(u.tolist()):
-                self._known, self._status = u, SampleStatus.GOOD
+            status = self._screen.at_once(y.tolist(), u.tolist())
+            if status is not None:
+                self._known, self._status = u, status
                 return y[None], u[None]
             self._held = Held.good(before[None])
         samples = self._judge(y, u, self._held)
@@ -220,7 +221,7 @@ class RunningObserver:
                 self._begin(samples.y[0], samples.u[0])
         elif samples.starts[0, 0]:
             self._begin(samples.y[0], samples.u[0])
-        if not (self._status or self._held.stale[0] or self._held.since.any()):
+        if not (self._held.stale[0] or self._held.since.any()):
             self._known = samples.u[0, 0]
         return samples.y[0], samples.u[0]
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from math import isfinite
 
 import numpy as np
 import numpy.typing as npt
@@ -72,6 +73,10 @@ class Bounds:
         """Whether one sample is good as it is, as `pass_all` for many: a comparison with what is not a number is false."""
         return all(least <= value <= most for value, (least, most) in zip(values, self.good, strict=True))
 
+    def pass_where_there(self, values: Sequence[float]) -> bool:
+        """Whether one sample is good but for channels that are missing."""
+        return all(least <= value <= most or not isfinite(value) for value, (least, most) in zip(values, self.good, strict=True))
+
     def judge(self, values: Array) -> tuple[Array, Flags, Flags]:
         """Return samples within their limits, which of them are plausible, and which are beyond a limit or their range."""
         plausible = (values >= self.least) & (values <= self.most)
@@ -110,6 +115,14 @@ class Screen:
         """Return the screen of an estimator that declares no limits."""
         sizes = (None, None) if seen is None else (seen.measured, seen.inputs)
         return cls(Bounds.of_measurements(q, seen=sizes[0]), Bounds.of_inputs(m, seen=sizes[1]))
+
+    def at_once(self, y: Sequence[float], u: Sequence[float]) -> SampleStatus | None:
+        """Return the status of one sample that is taken as it is, good or without some measurements; None for one that `take` has to judge."""
+        if not self.inputs.pass_one(u):
+            return None
+        if self.measured.pass_one(y):
+            return SampleStatus.GOOD
+        return SampleStatus.MISSING if self.measured.pass_where_there(y) else None
 
     def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
         """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m) in the order in which they arrive; `held` is known before the first."""

@@ -167,11 +167,12 @@ def track_parameter(
     steps, missing = Steps([observer], batch, values), ~np.isfinite(y)
     estimates, followed = np.empty((*y.shape[:2], observer.lifting.n_states)), np.empty(y.shape[:2])
     steps.begin(y[0])
+    steps.begin(y[0], starts[0], u[0])
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for k in range(len(y)):
             estimates[k], followed[k] = observer.runtime.clip_estimate(steps.x[0]), values[name]
             if k and starts[k].any():  # the parameter stays
-                steps.begin(y[k], starts[k])
+                steps.begin(y[k], starts[k], u[k])
                 loop.begin(starts[k])
             values[name] = loop.step(steps, y[k], u[k], missing[k] if missing[k].any() else None)
     return Tracked(estimates, followed)

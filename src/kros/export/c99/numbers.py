@@ -229,11 +229,18 @@ class Source:
         if start is None or not len(start):
             return None
         rows = np.flatnonzero(np.any(start.gain, axis=1) | np.any(start.corrections, axis=(0, 2)))
-        gain = start.gain[rows]
-        if self.shift is not None:  # exactly, so that nothing is left of where the origin is
-            gain[:, 0] = -gain[:, q:] @ self.shift.inputs
+        gain, places = start.gain[rows], self.observer.measured
+        less = [(j, places.index(i), factor) for j, i, factor in self.realised.less]
+        for j, i, factor in less:  # as in the model, differences first
+            gain[:, i] += factor * gain[:, q + j]
         corrections = start.corrections[:, rows].reshape(len(start), -1)
-        return {"rows": rows.tolist(), "count": len(start), "gain": self.matrix(gain), "corrections": self.matrix(corrections)}
+        return {
+            "rows": rows.tolist(),
+            "count": len(start),
+            "gain": self.matrix(gain),
+            "corrections": self.matrix(corrections),
+            "less": [(j, i, None if factor == 1 else Precision().literal(factor)) for j, i, factor in less],
+        }
 
     def symbol(self, name: str) -> str:
         """Return what stands for a quantity of a formula in C: window w, parameters p, inputs u."""

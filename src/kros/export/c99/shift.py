@@ -21,7 +21,6 @@ from ...observer import Observer
 
 Array = npt.NDArray[np.float64]
 _EXACT, _NOTHING = 1e-11, 1e-13
-_STARTS = 1e-9  # share of the first estimate's gain
 _MOST = 64  # periods of the first function until all others repeat
 
 
@@ -63,11 +62,6 @@ def find_shift(observer: Observer) -> Shift | None:
     largest = float(np.abs(moving * direction).max(initial=0.0))
     direction = plain if np.abs(moving @ plain).max() <= _EXACT * max(largest, 1e-300) else direction
     if period is None or np.abs(moving @ direction).max() > _EXACT * max(largest, 1e-300):
-        return None
-    start = observer.start_in_motion
-    if start is not None and not np.allclose(
-        start.gain @ direction[[at, *range(n, n + m)]], 0.0, atol=_STARTS * np.abs(start.gain[:, 0]).max()
-    ):
         return None
     return Shift(direction[:n], direction[n:], period)
 

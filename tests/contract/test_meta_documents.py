@@ -147,3 +147,9 @@ def test_the_page_of_keys_is_filled(monkeypatch: pytest.MonkeyPatch) -> None:
     page = page_of_keys(monkeypatch)
     assert "<!--" not in page
     assert all(f"### `{step}`\n" in page for step in kros.data.steps.parsing.STEPS)
+
+
+@pytest.mark.parametrize("name", [name for name in kros.__all__ if name != "__version__"])
+def test_every_public_object_has_an_example(name: str) -> None:
+    """Those of functions and packages run with their modules."""
+    assert ">>> " in (getattr(kros, name).__doc__ or "")

@@ -1,6 +1,13 @@
 """Ground floor: systems, norms, artifacts and errors. Imports nothing else of kros.
 
 What needs NumPy is loaded on first use, so that importing the package stays cheap.
+
+Examples
+--------
+>>> from kros.core import StateSpace, hinf_norm
+>>> lag = StateSpace([[0.5]], [[0.5]], [[1.0]], [[0.0]], 0.01)  # 0.5 / (z - 0.5), every 0.01 s
+>>> round(hinf_norm(lag), 9)
+1.0
 """
 
 from __future__ import annotations

@@ -1,6 +1,15 @@
 """Recordings: units, conditions and episodes with named channels, read lazily, prepared by declared steps, checked.
 
 folder or arrays ── reader ── Population ── prepare ── check ── write_parquet, or the stages of a study
+
+Examples
+--------
+>>> import numpy as np
+>>> from kros.data import Channel, Role, from_arrays
+>>> channels = (Channel("angle", Role.STATE, "rad", measured=True), Channel("rate", Role.STATE, "rad/s"), Channel("torque", Role.INPUT, "N m"))
+>>> population = from_arrays({"left": [np.zeros((50, 3))], "right": [np.ones((50, 3))]}, channels, sample_period_s=0.01)
+>>> population.measured, population.read(population.keys("right")[0]).shape
+(('angle',), (50, 3))
 """
 
 from . import steps

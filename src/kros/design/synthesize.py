@@ -164,6 +164,15 @@ def synthesize(
         When it cannot be made, with the reason.
     ConfigError
         When there is no such method.
+
+    Examples
+    --------
+    >>> import kros
+    >>> drives = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> uncertain = kros.quantify(kros.identify(drives, refine=False), n_freqs=50, max_order=1, structure="scalar")
+    >>> design = kros.synthesize(uncertain, "kalman_tuned", methods=())
+    >>> design.name, design.observer.start([0.0]).states
+    ('linear_edmd/kalman_tuned', ('position', 'velocity', 'current'))
     """
     require_kind(uncertain, UncertainModels, "Synthesize", "quantify the models first, kros.quantify(models)")
     asked = SynthesisSettings.of(settings, "Synthesize")

@@ -1,4 +1,13 @@
-"""Evaluation: errors and spectra of estimates and free runs against recordings, also of disturbed ones; Monte Carlo over uncertain sets."""
+"""Evaluation: errors and spectra of estimates and free runs against recordings, also of disturbed ones; Monte Carlo over uncertain sets.
+
+Examples
+--------
+>>> import numpy as np
+>>> from kros.evaluate import error_percent, error_rms
+>>> recorded, estimated = np.array([[[0.0], [2.0], [-4.0]]]), np.array([[[0.1], [2.1], [-4.1]]])  # episode, sample, channel
+>>> error_rms(estimated, recorded, [3]).round(9).tolist(), error_percent(estimated, recorded, [3]).round(9).tolist()
+([[0.1]], [[2.5]])
+"""
 
 from .contractions import Contractions
 from .disturb import SEVERITIES, Disturbance, Kind, Measured, hold_missing, standard_disturbances

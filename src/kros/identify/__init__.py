@@ -1,6 +1,13 @@
 """Identification: from recordings to models of every unit. ``kros.identify(population)`` calls the verb `identify` of this package.
 
 Python binds a package's name to the package, so the package itself is made callable.
+
+Examples
+--------
+>>> import kros
+>>> drives = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+>>> kros.identify(drives, refine=False).kinds
+('linear_edmd',)
 """
 
 import sys

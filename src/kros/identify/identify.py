@@ -89,6 +89,13 @@ def identify(
         When recordings or settings cannot be used.
     IdentificationError
         When no stable models are found, or too few units can be calibrated.
+
+    Examples
+    --------
+    >>> import kros
+    >>> drives = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> kros.identify(drives, refine=False)
+    <IdentifiedModels: linear_edmd of 2 units, identified on 'default'>
     """
     require_kind(population, Population, "Identify", "read recordings with kros.read, or make a population of arrays with kros.from_arrays")
     asked, work = IdentifySettings.of(settings, "Identify"), work or Work()

@@ -1,4 +1,13 @@
-"""Bridges to scikit-learn, pykoop and python-control. Each is imported when one of its names is first used."""
+"""Bridges to scikit-learn, pykoop and python-control. Each is imported when one of its names is first used.
+
+Examples
+--------
+>>> import control
+>>> from kros.interop import from_control
+>>> lag = from_control(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01))
+>>> lag.A.tolist(), lag.dt
+([[0.5]], 0.01)
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,12 @@
-"""Liftings as formulas: build, evaluate, differentiate, bound, separate from per-unit parameters, write as C."""
+"""Liftings as formulas: build, evaluate, differentiate, bound, separate from per-unit parameters, write as C.
+
+Examples
+--------
+>>> from kros.lifting import Lifting
+>>> gearbox = Lifting(("position", "velocity"), ("sin(100*position + phase)",), parameters=("phase",))
+>>> gearbox.lift([[0.0, 3.0]], {"phase": 0.0}).tolist()
+[[0.0, 3.0, 0.0]]
+"""
 
 from .centres import grid_centres, kmeans_centres, latin_hypercube_centres, random_centres
 from .families import concatenate, delays, formulas, harmonics, polynomials, products

@@ -2,6 +2,13 @@
 
 `signals` computes what a mounted load does and how much of it can be seen; `from_current` is the paper's way; `calibrate` and `load_observer` give
 the observer that learns from one known load how loads show; `level` brings back what no measurement holds; `accuracy` judges all of them.
+
+Examples
+--------
+>>> import numpy as np
+>>> from kros.motor_drive import known_load
+>>> known_load([0.0, np.pi / 2], 0.001, moment=0.2).round(9).tolist()  # a mass that hangs, and one held out
+[0.0, 0.2]
 """
 
 from .accuracy import LoadAccuracy, load_accuracy

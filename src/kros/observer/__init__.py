@@ -1,4 +1,15 @@
-"""The observer as it runs: one-step predictor with retraction and re-lifting, and the baselines it is compared with."""
+"""The observer as it runs: one-step predictor with retraction and re-lifting, and the baselines it is compared with.
+
+Examples
+--------
+>>> import numpy as np
+>>> from kros.lifting import Lifting
+>>> from kros.observer import Observer
+>>> plant = Observer.open_loop("lag", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), 0.01)
+>>> running = plant.start([1.0])
+>>> [float(running.step([x], [0.0])["x"]) for x in (1.0, 0.5)]
+[0.5, 0.25]
+"""
 
 from .baselines.difference import FilteredDifference, cutoffs_hz, followed, rates
 from .baselines.extended_kalman import ExtendedKalman, start_covariance

@@ -1,4 +1,11 @@
-"""Simulated populations with known truth. Returns populations and truth; writing to disk is `kros.data`'s."""
+"""Simulated populations with known truth. Returns populations and truth; writing to disk is `kros.data`'s.
+
+Examples
+--------
+>>> from kros.plants import DcMotorPopulation
+>>> DcMotorPopulation(n_units=2, n_episodes=1, seconds=1.0).simulate().population
+Population(2 units, 1 condition, 2 episodes every 0.002 s; states position (measured), velocity, current; inputs voltage; true velocity, current)
+"""
 
 from .dc_motor import DcMotorPopulation
 from .harmonic_drive import HarmonicDrivePopulation

@@ -5,6 +5,14 @@
     a result in memory ──► plot ──► matplotlib Figure
 
 matplotlib and Jinja2 are imported by nobody else, and only when something is drawn; pyplot is never touched.
+
+Examples
+--------
+>>> from kros.core.lti import gain
+>>> from kros.report import plot
+>>> from kros.synthesis import Status, Synthesis
+>>> plot(Synthesis("h2", gain([[0.5]], 0.01), Status.OPTIMAL, h2_norm=1.2)).axes[0].get_xscale()
+'log'
 """
 
 from __future__ import annotations

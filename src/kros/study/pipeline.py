@@ -118,6 +118,16 @@ def run(
     Returns
     -------
     RunResult
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import kros
+    >>> drives = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> with TemporaryDirectory() as folder:
+    ...     result = kros.run(drives, folder + "/run", until="identify", identify={"refine": False})
+    ...     result.metrics["study"]["units"]
+    2
     """
     tables: dict[str, Any] = dict(sections)
     if isinstance(tables.get("lifting"), list | tuple):

@@ -3,6 +3,12 @@
     UncertainModel --> ObserverProblem --> h2 | hinf | mixed | worst_case_h2 | worst_case_hinf | kalman --> Synthesis
 
 Nothing leaves this layer unverified: norms and stability are recomputed by `kros.core`, failure is a `SynthesisError` that says why.
+
+Examples
+--------
+>>> from kros.synthesis import kalman
+>>> float(kalman([[1.0]], [[1.0]], [[1.0]], [[2.0]]).controller.D[0, 0])  # P = 2, L = 2 / (2 + 2)
+0.5
 """
 
 from __future__ import annotations

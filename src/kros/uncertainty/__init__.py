@@ -1,4 +1,16 @@
-"""Uncertainty of a population: six forms, residuals, nominal, cover and weights, outliers. The stage's result is an `UncertainModel`."""
+"""Uncertainty of a population: six forms, residuals, nominal, cover and weights, outliers. The stage's result is an `UncertainModel`.
+
+Examples
+--------
+>>> import numpy as np
+>>> from kros.core import StateSpace
+>>> from kros.uncertainty import quantify_systems
+>>> poles = np.array([0.88, 0.9, 0.91])[:, None, None]
+>>> units = StateSpace(poles, 1 - poles, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
+>>> found = quantify_systems(units, "additive")
+>>> found.unit_ids[found.nominal], found.cover_max <= 1
+('1', True)
+"""
 
 from .fits.magnitude import FittedMagnitude, Side, Tightness, fit_magnitude, invert, magnitude_tightness
 from .forms import Form, bounds, completion, existence, misfit, rebuild, residual, residual_shape

@@ -61,6 +61,15 @@ def from_frame(
         A missing column, ids that are not text or whole numbers, uneven time.
     MissingDependencyError
         Without pandas.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pandas as pd
+    >>> import kros
+    >>> frame = pd.DataFrame({"unit": ["a"] * 50 + ["b"] * 50, "angle": np.arange(100) / 10, "torque": np.cos(np.arange(100))})
+    >>> kros.from_frame(frame, states=["angle"], inputs=["torque"], measured=["angle"], sample_period_s=0.01)
+    Population(2 units, 1 condition, 2 episodes every 0.01 s; states angle (measured); inputs torque)
     """
     _require_frame(frame)
     if (time is None) == (sample_period_s is None):

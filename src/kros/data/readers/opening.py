@@ -75,6 +75,16 @@ def read(
         Unknown reader or option, invalid mapping or step.
     DataError
         No such folder, an empty one, one that another reader fits, or recordings that cannot be used.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import kros
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=1.0).simulate().population
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = kros.data.write_parquet(motors, folder)
+    ...     kros.read(folder).unit_ids
+    ('001', '002')
     """
     steps, policy = parse_steps(prepare), parse_on_nan(on_nan)
     if reader is not None and reader not in READERS:

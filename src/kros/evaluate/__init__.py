@@ -4,8 +4,9 @@ Examples
 --------
 >>> import numpy as np
 >>> from kros.evaluate import error_percent, error_rms
->>> recorded, estimated = np.array([[[0.0], [2.0], [-4.0]]]), np.array([[[0.1], [2.1], [-4.1]]])  # episode, sample, channel
->>> error_rms(estimated, recorded, [3]).round(9).tolist(), error_percent(estimated, recorded, [3]).round(9).tolist()
+>>> recorded = np.array([0.0, 2.0, -4.0]).reshape(3, 1, 1)  # sample, episode, channel
+>>> estimated, lengths = recorded + 0.1, np.array([3])
+>>> error_rms(estimated, recorded, lengths).round(9).tolist(), error_percent(estimated, recorded, lengths).round(9).tolist()
 ([[0.1]], [[2.5]])
 """
 

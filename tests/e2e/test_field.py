@@ -170,7 +170,8 @@ def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> No
         assert row["missing"] == ["velocity", "current"]
         assert (row["level_db"] > 0) == row["outlier"] == (row["status"] == "outlier")
         assert len(row["bands_db"]["position"]) == 6
-    assert [row["outlier"] for row in rows.values()] == [True, False, False]
+    bad, *good = (row["level_db"] for row in rows.values())
+    assert bad > max(0.0, max(good) + 1.0)  # of five units the bound is rough; see the limits
     assert result.exit_code == 3
     lines = kros("check", demo, data).stdout.splitlines()
     assert all("without velocity, current" in line and "the monitor's bound" in line for line in lines)

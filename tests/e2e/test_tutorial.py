@@ -1,0 +1,50 @@
+"""The tutorial as a reader follows it: its Python and its commands, in order, in an empty folder."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
+# the study of the page takes a minute; what it does is the same
+QUICKER = ["identify.refine=false", 'synthesis.methods=["worst_case_h2"]', 'observer.baselines=["open_loop"]', "synthesis.input_weight=3.0"]
+QUICKER += ["evaluate.robustness=false", "evaluate.monte_carlo=0", "predictor.effort=quick", "uncertainty.n_freqs=60"]
+
+
+def steps() -> list[tuple[str, str]]:
+    """Blocks of Python and lines of the console behind the installation, in order."""
+    followed = PAGE.read_text(encoding="utf-8").split("## 2. ")[1]
+    found: list[tuple[str, str]] = []
+    for language, block in re.findall(r"^```(python|console)\n(.*?)^```$", followed, flags=re.MULTILINE | re.DOTALL):
+        lines = [block] if language == "python" else [line.removeprefix("$ ") for line in block.splitlines()]
+        found += [(language, line) for line in lines]
+    return found
+
+
+def test_the_tutorial_from_csv_to_a_board(kros, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = []
+    for language, text in steps():
+        if language == "python":
+            exec(compile(text, str(PAGE), "exec"), {})
+            continue
+        name, *arguments = shlex.split(text)
+        if name == "kros":
+            quicker = [part for setting in QUICKER for part in ("--set", setting)] if arguments[0] == "run" else []
+            result = kros(*arguments, *quicker)
+            assert result.exit_code == 0, f"{text}: {result.output}"
+        elif shutil.which(name):
+            ran = subprocess.run([name, *arguments], capture_output=True, text=True, check=False)
+            assert ran.returncode == 0, f"{text}: {ran.stdout}{ran.stderr}"
+        done.append(" ".join([name, *arguments][:2]))
+    assert done[:6] == ["kros init", "kros run", "kros list", "kros estimate", "kros check", "kros export"]
+    assert Path("estimates.csv").read_text().splitlines()[0] == "unit,condition,episode,k,position_hat,velocity_hat,current_hat"
+    for path in ("runs/study/report.html", "axis/axis.c", "axis/axis.h", "axis/README.md", "axis/example_main.c"):
+        assert Path(path).is_file()
+    called = set(re.findall(r"\baxis_\w+(?=\()", PAGE.read_text(encoding="utf-8")))
+    assert called == set(re.findall(r"\baxis_\w+(?=\()", Path("axis/axis.h").read_text())) & called != set()

@@ -153,3 +153,15 @@ def test_the_page_of_keys_is_filled(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_every_public_object_has_an_example(name: str) -> None:
     """Those of functions and packages run with their modules."""
     assert ">>> " in (getattr(kros, name).__doc__ or "")
+
+
+OLD_WORDS = re.compile(
+    r"surroundings|\boutlying\b|\bladders?\b|bears? gaps|careful step|observer with a memory|models? with a memory", re.IGNORECASE
+)
+SHOWN = sorted([*(ROOT / "src" / "kros" / "report" / "templates").iterdir(), ROOT / "src" / "kros" / "cli.py"])
+
+
+@pytest.mark.parametrize("path", [*DOCUMENTS, *SHOWN], ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_word_of_the_old_vocabulary(path: Path) -> None:
+    """What users read has the words of the glossary."""
+    assert OLD_WORDS.findall(path.read_text(encoding="utf-8")) == []

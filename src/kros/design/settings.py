@@ -44,7 +44,7 @@ class SynthesisSettings(Settings):
 
 
 class PredictorSettings(Settings):
-    """The observer with a memory.
+    """The subspace-identified predictor.
 
     Its memory, order and the weight of every condition are chosen on training episodes of units that are left out in turn, and then it is tuned: with
     effort "full" among longer memories and more states, on five times as many recordings and by more steps than with "quick". `states` and tuning `steps`,
@@ -59,7 +59,9 @@ class PredictorSettings(Settings):
     states: int | None = Field(None, ge=1, description="states besides the recorded ones; chosen where none is given")
     steps: int | None = Field(None, ge=0, description="most steps of tuning; by default 15 with full effort and 4 with quick")
     episodes: int = Field(2, ge=1, description="of every unit and condition that tuning uses")
-    others: float = Field(1.0, ge=0, description="how much errors count in conditions besides that of synthesis")
+    others: float = Field(
+        1.0, ge=0, description="how much errors count in conditions besides that of synthesis; with zero these are left out of everything"
+    )
     importance: dict[str, float] = Field(
         default_factory=dict, description="weights of the logarithmic errors of hidden states, by name; one where none is given"
     )

@@ -168,10 +168,10 @@ def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> No
     for row in rows.values():
         assert row["score"] is None
         assert row["missing"] == ["velocity", "current"]
-        assert (row["level_db"] > 0) == row["outlier"] == (row["status"] == "outlier")
-        assert len(row["bands_db"]["position"]) == 6
+        assert (row["status"], row["outlier"], row["level_units"]) == ("cannot tell", False, 5)  # too few units for a verdict
+        assert set(row["bands_db"]) == {"position"}
     bad, *good = (row["level_db"] for row in rows.values())
-    assert bad > max(0.0, max(good) + 1.0)  # of five units the bound is rough; see the limits
-    assert result.exit_code == 3
+    assert bad > max(0.0, max(good) + 1.0)
+    assert result.exit_code == 0
     lines = kros("check", demo, data).stdout.splitlines()
     assert all("without velocity, current" in line and "the monitor's bound" in line for line in lines)

@@ -73,7 +73,9 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[
             f"Checking {data}: the recordings have the conditions {', '.join(population.conditions)}, and the run has models of "
             f"{', '.join(ModelSet.load(store.path('models', folder.name)).condition for folder in folders)} alone; name the condition, as in the study."
         )
-    levels = {(row["unit"], row["condition"]): {key: row[key] for key in ("level_db", "level_rate", "bands_db")} for row in watched}
+    levels = {
+        (row["unit"], row["condition"]): {key: row[key] for key in ("level_db", "level_rate", "level_units", "bands_db")} for row in watched
+    }
     return in_order([row | levels.get((row["unit"], row["condition"]), {}) for row in rows])
 
 

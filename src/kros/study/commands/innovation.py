@@ -13,13 +13,15 @@ from ...uncertainty import Status
 from .field import Arriving, FieldRecordings
 
 Array = npt.NDArray[np.float64]
+FEWEST = 8  # units behind a bound that calls one an outlier: of studies of five up to a third of the good ones were beyond it
 
 
 def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
     """Return a row for every unit and condition, as `kros check` does, with what needs hidden channels left unknown.
 
-    ``level_db`` is the highest level of the innovation over the monitor's bound, that of the condition where the monitor knows it: above zero the unit is
-    an outlier, and a share ``level_rate`` of good ones is. It is None where the deployed observer has no monitor, or nothing could be judged.
+    ``level_db`` is the highest level of the innovation over the monitor's bound, that of the condition where the monitor knows it. The bound is set for a
+    share ``level_rate`` of good units, from ``level_units``; above it a unit is an outlier where these are at least `FEWEST`. The level is None where the
+    deployed observer has no monitor, or nothing could be judged.
     ``bands_db`` says by measured channel and centre frequency in Hz where the highest residual power is, dB over the limit of the band.
     """
     population, observer = recordings.population, recordings.observer
@@ -37,12 +39,13 @@ def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
                     levels.append(level)
                     bands.append(of_bands)
         highest = max(levels, default=None)
-        outlier = highest is not None and highest > 0
+        outlier = monitor is not None and monitor.units >= FEWEST and highest is not None and highest > 0
         row: dict[str, Any] = {"unit": unit, "condition": condition, "score": None, "threshold": None, "outlier": outlier}
         row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "detectable": None, "episodes": len(keys)}
         row |= {"recorded_s": samples * population.sample_period_s, "left_out": []}
         row |= {"missing": [name for name in observer.recorded if name not in population.states], "level_db": highest}
-        row |= {"level_rate": None if monitor is None else monitor.false_alarm_rate, "samples": counts.get(unit, {})}
+        rate, units = (None, None) if monitor is None else (monitor.false_alarm_rate, monitor.units)
+        row |= {"level_rate": rate, "level_units": units, "samples": counts.get(unit, {})}
         row |= {"bands_db": by_band(observer, monitor, np.max(bands, axis=0)) if monitor is not None and bands else None}
         rows.append(row | {"parameters": recordings.sources.get(unit)})
     return rows
@@ -79,6 +82,6 @@ def monitored_line(row: dict[str, Any]) -> str:
     if row["level_db"] is None:
         line += "the deployed observer has no monitor, or no sample can be judged"
     else:
-        line += f"innovation {level_text(row)}, which {100 * row['level_rate']:.3g} % of good units exceed"
+        line += f"innovation {level_text(row)} (set for {100 * row['level_rate']:.3g} % of good units, from {row['level_units']} units)"
     line += "".join(f"; {count} samples {bit}" for bit, count in row["samples"].items())
     return line + (f"; parameters {row['parameters']}" if row["parameters"] else "")

@@ -1,0 +1,41 @@
+"""What `kros check` says of units whose hidden channels were not recorded, by the number of units behind the monitor's bound."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kros.data import Channel, Role, from_arrays
+from kros.lifting import Lifting
+from kros.observer import Monitor, Observer
+from kros.observer.monitor import octaves
+from kros.study.commands.field import FieldRecordings
+from kros.study.commands.innovation import FEWEST, monitored, monitored_line
+
+CHANNELS = (Channel("position", Role.STATE, "rad", True), Channel("force", Role.INPUT, "N"))
+
+
+def recordings(units: int, noise: float) -> FieldRecordings:
+    """A mass of which the position alone was recorded, with noise; the bound is one."""
+    A, B = np.array([[1.0, 0.01], [0.0, 0.99]]), np.array([[0.0], [0.01]])
+    plain = Observer.open_loop("model", Lifting(("position", "velocity")), A, B, (0,), ("force",), 0.01)
+    weights = np.array([[3, 3, 3, 3, 2, 2]])
+    watch = Monitor(octaves(), 1e-2, 10, np.ones(1), np.ones((1, 6)), weights, 0.02, units=units)
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=500)
+    x = np.zeros((500, 2))
+    for k in range(499):
+        x[k + 1] = A @ x[k] + B[:, 0] * u[k]
+    y = x[:, 0] + noise * rng.normal(size=500)
+    y[0] = 0.0
+    population = from_arrays({"a": [np.column_stack([y, u])]}, CHANNELS, 0.01)
+    return FieldRecordings(replace(plain, monitor=watch), population, {"a": {}}, {}, frozenset(), None)
+
+
+@pytest.mark.parametrize(("units", "noise", "outlier"), [(FEWEST, 100.0, True), (FEWEST, 1e-3, False), (FEWEST - 1, 100.0, False)])
+def test_a_unit_beyond_the_bound_is_an_outlier_where_enough_units_made_it(units: int, noise: float, outlier: bool) -> None:
+    (row,) = monitored(recordings(units, noise))
+    assert (row["outlier"], row["score"], row["missing"]) == (outlier, None, ["velocity"])
+    assert (row["level_db"] > 0) == (noise == 100.0)
+    assert row["status"] == ("outlier" if outlier else "cannot tell")
+    assert f"from {units} units" in monitored_line(row)

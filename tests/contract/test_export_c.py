@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from machines import LIMITS, MACHINES, apart, drive, in_python, replaced, samples, watched
+from machines import LIMITS, MACHINES, apart, drive, in_python, moving, replaced, samples, watched
 
 from kros.core.errors import ConfigError, DataError
 from kros.export import CompiledObserver, HeldOut, LoadOutput, export_c, find_compiler
@@ -163,7 +163,7 @@ def test_the_selftest_passes_on_a_board(tmp_path):
 @pytest.mark.skipif(shutil.which("cppcheck") is None, reason="cppcheck is not on the PATH")
 def test_misra_deviations_are_those_that_the_documentation_lists(tmp_path):
     outputs = LoadOutput(AngleLoad(2.0, 1e-3, limit=0.3), load="velocity")
-    folder = export_c(watched(drive(**LIMITS)), tmp_path / "c", "drive", "float", track="phase", load=outputs)
+    folder = export_c(watched(moving(drive(**LIMITS))), tmp_path / "c", "drive", "float", track="phase", load=outputs)
     sources = ("drive.c", "drive_selftest.c", "example_main.c")
     command = ["cppcheck", "-q", "--addon=misra", "--std=c99", "--enable=style", *sources]
     said = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)

@@ -18,6 +18,7 @@ from kros.observer import (
     driven_coordinates,
     relift_certificate,
     run_observer,
+    signal_bound,
     with_internal,
     with_limits,
 )
@@ -121,3 +122,32 @@ def test_limits_are_written_in_many_ways_and_refused_where_they_cannot_be():
             Limit.of(wrong, "Study, limits.current")
     with pytest.raises(ConfigError, match="torque should be among the recorded states"):
         limits_of({"torque": Limit.of(1.0, "x")}, {}, ("y", "current"))
+
+
+def ripple(predictor):
+    """The predictor with the ripple of an angle in the current's and the integrator's rows, whose slope lets errors come back through the measurement."""
+    lifting = Lifting(("y", "current", "memory_1"), ("sin(30*y)",))
+    A = np.zeros((4, 4))
+    A[:3, :3], A[:3, 3] = predictor.A, [0.002, 0.003, 0.0005]
+    return replace(predictor, lifting=lifting, A=A, B=np.vstack([predictor.B, [[0.0]]]), controller=gain(A[:, :1], 1e-3))
+
+
+def test_a_gain_leaves_room_for_the_slopes_of_lifted_functions(predictor):
+    batch = recorded(limit=0.05, size=20.0, batch=1)  # more than limits and slopes together leave stable
+    found = conditioned(with_limits(ripple(predictor), [-np.inf, -0.05], [np.inf, 0.05]), batch)
+    assert np.abs(found.A[2:4, 1]).max() > 1e-3
+    certificate = relift_certificate(found, lookahead=-1, mismatch=False)
+    assert certificate.certified
+    assert len(certificate.channels) == 2
+
+
+def test_recorded_signals_within_the_limits_have_the_bound_of_an_observer_without(predictor):
+    quiet, loud = recorded(seed=1, size=0.1), recorded()
+    assert np.abs(quiet.states[..., 1]).max() < 0.9 * LIMIT
+    found = conditioned(with_limits(predictor, [-np.inf, -LIMIT], [np.inf, LIMIT]), loud, iterations=4)
+    free = replace(found, runtime=Runtime())
+    with_them, without = (signal_bound(relift_certificate(o), o, quiet) for o in (found, free))
+    assert with_them.within
+    assert with_them.facts((0,))["set_within_limits"]
+    np.testing.assert_allclose(with_them.cover, without.cover, rtol=1e-9)
+    assert not signal_bound(relift_certificate(found), found, loud).within

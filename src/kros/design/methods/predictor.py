@@ -16,7 +16,9 @@ from ...core.errors import KrosError, SynthesisError
 from ...data import EpisodeBatch
 from ...evaluate import error_rms
 from ...lifting import Lifting
-from ...observer import Observer, PastMoments, Runtime, conditioned, driven_coordinates, relift_certificate, run_observer, with_limits
+from ...observer import Observer, PastMoments, Runtime, conditioned, driven_coordinates, run_observer, with_limits
+from ...observer.certificate.error import error_system
+from ...observer.certificate.search import quick_gain
 from ...observer.limits import sides
 from ...observer.predictor import Recipe, choose, embedded, tune_predictor
 from ...observer.predictor.choice import AT_LIMITS
@@ -35,7 +37,7 @@ _RIDGES = (1e-6, 1e-5, 1e-7, 1e-8)  # of what predicts measurements that are mis
 UNCOVERED = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
 log = logging.getLogger(__name__)
 _SAMPLES, _EPISODES = 6000, 12  # that an observer is conditioned on, at most
-_SHARES = (1.0, 0.5)  # of the gain that is best, until a certificate covers it
+_SHARES = (1.0, 0.75, 0.5, 0.25, 0.1)  # of the gain that is best, until a certificate covers it
 _CLOSE, _SHARE = 0.01, 0.001  # share of a limit that counts as at it, and how much of an episode has to be
 _NEAR = 0.03  # share of a limit that may have touched it, noise taken off
 _TINY = np.finfo(float).tiny
@@ -245,7 +247,8 @@ def settled(task: DesignTask, reached: EpisodeBatch | None, data: ValidationSet,
     best = conditioned(observer, reached, importance_of(task))
     for share in _SHARES:
         found = driven_coordinates(replace(observer, A=share * best.A + (1 - share) * observer.A), data.batch, sizes)
-        if relift_certificate(found, scales=scales_of([found], data, task)[0], mismatch=False).certified:
+        system = error_system(found, scales_of([found], data, task)[0])
+        if np.isfinite([quick_gain(system), quick_gain(system.mismatch())]).all():
             return found
     log.info("%s is cut off at its limits and not conditioned: no certificate covers it otherwise.", task.name)
     return as_is

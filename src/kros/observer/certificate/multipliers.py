@@ -23,6 +23,7 @@ _CENTRES = 40
 _ACCURACY = 2e-4
 _MOST_FREQUENCIES = 80
 _WELL_INSIDE = 0.25
+_CUTS = 4
 _BINDING = 0.1
 
 
@@ -31,8 +32,22 @@ def best_multipliers(H: Array, width: int) -> Array | None:
 
     H are responses from [p, w] to [q, z], shape (f, n_p + n_z, n_p + n_w); `width` is n_p.
     """
-    largest = np.argsort(-np.linalg.norm(H, axis=(1, 2)))[: _MOST_FREQUENCIES // 2]
-    H = H[np.union1d(largest, np.linspace(0, len(H) - 1, _MOST_FREQUENCIES // 2).astype(int))]
+    G, some = H[:, :width, :width], _MOST_FREQUENCIES // 2
+    largest = [np.argsort(-size)[:some] for size in (np.linalg.norm(H, axis=(1, 2)), _needed(G, _balanced(np.abs(G).max(axis=0))))]
+    chosen = np.unique(np.concatenate([*largest, np.linspace(0, len(H) - 1, some).astype(int)]))
+    for _ in range(_CUTS):
+        t = _best(H[chosen], width)
+        if t is None:
+            return None
+        above = _needed(G, t)
+        if above.max() < 1:
+            return t
+        chosen = np.union1d(chosen, np.argsort(-above)[:some])
+    return None
+
+
+def _best(H: Array, width: int) -> Array | None:
+    """Return them for all frequencies that are given."""
     through = np.sqrt(np.max(np.sum(np.abs(H[:, width:, :width]) ** 2, axis=1), axis=0))
     by_slopes = through @ np.sqrt(np.max(np.sum(np.abs(H[:, :width, width:]) ** 2, axis=2), axis=0))
     size = max(np.linalg.norm(H[:, width:, width:], 2, axis=(1, 2)).max(), by_slopes) or 1.0
@@ -70,6 +85,7 @@ def _stabilising(G: Array) -> Array | None:
     t = min((np.ones(width), _balanced(np.abs(G).max(axis=0))), key=lambda t: _needed(G, t).max())
     needed = _needed(G, t)
     level, binding = needed.max(), np.zeros(len(G), bool)
+    least, best = level, t
     for centred in range(_CENTRES):
         if level < _WELL_INSIDE and centred:
             break
@@ -83,9 +99,11 @@ def _stabilising(G: Array) -> Array | None:
         t = _newton(rest, slopes, np.zeros(width), t * width / t.sum())
         needed, before = _needed(G, t), level
         level = needed.max()
+        if level < least:
+            least, best = level, t
         if level > 0.999 * before and before >= _WELL_INSIDE and np.array_equal(binding, known):
             break
-    return t if level < 1 else None
+    return best if least < 1 else None  # where little room is left, the centre at a looser level may be worse than what it began with
 
 
 def _balanced(size: Array) -> Array:

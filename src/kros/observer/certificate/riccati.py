@@ -148,7 +148,9 @@ def _responses(system: ErrorSystem) -> Array:
     plant = StateSpace(system.A, np.hstack([system.L, system.B]), C, D, system.dt)
     poles = np.log(plant.poles().astype(complex) + 1e-300)
     nyquist = 0.5 / system.dt
-    marks = np.concatenate([np.abs(poles.imag), np.abs(poles.real), np.abs(poles)]) / (2 * np.pi * system.dt)
+    angle, width = np.abs(poles.imag), np.abs(poles.real)
+    beside = np.maximum(angle + np.multiply.outer([-1.0, -0.5, 0.5, 1.0], width), 0.0).ravel()
+    marks = np.concatenate([angle, width, np.abs(poles), beside]) / (2 * np.pi * system.dt)
     grid = np.geomspace(max(min(marks[marks > 0].min(initial=nyquist), nyquist) / 30, 1e-9 * nyquist), nyquist, _GRID)
     return plant.frequency_response(np.unique(np.concatenate([[0.0], grid, marks[marks <= nyquist]])))
 

@@ -23,6 +23,7 @@ from ...core.lti import StateSpace
 from ...data import EpisodeBatch
 from ...uncertainty.coprime.bands import BandEnergies, band_edges, cover
 from ..data import ObserverData
+from ..simulate import run_observer
 from .certificate import ReliftCertificate
 from .error import ErrorSystem, error_system
 from .majorants import energy, majorants
@@ -64,6 +65,9 @@ class SignalBound:
         Why there is no bound; empty where there is one.
     outside : tuple of str
         Units of which the observer refuses samples as implausible. Their rows are infinite.
+    within : bool
+        Whether it is for signals with which the estimate stays within its limits, as with all that were recorded. Energies say nothing of peaks: where
+        limits may bind at any sample, a gain that brings internal states back makes a bound as much larger as it makes their excess smaller.
     """
 
     states: tuple[str, ...]
@@ -75,6 +79,7 @@ class SignalBound:
     sizes: Array
     reason: str = ""
     outside: tuple[str, ...] = ()
+    within: bool = False
 
     @property
     def certified(self) -> bool:
@@ -101,6 +106,7 @@ class SignalBound:
             ratios, over = self.ratios[:, hidden], (self.cover / self.errors)[:, hidden]
         ratios, over = (v[np.isfinite(self.bounds[:, hidden]) & np.isfinite(v)] for v in (ratios, over))
         facts: dict[str, Any] = {"set_certified": True, "set_bound_percent": self.percent()}
+        facts |= {"set_within_limits": True} if self.within else {}
         least, most = (float(ratios.min()), float(ratios.max())) if ratios.size else (None, None)
         facts |= {"set_bound_to_error_min": least, "set_bound_to_error_max": most}
         return facts | {"set_cover_to_error_max": float(over.max()) if over.size else None, "set_outside": list(self.outside)}
@@ -113,7 +119,14 @@ class SignalBound:
     def as_dict(self) -> dict[str, Any]:
         """Return it for a record; what is infinite is None."""
         arrays = {name: _finite(getattr(self, name)) for name in ("cover", "bounds", "errors", "movement", "sizes")}
-        return {"states": self.states, "units": self.units, **arrays, "reason": self.reason, "outside": self.outside}
+        return {
+            "states": self.states,
+            "units": self.units,
+            **arrays,
+            "reason": self.reason,
+            "outside": self.outside,
+            "within_limits": self.within,
+        }
 
 
 def signal_bound(
@@ -143,7 +156,8 @@ def signal_bound(
         Also where there is none: `reason` says why.
     """
     seen = course(observer, batch, estimates)
-    n = len(observer.recorded)
+    n, free = len(observer.recorded), _without_limits(observer, batch, seen)
+    observer = free or observer
     units = list(dict.fromkeys(batch.units))
     member = np.array([[unit == name for unit in batch.units] for name in units], dtype=float)
     member /= member.sum(axis=1, keepdims=True)
@@ -151,7 +165,14 @@ def signal_bound(
     errors = np.sqrt(member @ seen.mean_square(seen.error[..., :n] + seen.beyond))
     nothing = np.full(n, np.inf)
     found = SignalBound(
-        observer.recorded, tuple(units), nothing, np.full(errors.shape, np.inf), errors, nothing, certificate.scales.error[:n].copy()
+        observer.recorded,
+        tuple(units),
+        nothing,
+        np.full(errors.shape, np.inf),
+        errors,
+        nothing,
+        certificate.scales.error[:n].copy(),
+        within=free is not None,
     )
     if not certificate.certified:
         return replace(found, reason="it has no certificate as it runs")
@@ -184,6 +205,16 @@ def signal_bound(
     by = found.sizes * (1 + _SPARE)
     of_all = (linear[:n] + movement) * by + beyond.max(axis=0)
     return replace(found, cover=of_all, bounds=each * by + beyond, movement=movement * by, reason=reason, outside=left)
+
+
+def _without_limits(observer: ObserverData, batch: EpisodeBatch, seen: Course) -> ObserverData | None:
+    """Return the observer without the limits that it goes on from, where they change no estimate of the recordings."""
+    if not observer.runtime.clipped_states(observer.lifting.n_states):
+        return None
+    free = replace(observer, runtime=replace(observer.runtime, lower=None, upper=None))
+    ours, theirs = (run_observer(one, seen.y, seen.inputs, observer.own(batch.parameters)) for one in (free, observer))
+    beyond = np.arange(len(ours))[:, None] >= seen.lengths
+    return free if bool(((ours == theirs).all(axis=-1) | beyond).all()) else None
 
 
 def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:

@@ -71,7 +71,7 @@ def run_study(
     workers : int
         Processes for maps over units. More than one needs the usual ``if __name__ == "__main__":`` guard in a script.
     scheduler : str, optional
-        Address of a Dask scheduler, instead of processes.
+        Address of a Dask scheduler, instead of processes; `out` and the recordings are in a shared folder then.
     progress : Progress, optional
         Told which stage runs and how far it is.
     population : Population, optional
@@ -86,7 +86,10 @@ def run_study(
     KrosError
         Bad input leaves no folder behind that was not there before; so does a folder in which another study lives, or another run is at work.
     """
-    out, until = Path(out), stage_of(until)
+    out, until = (
+        Path(out) if scheduler is None else Path(out).absolute(),
+        stage_of(until),
+    )  # workers elsewhere have a current folder of their own
     require_own(out, config)
     require_usable(config, until, population)
     with open_run(out, config) as store:

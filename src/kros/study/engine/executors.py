@@ -10,11 +10,12 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
-from ...core.errors import ConfigError, KrosError, MissingDependencyError
+from ...core.errors import ConfigError, KrosError
 from ...core.work import Executor, SerialExecutor
+from .cluster import open_dask
+from .threads import single_threaded
 
 T = TypeVar("T")
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ARROW_NUM_THREADS")
 
 
 class ProcessExecutor:
@@ -47,18 +48,6 @@ def _results(found: Iterator[T]) -> Iterator[T]:
         ) from error
 
 
-class DaskExecutor:
-    """Runs tasks on a Dask cluster."""
-
-    def __init__(self, client: Any) -> None:
-        self._client = client
-
-    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
-        """Yield results in the order of the tasks."""
-        for future in self._client.map(function, list(tasks), pure=False):
-            yield future.result()
-
-
 @contextmanager
 def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
     """Open the executor that fits: Dask for a scheduler's address, processes for more than one worker.
@@ -71,35 +60,16 @@ def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Ex
         Address of a Dask scheduler.
     """
     if scheduler is not None:
-        try:
-            from distributed import Client
-        except ImportError as error:
-            raise MissingDependencyError(f"--scheduler {scheduler} needs Dask; install it with: pip install 'kros[dask]'.") from error
-        with Client(scheduler) as client:
-            yield DaskExecutor(client)
+        with open_dask(scheduler) as executor:
+            yield executor
         return
     if workers < 1:
         raise ConfigError(f"--workers {workers}: at least 1 is needed.")
     if workers == 1:
         yield SerialExecutor()
         return
-    with _single_threaded(), _pool(workers) as pool:
+    with single_threaded(), _pool(workers) as pool:
         yield ProcessExecutor(pool)
-
-
-@contextmanager
-def _single_threaded() -> Iterator[None]:
-    """Let processes that start now use one thread for linear algebra."""
-    saved = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
-    try:
-        yield
-    finally:
-        for name, value in saved.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 @contextmanager

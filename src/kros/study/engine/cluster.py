@@ -1,0 +1,137 @@
+"""Maps over units on a Dask cluster: the same code as here, one task at a time in a worker process, with one thread for linear algebra.
+
+Sums of a matrix product are ordered by the number of its threads, so that results have the same bytes only where all workers use the same number. A
+worker's environment is its own, and was read when its libraries were loaded: threads are set in the running process, around every task.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
+from functools import partial
+from threading import Lock
+from typing import Any, TypeVar
+
+from ...core.errors import ConfigError, KrosError, MissingDependencyError
+from .store import code_key
+from .threads import single_threaded
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+_BATCHES = 1024  # of a map, and
+_LARGEST = 1000  # tasks in one of them: the scheduler spends about a millisecond on a batch, whatever is in it
+_ALONE = Lock()
+
+
+class DaskExecutor:
+    """Runs tasks on a Dask cluster, in batches where they are many."""
+
+    def __init__(self, client: Any, address: str) -> None:
+        self._client, self._address = client, address
+
+    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
+        """Yield results in the order of the tasks, which run again elsewhere where a worker ends.
+
+        Raises
+        ------
+        KrosError
+            When the scheduler is lost, when workers die of a task, or have another version of kros.
+        """
+        from distributed.client import ClosedClientError
+
+        tasks = list(tasks)
+        size = min(_LARGEST, -(-len(tasks) // _BATCHES)) or 1
+        batches = [tasks[start : start + size] for start in range(0, len(tasks), size)]
+        try:
+            futures = self._client.map(partial(run_batch, code_key(), function), batches, pure=False)
+        except ClosedClientError as error:
+            raise self._lost() from error
+        return self._results(deque(futures))
+
+    def _results(self, futures: deque[Any]) -> Iterator[Any]:
+        """Yield results of batches; workers forget what was yielded."""
+        from distributed import KilledWorker
+
+        try:
+            while futures:
+                yield from futures.popleft().result()
+        except KilledWorker as error:
+            raise KrosError(
+                f"Dask scheduler {self._address}: one piece of work ended several workers, and was given up: memory ran out, or they were stopped. "
+                "Give workers more memory, see their logs, and run the same command again: it goes on where this one ended."
+            ) from error
+        except CancelledError as error:
+            raise self._lost() from error
+
+    def _lost(self) -> KrosError:
+        return KrosError(
+            f"Dask scheduler {self._address}: the connection was lost, and what was not finished there is gone. "
+            "Start a scheduler and workers again; the same command goes on where this one ended."
+        )
+
+
+def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> list[T]:
+    """In a worker: run a batch of tasks, while no other one runs in this process.
+
+    Workers of several threads would share warning filters and caches between tasks.
+
+    Raises
+    ------
+    KrosError
+        When kros is another one than that of the client, by `key`, or files of the study are not here.
+    """
+    from threadpoolctl import threadpool_limits
+
+    if code_key() != key:
+        raise KrosError(
+            f"Dask worker on {socket.gethostname()}: its kros is not the one that runs the study; install the same version on every worker."
+        )
+    with _ALONE, single_threaded(), threadpool_limits(1):
+        try:
+            return [function(task) for task in tasks]
+        except FileNotFoundError as error:
+            raise KrosError(
+                f"Dask worker on {socket.gethostname()}: finds no {error.filename}; recordings and run folder must be in a "
+                "shared folder, which has the same path on every worker."
+            ) from error
+
+
+@contextmanager
+def open_dask(address: str) -> Iterator[DaskExecutor]:
+    """Connect to a Dask scheduler.
+
+    Raises
+    ------
+    MissingDependencyError
+        Without Dask.
+    ConfigError
+        When no scheduler answers.
+    """
+    try:
+        import threadpoolctl  # noqa: F401  # workers have what is installed here
+        from distributed import Client
+    except ImportError as error:
+        raise MissingDependencyError(f"--scheduler {address} needs Dask; install it with: pip install 'kros[dask]'.") from error
+    try:
+        client = Client(address, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"--scheduler {address}: no Dask scheduler of this version answers there ({error}); start one, or name its address."
+        ) from error
+    threads = client.nthreads()
+    if not threads:
+        log.warning("Dask scheduler %s: has no workers yet; the study waits for them.", address)
+    if any(n > 1 for n in threads.values()):
+        log.warning("Dask scheduler %s: workers of several threads run one task at a time; start them with --nthreads 1.", address)
+    told = logging.getLogger("distributed.client")
+    level = told.level
+    told.setLevel(logging.CRITICAL)  # what it says of a lost connection is said by an error here
+    try:
+        with client:
+            yield DaskExecutor(client, address)
+    finally:
+        told.setLevel(level)

@@ -20,6 +20,9 @@ PIP := $(CLEAN_ENV) $(BIN)/python -m pip --disable-pip-version-check
 # Two workers of two threads each would fight for two cores.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
+# A demo that shows that an installation works, in seconds of processor time.
+SHORT := --set identify.refine=false --set synthesis.input_weight=3.0 --set evaluate.robustness=false --set evaluate.monte_carlo=0
+
 TEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadgroup --benchmark-skip
 
 help:  ## show this list
@@ -60,7 +63,7 @@ dist: $(INSTALLED)  ## build wheel and sdist in dist/, and try the wheel in a fr
 	$(CLEAN_ENV) $(BIN)/python -m venv build/tried
 	$(CLEAN_ENV) build/tried/bin/python -m pip --disable-pip-version-check install -q --require-hashes -r requirements.lock
 	$(CLEAN_ENV) build/tried/bin/python -m pip --disable-pip-version-check install -q --no-deps dist/*.whl
-	cd build && tried/bin/python -m kros --version && tried/bin/kros demo --units 4 --episodes 4 --seconds 10 --out tried-demo
+	cd build && tried/bin/python -m kros --version && tried/bin/kros demo --units 4 --episodes 4 --seconds 10 --out tried-demo $(SHORT)
 
 lock:  ## write both lock files anew from pyproject.toml
 	@uv=$$(command -v uv) || { $(FIND_PYTHON); $(CLEAN_ENV) "$$python" -m venv build/uv && build/uv/bin/python -m pip install -q uv && uv=build/uv/bin/uv; }; \

@@ -6,6 +6,7 @@ Options that are not listed go on to `kros run`.
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from kros.cli import app
@@ -14,8 +15,9 @@ HERE = Path(__file__).parent
 
 
 def call(*arguments: object) -> None:
-    """Call the command line, which raises `SystemExit` where something is wrong."""
-    app([str(argument) for argument in arguments], standalone_mode=False)
+    """Call the command line, and end with its exit code where something is wrong."""
+    if code := app([str(argument) for argument in arguments], standalone_mode=False):
+        sys.exit(code)
 
 
 if __name__ == "__main__":

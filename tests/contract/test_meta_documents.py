@@ -165,3 +165,33 @@ SHOWN = sorted([*(ROOT / "src" / "kros" / "report" / "templates").iterdir(), ROO
 def test_no_word_of_the_old_vocabulary(path: Path) -> None:
     """What users read has the words of the glossary."""
     assert OLD_WORDS.findall(path.read_text(encoding="utf-8")) == []
+
+
+def slug(heading: str) -> str:
+    """The anchor of a heading, as GitHub and MyST make it."""
+    return re.sub(r"[^\w\- ]", "", re.sub(r"[`*]|\]\([^)]*\)", "", heading).lower()).replace(" ", "-")
+
+
+def broken_links(path: Path, text: str) -> list[str]:
+    """Links to files that are not there, and to headings that they do not have."""
+    broken = []
+    prose = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    for target, anchor in re.findall(r"\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)", prose):
+        to = path.parent / target if target else path
+        headings = (
+            re.findall(r"^#+ (.+)$", to.read_text(encoding="utf-8"), flags=re.MULTILINE) if to.suffix == ".md" and to.is_file() else []
+        )
+        if not to.exists() or (anchor and anchor not in map(slug, headings)):
+            broken.append(f"{target}#{anchor}")
+    return broken
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_no_link_is_broken(path: Path) -> None:
+    """Sphinx looks at docs/ alone."""
+    assert broken_links(path, path.read_text(encoding="utf-8")) == []
+
+
+def test_broken_links_are_found() -> None:
+    text = "[a](docs/data.md#preparation) [b](docs/date.md) [c](docs/data.md#preparations) [d](https://example.org) [e](#e)\n# E\n"
+    assert broken_links(ROOT / "README.md", text) == ["docs/date.md#", "docs/data.md#preparations", "#e"]

@@ -61,6 +61,12 @@ class StateSpace:
     ------
     DimensionError
         When the shapes do not fit together or `dt` is negative.
+
+    Examples
+    --------
+    >>> lag = StateSpace([[0.5]], [[0.5]], [[1.0]], [[0.0]], 0.01)
+    >>> abs(lag.frequency_response([0.0])).item()
+    1.0
     """
 
     A: Array

@@ -55,6 +55,11 @@ class Channel:
         Unit of measure, for example ``rad/s``; empty where unknown.
     measured : bool
         Whether a state is available at run time; synthesis uses exactly those as ``y``.
+
+    Examples
+    --------
+    >>> Channel("angle", Role.STATE, "rad", measured=True).unit
+    'rad'
     """
 
     name: str

@@ -54,6 +54,12 @@ class Lifting:
     ------
     ConfigError
         When a formula cannot be read, is repeated, or depends on no state (an input function: on no input).
+
+    Examples
+    --------
+    >>> gearbox = Lifting(("position", "velocity"), ("sin(100*position + phase)",), ("phase",))
+    >>> gearbox.lift([[0.0, 3.0]], {"phase": 0.0}).tolist()
+    [[0.0, 3.0, 0.0]]
     """
 
     states: tuple[str, ...]

@@ -168,6 +168,10 @@ def missing(folder: Path) -> str:
     return (folder / "nowhere").read_text()
 
 
+def unknown(_: int) -> None:
+    raise ModuleNotFoundError("No module named 'kros'")
+
+
 def alone(_: int, folder: Path) -> bool:
     """Whether no other task runs in this process beside this one."""
     mark = folder / str(os.getpid())
@@ -204,6 +208,8 @@ def test_tasks_run_alone_with_one_thread_and_their_errors_come_back(cluster, tmp
             list(executor.map(refuse, [7]))
         with pytest.raises(KrosError, match="nowhere; recordings and run folder must be in a shared folder"):
             list(executor.map(missing, [tmp_path]))
+        with pytest.raises(KrosError, match="there or on a worker a package is not installed"):
+            list(executor.map(unknown, [0]))
     if len(os.sched_getaffinity(0)) > 1:  # else one thread is all there is
         with distributed.Client(address, set_as_default=False) as client:
             assert client.submit(threads, 0).result() != {1}
@@ -248,9 +254,10 @@ def test_work_that_ends_every_worker_is_given_up(cluster):
         list(executor.map(die, [0]))
 
 
-def test_an_address_where_nothing_answers_leaves_no_folder(kros, study, tmp_path):
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense"])
+def test_an_address_where_nothing_answers_leaves_no_folder(address, kros, study, tmp_path):
     with dask.config.set({"distributed.comm.timeouts.connect": "0.2s"}):
-        result = kros("run", study, "--out", tmp_path / "run", "--scheduler", "tcp://127.0.0.1:1")
+        result = kros("run", study, "--out", tmp_path / "run", "--scheduler", address)
     assert result.exit_code == 2
-    assert "no Dask scheduler of this version answers" in result.stderr
+    assert f"--scheduler {address}: no Dask scheduler of this version answers" in result.stderr
     assert not (tmp_path / "run").exists()

@@ -66,6 +66,13 @@ class DaskExecutor:
             ) from error
         except CancelledError as error:
             raise self._lost() from error
+        except (ImportError, RuntimeError) as error:
+            missing = error if isinstance(error, ImportError) else error.__cause__
+            if isinstance(error, KrosError) or not isinstance(missing, ModuleNotFoundError):
+                raise
+            raise KrosError(
+                f"Dask scheduler {self._address}: there or on a worker a package is not installed ({missing}); install the same kros[dask] on all of them."
+            ) from error
 
     def _lost(self) -> KrosError:
         return KrosError(
@@ -114,9 +121,11 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
     try:
         import threadpoolctl  # noqa: F401  # workers have what is installed here
         from distributed import Client
+        from distributed.comm import get_address_host_port
     except ImportError as error:
         raise MissingDependencyError(f"--scheduler {address} needs Dask; install it with: pip install 'kros[dask]'.") from error
     try:
+        get_address_host_port(address)  # a client made with something else goes on trying
         client = Client(address, set_as_default=False)
     except (OSError, ValueError) as error:
         raise ConfigError(

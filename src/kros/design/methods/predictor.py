@@ -147,7 +147,9 @@ class Plan:
         if steps:
             slowest, recipe = max(self.recipe.basis.poles), self.recipe
             model, _ = tune_predictor(model, self.past, few, self.importance, recipe.deviation, slowest, steps, weights=self.emphasis)
-        made = [embedded(task.name, self.past, model, models.recorded_inputs, few, ridge) for ridge in _RIDGES]
+        # Rows of measured states count where measurements are missing. Fitted to all conditions they are those of none, and drift.
+        home = few.take([i for i, key in enumerate(few.keys) if key.condition == task.training.keys[0].condition])
+        made = [embedded(task.name, self.past, model, models.recorded_inputs, home, ridge) for ridge in _RIDGES]
         made = [replace(one, runtime=Runtime(task.runtime.delay), sensor=task.sensor) for one in made]
         if task.limits:
             made = [with_limits(one, *sides(task.limits, one.recorded)) for one in made]

@@ -121,7 +121,7 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
     try:
         import threadpoolctl  # noqa: F401  # workers have what is installed here
         from distributed import Client
-        from distributed.comm import get_address_host_port
+        from distributed.comm.addressing import get_address_host_port
     except ImportError as error:
         raise MissingDependencyError(f"--scheduler {address} needs Dask; install it with: pip install 'kros[dask]'.") from error
     try:

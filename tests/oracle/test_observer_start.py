@@ -78,6 +78,18 @@ def test_a_sample_without_its_input_starts_from_rest():
     np.testing.assert_array_equal(with_it, without)
 
 
+@pytest.mark.parametrize("kind", [k for k in MACHINES if "motion" in k])
+def test_a_machine_at_rest_starts_as_without(kind):
+    o, (y, u) = MACHINES[kind](), samples(20, faults=False)
+    y[:] = u[:, :1] = 0.3
+    u[:, 1] = 0.0
+    y[1:] += 1e-3 * np.random.default_rng(0).normal(size=(19, 1))
+    with_it, without = (run_observer(own, y[:, None], u[:, None]) for own in (o, replace(o, start_in_motion=None)))
+    np.testing.assert_array_equal(with_it, without)
+    u[0, 1] = 0.1
+    assert np.abs(run_observer(o, y[:, None], u[:, None]) - without).max() > 1e-4
+
+
 def test_what_the_first_samples_add_is_what_makes_the_run_differ():
     o, (y, u) = moving(MACHINES["gain"]()), samples(30, faults=False)
     y, u = y[:, None], u[:, None]

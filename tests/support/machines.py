@@ -89,7 +89,8 @@ def moving(observer):
     gain = 0.3 * rng.normal(size=(n, 1)) * hidden * np.array([1.0, -1.0, 0.0]) + 0.05 * rng.normal(size=(n, 1)) * hidden * np.array(
         [0, 0, 1.0]
     )
-    return replace(observer, start_in_motion=Start(gain, 0.5 * rng.normal(size=(5, n, 1)) * hidden))
+    rest = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]) / 0.02
+    return replace(observer, start_in_motion=Start(gain, 0.5 * rng.normal(size=(5, n, 1)) * hidden, rest))
 
 
 def watched(observer, bound=1.0):

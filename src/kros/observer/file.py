@@ -244,11 +244,15 @@ def _seen(found: Any, measured: int, inputs: int, where: str) -> Seen | None:
 def _start(found: Any, n: int, measured: int, inputs: int, where: str) -> Start | None:
     if found is None:
         return None
-    _known(found, ("gain", "corrections"), f"{where}: start_in_motion")
+    _known(found, ("gain", "corrections", "rest"), f"{where}: start_in_motion")
     gain, rows = matrix(found["gain"], (n, measured + inputs), f"{where}: start_in_motion.gain"), found["corrections"]
     _require(isinstance(rows, list), f"{where}: start_in_motion.corrections should be a list of gains", rows)
     each = [matrix(own, (n, measured), f"{where}: start_in_motion.corrections[{k}]") for k, own in enumerate(rows)]
-    return Start(gain, np.array(each).reshape(len(each), n, measured))
+    rest = found.get("rest", [])
+    _require(isinstance(rest, list), f"{where}: start_in_motion.rest should be a list of rows", rest)
+    return Start(
+        gain, np.array(each).reshape(len(each), n, measured), matrix(rest, (len(rest), measured + inputs), f"{where}: start_in_motion.rest")
+    )
 
 
 def _sensor(found: Any, where: str) -> dict[str, Sensor]:

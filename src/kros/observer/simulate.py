@@ -117,7 +117,7 @@ def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters |
     for k in range(count):
         assert start is not None
         arrived = samples.y[k + late]
-        added[k] = start.correction(np.full(batch, k), steps.innovation(arrived)[0])
+        added[k] = start.correction(steps.since, steps.innovation(arrived)[0])
         steps.step(arrived, samples.u[k], ~np.isfinite(arrived))
     return first, added
 

@@ -6,13 +6,12 @@ inputs, and the first few innovations correct hidden states by gains of their ow
 
 .. math:: \hat x_0 = x_{rest}(y_0) + G [y_0; u_0], \qquad \hat x_{k+1} = \dots + S_k (y_k - C \hat x_k), \quad k < K .
 
-From then on the observer is what it was. All of this is zero where a machine starts at rest.
+From then on the observer is what it was. Where the first sample shows a machine at rest nothing is added, not even what noise would say of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -33,6 +32,8 @@ class Start:
         G, of the first measurement and the first recorded inputs.
     corrections : ndarray, shape (count, n, q)
         S_k, of the first innovations, beside the observer's own correction.
+    rest : ndarray, shape (p, q + m), optional
+        What is at most one in size, all of it, for the first measurement and inputs of a machine at rest; by default nothing tells, and no machine is.
 
     Raises
     ------
@@ -42,9 +43,10 @@ class Start:
 
     gain: Array
     corrections: Array
+    rest: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
-        for name in ("gain", "corrections"):
+        for name in ("gain", "corrections", "rest"):
             values = np.asarray(getattr(self, name), dtype=float)
             object.__setattr__(self, name, values)
             if not np.isfinite(values).all():
@@ -56,16 +58,24 @@ class Start:
 
     def require_fit(self, name: str, n: int, q: int, m: int) -> None:
         """Refuse arrays of another size than the observer's."""
-        if self.gain.shape != (n, q + m) or self.corrections.shape[1:] != (n, q):
+        fits = self.gain.shape == (n, q + m) and self.corrections.shape[1:] == (n, q)
+        if not fits or (len(self.rest) and self.rest.shape[1:] != (q + m,)):
             raise DimensionError(
-                f"Observer {name}: start_in_motion.gain should have shape {(n, q + m)} and start_in_motion.corrections (count, {n}, {q}), "
-                f"found {self.gain.shape} and {self.corrections.shape}."
+                f"Observer {name}: start_in_motion should have gain {(n, q + m)}, corrections (count, {n}, {q}) and rest (p, {q + m}), "
+                f"found {self.gain.shape}, {self.corrections.shape} and {self.rest.shape}."
             )
 
+    def at_rest(self, y: Array, u: Array) -> npt.NDArray[np.bool_]:
+        """Return whether the first sample shows a machine at rest, shape (...)."""
+        shown = np.concatenate([y, u], axis=-1)
+        if not len(self.rest):
+            return np.zeros(shown.shape[:-1], dtype=bool)
+        return np.asarray((np.abs(shown @ self.rest.T) <= 1).all(axis=-1))
+
     def moved(self, y: Array, u: Array) -> Array:
-        """Return what motion adds to the first estimate, shape (..., n): nothing where a measurement or an input is not known."""
-        known = np.asarray(np.isfinite(y).all(axis=-1) & np.isfinite(u).all(axis=-1))
-        first = np.where(known[..., None], np.concatenate([y, u], axis=-1), 0.0)
+        """Return what motion adds to the first estimate, shape (..., n): nothing at rest, or where a measurement or an input is not known."""
+        adds = np.isfinite(y).all(axis=-1) & np.isfinite(u).all(axis=-1) & ~self.at_rest(y, u)
+        first = np.where(adds[..., None], np.concatenate([y, u], axis=-1), 0.0)
         return np.asarray(first @ self.gain.T)
 
     def correction(self, since: npt.NDArray[np.int64], innovation: Array) -> Array:
@@ -75,17 +85,13 @@ class Start:
 
     def times(self, x: Array, y: Array, u: Array) -> Start:
         """Return the start in other units of measure, by the factors of states, measurements and inputs."""
-        return Start(self.gain * x[:, None] / np.concatenate([y, u]), self.corrections * x[:, None] / y)
+        both = np.concatenate([y, u])
+        return Start(self.gain * x[:, None] / both, self.corrections * x[:, None] / y, self.rest / both if len(self.rest) else self.rest)
 
     def turned(self, turn: Array) -> Start:
         """Return the start for states ``turn @ x``, shape (n', n)."""
-        return Start(turn @ self.gain, turn @ self.corrections)
+        return Start(turn @ self.gain, turn @ self.corrections, self.rest)
 
     def content(self) -> dict[str, Any]:
         """Return what an observer's file holds of it."""
-        return {"gain": self.gain.tolist(), "corrections": self.corrections.tolist()}
-
-    @classmethod
-    def from_content(cls, content: Mapping[str, Any]) -> Start:
-        """Read what `content` returned."""
-        return cls(np.array(content["gain"], dtype=float), np.array(content["corrections"], dtype=float))
+        return {name: getattr(self, name).tolist() for name in ("gain", "corrections", "rest")}

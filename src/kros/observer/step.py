@@ -57,12 +57,21 @@ class Steps:
             own[rows] = observer.runtime.relifted(observer.initial(y, self.values, u))[rows]
         self._x_c[:, rows] = 0.0
         self._fresh[rows] = True
-        self._since[rows], self._starting = 0, self._start is not None and len(self._start) > 0
+        self._since[rows] = 0
+        if self._start is not None and u is not None:  # at rest there is nothing to find out
+            resting = self._start.at_rest(y, u)
+            self._since[rows] = np.where(resting, len(self._start), 0)[rows]
+        self._starting = self._start is not None and bool(self._since.min() < len(self._start))
 
     def place(self, x: Array, earlier: Array) -> None:
         """Put states, shape (batch, n), and earlier values in place; corrections start at rest."""
         self.x[...], self._x_c[...], self._earlier[...], self._fresh[:] = x, 0.0, earlier, False
         self._starting = False
+
+    @property
+    def since(self) -> npt.NDArray[np.int64]:
+        """Samples since the start in motion, shape (batch,)."""
+        return self._since
 
     def earlier(self, u: Array) -> Array:
         """Return the earlier values that the lifting reads, shape (observer, batch, n_earlier); after a start they equal the present ones."""

@@ -233,8 +233,12 @@ class Source:
         less = [(j, places.index(i), factor) for j, i, factor in self.realised.less]
         for j, i, factor in less:  # as in the model, differences first
             gain[:, i] += factor * gain[:, q + j]
+        rest = start.rest.reshape(-1, gain.shape[1]).copy()
+        for j, i, factor in less:
+            rest[:, i] += factor * rest[:, q + j]
         corrections = start.corrections[:, rows].reshape(len(start), -1)
         return {
+            "rest": self.matrix(rest),
             "rows": rows.tolist(),
             "count": len(start),
             "gain": self.matrix(gain),

@@ -125,7 +125,11 @@ def c_files(
     state_bytes = _state_bytes(context)
     numbers = sum(len(row) for key in ("model", "correction", "into", "controller", "filter_gain") for row in context[key] or ())
     numbers += 0 if context["tracked"] is None else sum(len(row) for key in ("model", "correction") for row in context["tracked"][key])
-    begins = 0 if observer.start_in_motion is None else observer.start_in_motion.gain.size + observer.start_in_motion.corrections.size
+    begins = (
+        0
+        if observer.start_in_motion is None
+        else sum(getattr(observer.start_in_motion, part).size for part in ("gain", "corrections", "rest"))
+    )
     watched = 0 if observer.monitor is None else observer.monitor.limits.size
     largest = None if observer.seen is None else f"{1.5 * float(observer.seen.measured.max()):.6g}"
     functions = sorted({f for text in context["sigma"] + context["gamma"] for f in re.findall(r"\b([a-z]+)\(", text)})

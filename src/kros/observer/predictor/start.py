@@ -28,6 +28,7 @@ COUNT = 16  # innovations with gains of their own
 _WINDOWS = 2000
 _ROUNDS = 3  # an observer that starts better has forgotten its start earlier
 _SILENT = 0.05  # of what it says in motion
+_STILL = (0.01, 0.05)
 _RIDGE = 1e-6  # relative to mean squares
 
 
@@ -69,13 +70,13 @@ def with_start(
     alone = replace(observer, runtime=Runtime(), start_in_motion=None)
     rest = alone.initial(y_w[0], repeated)
     moving = np.concatenate([y_w[0], u_w[0]], axis=-1) @ seen.T
-    start = None
+    start, still = None, at_rest(seen, moving, np.concatenate([y[0], u[0]], axis=-1) @ seen.T, in_motion(truth))
     for _ in range(_ROUNDS):
         known = run_observer(replace(alone, start_in_motion=start), y, u, own)[window].reshape(count + 1, -1, len(hidden))
         gain = regressed(moving, np.where(hidden, known[0] - rest, 0.0)) @ seen
         if not shows_motion(gain @ np.concatenate([y[0], u[0]], axis=-1).T, (known[0] - rest).T, truth):
-            gain = np.zeros_like(gain)
-        start = Start(gain, np.zeros((0, len(hidden), len(at))))
+            gain, still = np.zeros_like(gain), still[:0]
+        start = Start(gain, np.zeros((0, len(hidden), len(at))), still)
         steps = Steps([replace(alone, start_in_motion=start)], len(rest), {**alone.parameters, **repeated})
         steps.begin(y_w[0], u=u_w[0])
         corrections = np.zeros((count, len(hidden), len(at)))
@@ -84,8 +85,15 @@ def with_start(
             steps.step(y_w[k], u_w[k])
             corrections[k] = regressed(innovation, np.where(hidden, known[k + 1] - steps.x[0], 0.0))
             steps.x[0] += innovation @ corrections[k].T
-        start = Start(gain, corrections)
+        start = Start(gain, corrections, still)
     return replace(observer, start_in_motion=start)
+
+
+def at_rest(seen: Array, moving: Array, first: Array, begun: bool) -> Array:
+    """Return rows of `Start.rest`: three times what machines show that rest at first, within shares of what they show in motion; those that say nothing go."""
+    size = np.sqrt(np.mean(moving**2, axis=0))
+    bound = _STILL[0] * size if begun else np.clip(3 * np.abs(first).max(axis=0), _STILL[0] * size, _STILL[1] * size)
+    return seen[size > 0] / bound[size > 0, None]
 
 
 def shows_motion(said: Array, known: Array, truth: Array) -> bool:

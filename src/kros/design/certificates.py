@@ -33,7 +33,7 @@ from ..observer import (
 from ..observer.units import factors
 from ..uncertainty.coprime.bands import BandEnergies
 from .task import DesignResult, DesignTask
-from .validation import ValidationSet, hidden_mean
+from .validation import SHORT_S, ValidationSet, hidden_mean
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -96,8 +96,10 @@ def certify_running(task: DesignTask, results: Sequence[DesignResult]) -> list[R
 
 
 def certified_on(task: DesignTask) -> ValidationSet:
-    """Return the episodes whose signals make the set that observers are certified for: the beginning of the first one of every unit."""
-    return task.training.first_of_units().read().first(_EPISODE_S / task.models.sample_period_s)
+    """Return the episodes whose signals make the set that observers are certified for: the beginning of the first one of every unit, or some short ones."""
+    first = task.training.first_of_units().read().first(_EPISODE_S / task.models.sample_period_s)
+    length_s = len(first.batch.states) * task.models.sample_period_s
+    return first if length_s > SHORT_S else task.training.read()
 
 
 def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:

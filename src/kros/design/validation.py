@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..data.scaled import scale_population
-from ..evaluate import as_shown, error_percent
+from ..evaluate import as_shown, error_rms
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..observer import Observer, Seen, Sensor, Sensors, run_observer, run_observers
@@ -23,7 +23,7 @@ Array = npt.NDArray[np.float64]
 T = TypeVar("T")
 TUNING_UNITS = 12
 TUNING_EPISODES = 3
-TUNING_S = 10.0
+TUNING_S, SHORT_S = 10.0, 2.0
 TUNING_EPISODES_AT_LIMITS = 72
 SIDE_BY_SIDE = 20  # keeps a study of twelve units below 200 MB
 
@@ -40,10 +40,16 @@ class TrainingSet:
 
     @classmethod
     def of(cls, identified: IdentifiedModels, models: ModelSet, sensor: Sensors | None = None) -> TrainingSet:
-        """Take some of the first units, and of each some episodes from the first to the last: those recorded one after the other may be alike."""
+        """Take some of the first units, and of each some episodes from the first to the last: those recorded one after the other may be alike.
+
+        Of episodes shorter than `SHORT_S` as many more as make up for it.
+        """
         facts, known = identified.facts, identified.parameters
         units = [u for u in facts.pooled if u in models.unit_ids][:TUNING_UNITS]
-        keys = tuple(k for u in units for k in spread(facts.keys("train", u, facts.identify_on), TUNING_EPISODES))
+        every = [facts.keys("train", u, facts.identify_on) for u in units]
+        length = len(identified.population.read(every[0][0])) * identified.population.sample_period_s if every and every[0] else SHORT_S
+        count = TUNING_EPISODES * max(1, round(SHORT_S / length))
+        keys = tuple(k for own in every for k in spread(own, count))
         return cls(
             identified.population.select(units), keys, {u: known[u] for u in units}, seen_by(identified, models.measured), sensor or {}
         )
@@ -164,8 +170,14 @@ class ValidationSet:
 
     def compare(self, estimates: Iterable[Array]) -> Array:
         """Return the same for estimates that are there already, shape (observer, n); those of a memory have nothing to be compared with."""
-        n = self.batch.states.shape[-1]
-        found = [error_percent(estimate[..., :n], self.batch.states, self.batch.lengths).mean(axis=0) for estimate in estimates]
+        x, lengths = self.batch.states, self.batch.lengths
+        inside = np.arange(len(x))[:, None, None] < lengths[:, None]
+        size = np.max(np.abs(x), axis=0, where=inside, initial=0.0)
+        groups = [(key.unit, key.condition) for key in self.batch.keys]  # an episode in which a machine hardly moves has no size of its own
+        of = {group: size[[i for i, own in enumerate(groups) if own == group]].max(axis=0) for group in set(groups)}
+        size = np.array([of[group] for group in groups])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = [(100 * error_rms(e[..., : x.shape[-1]], x, lengths) / size).mean(axis=0) for e in estimates]
         return np.where(np.isfinite(found), found, np.inf)
 
 

@@ -1,6 +1,6 @@
 """The monitor on simulated drives: healthy ones, badly assembled ones, more friction, a rougher gearbox.
 
-    python benchmarks/monitor.py --loop stiff --seeds 40 --work /tmp/monitor
+    python benchmarks/monitor.py --loop stiff --seeds 40 --work monitor-work
 
 One observer is designed for a loop, on a population of 12 drives of its own (seed 9041): identified, quantified, `--method` synthesised, kept in `--work`.
 Then every seed is a population of the same distribution: 12 drives, 6 episodes of 12 s with and without load each, that the monitor's bounds are found

@@ -28,7 +28,7 @@ COUNT = 16  # innovations with gains of their own
 _WINDOWS = 2000
 _ROUNDS = 3  # an observer that starts better has forgotten its start earlier
 _SILENT = 0.05  # of what it says in motion
-_STILL = (0.01, 0.05)
+_STILL = (0.01, 0.05)  # of what machines show in motion: between these is what counts as rest
 _RIDGE = 1e-6  # relative to mean squares
 
 

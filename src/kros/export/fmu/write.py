@@ -36,7 +36,8 @@ def export_fmu(
     """Write an observer as an FMU for co-simulation.
 
     Measurements, inputs and parameters are variables of their own names, estimates end in ``_hat``, ``status`` holds the bits of `SampleStatus`. A
-    communication step of one sampling period takes one sample and gives the estimate for its end.
+    communication step of one sampling period takes one sample and gives the estimate for its end. ``condition``, where the monitor knows some, is a
+    tunable enumeration: the recorded condition that the machine is in, ``unknown`` at first.
 
     Parameters
     ----------
@@ -82,6 +83,7 @@ def rendered(source: Source, fmi: int, guid: str, units: Mapping[str, str]) -> d
     estimates = [*observer.recorded, *([] if source.loop is None else [source.loop.name])]
     context |= {"version": version("kros"), "fmi": fmi, "guid": guid, "units": units, "estimates": len(estimates)}
     context["variables"] = variables(observer, units, estimates)
+    context["conditions"] = conditions(observer)
     context["wide_parameters"] = [f"{observer.parameters.get(p, 0.0):.17g}" for p in observer.lifting.parameters]
     environment = Environment(loader=PackageLoader("kros.export.fmu"), undefined=StrictUndefined, keep_trailing_newline=True)
     chosen = {f"sources/{name}_fmu.c": "machine.c", "modelDescription.xml": f"model{fmi}.xml"}
@@ -91,7 +93,7 @@ def rendered(source: Source, fmi: int, guid: str, units: Mapping[str, str]) -> d
 
 
 def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the variables in the order of their references: measurements, inputs, parameters, estimates, status."""
+    """Return the variables in the order of their references: measurements, inputs, parameters, estimates, status, condition."""
     measured = [observer.lifting.states[i] for i in observer.measured]
 
     def rows(names: Any, causality: str, variability: str, description: str, start: Any, suffix: str = "") -> list[dict[str, Any]]:
@@ -103,7 +105,7 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
                 "description": description.format(n),
                 "unit": units.get(n, ""),
             }
-            | {"start": start(n), "real": True}
+            | {"start": start(n), "kind": "real"}
             for n in names
         ]
 
@@ -115,9 +117,18 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
     found += rows(estimates, "output", "discrete", "estimate of {} at the end of the step", lambda _: None, "_hat")
     bits = "1 missing measurement, 2 invalid input, 4 limit, 8 outside the certificate"
     found.append(
-        {"name": "status", "causality": "output", "variability": "discrete", "description": bits, "unit": "", "start": None, "real": False}
+        {"name": "status", "causality": "output", "variability": "discrete", "description": bits, "unit": "", "start": None, "kind": "bits"}
     )
+    if conditions(observer):
+        told = rows(["condition"], "parameter", "tunable", "{} that the machine is in, as far as the monitor knows it", lambda _: "0")
+        found.append(told[0] | {"kind": "choice"})
     return [{**variable, "index": i} for i, variable in enumerate(found)]
+
+
+def conditions(observer: Observer) -> list[str]:
+    """Return the conditions that the monitor knows, in the order of their numbers, the unknown one first; nothing where it knows none."""
+    known = () if observer.monitor is None else observer.monitor.bounds
+    return ["unknown", *known] if known else []
 
 
 def compiled(files: Mapping[str, bytes], name: str, fmi: int) -> dict[str, bytes]:

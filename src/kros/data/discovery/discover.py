@@ -388,10 +388,10 @@ def _too_few(population: Population, found: Examined) -> list[str]:
     if counts and min(counts.values()) < 4:
         (unit, condition), n = min(counts.items(), key=lambda item: item[1])
         texts.append(f"few episodes: unit {unit} ({condition}) has {n}, one of them for testing")
-    for condition in population.conditions:
-        missing = [u for u in units if (u, condition) not in counts]
-        if missing:
-            texts.append(f"not every unit was recorded in condition {condition!r}: {_some(missing)} were not")
+    lacking = {u: [c for c in population.conditions if (u, c) not in counts] for u in units}
+    some = [f"{u} lacks {_some(missing)}" for u, missing in lacking.items() if missing]
+    if some:
+        texts.append(f"not every unit was recorded in every condition: {'; '.join(some[:4])}{f'; {len(some) - 4} more units' if len(some) > 4 else ''}")
     return texts
 
 

@@ -192,9 +192,11 @@ def _calibrates(population: Population, facts: RecordingFacts, spec: PhaseSpec) 
 def _lines(population: Population, found: Discovery | None, proposal: LiftingProposal, findings: Sequence[str], out: Path) -> list[str]:
     """Return what people read at the terminal."""
     units, counts = population.unit_ids, {(u, c): len(keys) for u, c, keys in population.groups()}
+    fewest, most = min(counts.values()), max(counts.values())
+    each = f"{fewest}" if fewest == most else f"{fewest} to {most}"
     lines = [
         f"{len(units)} unit{'s' * (len(units) != 1)} ({_some(units)}), conditions {', '.join(population.conditions)}, {len(population.episodes)} episodes "
-        f"({min(counts.values())} to {max(counts.values())} a unit and condition), every {population.sample_period_s:g} s"
+        f"({each} for each unit and condition), every {population.sample_period_s:g} s"
     ]
     if found is not None:
         lines += column_lines(found.columns)

@@ -43,8 +43,8 @@ def study_text(
         lines += ["#", "# What looks wrong:", *(line for text in findings for line in _comment(f"- {text}"))]
     lines += ["", "[data]", *(f"{key} = {_value(data[key])}" for key in ("source", "reader", "on_nan") if key in data)]
     condition = _value(data["identify_on"]) if "identify_on" in data else None
-    identify_on = '# identify_on = "noload"' if condition is None else f"identify_on = {condition}"
-    lines += [f"{identify_on}  # condition that models and observers are made from"]
+    identify_on = '# identify_on = "..."' if condition is None else f"identify_on = {condition}"
+    lines += [f"{identify_on}  # condition that models and observers are made from, where there are several"]
     lines += ['# exclude = ["..."]  # units that take no part']
     if found is not None:
         lines += _mapping(found)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from kros.data import EpisodeKey, Population, Unit, read, write_parquet, write_raw
-from kros.plants.harmonic_drive import HarmonicDrivePopulation
+from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
 UNITS = int(os.environ.get("KROS_BENCH_UNITS", "4"))
 EPISODES = 20

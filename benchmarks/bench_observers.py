@@ -19,19 +19,11 @@ import numpy as np
 
 from kros.core.lti import StateSpace, gain
 from kros.data import EpisodeBatch, EpisodeKey
-from kros.evaluate import summarise
+from kros.evaluate.errors import summarise
 from kros.lifting import Lifting
-from kros.observer import (
-    ExtendedKalman,
-    Features,
-    FilteredDifference,
-    Moments,
-    Observer,
-    Runtime,
-    run_observer,
-    run_observers,
-    track_parameter,
-)
+from kros.observer import ExtendedKalman, FilteredDifference, Observer, Runtime, run_observer, run_observers, track_parameter
+from kros.observer.baselines.learned import Features
+from kros.observer.baselines.learned_moments import Moments
 from kros.synthesis import Injection
 
 DT = 0.001

@@ -30,18 +30,9 @@ from kros.core.lti import StateSpace
 from kros.identify import edmd
 from kros.identify.edmd import smallest_stabilising_alpha
 from kros.lifting import Lifting
-from kros.uncertainty import (
-    Cover,
-    choose_nominal,
-    fit_magnitude,
-    fit_weight,
-    optimal_cover,
-    quantify_responses,
-    quantify_systems,
-    residual,
-    scale_system,
-)
+from kros.uncertainty import Cover, choose_nominal, fit_magnitude, fit_weight, optimal_cover, quantify_responses, quantify_systems, residual
 from kros.uncertainty.bilinear import BilinearAxis
+from kros.uncertainty.model import scale_system
 from kros.uncertainty.weights.certificate import ResidualSystems
 from kros.uncertainty.weights.weight import Weight
 

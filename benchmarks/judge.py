@@ -46,7 +46,8 @@ from kros.design.estimators import make_learned  # noqa: E402
 from kros.design.settings import ObserverSettings, PredictorSettings, SynthesisSettings  # noqa: E402
 from kros.design.synthesize import Designs, synthesize_all  # noqa: E402
 from kros.design.validation import TrainingSet  # noqa: E402
-from kros.evaluate import as_shown, true_errors  # noqa: E402
+from kros.evaluate import true_errors  # noqa: E402
+from kros.evaluate.sensor import as_shown  # noqa: E402
 from kros.identify.calibrate import segments_of  # noqa: E402
 from kros.observer import Sensor, run_observer  # noqa: E402
 from kros.observer.limits import Limit  # noqa: E402

@@ -25,25 +25,13 @@ from kros.data import EpisodeBatch, EpisodeKey
 from kros.evaluate.errors import error_spectrum
 from kros.identify import PhaseSpec, find_segments, resolve_branches, unit_phase
 from kros.lifting import Lifting
-from kros.motor_drive import (
-    AngleLoad,
-    calibrate_load,
-    calibrate_torque,
-    load_accuracy,
-    load_from_current,
-    load_observer,
-    low_passed,
-    without_level,
-)
-from kros.observer import (
-    Observer,
-    identify_predictor,
-    noise_covariances,
-    one_step_residual,
-    one_step_rows,
-    relift_certificate,
-    run_observer,
-)
+from kros.motor_drive import AngleLoad, calibrate_load, calibrate_torque, load_from_current, load_observer
+from kros.motor_drive.accuracy import load_accuracy
+from kros.motor_drive.signals import low_passed, without_level
+from kros.observer import Observer, identify_predictor, relift_certificate, run_observer
+from kros.observer.baselines.kalman import noise_covariances
+from kros.observer.residual.models import one_step_rows
+from kros.observer.residual.one_step import one_step_residual
 from kros.plants import HarmonicDrivePopulation
 from kros.plants.harmonic_drive.control import COUNT_RAD
 from kros.synthesis import kalman

@@ -27,9 +27,10 @@ from kros.data import EpisodeBatch, Unit
 from kros.design.monitor import MOVING, fit_monitor, monitor_facts, poisson_interval
 from kros.design.validation import TrainingSet
 from kros.identify.identified import IdentifiedModels
-from kros.observer import Observer, run_innovations
-from kros.plants.harmonic_drive import DriveParameters, HarmonicDrivePopulation
-from kros.plants.harmonic_drive.parameters import concatenate, draw_outlier, draw_parameters
+from kros.observer import Observer
+from kros.observer.simulate import run_innovations
+from kros.plants.harmonic_drive.parameters import DriveParameters, concatenate, draw_outlier, draw_parameters
+from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
 DESIGN_SEED, UNITS, EPISODES, SECONDS, WITHIN_S, RATE = 9041, 12, 6, 12.0, 10.0, 0.02
 NEW_EPISODES, NEW_SECONDS = 2, 14.0

@@ -26,7 +26,9 @@ from kros.core.work import Work
 from kros.data import EpisodeBatch, read_parquet
 from kros.design.methods.design import design
 from kros.design.synthesize import tasks_of
-from kros.observer import Observer, ReliftScales, one_step_residual, relift_certificate, relift_report
+from kros.observer import Observer, ReliftScales, relift_certificate
+from kros.observer.certificate.report import relift_report
+from kros.observer.residual.one_step import one_step_residual
 from kros.study import run_study, validate_config
 from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage

@@ -25,7 +25,8 @@ import numpy as np
 from kros.core.errors import KrosError
 from kros.core.work import Work
 from kros.data import EpisodeBatch, Population
-from kros.evaluate import Kind, error_percent, severity_of_growth
+from kros.evaluate import Kind, error_percent
+from kros.evaluate.robustness import severity_of_growth
 from kros.observer import run_observers
 from kros.plants import HarmonicDrivePopulation
 from kros.report.disturbances import AXES, curves

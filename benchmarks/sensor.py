@@ -23,7 +23,8 @@ from kros.design.methods.design import design
 from kros.design.settings import PredictorSettings, SynthesisSettings
 from kros.design.synthesize import tasks_of
 from kros.design.validation import TrainingSet
-from kros.evaluate import as_shown, error_percent
+from kros.evaluate import error_percent
+from kros.evaluate.sensor import as_shown
 from kros.identify.calibrate import segments_of
 from kros.observer import Sensor, in_sizes, run_observer
 from kros.study.commands.demo import simulate_to

@@ -24,8 +24,9 @@ from scipy.stats import binom
 from kros.data import Channel, Role
 from kros.identify import Factor, ModelSet, reduce_episode
 from kros.lifting import Lifting
-from kros.uncertainty import OutlierModel, Status, score_outliers
+from kros.uncertainty import OutlierModel, score_outliers
 from kros.uncertainty.outliers.recorded import Evidence, Recorded
+from kros.uncertainty.outliers.score import Status
 
 Array = npt.NDArray[Any]
 

@@ -73,7 +73,7 @@ def init(
     period: Annotated[float | None, typer.Option(metavar="SECONDS", help="Sampling period, where no column holds time.")] = None,
 ) -> None:
     """Look at a folder of recordings and write a study for it."""
-    from .data.discovery import Wanted
+    from .data.discovery.discover import Wanted
     from .study.commands.init import init_study
     from .study.engine.progress import make_progress
 
@@ -91,7 +91,8 @@ def _on_terminal() -> bool:
 
 def _ask_parts(columns: Any) -> Any:
     """Ask which columns are measured and which are inputs; Return takes what is proposed."""
-    from .data.discovery import Part, assign
+    from .data.discovery.discover import assign
+    from .data.discovery.roles import Part
     from .study.commands.init import column_lines
 
     for line in column_lines(columns):

@@ -22,7 +22,7 @@ from kros.data import (
     write_parquet,
     write_raw,
 )
-from kros.plants.harmonic_drive import HarmonicDrivePopulation
+from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
 PERIOD = 1e-3
 CHANNELS = (

@@ -9,7 +9,8 @@ import pytest
 from machines import drive, in_python, samples, watched
 
 from kros.core.errors import ConfigError
-from kros.export import export_fmu, find_compiler
+from kros.export import export_fmu
+from kros.export.c99.compiled import find_compiler
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler is on the PATH")

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DimensionError
-from kros.uncertainty import Form, bounds, existence, misfit, rebuild, residual, residual_shape, sigma_max
+from kros.uncertainty import Form, bounds, existence, misfit, rebuild, residual, sigma_max
+from kros.uncertainty.forms import residual_shape
 
 SHAPES = [(2, 2), (3, 3), (1, 1), (4, 2), (2, 4), (3, 1), (1, 3), (5, 3)]
 FORMS = list(Form)

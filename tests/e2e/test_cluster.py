@@ -16,7 +16,8 @@ import pytest
 
 from kros.core.errors import DataError, KrosError
 from kros.core.work import Silent
-from kros.data import OUTLIERS, Channel, EpisodeKey, Role, Unit, from_arrays, write_parquet
+from kros.data import Channel, EpisodeKey, Role, Unit, from_arrays, write_parquet
+from kros.data.population import OUTLIERS
 from kros.study.config import Stage, load_config
 from kros.study.engine.executors import open_executor
 from kros.study.pipeline import run_study

@@ -15,7 +15,8 @@ from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.pipeline import load_run
 from kros.study.stages.resampling import resampled_models
-from kros.uncertainty import Tightness, UncertainModel, VariationAndNoise
+from kros.uncertainty import UncertainModel, VariationAndNoise
+from kros.uncertainty.fits.magnitude import Tightness
 from kros.uncertainty.unit_residuals import UnitResiduals
 
 STAGES = ["read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report"]

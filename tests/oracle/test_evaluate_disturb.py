@@ -8,7 +8,8 @@ from kros.core.lti import StateSpace, gain
 from kros.core.norms import gramian
 from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey
-from kros.evaluate import Disturbance, DisturbedEpisodes, Kind, Measured, hold_missing, robustness_rows, standard_disturbances
+from kros.evaluate import Disturbance, DisturbedEpisodes, Kind, robustness_rows, standard_disturbances
+from kros.evaluate.disturb import Measured, hold_missing
 from kros.lifting import Lifting
 from kros.observer import ExtendedKalman, Observer, run_observers
 from kros.synthesis import Injection

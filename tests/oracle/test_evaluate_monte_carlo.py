@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
-from kros.evaluate import Contractions, sample_errors
+from kros.evaluate import sample_errors
+from kros.evaluate.contractions import Contractions
 from kros.evaluate.monte_carlo import draw_members
 from kros.synthesis import Injection, ObserverProblem, worst_case_h2
 from kros.synthesis.problem.plants import generalized_plant

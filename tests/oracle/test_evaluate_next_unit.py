@@ -9,7 +9,8 @@ import pytest
 from scipy import stats
 
 from kros.core.errors import DataError
-from kros.evaluate import draw_reserve, fewest_units, next_unit_bound
+from kros.evaluate import next_unit_bound
+from kros.evaluate.next_unit import draw_reserve, fewest_units
 
 
 @pytest.mark.parametrize(("confidence", "fewest"), [(0.95, 19), (0.9, 9), (0.99, 99), (0.5, 1), (0.8, 4), (0.75, 3), (2 / 3, 2)])

@@ -5,7 +5,8 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
-from kros.evaluate import delay_samples, true_errors
+from kros.evaluate import true_errors
+from kros.evaluate.truth import delay_samples
 
 N = 3000
 

@@ -9,16 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kros.identify import (
-    Factor,
-    ModelSamples,
-    bootstrap_edmd,
-    bootstrap_refined,
-    combine,
-    episode_factors,
-    episode_weights,
-    one_step_deviations,
-)
+from kros.identify import Factor, ModelSamples, bootstrap_edmd, bootstrap_refined, combine, episode_factors, episode_weights
+from kros.identify.bootstrap import one_step_deviations
 from kros.identify.refine import RefinedModels, RefineOptions, refine_population
 from kros.identify.refine.episodes import episode_normals, segment_owners
 from kros.identify.refine.marquardt import minimise

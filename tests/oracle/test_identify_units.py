@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from kros.core.errors import IdentificationError
-from kros.data import check_episode
-from kros.data.checks import is_constant
+from kros.data.checks import check_episode, is_constant
 from kros.data.scaled import scale_population
-from kros.identify import Factor, PhaseSpec, Ranges, combine, edmd, find_segments, lifted_factor, reduce_episode, smallest_stabilising_alpha
+from kros.identify import Factor, PhaseSpec, combine, edmd, find_segments, lifted_factor, reduce_episode, smallest_stabilising_alpha
 from kros.identify.excitation import require_excitation
+from kros.identify.ranges import Ranges
 from kros.identify.refine import RefineOptions, refine_population
 from kros.lifting import Lifting
 from kros.plants import DcMotorPopulation, HarmonicDrivePopulation

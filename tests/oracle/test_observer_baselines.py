@@ -11,20 +11,12 @@ from kros.core.lti import StateSpace, gain
 from kros.data import Channel, Role
 from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
-from kros.observer import (
-    Choice,
-    ExtendedKalman,
-    Features,
-    FilteredDifference,
-    Moments,
-    Observer,
-    cutoffs_hz,
-    luenberger_candidates,
-    rates,
-    run_observer,
-    run_observers,
-    start_covariance,
-)
+from kros.observer import ExtendedKalman, FilteredDifference, Observer, run_observer, run_observers
+from kros.observer.baselines.difference import cutoffs_hz, rates
+from kros.observer.baselines.extended_kalman import start_covariance
+from kros.observer.baselines.kalman import luenberger_candidates
+from kros.observer.baselines.learned import Features
+from kros.observer.baselines.learned_moments import Choice, Moments
 from kros.synthesis import Injection, kalman
 
 DT = 0.001

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.lifting import Lifting
-from kros.observer import Observer, one_step_residual, run_observer
+from kros.observer import Observer, run_observer
 from kros.observer.certificate.certificate import ReliftCertificate, relift_certificate
 from kros.observer.certificate.error import ErrorSystem, ReliftScales, error_system
 from kros.observer.certificate.multipliers import best_multipliers
@@ -23,6 +23,7 @@ from kros.observer.certificate.report import relift_report
 from kros.observer.certificate.sdp import sdp_proposal
 from kros.observer.certificate.search import growing_sequence
 from kros.observer.certificate.status import Dropped, ReliftStatus
+from kros.observer.residual.one_step import one_step_residual
 from kros.synthesis import Injection
 
 

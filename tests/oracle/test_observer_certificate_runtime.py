@@ -10,11 +10,11 @@ from adversary import attack, attack_running
 from batches import batch_of
 
 from kros.core.lti import StateSpace, gain
-from kros.evaluate import as_shown
+from kros.evaluate.sensor import as_shown
 from kros.lifting import Lifting
-from kros.observer import Observer, ReliftScales, Runtime, Sensor, relift_certificate, relift_report, run_observer
+from kros.observer import Observer, ReliftScales, Runtime, Sensor, relift_certificate, run_observer
 from kros.observer.certificate.error import error_system, state_sizes
-from kros.observer.certificate.report import frozen_response
+from kros.observer.certificate.report import frozen_response, relift_report
 from kros.synthesis import Injection
 
 DT = 0.01

@@ -11,8 +11,9 @@ from scipy.signal import lfilter
 
 from kros.core.lti import StateSpace, gain
 from kros.lifting import Lifting
-from kros.observer import Observer, Runtime, Seen, relift_certificate, relift_report, run_observer
+from kros.observer import Observer, Runtime, Seen, relift_certificate, run_observer
 from kros.observer.certificate.majorants import energy, majorants
+from kros.observer.certificate.report import relift_report
 from kros.observer.certificate.signals import signal_bound
 from kros.observer.start import Start
 from kros.synthesis import Injection

@@ -9,18 +9,10 @@ from batches import batch_of
 
 from kros.core.errors import DimensionError
 from kros.lifting import Lifting
-from kros.observer import (
-    Observer,
-    PastMoments,
-    ReliftScales,
-    driven_coordinates,
-    one_step_residual,
-    relift_certificate,
-    relift_report,
-    run_observer,
-    with_internal,
-)
-from kros.observer.predictor import embedded
+from kros.observer import Observer, PastMoments, ReliftScales, driven_coordinates, relift_certificate, run_observer, with_internal
+from kros.observer.certificate.report import relift_report
+from kros.observer.predictor.build import embedded
+from kros.observer.residual.one_step import one_step_residual
 from kros.synthesis.residual_shaped.shaping_filter import Basis
 
 DT, SIZES, UNITS = 0.01, (1.0, 0.5), list("aabbcc")

@@ -23,9 +23,9 @@ from kros.observer import (
     run_observer,
     run_observers,
     sample_status,
-    start_covariance,
     track_parameter,
 )
+from kros.observer.baselines.extended_kalman import start_covariance
 from kros.observer.certificate.error import error_system
 from kros.synthesis import Injection
 

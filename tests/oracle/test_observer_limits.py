@@ -10,19 +10,9 @@ from kros.core.lti import gain
 from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
-from kros.observer import (
-    Limit,
-    Observer,
-    Runtime,
-    conditioned,
-    driven_coordinates,
-    relift_certificate,
-    run_observer,
-    signal_bound,
-    with_internal,
-    with_limits,
-)
-from kros.observer.limits import limits_of
+from kros.observer import Observer, Runtime, conditioned, driven_coordinates, relift_certificate, run_observer, signal_bound, with_internal
+from kros.observer.limits import Limit, limits_of
+from kros.observer.predictor.limited import with_limits
 from kros.synthesis import Injection
 
 BACK, LEAK, LIMIT = 0.1, 0.995, 0.4  # of the controller: share of the excess taken off its integrator, its leak, the current's limit

@@ -11,8 +11,9 @@ from kros.core.lti import gain
 from kros.design.monitor import fit_monitor, monitor_facts, poisson_interval, steady, weighted
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
-from kros.observer import Monitor, Observer, SampleStatus, in_sizes, octaves, run_innovations
-from kros.observer.monitor import RECOVERY, WEIGHT
+from kros.observer import Monitor, Observer, SampleStatus, in_sizes
+from kros.observer.monitor import RECOVERY, WEIGHT, octaves
+from kros.observer.simulate import run_innovations
 from kros.plants import HarmonicDrivePopulation
 from kros.synthesis import Injection
 from kros.uncertainty.outliers.tail import prediction_bound

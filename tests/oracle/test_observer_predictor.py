@@ -13,7 +13,8 @@ from kros.observer import (
     relift_certificate,
     run_observer,
 )
-from kros.observer.predictor import embedded, tune_predictor
+from kros.observer.predictor.build import embedded
+from kros.observer.predictor.tuning import tune_predictor
 from kros.synthesis import Injection, kalman
 from kros.synthesis.residual_shaped.shaping_filter import Basis
 

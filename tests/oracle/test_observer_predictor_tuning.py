@@ -6,8 +6,7 @@ from batches import batch_of
 
 from kros.lifting import Lifting
 from kros.observer import Observer, PastMoments, identify_predictor, run_observer
-from kros.observer.predictor import tune_predictor
-from kros.observer.predictor.tuning import _slowing, _Tuning
+from kros.observer.predictor.tuning import _slowing, _Tuning, tune_predictor
 from kros.observer.tuning.blocks import blocks_of, joined
 from kros.synthesis import Injection, kalman
 from kros.synthesis.residual_shaped.shaping_filter import Basis

@@ -6,8 +6,9 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from kros.core import StateSpace
 from kros.lifting import Lifting
-from kros.observer import mean_error_dynamics, one_step_residual, residual_spectra
-from kros.synthesis import Basis, Injection, ResidualProblem, Status, kalman, residual_h2, shaping_filter
+from kros.observer.residual.one_step import mean_error_dynamics, one_step_residual, residual_spectra
+from kros.synthesis import Injection, ResidualProblem, Status, kalman, residual_h2
+from kros.synthesis.residual_shaped.shaping_filter import Basis, shaping_filter
 
 DT = 1e-2
 A = np.array([[1.0, 0.01], [-0.05, 0.95]])

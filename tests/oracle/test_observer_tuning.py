@@ -8,7 +8,8 @@ from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
 from kros.evaluate import unit_interval
 from kros.lifting import Lifting
-from kros.observer import Observer, one_step_rows, residual_models, run_observer, tune_observer
+from kros.observer import Observer, residual_models, run_observer, tune_observer
+from kros.observer.residual.models import one_step_rows
 from kros.synthesis import Injection, ResidualProblem, kalman, residual_h2
 
 DT = 0.01

@@ -11,19 +11,10 @@ from batches import batch_of
 from kros.core.linalg import least_squares, solve_balanced
 from kros.core.lti import StateSpace, gain
 from kros.lifting import Lifting
-from kros.observer import (
-    Features,
-    FilteredDifference,
-    Observer,
-    ReliftScales,
-    Runtime,
-    followed,
-    in_sizes,
-    kalman_candidates,
-    like_measurement_noise,
-    relift_certificate,
-    run_observer,
-)
+from kros.observer import FilteredDifference, Observer, ReliftScales, Runtime, in_sizes, relift_certificate, run_observer
+from kros.observer.baselines.difference import followed
+from kros.observer.baselines.kalman import kalman_candidates, like_measurement_noise
+from kros.observer.baselines.learned import Features
 from kros.synthesis import Injection
 
 DT = 0.01

@@ -10,8 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.signal import welch
 
 from kros.plants import HarmonicDrivePopulation
-from kros.plants.harmonic_drive import GAINS, Loop
-from kros.plants.harmonic_drive.control import VELOCITY_POLE
+from kros.plants.harmonic_drive.control import GAINS, VELOCITY_POLE, Loop
 from kros.plants.harmonic_drive.dynamics import Physics
 from kros.plants.harmonic_drive.linear import disturbance_response
 from kros.plants.harmonic_drive.parameters import draw_parameters

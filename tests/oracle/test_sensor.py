@@ -11,7 +11,7 @@ from kros.core.errors import ConfigError
 from kros.core.lti import gain
 from kros.design.synthesize import measurement_noise
 from kros.design.validation import ValidationSet
-from kros.evaluate import as_arriving, as_shown
+from kros.evaluate.sensor import as_arriving, as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, Sensor, in_sizes, run_observers
 from kros.observer.sensor import require_measured

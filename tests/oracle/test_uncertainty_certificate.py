@@ -7,9 +7,10 @@ import pytest
 
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
-from kros.uncertainty import cover_ratio, fit_magnitude, residual
+from kros.uncertainty import fit_magnitude, residual
 from kros.uncertainty.fits.magnitude import alternation_db
 from kros.uncertainty.weights.certificate import Method, certify
+from kros.uncertainty.weights.cover import cover_ratio
 from kros.uncertainty.weights.fit import fit_weight
 from kros.uncertainty.weights.pencils import Part, ResidualSystems, ratio_systems
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kros.uncertainty import cover_ratio, optimal_cover
+from kros.uncertainty import optimal_cover
+from kros.uncertainty.weights.cover import cover_ratio
 
 
 def residuals(seed: int, units: int, freqs: int, p: int, m: int) -> np.ndarray:

@@ -11,18 +11,11 @@ import pytest
 from kros.core.lti import StateSpace, gain
 from kros.design.settings import SynthesisSettings
 from kros.design.uncertain_set import usable_problem
-from kros.uncertainty import (
-    EntrywiseWeight,
-    Method,
-    Perturbation,
-    ResidualSystems,
-    Structure,
-    UncertainModel,
-    fit_weight,
-    quantify_systems,
-    residual,
-)
+from kros.uncertainty import ResidualSystems, UncertainModel, fit_weight, quantify_systems, residual
+from kros.uncertainty.weights.certificate import Method
+from kros.uncertainty.weights.cover import Perturbation, Structure
 from kros.uncertainty.weights.pencils import ratio_systems
+from kros.uncertainty.weights.weight import EntrywiseWeight
 
 DT = 1e-3
 GRID = np.geomspace(0.01, 500.0, 60)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError, DimensionError
-from kros.uncertainty import fit_magnitude, invert
+from kros.uncertainty import fit_magnitude
+from kros.uncertainty.fits.magnitude import invert
 
 DT = 1e-3
 FREQS = np.geomspace(500e-6, 500.0, 1000)

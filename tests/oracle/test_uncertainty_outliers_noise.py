@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError, DimensionError
-from kros.uncertainty import Form, OutlierModel, Status, score_outliers
+from kros.uncertainty import Form, OutlierModel, score_outliers
+from kros.uncertainty.outliers.score import Status
 
 FREQS = np.geomspace(0.1, 100.0, 40)
 SPREAD, NOISE, DRAWS = 0.02, 0.01, 30

@@ -9,8 +9,10 @@ import pytest
 
 from kros.core.errors import DimensionError
 from kros.core.lti import StateSpace, gain
-from kros.uncertainty import Cover, Form, Structure, Tightness, Weight, fit_magnitude, magnitude_tightness
+from kros.uncertainty import Cover, Form, Weight, fit_magnitude, magnitude_tightness
+from kros.uncertainty.fits.magnitude import Tightness
 from kros.uncertainty.unit_residuals import UnitResiduals, shown_rows, unit_residuals, unstructured_excess, weight_ratio
+from kros.uncertainty.weights.cover import Structure
 
 DT = 1e-2
 FREQS = np.geomspace(0.01, 50.0, 30)

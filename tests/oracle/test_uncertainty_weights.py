@@ -9,7 +9,9 @@ import pytest
 
 from kros.core import StateSpace
 from kros.core.errors import ConfigError
-from kros.uncertainty import EntrywiseWeight, Structure, optimal_cover, quantify_responses, quantify_systems
+from kros.uncertainty import optimal_cover, quantify_responses, quantify_systems
+from kros.uncertainty.weights.cover import Structure
+from kros.uncertainty.weights.weight import EntrywiseWeight
 
 Array = np.ndarray[Any, Any]
 

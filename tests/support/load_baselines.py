@@ -20,8 +20,8 @@ import numpy.typing as npt
 
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
-from kros.motor_drive import low_passed
 from kros.motor_drive.calibrate import LOAD
+from kros.motor_drive.signals import low_passed
 from kros.observer import Observer
 from kros.synthesis.result import Injection
 from kros.synthesis.riccati.constant_gain import kalman

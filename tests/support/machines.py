@@ -6,7 +6,8 @@ import numpy as np
 
 from kros.core.lti import StateSpace
 from kros.lifting import Lifting
-from kros.observer import Monitor, Observer, Runtime, Seen, octaves
+from kros.observer import Monitor, Observer, Runtime, Seen
+from kros.observer.monitor import octaves
 from kros.observer.start import Start
 from kros.synthesis import Injection
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError
-from kros.data import Channel, EpisodeKey, Population, Role, Unit, check_episode, check_population, from_arrays, scan_population
-from kros.data.checks import OnNan, parse_on_nan
+from kros.data import Channel, EpisodeKey, Population, Role, Unit, check_population, from_arrays
+from kros.data.checks import OnNan, check_episode, parse_on_nan, scan_population
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 KEY = EpisodeKey("001011", "load", "7")

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError
-from kros.data import Channel, Role, detect_reader, from_arrays, read, read_parquet, write_parquet, write_raw
+from kros.data import Channel, Role, from_arrays, read, read_parquet, write_parquet, write_raw
 from kros.data.readers.motor_drive_raw import CHANNELS, STEPS
+from kros.data.readers.opening import detect_reader
 
 MAPPING: dict[str, Any] = {
     "files": r"(?P<unit>\w)_(?P<episode>\d)\.csv",

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import EpisodeKey, Unit, from_arrays, read_motor_drive_raw, scan_population, write_raw
+from kros.data import EpisodeKey, Unit, from_arrays, read_motor_drive_raw, write_raw
+from kros.data.checks import scan_population
 from kros.data.readers.motor_drive_raw import CHANNELS, STEPS
 
 HEADER = "t,theta,omega,tau,theta_ref,omega_ref"

@@ -18,8 +18,8 @@ from kros.design.certificates import Running, certify, save_running
 from kros.design.synthesize import choose_deployed, robust_of
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
-from kros.observer import Observer, ReliftScales, ReliftStatus, dropout_bound, relift_certificate, relift_report, signal_bound
-from kros.observer.certificate.report import ReliftRow
+from kros.observer import Observer, ReliftScales, ReliftStatus, dropout_bound, relift_certificate, signal_bound
+from kros.observer.certificate.report import ReliftRow, relift_report
 from kros.report.names import number
 from kros.report.run_folder import RunFolder
 from kros.report.sections.relift import section

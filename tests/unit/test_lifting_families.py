@@ -10,7 +10,6 @@ from kros.lifting import (
     Lifting,
     concatenate,
     delays,
-    family,
     formulas,
     fourier_features,
     grid_centres,
@@ -23,6 +22,7 @@ from kros.lifting import (
     random_centres,
 )
 from kros.lifting.families import number
+from kros.lifting.tables import family
 
 STATES = ("position", "velocity", "current")
 RNG = np.random.default_rng(0)

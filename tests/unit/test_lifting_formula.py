@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DimensionError
-from kros.lifting import Formula, Lifting, parse
+from kros.lifting import Lifting
+from kros.lifting.formula import Formula, parse
 
 NAMES = ("position", "velocity", "phase")
 

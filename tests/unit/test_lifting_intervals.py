@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kros.core.errors import ConfigError
-from kros.lifting import Formula, Lifting, radial
+from kros.lifting import Lifting, radial
+from kros.lifting.formula import Formula
 from kros.lifting.intervals import bounds_of
 
 INF = np.inf

@@ -6,9 +6,10 @@ import pytest
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import StateSpace
 from kros.data import EpisodeBatch
-from kros.evaluate import summarise
+from kros.evaluate.errors import summarise
 from kros.lifting import Lifting
-from kros.observer import Observer, kalman_candidates, noise_covariances, run_observer
+from kros.observer import Observer, run_observer
+from kros.observer.baselines.kalman import kalman_candidates, noise_covariances
 from kros.synthesis import Injection
 
 LIFTING = Lifting(("position", "velocity", "current"), ("sin(10*position + phase)",), ("phase",))

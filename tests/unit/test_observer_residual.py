@@ -5,8 +5,9 @@ import pytest
 
 from kros.core import DataError, DimensionError, SynthesisError
 from kros.lifting import Lifting
-from kros.observer import one_step_residual, residual_spectra
-from kros.synthesis import Basis, ResidualProblem, residual_h2, shaping_filter
+from kros.observer.residual.one_step import one_step_residual, residual_spectra
+from kros.synthesis import ResidualProblem, residual_h2
+from kros.synthesis.residual_shaped.shaping_filter import Basis, shaping_filter
 
 A, C, NOISE, SCALE, DT = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[1.0, 0.0]]), [1e-3], [1.0, 1.0], 1e-2
 

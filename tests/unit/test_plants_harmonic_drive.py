@@ -12,8 +12,8 @@ import pytest
 from kros.core.errors import ConfigError, DataError
 from kros.data import EpisodeKey, read_motor_drive_raw, write_raw
 from kros.plants import HarmonicDrivePopulation
-from kros.plants.harmonic_drive import NOMINAL, Loop
-from kros.plants.harmonic_drive.parameters import OUTLIER_LOG_FACTORS, RIPPLE_DEVIATION, draw_outlier, draw_parameters
+from kros.plants.harmonic_drive.control import Loop
+from kros.plants.harmonic_drive.parameters import NOMINAL, OUTLIER_LOG_FACTORS, RIPPLE_DEVIATION, draw_outlier, draw_parameters
 from kros.plants.harmonic_drive.reference import (
     ACCELERATION_SAMPLES,
     JERK_SAMPLES,

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError, DimensionError
-from kros.evaluate import Kind, draw_interval, interval_rows, mean_intervals, severity_of_growth, unit_interval
+from kros.evaluate import Kind, unit_interval
+from kros.evaluate.intervals import draw_interval, interval_rows, mean_intervals
+from kros.evaluate.robustness import severity_of_growth
 from kros.report.disturbances import Curve, curves, needed, shown_observers
 from kros.report.error_tables import error_table
 

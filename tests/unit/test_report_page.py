@@ -28,9 +28,11 @@ from kros.data.population import Channel, EpisodeKey, Population, Role, Unit
 from kros.data.survey import RecordingFacts
 from kros.design import Design
 from kros.evaluate import standard_disturbances
-from kros.identify import KoopmanMatrices, ModelSet, PhaseCalibration, PhaseSpec, UnitPhase
+from kros.identify import KoopmanMatrices, ModelSet, PhaseCalibration, PhaseSpec
+from kros.identify.calibration import UnitPhase
 from kros.identify.identified import IdentifiedModels
-from kros.identify.refine import RefinedModels, TradeOff
+from kros.identify.refine import RefinedModels
+from kros.identify.refine.model import TradeOff
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.report import plot, render, write_figures
@@ -51,20 +53,11 @@ from kros.report.run_folder import NotShownError, RunFolder
 from kros.report.theme import Tone
 from kros.study.pipeline import RunResult
 from kros.synthesis.result import Injection, Status, Synthesis
-from kros.uncertainty import (
-    Cover,
-    Form,
-    OutlierModel,
-    Tightness,
-    UncertainModel,
-    VariationAndNoise,
-    cover_ratio,
-    quantify_systems,
-    residual,
-    score_outliers,
-)
+from kros.uncertainty import Cover, Form, OutlierModel, UncertainModel, VariationAndNoise, quantify_systems, residual, score_outliers
+from kros.uncertainty.fits.magnitude import Tightness
 from kros.uncertainty.quantify import UncertainModels
 from kros.uncertainty.unit_residuals import UnitResiduals
+from kros.uncertainty.weights.cover import cover_ratio
 
 DT = 0.001
 UNITS = ("000000", "001", "002", "003", "0<b>4")

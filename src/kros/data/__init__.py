@@ -14,41 +14,29 @@ Examples
 
 from . import steps
 from .batch import EpisodeBatch
-from .checks import check_episode, check_population, scan_population
-from .population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Role, Split, TrueChannel, Unit, split_episodes
+from .checks import check_population
+from .population import Channel, EpisodeKey, Population, Role, Split, TrueChannel, Unit, split_episodes
 from .prepare import prepare
-from .readers import (
-    READERS,
-    CsvMapping,
-    detect_reader,
-    from_arrays,
-    from_frame,
-    from_pykoop,
-    read,
-    read_csv_folder,
-    read_motor_drive_raw,
-    read_parquet,
-    to_pykoop,
-)
-from .writers import GroupRecord, write_group, write_index, write_parquet, write_raw
+from .readers.arrays import from_arrays
+from .readers.csv_folder import read_csv_folder
+from .readers.frame import from_frame
+from .readers.motor_drive_raw import read_motor_drive_raw
+from .readers.opening import read
+from .readers.parquet import read_parquet
+from .readers.pykoop_array import from_pykoop, to_pykoop
+from .writers.parquet import write_parquet
+from .writers.raw import write_raw
 
 __all__ = [
-    "DEFAULT_CONDITION",
-    "OUTLIERS",
-    "READERS",
     "Channel",
-    "CsvMapping",
     "EpisodeBatch",
     "EpisodeKey",
-    "GroupRecord",
     "Population",
     "Role",
     "Split",
     "TrueChannel",
     "Unit",
-    "check_episode",
     "check_population",
-    "detect_reader",
     "from_arrays",
     "from_frame",
     "from_pykoop",
@@ -57,12 +45,9 @@ __all__ = [
     "read_csv_folder",
     "read_motor_drive_raw",
     "read_parquet",
-    "scan_population",
     "split_episodes",
     "steps",
     "to_pykoop",
-    "write_group",
-    "write_index",
     "write_parquet",
     "write_raw",
 ]

@@ -23,7 +23,7 @@ from .checks import check_population, scan_prints
 from .copies import Print, refuse_copies
 from .flat_tops import Ends, FoundLimit, ends_of, found_limit
 from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
-from .writers import GroupRecord, write_group, write_index
+from .writers.parquet import GroupRecord, write_group, write_index
 
 log = logging.getLogger(__name__)
 UNLOADED = "noload"
@@ -238,7 +238,7 @@ def _limits(found: Sequence[_Found]) -> dict[str, FoundLimit]:
 
 def _kept(population: Population, found: Sequence[_Found], folder: Path | None) -> Population:
     if folder is not None:
-        from .readers import read_parquet
+        from .readers.parquet import read_parquet
 
         write_index(population, [f.record for f in found if f.record is not None], folder)
         return read_parquet(folder)

@@ -2,14 +2,14 @@
 
 Examples
 --------
->>> from kros.design import PredictorSettings, SynthesisSettings
->>> SynthesisSettings(methods=["memory"]).methods, PredictorSettings(effort="quick").effort
-(('memory',), 'quick')
-
-`kros.synthesize` shows a whole design.
+>>> import kros
+>>> from kros.plants import DcMotorPopulation
+>>> motors = DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+>>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50)
+>>> kros.design.synthesize(uncertain, method="kalman_white").name
+'linear_edmd/kalman_white'
 """
 
-from .settings import ObserverSettings, PredictorSettings, SynthesisSettings
-from .synthesize import Design, Designs, synthesize, synthesize_all
+from .synthesize import Design, synthesize
 
-__all__ = ["Design", "Designs", "ObserverSettings", "PredictorSettings", "SynthesisSettings", "synthesize", "synthesize_all"]
+__all__ = ["Design", "synthesize"]

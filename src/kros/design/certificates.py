@@ -17,19 +17,18 @@ from ..observer import (
     DropoutBound,
     Observer,
     ReliftCertificate,
-    ReliftRow,
     ReliftScales,
     ReliftStatus,
     Sensor,
     SignalBound,
     dropout_bound,
-    one_step_residual,
     relift_certificate,
-    relift_report,
     run_observers,
     signal_bound,
     with_internal,
 )
+from ..observer.certificate.report import ReliftRow, relift_report
+from ..observer.residual.one_step import one_step_residual
 from ..observer.units import factors
 from ..uncertainty.coprime.bands import BandEnergies
 from .task import DesignResult, DesignTask

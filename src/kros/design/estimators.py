@@ -13,22 +13,16 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, SynthesisError
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
-from ..evaluate import error_percent, hold_missing
+from ..evaluate import error_percent
+from ..evaluate.disturb import hold_missing
 from ..identify import ModelSet
 from ..lifting import Lifting
-from ..observer import (
-    ExtendedKalman,
-    Features,
-    FilteredDifference,
-    Learned,
-    Moments,
-    Seen,
-    cutoffs_hz,
-    followed,
-    like_measurement_noise,
-    rates,
-    start_covariance,
-)
+from ..observer import ExtendedKalman, FilteredDifference, Seen
+from ..observer.baselines.difference import cutoffs_hz, followed, rates
+from ..observer.baselines.extended_kalman import start_covariance
+from ..observer.baselines.kalman import like_measurement_noise
+from ..observer.baselines.learned import Features, Learned
+from ..observer.baselines.learned_moments import Moments
 from ..observer.baselines.restarts import restarted
 from ..observer.residual.one_step import one_step_covariance, one_step_residual
 from ..observer.screen import Screen

@@ -17,9 +17,10 @@ import numpy.typing as npt
 
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
-from ..evaluate import as_shown
-from ..observer import Observer, run_innovations
+from ..evaluate.sensor import as_shown
+from ..observer import Observer
 from ..observer.monitor import WEIGHT, Monitor, octaves
+from ..observer.simulate import run_innovations
 from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
 from .validation import TrainingSet, spread
 

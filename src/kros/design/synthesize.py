@@ -24,9 +24,9 @@ from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..identify.kinds import kind_of
-from ..observer import Limit, Limits, Observer, ReliftCertificate, Sensor, Sensors, in_sizes
-from ..observer.limits import limits_of
-from ..observer.sensor import require_measured
+from ..observer import Observer, ReliftCertificate, Sensor, in_sizes
+from ..observer.limits import Limit, Limits, limits_of
+from ..observer.sensor import Sensors, require_measured
 from ..synthesis import ObserverProblem, Synthesis
 from ..uncertainty.quantify import UncertainModels
 from .about import about

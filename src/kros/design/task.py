@@ -13,9 +13,9 @@ from ..core.errors import SynthesisError
 from ..core.lti import gain
 from ..identify import ModelSet
 from ..lifting import Lifting
-from ..observer import Limits, Observer, Runtime, Sensors
-from ..observer.limits import sides
-from ..observer.sensor import delay_of
+from ..observer import Observer, Runtime
+from ..observer.limits import Limits, sides
+from ..observer.sensor import Sensors, delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .settings import PredictorSettings, SynthesisSettings
 from .validation import TrainingSet, rank

@@ -13,11 +13,12 @@ import numpy.typing as npt
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..data.scaled import scale_population
-from ..evaluate import as_shown, error_rms
+from ..evaluate import error_rms
+from ..evaluate.sensor import as_shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
-from ..observer import Observer, Seen, Sensor, Sensors, run_observer, run_observers
-from ..observer.sensor import in_units
+from ..observer import Observer, Seen, Sensor, run_observer, run_observers
+from ..observer.sensor import Sensors, in_units
 
 Array = npt.NDArray[np.float64]
 T = TypeVar("T")

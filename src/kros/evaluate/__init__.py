@@ -10,44 +10,27 @@ Examples
 ([[0.1]], [[2.5]])
 """
 
-from .contractions import Contractions
-from .disturb import SEVERITIES, Disturbance, Kind, Measured, hold_missing, standard_disturbances
-from .errors import ErrorSummary, error_percent, error_rms, error_spectrum, summarise
-from .intervals import draw_interval, interval_rows, mean_intervals, unit_interval
+from .disturb import Disturbance, Kind, standard_disturbances
+from .errors import error_percent, error_rms, error_spectrum
+from .intervals import unit_interval
 from .monte_carlo import MonteCarlo, sample_errors
-from .next_unit import draw_reserve, fewest_units, next_unit_bound
-from .robustness import DisturbedEpisodes, robustness_rows, severity_of_growth
-from .sensor import as_arriving, as_shown
-from .truth import TrueErrors, delay_samples, true_errors
+from .next_unit import next_unit_bound
+from .robustness import DisturbedEpisodes, robustness_rows
+from .truth import TrueErrors, true_errors
 
 __all__ = [
-    "SEVERITIES",
-    "Contractions",
     "Disturbance",
     "DisturbedEpisodes",
-    "ErrorSummary",
     "Kind",
-    "Measured",
     "MonteCarlo",
     "TrueErrors",
-    "as_arriving",
-    "as_shown",
-    "delay_samples",
-    "draw_interval",
-    "draw_reserve",
     "error_percent",
     "error_rms",
     "error_spectrum",
-    "fewest_units",
-    "hold_missing",
-    "interval_rows",
-    "mean_intervals",
     "next_unit_bound",
     "robustness_rows",
     "sample_errors",
-    "severity_of_growth",
     "standard_disturbances",
-    "summarise",
     "true_errors",
     "unit_interval",
 ]

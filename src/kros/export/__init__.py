@@ -16,9 +16,9 @@ True
 """
 
 from .c99.accuracy import HeldOut
-from .c99.compiled import CompiledObserver, find_compiler
+from .c99.compiled import CompiledObserver
 from .c99.numbers import LoadOutput
 from .c99.write import export_c
 from .fmu.write import export_fmu
 
-__all__ = ["CompiledObserver", "HeldOut", "LoadOutput", "export_c", "export_fmu", "find_compiler"]
+__all__ = ["CompiledObserver", "HeldOut", "LoadOutput", "export_c", "export_fmu"]

@@ -13,18 +13,16 @@ Examples
 import sys
 from types import ModuleType
 
-from .bootstrap import ModelSamples, bootstrap_edmd, bootstrap_refined, episode_weights, one_step_deviations
-from .calibration import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
-from .edmd import KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
+from .bootstrap import ModelSamples, bootstrap_edmd, bootstrap_refined, episode_weights
+from .calibration import PhaseCalibration, PhaseSpec, find_segments, resolve_branches, unit_phase
+from .edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from .factors import Factor, combine, episode_factors, lifted_factor, reduce_episode
 from .free_run import free_run
-from .identified import EpisodeFactors, IdentifiedModels
+from .identified import IdentifiedModels
 from .identify import identify
 from .model_set import ModelSet
-from .ranges import Ranges
 
 __all__ = [
-    "EpisodeFactors",
     "Factor",
     "IdentifiedModels",
     "KoopmanMatrices",
@@ -32,9 +30,6 @@ __all__ = [
     "ModelSet",
     "PhaseCalibration",
     "PhaseSpec",
-    "Ranges",
-    "Segment",
-    "UnitPhase",
     "bootstrap_edmd",
     "bootstrap_refined",
     "combine",
@@ -45,9 +40,7 @@ __all__ = [
     "free_run",
     "identify",
     "lifted_factor",
-    "one_step_deviations",
     "reduce_episode",
-    "residual_covariance",
     "resolve_branches",
     "smallest_stabilising_alpha",
     "unit_phase",

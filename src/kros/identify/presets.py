@@ -12,7 +12,9 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 from ..core.files import did_you_mean
 from ..data.population import Population, split_episodes
-from ..lifting import Formula, Lifting, concatenate, family
+from ..lifting import Lifting, concatenate
+from ..lifting.formula import Formula
+from ..lifting.tables import family
 from .calibration import PhaseSpec
 from .settings import CalibrationSettings, LiftingSettings
 

@@ -9,7 +9,9 @@ import numpy as np
 
 from ..core.errors import ConfigError, DataError
 from ..data import Population
-from ..identify import KoopmanMatrices, ModelSet, Ranges, combine, episode_factors, residual_covariance
+from ..identify import KoopmanMatrices, ModelSet, combine, episode_factors
+from ..identify.edmd import residual_covariance
+from ..identify.ranges import Ranges
 from .pykoop import from_pykoop
 
 

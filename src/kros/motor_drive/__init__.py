@@ -11,26 +11,19 @@ Examples
 [0.0, 0.2]
 """
 
-from .accuracy import LoadAccuracy, load_accuracy
 from .calibrate import LoadCalibration, calibrate_load
 from .from_current import TorqueScale, calibrate_torque, load_from_current
-from .level import AngleLoad, LoadAndCurrent, RunningAngleLoad
+from .level import AngleLoad
 from .load_observer import load_observer
-from .signals import known_load, low_passed, without_level
+from .signals import known_load
 
 __all__ = [
     "AngleLoad",
-    "LoadAccuracy",
-    "LoadAndCurrent",
     "LoadCalibration",
-    "RunningAngleLoad",
     "TorqueScale",
     "calibrate_load",
     "calibrate_torque",
     "known_load",
-    "load_accuracy",
     "load_from_current",
     "load_observer",
-    "low_passed",
-    "without_level",
 ]

@@ -20,7 +20,7 @@ from ..core.errors import DataError, DimensionError
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
 from ..lifting import Lifting
-from ..observer.predictor import PastMoments
+from ..observer.predictor.moments import PastMoments
 from ..synthesis.residual_shaped.shaping_filter import Basis
 from .signals import low_passed, without_level
 

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..observer.observer import Observer
-from ..observer.predictor import embedded, tune_predictor
+from ..observer.predictor.build import embedded
 from ..observer.predictor.moments import hidden_of
+from ..observer.predictor.tuning import tune_predictor
 from .calibrate import LoadCalibration
 
 _OTHERS = 0.1  # weight of the recorded states' errors beside the load's

@@ -8,10 +8,10 @@ Population(2 units, 1 condition, 2 episodes every 0.002 s; states position (meas
 """
 
 from .dc_motor import DcMotorPopulation
-from .harmonic_drive import HarmonicDrivePopulation
+from .harmonic_drive.population import HarmonicDrivePopulation
 from .pendulum import PendulumPopulation
 from .simulated import SimulatedPopulation
 
 PLANTS = {"harmonic-drive": HarmonicDrivePopulation, "pendulum": PendulumPopulation, "dc-motor": DcMotorPopulation}
 
-__all__ = ["PLANTS", "DcMotorPopulation", "HarmonicDrivePopulation", "PendulumPopulation", "SimulatedPopulation"]
+__all__ = ["DcMotorPopulation", "HarmonicDrivePopulation", "PendulumPopulation", "SimulatedPopulation"]

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..evaluate import Kind, severity_of_growth
+from ..evaluate import Kind
+from ..evaluate.robustness import severity_of_growth
 from .names import Look, number, split_observer
 from .theme import Tone
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..data.population import natural_key
-from ..evaluate import mean_intervals, unit_interval
+from ..evaluate import unit_interval
+from ..evaluate.intervals import mean_intervals
 
 Rows = Sequence[Mapping[str, Any]]
 PAPER = "koopman_edmd/mixed"

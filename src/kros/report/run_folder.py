@@ -23,7 +23,8 @@ from ..identify import ModelSet, PhaseCalibration
 from ..identify.refine import RefinedModels
 from ..observer import Observer
 from ..synthesis.result import Synthesis
-from ..uncertainty import OutlierModel, Tightness, UncertainModel, VariationAndNoise
+from ..uncertainty import OutlierModel, UncertainModel, VariationAndNoise
+from ..uncertainty.fits.magnitude import Tightness
 from ..uncertainty.unit_residuals import UnitResiduals
 
 Array = npt.NDArray[Any]

@@ -12,10 +12,11 @@ import numpy as np
 
 from ..core.artifacts import load_artifact, plain, read_json
 from ..data.flat_tops import FoundLimit
-from ..evaluate import interval_rows
+from ..evaluate.intervals import interval_rows
 from ..observer.limits import Limit, limits_of
 from ..synthesis.result import Synthesis
-from ..uncertainty import Tightness, UncertainModel, VariationAndNoise
+from ..uncertainty import UncertainModel, VariationAndNoise
+from ..uncertainty.fits.magnitude import Tightness
 from .config import Stage
 from .engine.context import Context
 from .engine.store import Store

@@ -11,7 +11,8 @@ from typing import Any
 from ..core.artifacts import read_json
 from ..core.errors import ConfigError
 from ..core.work import Progress, Silent, Work
-from ..data import Population, detect_reader
+from ..data import Population
+from ..data.readers.opening import detect_reader
 from ..design.task import is_robust
 from ..observer import Observer
 from .config import Stage, StudyConfig, load_config, validate_config

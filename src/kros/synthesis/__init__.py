@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from .reduction.polishing import polish
     from .reduction.truncation import reduce_controller
     from .residual_shaped.residual_h2 import ResidualProblem, residual_h2
-    from .residual_shaped.shaping_filter import Basis, shaping_filter
     from .result import Injection, Status, Synthesis
     from .riccati.constant_gain import kalman, luenberger
     from .riccati.h2_optimal import h2
@@ -38,7 +37,6 @@ if TYPE_CHECKING:
     from .worst_case.worst_case_hinf import worst_case_hinf
 
 _HOME = {
-    "Basis": "residual_shaped.shaping_filter",
     "Block": "structured.blocks",
     "GeneralizedPlant": "generalized_plant",
     "Injection": "result",
@@ -63,13 +61,11 @@ _HOME = {
     "reduce_controller": "reduction.truncation",
     "residual_h2": "residual_shaped.residual_h2",
     "robust_gain": "worst_case.robust_gain",
-    "shaping_filter": "residual_shaped.shaping_filter",
     "worst_case_h2": "worst_case.worst_case_h2",
     "worst_case_hinf": "worst_case.worst_case_hinf",
 }
 
 __all__ = [
-    "Basis",
     "Block",
     "GeneralizedPlant",
     "Injection",
@@ -94,7 +90,6 @@ __all__ = [
     "reduce_controller",
     "residual_h2",
     "robust_gain",
-    "shaping_filter",
     "worst_case_h2",
     "worst_case_hinf",
 ]

@@ -12,54 +12,42 @@ Examples
 ('1', True)
 """
 
-from .fits.magnitude import FittedMagnitude, Side, Tightness, fit_magnitude, invert, magnitude_tightness
-from .forms import Form, bounds, completion, existence, misfit, rebuild, residual, residual_shape
-from .model import ResponseUncertainty, UncertainModel, scale_system
-from .nominal.choice import Criterion, NominalChoice, choose_nominal, choose_nominals
+from .fits.magnitude import FittedMagnitude, fit_magnitude, magnitude_tightness
+from .forms import Form, bounds, completion, existence, misfit, rebuild, residual
+from .model import ResponseUncertainty, UncertainModel
+from .nominal.choice import NominalChoice, choose_nominal, choose_nominals
 from .outliers.model import OutlierModel, score_outliers
-from .outliers.score import OutlierScore, Status
+from .outliers.score import OutlierScore
 from .quantify import UncertainModels, quantify
 from .responses import quantify_responses
 from .small_matrices import sigma_max
 from .systems import quantify_systems
 from .variation import VariationAndNoise, variation_and_noise
-from .weights.certificate import Method, certify
-from .weights.cover import Cover, Perturbation, Structure, cover_ratio, optimal_cover
+from .weights.cover import Cover, optimal_cover
 from .weights.fit import fit_weight
 from .weights.pencils import ResidualSystems
-from .weights.weight import EntrywiseWeight, Weight
+from .weights.weight import Weight
 
 __all__ = [
     "Cover",
-    "Criterion",
-    "EntrywiseWeight",
     "FittedMagnitude",
     "Form",
-    "Method",
     "NominalChoice",
     "OutlierModel",
     "OutlierScore",
-    "Perturbation",
     "ResidualSystems",
     "ResponseUncertainty",
-    "Side",
-    "Status",
-    "Structure",
-    "Tightness",
     "UncertainModel",
     "UncertainModels",
     "VariationAndNoise",
     "Weight",
     "bounds",
-    "certify",
     "choose_nominal",
     "choose_nominals",
     "completion",
-    "cover_ratio",
     "existence",
     "fit_magnitude",
     "fit_weight",
-    "invert",
     "magnitude_tightness",
     "misfit",
     "optimal_cover",
@@ -68,8 +56,6 @@ __all__ = [
     "quantify_systems",
     "rebuild",
     "residual",
-    "residual_shape",
-    "scale_system",
     "score_outliers",
     "sigma_max",
     "variation_and_noise",

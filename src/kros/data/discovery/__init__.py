@@ -2,8 +2,3 @@
 
 Nothing here decides what a study computes: it writes down a mapping that people can correct, and says what it rests on.
 """
-
-from .discover import Discovery, Wanted, assign, discover
-from .roles import Column, Part
-
-__all__ = ["Column", "Discovery", "Part", "Wanted", "assign", "discover"]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
-from ...observer import mean_error_dynamics
+from ...observer.residual.one_step import mean_error_dynamics
 from ...synthesis import Injection, ObserverProblem, Synthesis, worst_case_h2, worst_case_hinf
 from ...uncertainty import Form
 from ...uncertainty.coprime.bands import BandEnergies, band_edges

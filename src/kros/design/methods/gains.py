@@ -10,9 +10,9 @@ import numpy as np
 
 from ...core.errors import SynthesisError
 from ...core.lti import gain
-from ...observer import kalman_candidates, luenberger_candidates, mean_error_dynamics, noise_covariances
+from ...observer.baselines.kalman import kalman_candidates, luenberger_candidates, noise_covariances
 from ...observer.residual.models import Refitted, refitted_models
-from ...observer.residual.one_step import one_step_covariance
+from ...observer.residual.one_step import mean_error_dynamics, one_step_covariance
 from ...synthesis import Synthesis, kalman
 from ..task import DesignResult, DesignTask, without_correction
 from ..validation import ValidationSet, hidden_mean

@@ -16,14 +16,16 @@ from ...core.errors import KrosError, SynthesisError
 from ...data import EpisodeBatch
 from ...evaluate import error_rms
 from ...lifting import Lifting
-from ...observer import Observer, PastMoments, Runtime, conditioned, driven_coordinates, run_observer, with_limits
+from ...observer import Observer, PastMoments, Runtime, conditioned, driven_coordinates, run_observer
 from ...observer.certificate.error import error_system
 from ...observer.certificate.search import quick_gain
 from ...observer.limits import sides
-from ...observer.predictor import Recipe, choose, embedded, tune_predictor
-from ...observer.predictor.choice import AT_LIMITS
+from ...observer.predictor.build import embedded
+from ...observer.predictor.choice import AT_LIMITS, Recipe, choose
+from ...observer.predictor.limited import with_limits
 from ...observer.predictor.moments import limited
 from ...observer.predictor.start import with_start
+from ...observer.predictor.tuning import tune_predictor
 from ...synthesis import Status, Synthesis
 from ...synthesis.residual_shaped.shaping_filter import Basis
 from ..certificates import DIVERGED, dropout_error_percent, scales_of

@@ -8,7 +8,9 @@ import numpy as np
 
 from ...core.lti import StateSpace, gain
 from ...synthesis import Injection, ObserverProblem, mixed
-from ...uncertainty import EntrywiseWeight, Structure, quantify_systems
+from ...uncertainty import quantify_systems
+from ...uncertainty.weights.cover import Structure
+from ...uncertainty.weights.weight import EntrywiseWeight
 from ..task import DesignResult, DesignTask
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import SynthesisError
-from ...observer import Observer, ResidualModel, Runtime, residual_models, tune_observer
+from ...observer import Observer, Runtime, residual_models, tune_observer
+from ...observer.residual.models import ResidualModel
 from ...synthesis import ResidualProblem, Synthesis, residual_h2
 from ..task import DesignResult, DesignTask, first_of
 from ..validation import ValidationSet

@@ -21,17 +21,10 @@ import numpy.typing as npt
 from ...core.errors import KrosError, SynthesisError
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.norms import hinf_norm
-from ...observer import (
-    Observer,
-    Runtime,
-    mean_error_dynamics,
-    one_step_residual,
-    relift_certificate,
-    residual_spectra,
-    tune_observer,
-)
+from ...observer import Observer, Runtime, relift_certificate, tune_observer
 from ...observer.certificate.signals import SignalBound, signal_bound
 from ...observer.residual.models import refitted_models
+from ...observer.residual.one_step import mean_error_dynamics, one_step_residual, residual_spectra
 from ...observer.residual.signal_bounds import signal_lower_bounds
 from ...synthesis import Injection, ObserverProblem, ResidualProblem, Status, Synthesis, hinf, residual_h2
 from ...synthesis.problem.plants import shaped_plant

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...core.artifacts import json_bytes, with_checksum, write_bytes
 from ...core.errors import ConfigError
-from ...data.writers import whole_folder
+from ...data.writers.folders import whole_folder
 from ...observer import Observer
 from ...observer.file import observer_content
 from .accuracy import Accuracy, HeldOut

@@ -1,7 +1,7 @@
 """Population refinement: a pooled model on free-run error, then every unit with a prior centred on it."""
 
-from .model import RefinedModels, TradeOff
+from .model import RefinedModels
 from .options import RefineOptions
 from .population import refine_population
 
-__all__ = ["RefineOptions", "RefinedModels", "TradeOff", "refine_population"]
+__all__ = ["RefineOptions", "RefinedModels", "refine_population"]

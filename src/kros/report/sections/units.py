@@ -14,7 +14,7 @@ from ...core.artifacts import load_artifact
 from ...core.errors import KrosError
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey
-from ...evaluate import as_shown
+from ...evaluate.sensor import as_shown
 from ...observer import run_observer
 from ..content import Cell, Cells, Panel, Section, Table
 from ..figures.recordings.phase import GOOD

@@ -14,9 +14,10 @@ from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
 from ...observer import Observer
-from ...uncertainty import OutlierModel, Status
+from ...uncertainty import OutlierModel
 from ...uncertainty.outliers.population import score_row
 from ...uncertainty.outliers.recorded import Evidence, Recorded
+from ...uncertainty.outliers.score import Status
 from ..config import Stage, StudyConfig
 from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished

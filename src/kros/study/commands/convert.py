@@ -7,9 +7,10 @@ from typing import Any
 
 from ...core.files import read_toml
 from ...core.work import Progress
-from ...data import Population, check_population, read, read_parquet, write_group, write_index
-from ...data.readers import detect_reader
-from ...data.writers import GroupRecord, whole_folder
+from ...data import Population, check_population, read, read_parquet
+from ...data.readers.opening import detect_reader
+from ...data.writers.folders import whole_folder
+from ...data.writers.parquet import GroupRecord, write_group, write_index
 from ..engine.executors import open_executor
 
 Task = tuple[Population, str, str, Path]

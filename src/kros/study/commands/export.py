@@ -13,7 +13,7 @@ from ...core.files import did_you_mean
 from ...data import EpisodeBatch
 from ...data.survey import RecordingFacts
 from ...design.validation import spread
-from ...evaluate import as_arriving
+from ...evaluate.sensor import as_arriving
 from ...export import HeldOut, LoadOutput, export_c, export_fmu
 from ...motor_drive import AngleLoad
 from ...observer import Observer

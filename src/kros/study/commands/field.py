@@ -13,7 +13,7 @@ from ...core.errors import ConfigError, IdentificationError
 from ...data import EpisodeBatch, Population
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
-from ...evaluate import as_arriving
+from ...evaluate.sensor import as_arriving
 from ...observer import Observer, run_observer, track_parameter
 from ...observer.samples import SampleStatus
 from ...observer.screen import sample_status

@@ -13,11 +13,10 @@ from typing import Any
 from ...core.errors import ConfigError, DataError, IdentificationError
 from ...core.files import parse_toml
 from ...core.work import Progress, Work
-from ...data import Population, Role, check_population, detect_reader
-from ...data.discovery import Column, Discovery, Part, Wanted, discover
-from ...data.discovery.discover import Ask
-from ...data.discovery.roles import is_commanded, kind_of
-from ...data.readers.opening import LOOKS
+from ...data import Population, Role, check_population
+from ...data.discovery.discover import Ask, Discovery, Wanted, discover
+from ...data.discovery.roles import Column, Part, is_commanded, kind_of
+from ...data.readers.opening import LOOKS, detect_reader
 from ...data.survey import UNLOADED, RecordingFacts, survey
 from ...identify import PhaseSpec
 from ...identify.calibrate import calibrate

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...observer import Observer, run_innovations
+from ...observer import Observer
 from ...observer.monitor import Monitor
-from ...uncertainty import Status
+from ...observer.simulate import run_innovations
+from ...uncertainty.outliers.score import Status
 from .field import Arriving, FieldRecordings
 
 Array = npt.NDArray[np.float64]

@@ -8,7 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ...data.discovery import Column, Discovery, Part
+from ...data.discovery.discover import Discovery
+from ...data.discovery.roles import Column, Part
 
 COMMENTS = {
     "files": "what a file is: a regular expression on its path, whose groups unit, condition, episode and group are read",

@@ -18,16 +18,8 @@ import numpy as np
 
 from ...core.errors import KrosError
 from ...identify import ModelSet
-from ...uncertainty import (
-    Form,
-    Tightness,
-    UncertainModel,
-    choose_nominals,
-    magnitude_tightness,
-    optimal_cover,
-    residual,
-    variation_and_noise,
-)
+from ...uncertainty import Form, UncertainModel, choose_nominals, magnitude_tightness, optimal_cover, residual, variation_and_noise
+from ...uncertainty.fits.magnitude import Tightness
 from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.settings import UncertaintySettings
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals

@@ -16,18 +16,12 @@ from ...data.population import EpisodeKey, Population
 from ...design.estimators import Baseline
 from ...design.synthesize import measurement_noise
 from ...design.task import split_name
-from ...evaluate import (
-    Disturbance,
-    DisturbedEpisodes,
-    Kind,
-    Measured,
-    as_shown,
-    draw_interval,
-    robustness_rows,
-    standard_disturbances,
-    unit_interval,
-)
-from ...observer import Observer, Sensors, run_observers
+from ...evaluate import Disturbance, DisturbedEpisodes, Kind, robustness_rows, standard_disturbances, unit_interval
+from ...evaluate.disturb import Measured
+from ...evaluate.intervals import draw_interval
+from ...evaluate.sensor import as_shown
+from ...observer import Observer, run_observers
+from ...observer.sensor import Sensors
 from ..config import EvaluateConfig
 from ..engine.context import Context
 from .members import member_work

@@ -19,11 +19,14 @@ from ...design.estimators import Baseline, make_difference, make_extended, make_
 from ...design.mean_profile import make_mean_profile
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
-from ...evaluate import ErrorSummary, TrueErrors, as_shown, summarise, true_errors
+from ...evaluate import TrueErrors, true_errors
+from ...evaluate.errors import ErrorSummary, summarise
+from ...evaluate.sensor import as_shown
 from ...identify import ModelSet, free_run
 from ...identify.presets import gearbox_band_hz
-from ...observer import Observer, Sensors, run_observers
+from ...observer import Observer, run_observers
 from ...observer.limits import limits_of, sides
+from ...observer.sensor import Sensors
 from ..engine.context import Context
 from .disturbed import Trial, make_trial, run_disturbed
 from .load import run_load

@@ -20,19 +20,11 @@ from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey
 from ...design.validation import seen_by
-from ...evaluate import as_arriving
+from ...evaluate.sensor import as_arriving
 from ...lifting import Lifting
-from ...motor_drive import (
-    AngleLoad,
-    LoadCalibration,
-    calibrate_load,
-    calibrate_torque,
-    known_load,
-    load_accuracy,
-    load_from_current,
-    load_observer,
-    low_passed,
-)
+from ...motor_drive import AngleLoad, LoadCalibration, calibrate_load, calibrate_torque, known_load, load_from_current, load_observer
+from ...motor_drive.accuracy import load_accuracy
+from ...motor_drive.signals import low_passed
 from ...observer import Observer, run_observer
 from ..config import LoadConfig
 from ..engine.context import Context

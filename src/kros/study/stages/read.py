@@ -9,7 +9,7 @@ from ...data.population import OUTLIERS
 from ...data.prepare import prepare
 from ...data.steps import parse_steps
 from ...data.survey import check_usable, survey
-from ...evaluate import draw_reserve
+from ...evaluate.next_unit import draw_reserve
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...observer.limits import limits_of
 from ...observer.sensor import require_measured

@@ -14,18 +14,9 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...data.scaled import scale_population
-from ...identify import (
-    Factor,
-    KoopmanMatrices,
-    ModelSamples,
-    ModelSet,
-    Ranges,
-    bootstrap_edmd,
-    bootstrap_refined,
-    episode_weights,
-    lifted_factor,
-)
+from ...identify import Factor, KoopmanMatrices, ModelSamples, ModelSet, bootstrap_edmd, bootstrap_refined, episode_weights, lifted_factor
 from ...identify.identify import refine_options
+from ...identify.ranges import Ranges
 from ...identify.refine.episodes import episode_normals
 from ..engine.context import Context
 

@@ -45,11 +45,11 @@ class ResidualProblem:
     Parameters
     ----------
     A : ndarray, shape (n, n)
-        Error dynamics of the original states (`kros.observer.mean_error_dynamics`).
+        Error dynamics of the original states (`mean_error_dynamics` in `kros.observer.residual.one_step`).
     C : ndarray, shape (q, n)
         Selects the measured states.
     spectra : ndarray, shape (unit, f, n, n), complex
-        Cross spectral density of every unit's one-step residual (`kros.observer.residual_spectra`), physical units.
+        Cross spectral density of every unit's one-step residual (`residual_spectra` in `kros.observer.residual.one_step`), physical units.
     noise : ndarray, shape (q,)
         Standard deviation of the measurement noise.
     scale : ndarray, shape (n,)

@@ -56,7 +56,7 @@ class SignalSet:
         Parameters
         ----------
         residual : ndarray, shape (n_samples, batch, n)
-            One-step residuals (`kros.observer.one_step_residual`), of the states that are recorded.
+            One-step residuals (`kros.observer.residual.one_step`), of the states that are recorded.
         lengths : array_like of int, shape (batch,)
             Residuals of every episode that count.
         units : sequence of str, length batch

@@ -6,7 +6,7 @@ import numpy as np
 
 from ....data import EpisodeBatch
 from ....design import Design
-from ....evaluate import as_shown
+from ....evaluate.sensor import as_shown
 from ....identify.identified import IdentifiedModels
 from ....observer import Observer, run_observer
 from ...canvas import Figure, grid, label_below, legend, note

@@ -6,7 +6,8 @@ import numpy as np
 
 from ....data import EpisodeBatch
 from ....data.survey import RecordingFacts
-from ....observer import Observer, one_step_residual
+from ....observer import Observer
+from ....observer.residual.one_step import one_step_residual
 from ....uncertainty.coprime.signals import SignalSet
 from ...canvas import Array, Axes, Figure, frequency_axis, grid, legend, lines_of_units, logarithmic
 from ...names import best_models, model_label

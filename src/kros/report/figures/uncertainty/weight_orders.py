@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ....uncertainty import Structure, Tightness, UncertainModel
+from ....uncertainty import UncertainModel
+from ....uncertainty.fits.magnitude import Tightness
+from ....uncertainty.weights.cover import Structure
 from ...canvas import Axes, Figure, grid, legend
 from ...names import model_label
 from ...run_folder import RunFolder

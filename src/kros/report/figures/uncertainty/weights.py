@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ....uncertainty import Cover, Form, Structure, UncertainModel, sigma_max
+from ....uncertainty import Cover, Form, UncertainModel, sigma_max
+from ....uncertainty.weights.cover import Structure
 from ...canvas import Array, Axes, Figure, decibel, frequency_axis, grid, label_below, line_over_shade, note
 from ...names import best_models, model_label, number
 from ...run_folder import NotShownError, RunFolder

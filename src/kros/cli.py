@@ -128,7 +128,7 @@ def demo(
 
 @app.command()
 def simulate(
-    out: Annotated[Path, typer.Argument(help="New folder for the recordings.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the recordings.")],
     plant: Annotated[str, typer.Option(help="harmonic-drive, pendulum or dc-motor.")] = "harmonic-drive",
     units: Annotated[int, typer.Option(min=1)] = 12,
     episodes: Annotated[int, typer.Option(min=1, max=1000)] = 10,
@@ -229,7 +229,7 @@ def estimate(
         Path,
         typer.Argument(metavar="DATA", help="Folder in the run's reader, or a TOML with [data]; no hidden channels needed."),
     ],
-    out: Annotated[Path, typer.Argument(help="New file, .parquet or .csv")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="New file, .parquet or .csv")],
     parameter: Annotated[
         list[str] | None, typer.Option(metavar="UNIT.NAME=VALUE", help="A unit's lifting parameter, such as its phase.")
     ] = None,
@@ -251,7 +251,7 @@ app.add_typer(export, name="export")
 @export.command("c")
 def export_c(
     run_folder: Annotated[Path, typer.Argument(metavar="RUN")],
-    out: Annotated[Path, typer.Argument(help="New folder for the source.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the source.")],
     name: Annotated[str | None, typer.Option(help="Prefix of all names, a C identifier; default: the study's name.")] = None,
     precision: Annotated[str, typer.Option(help="double or float")] = "double",
     observer: Annotated[str, typer.Option(help="Observer of the run; default: the one that is deployed.")] = "deployed",

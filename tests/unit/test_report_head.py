@@ -49,6 +49,12 @@ def test_a_manager_reads_light_sentence_and_numbers_with_units() -> None:
     )
 
 
+BETTER_IN_ONE = [
+    (NAME, 0.2, "velocity"),
+    (NAME, 6.2, "current"),
+    ("koopman/open_loop", 0.9, "velocity"),
+    ("koopman/open_loop", 6.1, "current"),
+]
 FLAGGED = {"unit": "b", "condition": "default", "score": 9.0, "outlier": True}
 
 
@@ -61,6 +67,12 @@ FLAGGED = {"unit": "b", "condition": "default", "score": 9.0, "outlier": True}
         ({"evaluation": [row(NAME, 0.2), row("linear/mixed", 0.1)]}, Level.LOOK, "observers", "“linear, mixed H2-H∞” is more accurate"),
         ({"evaluation": [row(NAME, None)]}, Level.STOP, "models", "diverge"),
         ({"evaluation": [row(NAME, 0.9), row("koopman/open_loop", 0.9)]}, Level.STOP, "observers", "no better than its model alone"),
+        (
+            {"evaluation": [row(o, e, channel=c) for o, e, c in BETTER_IN_ONE]},
+            Level.LOOK,
+            "observers",
+            "Correction brings nothing for current",
+        ),
         ({"observers": {"learned": {}}}, Level.LOOK, "synthesis", "No robust observer"),
         ({"left_out": {"rows": [row(NAME, None)], "failed": {}}}, Level.STOP, "left-out", "diverges on some units"),
         ({"monte_carlo": {"sets": [{"observer": NAME, "exceeded": True}]}}, Level.STOP, "robustness", "the certificate is wrong"),
@@ -136,7 +148,7 @@ def test_the_card_says_what_an_engineer_needs_and_what_voids_the_certificate(tmp
     assert "phase (0.300 on the nominal unit)" in card["Parameters"]
     # of the one-step map: 0.5 (angle - C angle), 0.002 and 0.5 from angle's row; -2, 0.5, 0.25, 0.5 and 2 from velocity's
     assert card["Cost of a step"].startswith("2 states, 8 multiply-adds and 1 lifted function;")
-    assert "velocity 1.50 % of the largest value" in card["Certificate"]
+    assert "1.50 % in velocity (of the largest value)" in card["Certificate"]
     assert card["It assumes"] == "any value of phase."
     assert card["It is void"].startswith("When a loop is closed on the estimate")
     assert "of 38 units. One more good unit leaves it with a probability of 2 %, and 2.00 times an hour of motion" in card["Monitor"]

@@ -71,7 +71,7 @@ def _observer(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str
             f"Look at “{observer_label(better)}” before deploying anything: it is better in all that is not measured. Compare under Trust; "
             "observer.deployed names the one that is deployed."
         ]
-    if no_better_than_open_loop(table, name, hidden):
+    if hidden and not_improved(table, name, hidden) == hidden:
         return ["The observer is no better than its model alone: measure something that tells more of what is hidden, or look at Models."]
     entry = metrics.get("observers", {}).get(name, {})
     text = "Try it on recordings with “kros estimate”, then hand observers/deployed.json over: “kros export” writes C99 or an FMU."
@@ -86,10 +86,10 @@ def better_observer(table: ErrorTable, name: str, channels: Sequence[str]) -> st
     return min(better, key=lambda o: sum(table.cells[o][c].mean or 0.0 for c in channels), default=None)
 
 
-def no_better_than_open_loop(table: ErrorTable, name: str, channels: Sequence[str]) -> bool:
-    """Tell whether an observer is no better than its model without correction, in some channel."""
+def not_improved(table: ErrorTable, name: str, channels: Sequence[str]) -> list[str]:
+    """Return the channels in which an observer is no better than its model without correction."""
     other = f"{split_observer(name)[0]}/open_loop"
-    return name != other and other in table.cells and not _smaller(table, name, other, channels, 0.99)
+    return [c for c in channels if not _smaller(table, name, other, [c], 0.99)] if name != other and other in table.cells else []
 
 
 def _smaller(table: ErrorTable, one: str, other: str, channels: Sequence[str], ratio: float) -> bool:

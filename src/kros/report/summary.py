@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .advice import better_observer, no_better_than_open_loop
+from .advice import better_observer, not_improved
 from .caveats import confounded_text, small_set_text
 from .content import Alert, Level
 from .error_tables import home_table, left_out_tables
@@ -97,7 +97,7 @@ def _stops(metrics: Metrics, measured: Sequence[str]) -> list[Alert]:
         texts.append(
             (f"The estimates of “{observer_label(name)}” diverge on held-out episodes: do not use it. See Models first.", "models")
         )
-    elif table is not None and no_better_than_open_loop(table, name, table.hidden(measured, name)):
+    elif table is not None and (hidden := table.hidden(measured, name)) and not_improved(table, name, hidden) == hidden:
         texts.append(
             ("The observer is no better than its model alone: correction from these measurements brings nothing here.", "observers")
         )
@@ -131,6 +131,9 @@ def _looks(metrics: Metrics, measured: Sequence[str]) -> list[Alert]:
     model, trust, table = split_observer(name)[0], trust_of(metrics.get("observers", {}).get(name, {})), home_table(metrics)
     if table is not None and (better := better_observer(table, name, table.hidden(measured, name))):
         texts.append((f"“{observer_label(better)}” is more accurate in all that is not measured.", "observers"))
+    if table is not None and 0 < len(same := not_improved(table, name, hidden := table.hidden(measured, name))) < len(hidden):
+        channels = joined([c.replace("_", " ") for c in same])
+        texts.append((f"Correction brings nothing for {channels}: the model alone does as well there.", "observers"))
     if trust.running is False:
         texts.append(("No certificate covers the observer as it runs.", "trust"))
     if trust.outside:

@@ -167,8 +167,8 @@ def _certificate(metrics: Metrics) -> list[str]:
         sentences.append(f"Its error is certified for all plants inside the uncertain set{near}.")
     trust = trust_of(entry)
     if trust.signals:
-        bounds = joined([f"{state.replace('_', ' ')} {number(value)} %" for state, value in trust.signals.items()])
-        sentences.append(f"For all signals with the power that was recorded its RMS errors are at most {bounds} of the largest value.")
+        bounds = joined([f"{number(value)} % in {state.replace('_', ' ')}" for state, value in trust.signals.items()])
+        sentences.append(f"For all signals with the power that was recorded its RMS errors are at most {bounds} (of the largest value).")
     if entry.get("relift_certified") is not None:
         which = "Another certificate" if sentences else "A certificate"
         sentences.append(

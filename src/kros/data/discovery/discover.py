@@ -391,7 +391,9 @@ def _too_few(population: Population, found: Examined) -> list[str]:
     lacking = {u: [c for c in population.conditions if (u, c) not in counts] for u in units}
     some = [f"{u} lacks {_some(missing)}" for u, missing in lacking.items() if missing]
     if some:
-        texts.append(f"not every unit was recorded in every condition: {'; '.join(some[:4])}{f'; {len(some) - 4} more units' if len(some) > 4 else ''}")
+        texts.append(
+            f"not every unit was recorded in every condition: {'; '.join(some[:4])}{f'; {len(some) - 4} more units' if len(some) > 4 else ''}"
+        )
     return texts
 
 

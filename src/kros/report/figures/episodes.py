@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import repeat
@@ -10,11 +11,13 @@ import numpy as np
 
 from ...data.population import OUTLIERS, Channel, EpisodeKey, Role
 from ..canvas import Array, Axes, Figure, grid, label_below, legend, thin
-from ..names import Look, axis_label, paper_pair
+from ..names import Look, paper_pair, readable_unit, shorten
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import Tone
 
 Line = tuple[str, Array, Look]
+
+LINE = 14  # letters beside an axis of a strip
 
 
 @dataclass(frozen=True)
@@ -161,7 +164,9 @@ def label_rows(axes: Iterable[Axes], channels: Sequence[Channel], suffixes: Iter
     """Label the vertical axes with channel and unit of measure."""
     for row, channel, suffix in zip(axes, channels, suffixes):  # noqa: B905 - suffixes may go on for ever
         row.locator_params(axis="y", nbins=4)
-        row.set_ylabel(axis_label(f"{channel.name}{suffix}", channel.unit).replace(" (", "\n("))
+        lines = textwrap.wrap(f"{channel.name}{suffix}".replace("_", " "), LINE, break_long_words=False)[:2]
+        unit = readable_unit(channel.unit)
+        row.set_ylabel("\n".join([*(shorten(line, LINE) for line in lines), *([f"({unit})"] if unit else [])]))
 
 
 def hide_times(rows: Iterable[Axes]) -> None:

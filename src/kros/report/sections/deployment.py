@@ -129,8 +129,8 @@ def _certificate(trust: Trust) -> list[str]:
     if trust.plants is not None:
         told.append(f"For the set of plants: H2 norm of the error at most {number(trust.plants)}.")
     if trust.signals:
-        bounds = joined([f"{state.replace('_', ' ')} {number(value)} %" for state, value in trust.signals.items()])
-        told.append(f"For the set of recorded signals: RMS error of at most {bounds} of the largest value.")
+        bounds = joined([f"{number(value)} % in {state.replace('_', ' ')}" for state, value in trust.signals.items()])
+        told.append(f"For the set of recorded signals: RMS error of at most {bounds} (of the largest value).")
     return told
 
 

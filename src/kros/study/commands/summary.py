@@ -38,13 +38,17 @@ def observer_lines(result: RunResult) -> list[str]:
     if not rows:
         return []
     width = max(len(r["observer"]) for r in rows)
-    lines = ["mean error in percent of the largest value:", f"{'':<{width}}  " + "".join(f"{c:>12}" for c in channels)]
+    wide = {c: max(12, len(c) + 2) for c in channels}
+    lines = [
+        "mean error over all units, in percent of the largest value:",
+        f"{'':<{width}}  " + "".join(f"{c:>{wide[c]}}" for c in channels),
+    ]
     for name in dict.fromkeys(r["observer"] for r in rows):
         means = []
         for channel in channels:
             values = [r["error_percent"] for r in rows if r["observer"] == name and r["channel"] == channel]
             known = "diverged" if None in values else f"{sum(values) / max(len(values), 1):.4g}"
-            means.append(f"{known if values else '–':>12}")  # some observers estimate one channel only
+            means.append(f"{known if values else '–':>{wide[channel]}}")  # some observers estimate one channel only
         mark = "  <- deployed" if name == metrics["study"].get("deployed") else ""
         lines.append(f"{name:<{width}}  {''.join(means)}{mark}")
     return lines

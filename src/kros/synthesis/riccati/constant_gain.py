@@ -10,6 +10,7 @@ Q, R : process and measurement noise covariance;  P : covariance of the one-step
 from __future__ import annotations
 
 import time
+import warnings
 from typing import Any
 
 import numpy as np
@@ -128,7 +129,9 @@ def luenberger(A: npt.ArrayLike, C: npt.ArrayLike, poles: npt.ArrayLike, dt: flo
         )
     start = time.perf_counter()
     try:
-        L = place_poles(A.T, C.T, wanted).gain_matrix.T
+        with warnings.catch_warnings():  # of eigenvectors that could be better conditioned still; the poles reached are checked below
+            warnings.filterwarnings("ignore", message="Convergence was not reached", category=UserWarning)
+            L = place_poles(A.T, C.T, wanted).gain_matrix.T
     except (ValueError, np.linalg.LinAlgError) as error:
         raise SynthesisError(
             f"Luenberger observer: the poles cannot be placed ({error}); use distinct poles in conjugate pairs, or measure more."

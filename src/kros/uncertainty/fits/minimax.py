@@ -6,13 +6,12 @@ Two iterations, both in the coefficients a and b of n and d, with `e` the denomi
     improve (Dinkelbach):        minimise t  s.t.  d_i <= n_i / f_i,  n_i / (gamma f_i) - d_i <= t e_i,   mean(d / e) = 1
 
 The first needs no guess of the ratio gamma and is exact at once for data of that order; the second converges superlinearly to the global
-optimum from any bound. Rows are relative to what the denominator really is, columns to their largest entry, because HiGHS keeps absolute
-tolerances.
+optimum from any bound. Rows are relative to what the denominator really is, columns to their largest entry, because programs are solved to absolute
+tolerances; each starts from the active rows of the one before.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,24 +19,27 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from .program import solve
 from .spectral import RationalMagnitude, basis
 
 Array = npt.NDArray[Any]
 
-_LOG = logging.getLogger(__name__)
 _EDGE = 1e-4  # how far n and d may fall between the ends of the grid and DC or Nyquist
 _STARTS = 10
 _STEPS = 12
 _EXACT_DB = 1e-4
 _STALLED_DB = 5e-3
-_PIVOTS = 1500  # of the simplex method: about ten times what programs take that end
 
 
 @dataclass
 class Programs:
-    """How many linear programs may still be solved: bad data would take thousands, one after the other, and gain nothing."""
+    """How many linear programs may still be solved: bad data would take thousands, one after the other, and gain nothing.
+
+    `active` are the rows that were active in the last program on the same grid, where the next one starts.
+    """
 
     left: int
+    active: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +61,7 @@ class Grid:
     @classmethod
     def build(cls, tau: Array, targets: Array, knots: Array, cuts: Array, programs: Programs) -> Grid:
         """Evaluate the basis on a grid."""
-        phi = basis(tau, knots)
+        phi, programs.active = basis(tau, knots), None
         nearest = np.concatenate([[0], np.searchsorted(tau, cuts).clip(0, len(tau) - 1), [len(tau) - 1]])
         return cls(targets, knots, phi, basis(np.concatenate([[0.0], cuts, [np.inf]]), knots), phi[nearest], nearest, programs)
 
@@ -124,12 +126,10 @@ class Grid:
     def _improve(self, gamma: float, scale: Array) -> tuple[Array, Array] | None:
         d = self.phi / scale[:, None]
         n = d / self.targets[:, None]
-        return self._solve(n, d, [(-n, d, 0.0), (n / gamma, -d, -1.0)], scale)
+        return self._solve(n, d, [(n / gamma, -d, -1.0), (-n, d, 0.0)], scale)
 
     def _solve(self, n: Array, d: Array, blocks: Sequence[tuple[Array, Array, float]], scale: Array) -> tuple[Array, Array] | None:
         """Minimise t over (a, b, t) under blocks of rows, the normalisation and the edges."""
-        from scipy.optimize import linprog
-
         if self.programs.left <= 0:
             return None
         self.programs.left -= 1
@@ -144,18 +144,8 @@ class Grid:
             table /= np.abs(table).max(axis=1, keepdims=True)
         if not np.isfinite(table).all():  # a basis function that is zero on the grid
             return None
-        result = linprog(
-            np.append(np.zeros(2 * size), 1.0),
-            A_ub=table,
-            b_ub=np.zeros(len(table)),
-            A_eq=np.concatenate([np.zeros(size), d.mean(axis=0), [0.0]])[None] * unit,
-            b_eq=[1.0],
-            bounds=[(None, None)] * (2 * size + 1),
-            method="highs",
-            options={"primal_feasibility_tolerance": 1e-9, "dual_feasibility_tolerance": 1e-9, "time_limit": 5.0, "maxiter": _PIVOTS},
-        )
-        if result.x is None:
-            _LOG.debug("Magnitude fit: linear program ended with status %s (%s)", result.status, result.message)
+        found = solve(table, np.concatenate([np.zeros(size), d.mean(axis=0), [0.0]]) * unit, self.programs.active)
+        if found is None:
             return None
-        x = result.x * unit
+        self.programs.active, x = found[1], found[0] * unit
         return x[:size], x[size : 2 * size]

@@ -12,7 +12,6 @@ import logging
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -184,11 +183,11 @@ def signals_of(data: ValidationSet, observer: Observer) -> SignalSet:
 def candidates(task: DesignTask, data: ValidationSet) -> Iterator[Candidate]:
     """Yield observers of all nominals as they are; then, rows and gains improved in turn, of the mean of the units and of rows fitted to single steps."""
     judge = Judge(task, certified_on(task))
-    first = [one for name, A, B in task.nominals for one in attempts(task, data, name, A, B, judge, 0)]
-    yield from first
     models, n = task.models, task.models.lifting.n_states
-    name, A, B = task.nominals[-1]
-    yield from islice(attempts(task, data, name, A, B, judge, 1), 1, None)  # the first one is known
+    *others, (name, A, B) = task.nominals
+    for other in others:
+        yield from attempts(task, data, *other, judge, 0)
+    yield from attempts(task, data, name, A, B, judge, 1)
     for model in refitted_models(models.lifting, A, B, models.measured, data.batch)[0]:
         if len(model.rows) == n:
             yield from attempts(task, data, "single steps", model.A, model.B, judge, _ROUNDS)

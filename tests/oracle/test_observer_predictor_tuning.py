@@ -126,7 +126,7 @@ def test_the_gradient_of_all_samples_is_that_of_differences():
     n, blocks, step = len(F), blocks_of(F, G, H), 1e-6
     into = np.eye(n + G.shape[1])
     point = tuning.at(blocks)
-    found = tuning._gradient(blocks, None, (tuning.share / point.errors)[tuning.group] * tuning.each[:, None], into)
+    found = tuning._gradient(point, None, (tuning.share / point.errors)[tuning.group] * tuning.each[:, None], into)
     assert len(point.errors) == 2  # units count by the logarithms of their own errors
     F, G, H = joined(blocks)
     whole = np.hstack([F, G])
@@ -142,3 +142,13 @@ def test_the_gradient_of_all_samples_is_that_of_differences():
             np.add.at(square, tuning.group, np.mean(error**2, axis=-1).T * tuning.each[:, None])
             errors.append(np.sum(tuning.share * np.log(square)) / 2)
         assert found[k] == pytest.approx(-(errors[1] - errors[0]) / (2 * step), rel=1e-4, abs=1e-6 * np.abs(found).max())
+
+
+def test_runs_that_are_kept_and_those_that_are_run_again_give_one_model(monkeypatch):
+    x, u = ripple(np.array([1.0, 2.0, 0.5, 1.0]), n_samples=400)
+    batch = batch_of(x + np.array([0.3, 0.0]), u, DT, units=list("aabb"))
+    past = PastMoments.of(Lifting(("p", "v"), ("sin(5*p)",)), (0,), batch, Basis(5))
+    kept = tune_predictor(past.model(4), past, batch, deviation=0.4, iterations=2)
+    monkeypatch.setattr("kros.observer.predictor.tuning._KEPT", 0)
+    again = tune_predictor(past.model(4), past, batch, deviation=0.4, iterations=2)
+    assert np.allclose(kept[1], again[1], rtol=1e-9)

@@ -20,7 +20,7 @@ from ...observer import Observer, PastMoments, Runtime, conditioned, driven_coor
 from ...observer.certificate.error import error_system
 from ...observer.certificate.search import quick_gain
 from ...observer.limits import sides
-from ...observer.predictor.build import embedded
+from ...observer.predictor.build import embedded_with
 from ...observer.predictor.choice import AT_LIMITS, Recipe, choose
 from ...observer.predictor.limited import with_limits
 from ...observer.predictor.moments import limited
@@ -151,7 +151,7 @@ class Plan:
             model, _ = tune_predictor(model, self.past, few, self.importance, recipe.deviation, slowest, steps, weights=self.emphasis)
         # Rows of measured states count where measurements are missing. Fitted to all conditions they are those of none, and drift.
         home = few.take([i for i, key in enumerate(few.keys) if key.condition == task.training.keys[0].condition])
-        made = [embedded(task.name, self.past, model, models.recorded_inputs, home, ridge) for ridge in _RIDGES]
+        made = embedded_with(task.name, self.past, model, models.recorded_inputs, home, _RIDGES)
         made = [replace(one, runtime=Runtime(task.runtime.delay), sensor=task.sensor) for one in made]
         if task.limits:
             made = [with_limits(one, *sides(task.limits, one.recorded)) for one in made]

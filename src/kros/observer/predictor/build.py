@@ -89,6 +89,13 @@ def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], 
     Observer
         Its lifting has ``memory_1, ...`` after the original states; measurements replace the estimates of measured states.
     """
+    return embedded_with(name, past, model, inputs, batch, (ridge,))[0]
+
+
+def embedded_with(
+    name: str, past: PastMoments, model: Model, inputs: Sequence[str], batch: EpisodeBatch, ridges: Sequence[float]
+) -> list[Observer]:
+    """Return an observer as of `embedded` for every ridge: the recordings are run along once."""
     from scipy.linalg import null_space
 
     lifting, measured = past.lifting, past.measured
@@ -98,27 +105,29 @@ def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], 
     turn = np.vstack([H, null_space(H / np.linalg.norm(H, axis=1)[:, None]).T])
     back = np.linalg.inv(turn)
     F, G = turn @ F @ back, turn @ G
-    truth = batch.states[..., hidden]
-    following = _measured_rows(F, G, past.channels(batch), batch.measurements(measured, arrived=False), truth, ridge)
+    rows = _measured_rows(F, G, past.channels(batch), batch.measurements(measured, arrived=False), batch.states[..., hidden], ridges)
     place = [*hidden, *range(n, n + internal)]
-    raw = np.zeros((n + internal, q + m + len(lifting.functions)))  # of y, u and sigma, in place of z
-    own = np.zeros((n + internal, n + internal))
-    channels = [*range(q), *(q + j for j in past.free), *range(q + m, raw.shape[1])]
-    raw[np.ix_(place, channels)], own[np.ix_(place, place)] = G, F
-    raw[np.ix_(list(measured), channels)], own[np.ix_(list(measured), place)] = following[:, len(F) :], following[:, : len(F)]
-    raw[:, q : q + m] -= raw[:, :q] @ past.static
-    raw[list(measured), range(q)] += 1.0
-    own[:, list(measured)] = raw[:, :q]
+    channels = [*range(q), *(q + j for j in past.free), *range(q + m, q + m + len(lifting.functions))]
     widened = replace(lifting, states=(*lifting.states, *(f"memory_{i + 1}" for i in range(internal))))
-    silent = np.zeros((len(lifting.functions), widened.n_lifted))
-    A = np.vstack([np.hstack([own, raw[:, q + m :]]), silent])
-    B, D = (np.vstack([M, silent[:, : M.shape[1]]]) for M in (raw[:, q : q + m], raw[:, :q]))
-    dt = batch.sample_period_s
-    return Observer(name, widened, A, B, measured, tuple(inputs), gain(D, dt), Injection.STATE, dt, replaces=True, internal=internal)
+    silent, dt = np.zeros((len(lifting.functions), widened.n_lifted)), batch.sample_period_s
+
+    def observer(following: Array) -> Observer:
+        raw = np.zeros((n + internal, q + m + len(lifting.functions)))  # of y, u and sigma, in place of z
+        own = np.zeros((n + internal, n + internal))
+        raw[np.ix_(place, channels)], own[np.ix_(place, place)] = G, F
+        raw[np.ix_(list(measured), channels)], own[np.ix_(list(measured), place)] = following[:, len(F) :], following[:, : len(F)]
+        raw[:, q : q + m] -= raw[:, :q] @ past.static
+        raw[list(measured), range(q)] += 1.0
+        own[:, list(measured)] = raw[:, :q]
+        A = np.vstack([np.hstack([own, raw[:, q + m :]]), silent])
+        B, D = (np.vstack([M, silent[:, : M.shape[1]]]) for M in (raw[:, q : q + m], raw[:, :q]))
+        return Observer(name, widened, A, B, measured, tuple(inputs), gain(D, dt), Injection.STATE, dt, replaces=True, internal=internal)
+
+    return [observer(following) for following in rows]
 
 
-def _measured_rows(F: Array, G: Array, z: Array, y: Array, truth: Array, ridge: float) -> Array:
-    """Fit the change of the measured states on h and z, shape (q, order + channels); the first states of h are the hidden ones."""
+def _measured_rows(F: Array, G: Array, z: Array, y: Array, truth: Array, ridges: Sequence[float]) -> list[Array]:
+    """Fit the change of the measured states on h and z, shape (q, order + channels), by every ridge; the first states of h are the hidden ones."""
     h = np.zeros((*z.shape[:2], len(F)))
     driven = z @ G.T
     for k in range(len(z) - 1):
@@ -128,9 +137,10 @@ def _measured_rows(F: Array, G: Array, z: Array, y: Array, truth: Array, ridge: 
         free = FreeStart.of(F, np.eye(truth.shape[-1], len(F)), len(h), FreeStart.by_size(missed))
         h += free.moved(free.fitted(missed)).transpose(2, 1, 0)
     start = skipped(len(z))
-    regressors = np.concatenate([h, z], axis=-1)[start:-1:THIN].reshape(-1, len(F) + z.shape[-1])
+    regressors = np.concatenate([h[start:-1:THIN], z[start:-1:THIN]], axis=-1).reshape(-1, len(F) + z.shape[-1])
     change = np.diff(y, axis=0)[start::THIN].reshape(-1, y.shape[-1])
     size = np.sqrt(np.mean(regressors**2, axis=0))
     scaled = regressors / np.where(size > 0, size, 1.0)
-    normal = scaled.T @ scaled / len(scaled) + ridge * np.eye(len(size))
-    return np.asarray((np.linalg.solve(normal, scaled.T @ change / len(scaled)) / np.where(size > 0, size, 1.0)[:, None]).T)
+    normal, right = scaled.T @ scaled / len(scaled), scaled.T @ change / len(scaled)
+    found = [np.linalg.solve(normal + ridge * np.eye(len(size)), right) for ridge in ridges]
+    return [np.asarray((rows / np.where(size > 0, size, 1.0)[:, None]).T) for rows in found]

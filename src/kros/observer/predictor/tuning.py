@@ -36,6 +36,7 @@ _ROWS = 20  # samples for every coefficient that curvature is taken from: all sa
 _TINY = np.finfo(float).tiny
 _ALIKE = 1e-13  # share of a direction below which rounding decides
 _SIZED = 16  # episodes that say how large errors are
+_KEPT = 1e7  # states along recordings that are kept with a model, 80 MB; of more, models are run again where they are needed
 _BOUND, _AT_BOUND = 1e4, 1 - 1e-6  # a pole at its bound stays there instead of ending the search
 
 
@@ -95,13 +96,17 @@ def tune_predictor(
     return joined(found.blocks), criterion
 
 
+Runs = tuple[Array, Array, Array]
+
+
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A model in blocks, and its mean square errors, shape (group, h)."""
+    """A model in blocks, its mean square errors, shape (group, h), and its runs along all recordings, where they are few."""
 
     blocks: list[Block]
     errors: Array
     criterion: float
+    runs: Runs | None = None
 
 
 class _Tuning:
@@ -151,10 +156,14 @@ class _Tuning:
         """Run a model."""
         found = np.zeros(self.share.shape)
         with np.errstate(over="ignore", invalid="ignore"):
-            free = self._free(blocks)
+            free, runs = self._free(blocks), list[Runs]()
+            kept = sum(len(b.F) for b in blocks) * self.z[0].size < _KEPT
             for part in self._parts():
-                np.add.at(found, self.group[part], np.mean(self.missed(blocks, part, free)[2] ** 2, axis=-1).T * self.each[part, None])
-            return _Point(blocks, found, mean_log(self.share.ravel(), found.ravel()))
+                run = self.missed(blocks, part, free)
+                np.add.at(found, self.group[part], np.mean(run[2] ** 2, axis=-1).T * self.each[part, None])
+                runs += [run] if kept else []
+            whole = tuple(np.concatenate(parts, axis=1) for parts in zip(*runs, strict=True)) if kept else None
+            return _Point(blocks, found, mean_log(self.share.ravel(), found.ravel()), whole)  # type: ignore[arg-type]
 
     def steps(self, point: _Point) -> Callable[[float], _Point]:
         """Gauss-Newton steps, bounded where they slow down the slowest pole.
@@ -167,14 +176,14 @@ class _Tuning:
         blocks, model = point.blocks, joined(point.blocks)
         n, outputs = len(model[0]), len(self.truth)
         free = self._free(blocks)
-        into, out = self._whitening(blocks, free)
+        into, out = self._whitening(point, free)
         width = into.shape[1]
         weight = (self.share / np.maximum(point.errors, _TINY))[self.group]
         parameters = n * (width + outputs)
         every = max(1, int(self.truth[0, 0].size * sum(len(part) for part, _ in self.curved) * outputs / (_ROWS * parameters)))
         H = np.zeros((parameters, parameters))
         for part, each in self.curved:
-            h, rest, _ = self.missed(blocks, part, free)
+            h, rest, _ = self._run(point, part, free)
             signals = np.tensordot(into.T, np.concatenate([h, self.z[:, part]]), 1)
             rest = np.tensordot(into.T, np.concatenate([rest, self.rest[:, part]]), 1)
             inner = np.concatenate([b.responses(signals, rest, every) for b in blocks])
@@ -185,7 +194,7 @@ class _Tuning:
             root = np.sqrt(weight[part].T * each / h[0, 0, ::every].size)[..., None]
             X = np.concatenate([(part_of * root).reshape(-1, root[..., 0].size * inner.shape[-1]) for part_of in (inner, direct)])
             H += X @ X.T
-        g = self._gradient(blocks, free, weight * self.each[:, None], into)
+        g = self._gradient(point, free, weight * self.each[:, None], into)
         turn = block_diag(np.kron(np.linalg.pinv(out).T, np.eye(width)), np.kron(np.eye(outputs), out))
         H, g, size = scaled(turn.T @ H @ turn, turn.T @ g)
         slows = np.hstack([_slowing(model[0]), np.zeros((n, len(self.z)))]) @ into
@@ -206,14 +215,15 @@ class _Tuning:
 
         return trial
 
-    def _gradient(self, blocks: Sequence[Block], free: FreeStart | None, weight: Array, into: Array) -> Array:
+    def _gradient(self, point: _Point, free: FreeStart | None, weight: Array, into: Array) -> Array:
         """How fast the weighted squares fall with all coefficients, of all recordings and samples.
 
         What a signal added to a state does to all later estimates is gathered by the blocks' transposes running backwards: no response is needed.
         """
+        blocks = point.blocks
         inner, direct = np.zeros((sum(len(b.F) for b in blocks), len(into))), np.zeros((len(self.truth), sum(len(b.F) for b in blocks)))
         for part in self._parts():
-            h, rest, missed = self.missed(blocks, part, free)
+            h, rest, missed = self._run(point, part, free)
             missed = missed * (weight[part].T / missed.shape[-1])[..., None]
             if free is not None:
                 missed = free.back(missed)
@@ -230,17 +240,24 @@ class _Tuning:
             inner += np.tensordot(np.concatenate(before), resting, (1, 1))
         return np.concatenate([(inner @ into).ravel(), direct.ravel()])
 
-    def _whitening(self, blocks: Sequence[Block], free: FreeStart | None) -> tuple[Array, Array]:
+    def _whitening(self, point: _Point, free: FreeStart | None) -> tuple[Array, Array]:
         """What makes all states and channels white along the recordings, and what makes the states so."""
-        n = sum(len(b.F) for b in blocks)
+        n = sum(len(b.F) for b in point.blocks)
         moments = np.zeros((n + len(self.z),) * 2)
         for part in self._parts():
-            flat = np.concatenate([self.missed(blocks, part, free)[0][..., ::_THIN], self.z[:, part, ::_THIN]]).reshape(len(moments), -1)
+            flat = np.concatenate([self._run(point, part, free)[0][..., ::_THIN], self.z[:, part, ::_THIN]]).reshape(len(moments), -1)
             moments += flat @ flat.T
         moments *= _THIN / self.z[0].size
         return whitening(moments, _ALIKE), whitening(moments[:n, :n], _ALIKE)
 
-    def missed(self, blocks: Sequence[Block], part: slice | list[int], free: FreeStart | None) -> tuple[Array, Array, Array]:
+    def _run(self, point: _Point, part: slice | list[int], free: FreeStart | None) -> Runs:
+        """Return `missed` of a point on some episodes, run again where it was not kept."""
+        if point.runs is None:
+            return self.missed(point.blocks, part, free)
+        h, rest, missed = point.runs
+        return h[:, part], rest[:, part], missed[:, part]
+
+    def missed(self, blocks: Sequence[Block], part: slice | list[int], free: FreeStart | None) -> Runs:
         """Return states of all blocks on some episodes, their rest, and what the estimates miss."""
         runs = [b.run(self.z[:, part], self.rest[:, part]) for b in blocks]
         h, rest = np.concatenate([r[0] for r in runs]), np.concatenate([r[1] for r in runs])

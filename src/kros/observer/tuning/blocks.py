@@ -41,12 +41,12 @@ class Block:
 
     def run(self, z: Array, rest: Array) -> tuple[Array, Array]:
         """Return the states h along channels z (channels, batch, n_samples) that were `rest` (channels, batch) before, and at rest."""
-        held, held_rest = self._through(z, rest)
-        at_once, before = self.G, self._behind @ self.G
-        h = np.tensordot(at_once, held, 1)
-        h[..., 1:] -= np.tensordot(before, held[..., :-1], 1)
-        h[..., 0] -= before @ held_rest
-        return h, (at_once - before) @ held_rest
+        behind = self._behind
+        h, held_rest = self._through(np.tensordot(self.G, z, 1), self.G @ rest)
+        before = np.tensordot(behind, h[..., :-1], 1)
+        h[..., 1:] -= before
+        h[..., 0] -= behind @ held_rest
+        return h, held_rest - behind @ held_rest
 
     def responses(self, signals: Array, rest: Array, every: int) -> Array:
         """Return what signals added to each of its states do to the estimates, shape (d, signals, h, batch, n_samples / every)."""

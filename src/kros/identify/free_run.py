@@ -12,12 +12,13 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from ..lifting import Lifting
+from ..loops import Library, formulas, library, tape_of
 
 Array = npt.NDArray[np.float64]
 
 
 def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.ArrayLike], x0: Array, u: Array) -> Array:
-    """Simulate a batch of models, one Python step per sample for the whole batch.
+    """Simulate a batch of models, compiled where there is a compiler.
 
     Parameters
     ----------
@@ -54,6 +55,8 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.
             f"{past} and {width} inputs."
         )
     lifting.window.require(n_samples)
+    if (loops := library()) is not None:
+        return _compiled(loops, A, B, lifting, parameters, first, u)
     step = np.ascontiguousarray(np.swapaxes(np.concatenate([A, B], axis=-1)[..., :n, :], -1, -2))  # (.., n_lifted + m, n)
     psi = np.empty((batch, n_lifted + width))
     states = np.empty((n_samples, batch, n))
@@ -79,6 +82,31 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.
             earlier = lifting.window.advance(window, inputs[k])
             psi[:, :n] = advance(psi, step)
     return np.swapaxes(states, 0, 1)
+
+
+def _compiled(
+    loops: Library, A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.ArrayLike], first: Array, u: Array
+) -> Array:
+    batch, n_samples, m = u.shape
+    n, h, rows = lifting.n_states, lifting.history, np.concatenate([A, B], axis=-1)[..., : lifting.n_states, :]
+    window = lifting.windows(first, u[:, : h + 1])[:, 0]
+    column = np.zeros((rows.shape[-1], batch))
+    column[:n] = window[:, :n].T
+    states = np.empty((n_samples, n, batch))
+    states[:h] = first[:, :h].transpose(1, 2, 0)
+    job = {
+        "observers": 1,
+        "samples": n_samples - h,
+        "batch": batch,
+        "own": rows.ndim == 3,
+        "map": rows,
+        "u": np.swapaxes(u[:, h:], 0, 1),
+        "column": column,
+        "past": np.ascontiguousarray(window[:, n:]),
+        "states": states[h:],
+    }
+    loops.call("kros_relift", formulas(lifting, tape_of(lifting, m), parameters, m, batch), ("relift_job", job))
+    return states.transpose(2, 0, 1)
 
 
 def _multiply_all(psi: Array, step: Array) -> Array:

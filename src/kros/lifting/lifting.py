@@ -241,6 +241,14 @@ class Lifting:
         self.window.require_inputs(u)
         return self.window.slide(x, u)
 
+    def parameter_values(self, parameters: Parameters | None = None) -> dict[str, Array]:
+        """Return the values of all parameters, refusing to go on where one is missing."""
+        given = parameters if parameters is not None else {}
+        missing = [name for name in self.parameters if name not in given]
+        if missing:
+            raise DimensionError(f"Lifting: parameter values for {missing} are missing, found {sorted(given)}; calibrate the unit first.")
+        return {name: np.asarray(given[name], dtype=float) for name in self.parameters}
+
     def retract(self, lifted: npt.ArrayLike) -> Array:
         """Return the original states, a slice of the lifted ones."""
         return np.asarray(lifted, dtype=float)[..., : self.n_states]
@@ -357,11 +365,7 @@ class Lifting:
         return x
 
     def _values(self, x: Array, parameters: Parameters | None, earlier: Array | None = None, u: Array | None = None) -> dict[str, Array]:
-        given = parameters if parameters is not None else {}
-        missing = [name for name in self.parameters if name not in given]
-        if missing:
-            raise DimensionError(f"Lifting: parameter values for {missing} are missing, found {sorted(given)}; calibrate the unit first.")
-        values = {name: np.asarray(given[name], dtype=float) for name in self.parameters}
+        values = self.parameter_values(parameters)
         values.update({name: x[..., i] for i, name in self._read_states})
         if earlier is not None:
             values.update({name: earlier[..., i] for i, name in enumerate(self.window.earlier)})

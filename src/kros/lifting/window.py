@@ -69,23 +69,25 @@ class Window:
         return self.states + self.earlier
 
     @cached_property
-    def _shift(self) -> Index:
+    def shift(self) -> Index:
+        """Entry of ``[window, inputs]`` that every earlier value has at the next sample."""
         entries = (*self.names, *self.inputs)
         return np.array([entries.index(delayed_name(q, d - 1)) for q, depth in self.depths for d in range(1, depth + 1)], dtype=np.intp)
 
     @cached_property
-    def _present(self) -> Index:
+    def present(self) -> Index:
+        """Entry of ``[window, inputs]`` of the quantity that every earlier value is one of."""
         entries = (*self.names, *self.inputs)
         return np.array([entries.index(q) for q, depth in self.depths for _ in range(depth)], dtype=np.intp)
 
     def advance(self, window: Array, u: Array) -> Array:
         """Return the earlier values of the next sample, shape (..., n_earlier), from a window and the inputs of this one."""
-        return np.concatenate([window, u], axis=-1)[..., self._shift]
+        return np.concatenate([window, u], axis=-1)[..., self.shift]
 
     def hold(self, x: Array, u: Array) -> Array:
         """Return earlier values that all equal the present ones, shape (..., n_earlier)."""
         padding = np.zeros((*x.shape[:-1], len(self.earlier)))
-        return np.concatenate([x, padding, u], axis=-1)[..., self._present]
+        return np.concatenate([x, padding, u], axis=-1)[..., self.present]
 
     def slide(self, x: Array, u: Array) -> Array:
         """Return the windows of a recording.

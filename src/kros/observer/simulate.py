@@ -39,7 +39,7 @@ def run_observer(
     parameters: Mapping[str, npt.ArrayLike] | None = None,
     estimate: EstimateKind | str = EstimateKind.PREDICT,
 ) -> Array:
-    """Run an observer over a batch of episodes, one Python step per sample for the whole batch.
+    """Run an observer over a batch of episodes.
 
     Parameters
     ----------
@@ -131,31 +131,22 @@ def _run(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Para
     observer = observers[0]
     samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
     (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
-    steps, missing = Steps(observers, batch, values), ~np.isfinite(samples.y)
-    gone, anew = (np.atleast_1d(flags.any(axis=axes)) for flags, axes in ((missing, (1, 2)), (samples.starts, 1)))
-    pending = _pending(samples.starts, d) if d else None
+    steps, pending = Steps(observers, batch, values), _pending(samples.starts, d) if d else None
+    moving = None if pending is None else (pending == d) & ~samples.starts
     estimates = np.empty((n_samples, len(observers), observer.lifting.n_states, batch))
-    earlier = np.empty((n_samples, batch, len(observer.lifting.window.earlier))) if d else None
+    before = None if pending is None else (np.empty((n_samples, batch, len(observer.lifting.window.earlier))), pending)
     steps.begin(samples.y[0])
     steps.begin(samples.y[0], samples.starts[0], samples.u[0])
+    steps.through(samples.y, samples.u, d, moving, samples.starts, estimates, before=before)
+    found = estimates.transpose(1, 0, 3, 2)
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(n_samples):
-            estimates[k] = steps.x.swapaxes(1, 2)
-            moving = None
-            if earlier is not None and pending is not None:
-                earlier[k] = steps.earlier(samples.u[k - pending[k], np.arange(batch)])[0]
-                moving = (pending[k] == d) & ~samples.starts[k]
-            if anew[k] and k:
-                steps.begin(samples.y[k], samples.starts[k], samples.u[k])
-            if moving is None or moving.any():
-                steps.step(samples.y[k], samples.u[k - d], missing[k] if gone[k] else None, moving)
-        found = estimates.transpose(1, 0, 3, 2)
         if wanted is EstimateKind.FILTER:
             _filter(observer, found[0], samples.y, pending, d)
-        if earlier is not None and pending is not None:
+        if before is not None:
             for own, of_one in zip(observers, found, strict=True):
-                _predict(own, of_one, earlier, samples, pending, values)
-        found[...] = observer.runtime.clip_estimate(found)
+                _predict(own, of_one, *before, samples, values)
+        if observer.runtime.binding:
+            found[...] = observer.runtime.clip_estimate(found)
     return found
 
 
@@ -179,18 +170,11 @@ def run_innovations(
     """
     samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
     (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
-    steps, missing = Steps([observer], batch, values), ~np.isfinite(samples.y)
-    gone, anew = (np.atleast_1d(flags.any(axis=axes)) for flags, axes in ((missing, (1, 2)), (samples.starts, 1)))
+    steps, innovation = Steps([observer], batch, values), np.zeros(samples.y.shape)
     moving = (_pending(samples.starts, d) == d) & ~samples.starts if d else np.ones((n_samples, batch), dtype=bool)
-    innovation = np.zeros(samples.y.shape)
     steps.begin(samples.y[0])
     steps.begin(samples.y[0], samples.starts[0], samples.u[0])
-    with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(n_samples):
-            if anew[k] and k:
-                steps.begin(samples.y[k], samples.starts[k], samples.u[k])
-            innovation[k] = steps.innovation(samples.y[k])[0]
-            steps.step(samples.y[k], samples.u[k - d], missing[k] if gone[k] else None, moving[k] if d else None)
+    steps.through(samples.y, samples.u, d, moving if d else None, samples.starts, innovation=innovation)
     starts = samples.starts.copy()
     starts[0] = True
     return innovation, judged_samples(settle, samples.status, starts, moving)
@@ -211,7 +195,7 @@ def _filter(observer: ObserverData, x: Array, y: Array, pending: Whole | None, d
     np.copyto(x, filtered, where=True if pending is None else (pending == delay)[..., None])
 
 
-def _predict(observer: ObserverData, x: Array, earlier: Array, samples: Screened, pending: Whole, values: Parameters) -> None:
+def _predict(observer: ObserverData, x: Array, earlier: Array, pending: Whole, samples: Screened, values: Parameters) -> None:
     """Take states, shape (n_samples, batch, n), over the samples that lie between them and their rows, without correction."""
     batch, machines = x.shape[1], np.arange(x.shape[1])
     for start in range(0, len(x), _ROWS):
@@ -220,9 +204,8 @@ def _predict(observer: ObserverData, x: Array, earlier: Array, samples: Screened
         own = {name: np.tile(np.broadcast_to(np.asarray(v, dtype=float), (batch,)), len(count)) for name, v in values.items()}
         steps = Steps([observer], count.size, own)
         steps.place(ahead.reshape(count.size, -1), earlier[rows].reshape(count.size, -1))
-        unknown = np.ones((count.size, len(observer.measured)), dtype=bool)
-        for j in range(observer.runtime.delay):
-            at = np.arange(rows.start, rows.stop)[:, None] - count + j
-            u = samples.u[np.minimum(at, len(samples.u) - 1), machines].reshape(count.size, -1)
-            steps.step(np.zeros(unknown.shape), u, unknown, (j < count).ravel())
+        j = np.arange(observer.runtime.delay)[:, None, None]
+        at = np.minimum(np.arange(rows.start, rows.stop)[:, None] - count + j, len(samples.u) - 1)
+        u = samples.u[at, machines]
+        steps.through(None, u.reshape(len(j), count.size, u.shape[-1]), moving=(j < count).reshape(len(j), -1))
         x[rows] = steps.x[0].reshape(ahead.shape)

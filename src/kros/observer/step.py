@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..loops import formulas, library, tape_of
 from .data import ObserverData
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
+Whole = npt.NDArray[np.intp]
 Parameters = Mapping[str, npt.ArrayLike]
 
 
@@ -126,6 +128,127 @@ class Steps:
         if following_earlier is not None:
             np.copyto(self._earlier, following_earlier, where=True if moving is None else moving[:, None])
             self._fresh &= False if moving is None else ~moving
+
+    def through(
+        self,
+        y: Array | None,
+        u: Array,
+        late: int = 0,
+        moving: Flags | None = None,
+        starts: Flags | None = None,
+        states: Array | None = None,
+        innovation: Array | None = None,
+        before: tuple[Array, Whole] | None = None,
+    ) -> None:
+        """Take many samples, compiled where there is a compiler.
+
+        Parameters
+        ----------
+        y : ndarray, shape (n_samples, batch, q), optional
+            Not finite where nothing arrived; nothing is corrected where there is none.
+        u : ndarray, shape (n_samples, batch, m)
+        late : int
+            A sample is taken with the inputs of so many samples before.
+        moving, starts : ndarray of bool, shape (n_samples, batch), optional
+            Machines that take a sample, and those that start anew at it, but for the first one.
+        states : ndarray, shape (n_samples, observer, n, batch), optional
+            Filled with the estimates before every sample.
+        innovation : ndarray, shape (n_samples, batch, q), optional
+            Filled with those of the first observer.
+        before : tuple of ndarray, shapes (n_samples, batch, n_earlier) and (n_samples, batch), optional
+            Filled with the first observer's earlier values before every sample, which after a start equal the present ones with the inputs of
+            so many samples before.
+        """
+        loops, batch = library(), u.shape[1]
+        if loops is None:
+            self._one_by_one(y, u, late, moving, starts, states, innovation, before)
+            return
+        observer, lifting, limits = self.observers[0], self.lifting, self._limits
+        job: dict[str, Any] = {
+            "observers": len(self.observers),
+            "samples": len(u),
+            "batch": batch,
+            "order": self._x_c.shape[2],
+            "q": len(observer.measured),
+            "late": late,
+            "map": self.map,
+            "y": y,
+            "u": u,
+            "measured": observer.measured,
+            "moving": moving,
+            "column": self._column,
+            "past": self._earlier,
+            "fresh": self._fresh.view(np.uint8),
+            "since": self._since,
+            "states": states,
+            "innovation": innovation,
+        }
+        if before is not None:
+            job |= {"before": before[0], "pending": before[1]}
+        if starts is not None and starts[1:].any():
+            assert y is not None
+            job |= self._begins(y, u, starts)
+        if self._start is not None and (self._starting or "begin" in job):
+            job |= {"starts": len(self._start), "start": self._start.corrections}
+        if limits is not None:
+            K, n = observer.controller, lifting.n_states
+            if limits.correction is not None:
+                job |= {
+                    "width": len(limits.correction),
+                    "limit": limits.correction,
+                    "limit_c": K.C,
+                    "limit_d": K.D,
+                    "into": observer.into[:n],
+                }
+            if limits.relift and not (limits.lower is None and limits.upper is None):
+                sides = ((limits.lower, -np.inf), (limits.upper, np.inf))
+                job |= dict(zip(("lower", "upper"), (np.full(n, none) if side is None else side for side, none in sides), strict=True))
+        loops.call("kros_relift", formulas(lifting, tape_of(lifting, u.shape[2]), self.values, u.shape[2], batch), ("relift_job", job))
+        self._starting = self._start is not None and "starts" in job and bool(self._since.min() < len(self._start))
+
+    def _begins(self, y: Array, u: Array, starts: Flags) -> dict[str, Any]:
+        """Estimates of machines that start after the first sample, and which they are."""
+        rows, machines = np.nonzero(starts)
+        rows, machines = rows[rows > 0], machines[rows > 0]
+        number = np.zeros(starts.shape, dtype=np.int32)
+        number[rows, machines] = 1 + np.arange(len(rows))
+        own = {name: np.broadcast_to(np.asarray(v, dtype=float), starts.shape[1:])[machines] for name, v in self.values.items()}
+        first = y[rows, machines], u[rows, machines]
+        begun = np.stack([o.runtime.relifted(o.initial(first[0], own, first[1])) for o in self.observers])
+        since = np.zeros(len(rows), dtype=np.int64)
+        if self._start is not None:
+            since[self._start.at_rest(*first)] = len(self._start)
+        return {"begin": number, "begun": begun, "begins": len(rows), "begun_since": since}
+
+    def _one_by_one(
+        self,
+        y: Array | None,
+        u: Array,
+        late: int,
+        moving: Flags | None,
+        starts: Flags | None,
+        states: Array | None,
+        innovation: Array | None,
+        before: tuple[Array, Whole] | None,
+    ) -> None:
+        """`through` without a compiler."""
+        n_samples, batch = u.shape[:2]
+        y = np.full((n_samples, batch, len(self.observers[0].measured)), np.nan) if y is None else y
+        missing = ~np.isfinite(y)
+        starts = np.zeros((n_samples, batch), dtype=bool) if starts is None else starts
+        gone, anew = (np.atleast_1d(flags.any(axis=axes)) for flags, axes in ((missing, (1, 2)), (starts, 1)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in range(n_samples):
+                if states is not None:
+                    states[k] = self.x.swapaxes(1, 2)
+                if before is not None:
+                    before[0][k] = self.earlier(u[k - before[1][k], np.arange(batch)])[0]
+                if anew[k] and k:
+                    self.begin(y[k], starts[k], u[k])
+                if innovation is not None:
+                    innovation[k] = self.innovation(y[k])[0]
+                if moving is None or moving[k].any():
+                    self.step(y[k], u[k - late], missing[k] if gone[k] else None, None if moving is None else moving[k])
 
     def _limit(self) -> None:
         """Keep corrections and estimates within their limits."""

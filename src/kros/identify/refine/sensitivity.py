@@ -18,17 +18,19 @@ normal  : ``[J r]^T [J r]`` of every unit, (unit, n p + 1, n p + 1), over the re
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from ...lifting import Lifting
+from ...loops import Library, formulas, library, tape_of
 from .segments import Segments
 
 Array = npt.NDArray[np.float64]
 Past = tuple[int, int, int]
+_AT_ONCE = 500_000  # numbers in memory: residuals and how they move
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,38 +61,105 @@ def normal_equations(
     V: Array, T: Array, lifting: Lifting, parameters: Mapping[str, Array], segments: Segments, sigma: Array, stride: int = 1
 ) -> Normal:
     """Run all segments with their unit's model and accumulate the normal equations, errors in units of sigma (n,), at every `stride`-th step."""
-    n, nl, h = lifting.n_states, lifting.n_lifted, segments.history
+    n, h = lifting.n_states, segments.history
     n_samples, m, units, per_unit = segments.inputs.shape
-    batch, p = units * per_unit, V.shape[-1]
+    batch, width = units * per_unit, n * V.shape[-1] + 1
     own = {name: np.repeat(values, per_unit) for name, values in parameters.items()}
     W = np.repeat(np.moveaxis(V @ T.T, 0, -1), per_unit, axis=-1)  # (n, p, batch)
-    x = segments.states.reshape(n_samples, n, batch)
-    u = segments.inputs.reshape(n_samples, m, batch)
-    valid = segments.valid.reshape(n_samples, batch)
-    past = _moving_past(lifting)
-    psi, work, F = np.empty((p, batch)), np.empty((n * p, batch)), np.empty((n, n + len(past), batch))
-    S = [np.zeros((n, n * p, batch)) for _ in range(2 + max((d for _, _, d in past), default=0))]  # now, earlier, and space for the next
-    window = np.empty((len(lifting.window.names), batch)) if h else psi[:n]
-    window[:] = lifting.windows(x[: h + 1].transpose(2, 0, 1), u[: h + 1].transpose(2, 0, 1))[:, 0].T
-    psi[:n] = window[:n]
-    matrix, squares, counts = np.zeros((units, n * p + 1, n * p + 1)), np.zeros((n, units)), np.zeros(units)
+    x, u = segments.states.reshape(n_samples, n, batch), segments.inputs.reshape(n_samples, m, batch)
+    window = lifting.windows(x[: h + 1].transpose(2, 0, 1), u[: h + 1].transpose(2, 0, 1))[:, 0].T.copy()
+    run = _Run(W, T, lifting, own, x, u, segments.valid.reshape(n_samples, batch), h, sigma, stride, units, _moving_past(lifting))
+    matrix, squares = np.zeros((units, width, width)), np.zeros((units, n))
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(h, n_samples - 1):
-            lifting.lift_into(psi[:nl].T, own, window[n:].T)
-            psi[nl:] = lifting.lift_inputs(u[k].T, window.T, own).T
-            _state_matrix(F, W, window, u[k], lifting, own, past)
-            _advance(S, F, T.T @ psi, work, past)
-            if h:
-                window[n:] = lifting.window.advance(window.T, u[k].T).T
-            psi[:n] = window[:n] = np.einsum("apb,pb->ab", W, psi)
-            S = [S[-1], *S[:-1]]
-            if (k + 1 - h) % stride == 0:
-                error = np.where(valid[k + 1], x[k + 1] - psi[:n], 0.0)
-                squares += (error**2).reshape(n, units, per_unit).sum(axis=-1)
-                counts += valid[k + 1].reshape(units, per_unit).sum(axis=-1)
-                _accumulate(matrix, S[0], error, valid[k + 1], sigma, units)
+        for J in run.rows(window):
+            matrix += J @ np.swapaxes(J, -1, -2)
+            squares += (J[:, -1].reshape(units, -1, n, per_unit) ** 2).sum(axis=(1, 3)) * sigma**2
     matrix[~np.isfinite(matrix).all(axis=(1, 2))] = np.inf
-    return Normal(matrix, squares.T, counts)
+    return Normal(matrix, squares, segments.compared[stride - 1 :: stride].sum(axis=(0, 2)).astype(float))
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """Free runs of all segments: models W (n, p, batch), recordings x (n_samples, n, batch) and u (n_samples, m, batch)."""
+
+    W: Array
+    T: Array
+    lifting: Lifting
+    parameters: Mapping[str, Array]
+    x: Array
+    u: Array
+    valid: npt.NDArray[np.bool_]
+    history: int
+    sigma: Array
+    stride: int
+    units: int
+    past: Sequence[Past]
+
+    def rows(self, window: Array) -> Iterator[Array]:
+        """Yield ``[J r]^T`` of some samples after the other, shape (unit, n p + 1, residuals), from the first window on, which is moved on."""
+        n, p, batch = self.W.shape
+        S = np.zeros((2 + max((d for _, _, d in self.past), default=0), n, n * p, batch))  # now, earlier, and space for the next
+        loops = library()
+        return self._in_numpy(window, S) if loops is None else self._compiled(loops, window, S)
+
+    def _compiled(self, loops: Library, window: Array, S: Array) -> Iterator[Array]:
+        (n, p, batch), lifting, (n_samples, m), per_unit = self.W.shape, self.lifting, self.u.shape[:2], self.W.shape[2] // self.units
+        entries = (*range(n), *(entry for entry, _, _ in self.past))
+        tape = tape_of(lifting, m, entries)
+        job = {
+            "samples": n_samples,
+            "batch": batch,
+            "per_unit": per_unit,
+            "history": self.history,
+            "stride": self.stride,
+            "terms": len(entries),
+            "depth": len(S),
+            "slopes": len(tape.slopes),
+            "W": self.W,
+            "T": self.T,
+            "term": [*((state, 0) for state in range(n)), *((state, delay) for _, state, delay in self.past)],
+            "slope": tape.slopes,
+            "x": self.x,
+            "u": self.u,
+            "valid": self.valid,
+            "sigma": self.sigma,
+            "window": window,
+            "S": S,
+        }
+        of_lifting, total = formulas(lifting, tape, self.parameters, m, batch), (n_samples - 1 - self.history) // self.stride
+        together = max(1, _AT_ONCE // (batch * n * (n * p + 1)))
+        for start in range(0, total, together):
+            count, first = min(together, total - start), self.history + start * self.stride
+            J = np.empty((self.units, n * p + 1, count * n * per_unit))
+            loops.call(
+                "kros_sensitivities",
+                of_lifting,
+                ("sensitivity_job", job | {"first": first, "last": first + count * self.stride, "rows": count, "J": J}),
+            )
+            yield J
+
+    def _in_numpy(self, window: Array, S: Array) -> Iterator[Array]:
+        lifting, W, (n, p, batch), nl, h = self.lifting, self.W, self.W.shape, self.lifting.n_lifted, self.history
+        psi, work, F, kept = np.empty((p, batch)), np.empty((n * p, batch)), np.empty((n, n + len(self.past), batch)), list(S)
+        psi[:n] = window[:n]
+        for k in range(h, len(self.x) - 1):
+            u = self.u[k]
+            lifting.lift_into(psi[:nl].T, self.parameters, window[n:].T)
+            psi[nl:] = lifting.lift_inputs(u.T, window.T, self.parameters).T
+            _state_matrix(F, W, window, u, lifting, self.parameters, self.past)
+            _advance(kept, F, self.T.T @ psi, work, self.past)
+            window[n:] = lifting.window.advance(window.T, u.T).T
+            psi[:n] = window[:n] = np.einsum("apb,pb->ab", W, psi)
+            kept = [kept[-1], *kept[:-1]]
+            if (k + 1 - h) % self.stride == 0:
+                yield self._residuals(kept[0], self.x[k + 1] - psi[:n], self.valid[k + 1])
+
+    def _residuals(self, S: Array, error: Array, valid: npt.NDArray[np.bool_]) -> Array:
+        """``[J r]^T`` of one sample; J = dx/dV / sigma."""
+        rows = np.concatenate([S, error[:, None]], axis=1) / self.sigma[:, None, None]  # (n, n p + 1, batch)
+        rows[:, :, ~valid] = 0.0
+        n, width, batch = rows.shape
+        return rows.reshape(n, width, self.units, batch // self.units).transpose(2, 1, 0, 3).reshape(self.units, width, -1)
 
 
 def _moving_past(lifting: Lifting) -> list[Past]:
@@ -129,13 +198,3 @@ def _advance(S: Sequence[Array], F: Array, white: Array, work: Array, past: Sequ
             np.multiply(terms[b], F[a, b], out=work)
             np.add(into, work, out=into)
         into[a * p : (a + 1) * p] += white
-
-
-def _accumulate(matrix: Array, S: Array, error: Array, valid: npt.NDArray[np.bool_], sigma: Array, units: int) -> None:
-    """Add [J r]^T [J r] of one sample; J = dx/dV / sigma."""
-    rows = np.concatenate([S, error[:, None]], axis=1) / sigma[:, None, None]  # (n, n p + 1, batch)
-    if not valid.all():
-        rows[:, :, ~valid] = 0.0
-    n, width, batch = rows.shape
-    J = rows.reshape(n, width, units, batch // units).transpose(2, 1, 0, 3).reshape(units, width, -1)
-    matrix += J @ np.swapaxes(J, -1, -2)

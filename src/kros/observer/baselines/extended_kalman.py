@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError
 from ...lifting import Lifting
+from ...loops import Library, formulas, library, tape_of
 from ..samples import require_samples
 
 Array = npt.NDArray[np.float64]
@@ -90,6 +91,8 @@ class ExtendedKalman:
         values = {
             name: np.broadcast_to(np.asarray(v, dtype=float), (batch,)) for name, v in {**self.parameters, **(parameters or {})}.items()
         }
+        if (loops := library()) is not None:
+            return self._compiled(loops, y, u, values)
         x = np.zeros((k, batch, n))
         x[..., C] = np.where(np.isfinite(y[0]), y[0], 0.0)
         P = np.broadcast_to(self.P0, (k, batch, n, n)).copy()
@@ -124,6 +127,16 @@ class ExtendedKalman:
                 if earlier is not None:
                     earlier = lifting.window.advance(window, held)
         return np.moveaxis(estimates, 0, 1)
+
+    def _compiled(self, loops: Library, y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
+        lifting, n, (n_samples, batch, m) = self.lifting, self.lifting.n_states, u.shape
+        Q, tape = self.Q.reshape(-1, n, n), tape_of(lifting, m, tuple(range(n)), of_inputs=False)
+        states = np.empty((n_samples, len(Q), n, batch))
+        job = {"filters": len(Q), "samples": n_samples, "batch": batch, "q": len(self.measured), "slopes": len(tape.slopes)}
+        job |= {"A": self.A[:n], "B": self.B[:n], "Q": Q, "R": self.R, "P": self.P0, "y": y, "u": u, "measured": self.measured}
+        job |= {"slope": tape.slopes, "states": states}
+        loops.call("kros_kalman", formulas(lifting, tape, values, m, batch), ("kalman_job", job))
+        return states.transpose(1, 0, 3, 2)
 
     def _late(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
         """Run on what was measured, with the inputs of its time, and predict each estimate to the row in which it is there."""

@@ -1,0 +1,122 @@
+"""The compiled time loops, called with arrays by name."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import re
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError
+from ..lifting import Lifting
+from .compiler import load
+from .tape import Tape
+
+_log = logging.getLogger(__name__)
+_FLAGS = (
+    "-std=gnu11",
+    "-O2",
+    "-march=native",
+    "-fPIC",
+    "-shared",
+    "-fno-math-errno",
+    "-ffp-contract=off",
+)  # no fused products: NumPy has none
+_TYPES = {"double": np.float64, "int32_t": np.int32, "uint8_t": np.uint8, "whole": np.int64}
+CHOICE, CHOICES = "KROS_LOOPS", ("compiled", "numpy")
+
+
+class Library:
+    """Functions of a C source whose arguments are structs of 64-bit numbers and pointers.
+
+    Parameters
+    ----------
+    code : CDLL
+    source : str
+        Says what the structs hold.
+    """
+
+    def __init__(self, code: ctypes.CDLL, source: str) -> None:
+        self._code = code
+        self._types: dict[str, dict[str, tuple[Any, bool] | None]] = {}
+        for body, name in re.findall(r"typedef struct \{(.*?)\} (\w+);", source, re.DOTALL):
+            fields = re.findall(r"^\s+(const )?(\w+) (\*?)(\w+);", body, re.MULTILINE)
+            self._types[name] = {field: (_TYPES[kind], not given) if pointer else None for given, kind, pointer, field in fields}
+
+    def call(self, name: str, *jobs: tuple[str, Mapping[str, Any]]) -> None:
+        """Call a function with structs by type: numbers and arrays by field, nothing for a field that is left out.
+
+        What the function writes into has the field's type and is contiguous; all else is brought into that form.
+
+        Raises
+        ------
+        MemoryError
+        """
+        alive: list[Any] = []  # arrays that were made here live until the call is over
+        structs = [self._struct(type_, values, alive) for type_, values in jobs]
+        if self._code[name](*structs):
+            raise MemoryError(f"Time loop {name}: there is no memory left for its state.")
+
+    def _struct(self, type_: str, values: Mapping[str, Any], alive: list[Any]) -> ctypes.Array[ctypes.c_int64]:
+        fields = self._types[type_]
+        unknown = values.keys() - fields.keys()
+        assert not unknown, unknown
+        return (ctypes.c_int64 * len(fields))(*(self._slot(values.get(field), kind, alive) for field, kind in fields.items()))
+
+    @staticmethod
+    def _slot(value: Any, pointer: tuple[Any, bool] | None, alive: list[Any]) -> int:
+        if value is None or pointer is None:
+            return int(value or 0)
+        array = np.ascontiguousarray(value, dtype=pointer[0])
+        assert array is value or not pointer[1], "a copy would be written into"
+        alive.append(array)
+        return array.ctypes.data
+
+
+@cache
+def library() -> Library | None:
+    """Return the compiled loops; None where NumPy takes their place, because it was asked for by ``KROS_LOOPS=numpy`` or there is no compiler that works.
+
+    Raises
+    ------
+    ConfigError
+        When something else was asked for.
+    """
+    choice = os.environ.get(CHOICE, CHOICES[0])
+    if choice not in CHOICES:
+        raise ConfigError(f"{CHOICE}={choice}: should be one of {', '.join(CHOICES)}.")
+    if choice == "numpy":
+        return None
+    source = files(__package__).joinpath("loops.c").read_text(encoding="utf-8")
+    code = load(source, _FLAGS)
+    return None if code is None else Library(code, source)
+
+
+def formulas(lifting: Lifting, tape: Tape, values: Mapping[str, npt.ArrayLike] | None, m: int, batch: int) -> tuple[str, dict[str, Any]]:
+    """Return what the loops need to know of a lifting with parameters of shape (batch,), and m recorded inputs."""
+    window, given = lifting.window, lifting.parameter_values(values)
+    own = np.array([np.broadcast_to(given[name], (batch,)) for name in lifting.parameters])
+    return "formulas", {
+        "n": lifting.n_states,
+        "earlier": len(window.earlier),
+        "m": m,
+        "parameters": len(own),
+        "registers": tape.registers,
+        "constants": len(tape.constants),
+        "operations": len(tape.code),
+        "constant": tape.constants,
+        "code": tape.code,
+        "lifted": tape.lifted,
+        "n_lifted": lifting.n_lifted,
+        "n_inputs": len(tape.lifted) - lifting.n_lifted,
+        "shift": window.shift,
+        "present": window.present,
+        "values": own,
+    }

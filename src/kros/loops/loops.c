@@ -1,0 +1,530 @@
+/* The time loops of kros: what steps sample by sample, compiled at first use (kros.loops.library). Machines lie side by side in vectors;
+   every operation on a machine has the order of the NumPy code that stands for it where there is no compiler.
+
+   A job is a struct of 64-bit numbers and pointers, in the order in which kros.loops reads it from this file. */
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define WIDE 8  /* machines in a vector */
+#define MOST 4  /* vectors at a time, so that what a machine needs stays in the cache */
+typedef double vec __attribute__((vector_size(WIDE * sizeof(double))));
+typedef int64_t whole;
+
+/* Formulas of a lifting: registers hold [states; earlier values; inputs; parameters; constants; temporaries], one row of machines each. */
+typedef struct {
+    whole n;           /* states */
+    whole earlier;     /* earlier values */
+    whole m;           /* inputs */
+    whole parameters;
+    whole registers;
+    whole constants;
+    whole operations;
+    const double *constant;   /* (constants) */
+    const int32_t *code;      /* (operations, 4): what, into, from, from */
+    const int32_t *lifted;    /* registers of [x; sigma] and of [u; gamma], in the order of a model's columns */
+    whole n_lifted;
+    whole n_inputs;
+    const int32_t *shift;     /* (earlier): register that every earlier value has at the next sample */
+    const int32_t *present;   /* (earlier): register of the quantity itself */
+    const double *values;     /* (parameters, batch) */
+} formulas;
+
+/* Observers and free runs: [x+; c+] = map [theta; c; u; y], re-lifted at every sample. */
+typedef struct {
+    whole observers;
+    whole samples;
+    whole batch;
+    whole order;       /* of the correction */
+    whole q;
+    whole own;         /* every machine has a map of its own: one observer, map (batch, rows, columns) */
+    whole late;        /* measurements are so many samples old, and so are the inputs of their time */
+    whole starts;      /* samples of corrections after a start */
+    whole begins;
+    whole width;       /* of the corrections that have limits; 0 where none has */
+    const double *map;        /* (observers, n + order, n_lifted + order + n_inputs + q) */
+    const double *y;          /* (samples, batch, q); none where nothing is measured */
+    const double *u;          /* (samples, batch, m) */
+    const int32_t *measured;  /* (q) */
+    const uint8_t *moving;    /* (samples, batch); all where there is none */
+    const int32_t *begin;     /* (samples, batch): one more than the row of `begun` that a machine starts from; none */
+    const double *begun;      /* (observers, begins, n) */
+    const whole *begun_since; /* (begins) */
+    const int32_t *pending;   /* (samples, batch): samples between a state and its row; with `before` alone */
+    const double *start;      /* (starts, n, q) */
+    const double *lower;      /* (n); none where estimates go on without limits */
+    const double *upper;
+    const double *limit;      /* (width): largest corrections */
+    const double *limit_c;    /* (width, order) */
+    const double *limit_d;    /* (width, q) */
+    const double *into;       /* (n, width) */
+    double *column;           /* (observers, columns, batch): x and c in their rows, moved on */
+    double *past;             /* (observers, batch, earlier), moved on */
+    uint8_t *fresh;           /* (batch): earlier values equal the present ones, moved on */
+    whole *since;             /* (batch): samples since a start, moved on */
+    double *states;           /* (samples, observers, n, batch): x before every sample; none */
+    double *innovation;       /* (samples, batch, q) of the first observer; none */
+    double *before;           /* (samples, batch, earlier) of the first observer, before every sample; none */
+} relift_job;
+
+/* Free runs with sensitivities: see kros.identify.refine.sensitivity for the symbols. */
+typedef struct {
+    whole samples;
+    whole batch;
+    whole per_unit;
+    whole first;       /* sample to go on from, and the one to stop before */
+    whole last;
+    whole history;
+    whole stride;
+    whole terms;       /* n, and earlier values of states that move with the model */
+    whole depth;       /* sensitivities that are kept: of now, and of so many samples before */
+    whole slopes;
+    whole rows;        /* of J that are written for one state and machine */
+    const double *W;          /* (n, p, batch) */
+    const double *T;          /* (p, p) */
+    const int32_t *term;      /* (terms, 2): state, samples ago */
+    const int32_t *slope;     /* (slopes, 3): column of W, term, register */
+    const double *x;          /* (samples, n, batch) */
+    const double *u;          /* (samples, m, batch) */
+    const uint8_t *valid;     /* (samples, batch) */
+    const double *sigma;      /* (n) */
+    double *window;           /* (n + earlier, batch), moved on */
+    double *S;                /* (depth, n, n p, batch), moved on; that of sample k lies at k mod depth */
+    double *J;                /* (unit, n p + 1, rows, n, per_unit) */
+} sensitivity_job;
+
+/* Extended Kalman filters that differ in Q. */
+typedef struct {
+    whole filters;
+    whole samples;
+    whole batch;
+    whole q;
+    whole slopes;
+    const double *A;          /* (n, n_lifted): rows of the original states */
+    const double *B;          /* (n, n_inputs) */
+    const double *Q;          /* (filters, n, n) */
+    const double *R;          /* (q, q) */
+    const double *P;          /* (n, n): of the start */
+    const double *y;          /* (samples, batch, q) */
+    const double *u;          /* (samples, batch, m) */
+    const int32_t *measured;  /* (q) */
+    const int32_t *slope;     /* (slopes, 3): lifted function, state, register */
+    double *states;           /* (samples, filters, n, batch) */
+} kalman_job;
+
+enum { ADD, MULTIPLY, DIVIDE, POWER, SIN, COS, TAN, EXP, LOG, SQRT, TANH, ABS, SIGN, ATAN };
+
+#define LANES(X) ((double *)(X))
+#define EACH(EXPRESSION) for (whole b = 0; b < lanes; b++) { double x = LANES(from)[b]; LANES(into)[b] = (EXPRESSION); } break
+
+static void evaluate(const formulas *f, vec *reg, whole lanes)
+{
+    const whole w = (lanes + WIDE - 1) / WIDE;
+    const int32_t *code = f->code;
+    for (whole i = 0; i < f->operations; i++, code += 4) {
+        vec *into = reg + code[1] * MOST;
+        const vec *from = reg + code[2] * MOST, *other = reg + code[3] * MOST;
+        switch (code[0]) {
+        case ADD: for (whole v = 0; v < w; v++) into[v] = from[v] + other[v]; break;
+        case MULTIPLY: for (whole v = 0; v < w; v++) into[v] = from[v] * other[v]; break;
+        case DIVIDE: for (whole v = 0; v < w; v++) into[v] = from[v] / other[v]; break;
+        case POWER: for (whole b = 0; b < lanes; b++) LANES(into)[b] = pow(LANES(from)[b], LANES(other)[b]); break;
+        case SIN: EACH(sin(x));
+        case COS: EACH(cos(x));
+        case TAN: EACH(tan(x));
+        case EXP: EACH(exp(x));
+        case LOG: EACH(log(x));
+        case SQRT: EACH(sqrt(x));
+        case TANH: EACH(tanh(x));
+        case ABS: EACH(fabs(x));
+        case SIGN: EACH(x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : x);
+        case ATAN: EACH(atan(x));
+        }
+    }
+}
+
+static void gather(vec *to, const double *from, whole stride, whole lanes)
+{
+    for (whole b = 0; b < lanes; b++) LANES(to)[b] = from[b * stride];
+}
+
+static void scatter(double *to, const vec *from, whole stride, whole lanes)
+{
+    for (whole b = 0; b < lanes; b++) to[b * stride] = LANES(from)[b];
+}
+
+static void *room(whole bytes)
+{
+    void *found = NULL;
+    if (posix_memalign(&found, sizeof(vec), (size_t)(bytes > 0 ? bytes : 1))) return NULL;
+    memset(found, 0, (size_t)bytes);
+    return found;
+}
+
+static vec *vectors(whole count) { return room(count * MOST * (whole)sizeof(vec)); }
+
+/* Constants and parameters of some machines into their registers. */
+static void settle(const formulas *f, vec *reg, whole first, whole batch, whole lanes)
+{
+    vec *to = reg + (f->n + f->earlier + f->m) * MOST;
+    for (whole i = 0; i < f->parameters; i++, to += MOST) gather(to, f->values + i * batch + first, 1, lanes);
+    for (whole i = 0; i < f->constants; i++, to += MOST)
+        for (whole b = 0; b < WIDE * MOST; b++) LANES(to)[b] = f->constant[i];
+}
+
+/* Earlier values of the next sample, into `next`. */
+static void shifted(const formulas *f, const vec *reg, vec *next)
+{
+    for (whole e = 0; e < f->earlier; e++) memcpy(next + e * MOST, reg + f->shift[e] * MOST, MOST * sizeof(vec));
+}
+
+/* to = map column, four rows at a time; a map of every machine's own has vectors in place of numbers. */
+#define PRODUCT(NAME, TYPE, STEP)                                                                                                        \
+    static void NAME(const TYPE *map, whole columns, const vec *const *column, vec *to, whole rows, whole w)                            \
+    {                                                                                                                                    \
+        whole i = 0;                                                                                                                     \
+        for (; i + 4 <= rows; i += 4)                                                                                                    \
+            for (whole v = 0; v < w; v++) {                                                                                              \
+                vec a = {0}, b = {0}, c = {0}, d = {0};                                                                                  \
+                const TYPE *at = map + i * columns * STEP + (STEP > 1 ? v : 0);                                                          \
+                for (whole j = 0; j < columns; j++, at += STEP) {                                                                        \
+                    const vec x = column[j][v];                                                                                          \
+                    a += at[0] * x, b += at[columns * STEP] * x, c += at[2 * columns * STEP] * x, d += at[3 * columns * STEP] * x;       \
+                }                                                                                                                        \
+                to[i * MOST + v] = a, to[(i + 1) * MOST + v] = b, to[(i + 2) * MOST + v] = c, to[(i + 3) * MOST + v] = d;                \
+            }                                                                                                                            \
+        for (; i < rows; i++)                                                                                                            \
+            for (whole v = 0; v < w; v++) {                                                                                              \
+                vec a = {0};                                                                                                             \
+                const TYPE *at = map + i * columns * STEP + (STEP > 1 ? v : 0);                                                          \
+                for (whole j = 0; j < columns; j++, at += STEP) a += at[0] * column[j][v];                                               \
+                to[i * MOST + v] = a;                                                                                                    \
+            }                                                                                                                            \
+    }
+PRODUCT(product, double, 1)
+PRODUCT(product_each, vec, MOST)
+
+/* Corrections within their limits: next += into (clipped - correction). */
+static void limit_corrections(const relift_job *s, whole n, const vec *c, const vec *nu, vec *next, whole w)
+{
+    for (whole i = 0; i < s->width; i++)
+        for (whole v = 0; v < w; v++) {
+            vec y = {0}, more;
+            for (whole j = 0; j < s->order; j++) y += s->limit_c[i * s->order + j] * c[j * MOST + v];
+            for (whole j = 0; j < s->q; j++) y += s->limit_d[i * s->q + j] * nu[j * MOST + v];
+            for (whole b = 0; b < WIDE; b++)
+                more[b] = (y[b] < -s->limit[i] ? -s->limit[i] : y[b] > s->limit[i] ? s->limit[i] : y[b]) - y[b];
+            for (whole j = 0; j < n; j++) next[j * MOST + v] += s->into[j * s->width + i] * more;
+        }
+}
+
+static void limit_states(const relift_job *s, whole n, vec *next, whole lanes)
+{
+    for (whole i = 0; i < n; i++)
+        for (whole b = 0; b < lanes; b++) {
+            double *x = LANES(next + i * MOST) + b;
+            *x = *x < s->lower[i] ? s->lower[i] : *x > s->upper[i] ? s->upper[i] : *x;
+        }
+}
+
+int kros_relift(const formulas *f, const relift_job *s)
+{
+    const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
+    const whole columns = f->n_lifted + order + f->n_inputs + q;
+    vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *nu = vectors(q), *next = vectors(rows), *older = vectors(ne);
+    vec *each = s->own ? vectors(rows * columns) : NULL;
+    double *map = room(rows * columns * (whole)sizeof(double));
+    const vec **column = room(columns * (whole)sizeof(vec *));
+    int failed = !reg || !c || !y || !nu || !next || !older || !map || !column || (s->own && !each);
+    for (whole first = 0; first < batch && !failed; first += WIDE * MOST) {
+        const whole lanes = batch - first < WIDE * MOST ? batch - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
+        settle(f, reg, first, batch, lanes);
+        if (s->own)
+            for (whole i = 0; i < rows * columns; i++) gather(each + i * MOST, s->map + first * rows * columns + i, rows * columns, lanes);
+        for (whole o = 0; o < s->observers; o++) {
+            double *state = s->column + o * columns * batch + first, *past = s->past ? s->past + (o * batch + first) * ne : NULL;
+            uint8_t fresh[WIDE * MOST] = {0};
+            whole since[WIDE * MOST] = {0}, used = 0;
+            if (s->fresh) memcpy(fresh, s->fresh + first, (size_t)lanes);
+            if (s->since) memcpy(since, s->since + first, (size_t)lanes * sizeof(whole));
+            for (whole i = 0; i < n; i++) gather(reg + i * MOST, state + i * batch, 1, lanes);
+            for (whole i = 0; i < order; i++) gather(c + i * MOST, state + (f->n_lifted + i) * batch, 1, lanes);
+            for (whole e = 0; e < ne; e++) gather(reg + (n + e) * MOST, past + e, ne, lanes);
+            for (whole j = 0; j < columns; j++) { /* columns that are zero, such as those of a shorter correction than another's, cost nothing */
+                const double *from = s->map + o * rows * columns + j;
+                whole there = s->own;
+                for (whole i = 0; i < rows && !there; i++) there = from[i * columns] != 0.0;
+                if (!there) continue;
+                whole k = j;
+                if (k < f->n_lifted) column[used] = reg + f->lifted[k] * MOST;
+                else if ((k -= f->n_lifted) < order) column[used] = c + k * MOST;
+                else if ((k -= order) < f->n_inputs) column[used] = reg + f->lifted[f->n_lifted + k] * MOST;
+                else column[used] = y + (k - f->n_inputs) * MOST;
+                for (whole i = 0; i < rows; i++) map[i * columns + used] = from[i * columns];
+                used++;
+            }
+            for (whole i = 1; i < rows && used < columns && !s->own; i++) memmove(map + i * used, map + i * columns, (size_t)used * sizeof(double));
+            for (whole k = 0; k < s->samples; k++) {
+                const whole at = k * batch + first, then = k < s->late ? 0 : k - s->late;
+                const uint8_t *moving = s->moving ? s->moving + at : NULL;
+                const int32_t *begin = s->begin ? s->begin + at : NULL;
+                if (s->states)
+                    for (whole i = 0; i < n; i++) scatter(s->states + ((k * s->observers + o) * n + i) * batch + first, reg + i * MOST, 1, lanes);
+                if (s->before && o == 0)
+                    for (whole b = 0; b < lanes; b++)
+                        for (whole e = 0; e < ne; e++) {
+                            const whole from = f->present[e], of = k - s->pending[at + b];
+                            const double held = from < n ? LANES(reg + from * MOST)[b] : s->u[(of * batch + first + b) * m + from - n - ne];
+                            s->before[(at + b) * ne + e] = fresh[b] ? held : LANES(reg + (n + e) * MOST)[b];
+                        }
+                for (whole b = 0; begin && b < lanes; b++)
+                    if (begin[b]) {
+                        for (whole i = 0; i < n; i++) LANES(reg + i * MOST)[b] = s->begun[(o * s->begins + begin[b] - 1) * n + i];
+                        for (whole i = 0; i < order; i++) LANES(c + i * MOST)[b] = 0.0;
+                        fresh[b] = 1, since[b] = s->begun_since[begin[b] - 1];
+                    }
+                whole going = moving ? 0 : lanes;
+                for (whole b = 0; moving && b < lanes; b++) going += moving[b];
+                for (whole j = 0; j < q; j++)
+                    for (whole b = 0; b < lanes; b++) {
+                        const double x = LANES(reg + s->measured[j] * MOST)[b], seen = s->y ? s->y[(at + b) * q + j] : NAN;
+                        LANES(y + j * MOST)[b] = isfinite(seen) ? seen : x;
+                        LANES(nu + j * MOST)[b] = LANES(y + j * MOST)[b] - x;
+                        if (s->innovation && o == 0) s->innovation[(at + b) * q + j] = LANES(nu + j * MOST)[b];
+                    }
+                if (!going) continue;
+                for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (then * batch + first) * m + j, m, lanes);
+                for (whole e = 0; e < ne; e++)
+                    for (whole b = 0; b < lanes; b++)
+                        if (fresh[b]) LANES(reg + (n + e) * MOST)[b] = LANES(reg + f->present[e] * MOST)[b];
+                evaluate(f, reg, lanes);
+                if (s->own) product_each(each, columns, column, next, rows, w);
+                else product(map, used, column, next, rows, w);
+                for (whole b = 0; s->starts && b < lanes; b++)
+                    if (since[b] < s->starts) {
+                        for (whole i = 0; i < n; i++) {
+                            double more = 0.0;
+                            for (whole j = 0; j < q; j++) more += s->start[(since[b] * n + i) * q + j] * LANES(nu + j * MOST)[b];
+                            LANES(next + i * MOST)[b] += more;
+                        }
+                        since[b] += moving ? moving[b] : 1;
+                    }
+                if (s->width) limit_corrections(s, n, c, nu, next, w);
+                if (s->lower) limit_states(s, n, next, lanes);
+                shifted(f, reg, older);
+                if (going == lanes) {
+                    memcpy(reg, next, (size_t)n * MOST * sizeof(vec));
+                    memcpy(c, next + n * MOST, (size_t)order * MOST * sizeof(vec));
+                    memcpy(reg + n * MOST, older, (size_t)ne * MOST * sizeof(vec));
+                    memset(fresh, 0, sizeof fresh);
+                    continue;
+                }
+                for (whole b = 0; b < lanes; b++)
+                    if (moving[b]) {
+                        for (whole i = 0; i < n; i++) LANES(reg + i * MOST)[b] = LANES(next + i * MOST)[b];
+                        for (whole i = 0; i < order; i++) LANES(c + i * MOST)[b] = LANES(next + (n + i) * MOST)[b];
+                        for (whole e = 0; e < ne; e++) LANES(reg + (n + e) * MOST)[b] = LANES(older + e * MOST)[b];
+                        fresh[b] = 0;
+                    }
+            }
+            for (whole i = 0; i < n; i++) scatter(state + i * batch, reg + i * MOST, 1, lanes);
+            for (whole i = 0; i < order; i++) scatter(state + (f->n_lifted + i) * batch, c + i * MOST, 1, lanes);
+            for (whole e = 0; e < ne; e++) scatter(past + e, reg + (n + e) * MOST, ne, lanes);
+            if (o == s->observers - 1) {
+                if (s->fresh) memcpy(s->fresh + first, fresh, (size_t)lanes);
+                if (s->since) memcpy(s->since + first, since, (size_t)lanes * sizeof(whole));
+            }
+        }
+    }
+    free(reg), free(c), free(y), free(nu), free(next), free(older), free(each), free(map), free(column);
+    return failed;
+}
+
+int kros_sensitivities(const formulas *f, const sensitivity_job *s)
+{
+    const whole n = f->n, ne = f->earlier, m = f->m, batch = s->batch, p = f->n_lifted + f->n_inputs, np = n * p, terms = s->terms;
+    vec *reg = vectors(f->registers), *W = vectors(n * p), *F = vectors(n * terms), *S = vectors(s->depth * n * np), *white = vectors(p);
+    vec *next = vectors(n), *older = vectors(ne);
+    const vec **psi = room(p * (whole)sizeof(vec *)), **term = room(terms * (whole)sizeof(vec *));
+    const int failed = !reg || !W || !F || !S || !white || !next || !older || !psi || !term;
+    for (whole first = 0; first < batch && !failed; first += WIDE * MOST) {
+        const whole lanes = batch - first < WIDE * MOST ? batch - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
+        settle(f, reg, first, batch, lanes);
+        for (whole i = 0; i < np; i++) gather(W + i * MOST, s->W + i * batch + first, 1, lanes);
+        for (whole i = 0; i < n + ne; i++) gather(reg + i * MOST, s->window + i * batch + first, 1, lanes);
+        for (whole i = 0; i < s->depth * n * np; i++) gather(S + i * MOST, s->S + i * batch + first, 1, lanes);
+        for (whole j = 0; j < p; j++) psi[j] = reg + f->lifted[j] * MOST;
+        for (whole k = s->first, sample = 0; k < s->last; k++) {
+            for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (k * m + j) * batch + first, 1, lanes);
+            evaluate(f, reg, lanes);
+            for (whole a = 0; a < n; a++)
+                for (whole t = 0; t < terms; t++)
+                    for (whole v = 0; v < w; v++) F[(a * terms + t) * MOST + v] = t < n ? W[(a * p + t) * MOST + v] : (vec){0};
+            for (whole i = 0; i < s->slopes; i++) {
+                const int32_t *of = s->slope + 3 * i;
+                for (whole a = 0; a < n; a++)
+                    for (whole v = 0; v < w; v++) F[(a * terms + of[1]) * MOST + v] += W[(a * p + of[0]) * MOST + v] * reg[of[2] * MOST + v];
+            }
+            for (whole j = 0; j < p; j++) {
+                memset(white + j * MOST, 0, MOST * sizeof(vec));
+                for (whole i = 0; i < p; i++)
+                    if (s->T[i * p + j] != 0.0)
+                        for (whole v = 0; v < w; v++) white[j * MOST + v] += s->T[i * p + j] * psi[i][v];
+            }
+            for (whole t = 0; t < terms; t++) /* before the start nothing moves */
+                term[t] = S + (((k - s->term[2 * t + 1] + s->depth) % s->depth) * n + s->term[2 * t]) * np * MOST;
+            vec *moved = S + ((k + 1) % s->depth) * n * np * MOST;
+            for (whole a = 0; a < n; a++) {
+                vec *into = moved + a * np * MOST;
+                const vec *by = F + a * terms * MOST;
+                for (whole i = 0; i < np; i++)
+                    for (whole v = 0; v < w; v++) {
+                        vec sum = term[0][i * MOST + v] * by[v];
+                        for (whole t = 1; t < terms; t++) sum += term[t][i * MOST + v] * by[t * MOST + v];
+                        into[i * MOST + v] = sum;
+                    }
+                for (whole j = 0; j < p; j++)
+                    for (whole v = 0; v < w; v++) into[(a * p + j) * MOST + v] += white[j * MOST + v];
+            }
+            product_each(W, p, psi, next, n, w);
+            shifted(f, reg, older);
+            memcpy(reg, next, (size_t)n * MOST * sizeof(vec));
+            memcpy(reg + n * MOST, older, (size_t)ne * MOST * sizeof(vec));
+            if ((k + 1 - s->history) % s->stride) continue;
+            for (whole b = 0; b < lanes; b++) {
+                const whole unit = (first + b) / s->per_unit, step = s->rows * n * s->per_unit;
+                double *J = s->J + unit * (np + 1) * step + sample * n * s->per_unit + (first + b) % s->per_unit;
+                const int valid = s->valid[(k + 1) * batch + first + b];
+                for (whole a = 0; a < n; a++, J += s->per_unit) {
+                    const double *from = LANES(moved + a * np * MOST) + b;
+                    for (whole i = 0; i < np; i++) J[i * step] = valid ? from[i * MOST * WIDE] / s->sigma[a] : 0.0;
+                    J[np * step] = valid ? (s->x[((k + 1) * n + a) * batch + first + b] - LANES(reg + a * MOST)[b]) / s->sigma[a] : 0.0;
+                }
+            }
+            sample++;
+        }
+        for (whole i = 0; i < n + ne; i++) scatter(s->window + i * batch + first, reg + i * MOST, 1, lanes);
+        for (whole i = 0; i < s->depth * n * np; i++) scatter(s->S + i * batch + first, S + i * MOST, 1, lanes);
+    }
+    free(reg), free(W), free(F), free(S), free(white), free(next), free(older), free(psi), free(term);
+    return failed;
+}
+
+/* Solve L S = PC for the gains of one machine by elimination with pivots; S (q, q) is overwritten, PC (n, q) becomes L. */
+static void divide(double *S, double *L, whole n, whole q)
+{
+    for (whole j = 0; j < q; j++) { /* columns of L are combined as those of S */
+        whole pivot = j;
+        for (whole i = j + 1; i < q; i++)
+            if (fabs(S[j * q + i]) > fabs(S[j * q + pivot])) pivot = i;
+        for (whole r = 0; r < q + n; r++) {
+            double *row = r < q ? S + r * q : L + (r - q) * q, x = row[j];
+            row[j] = row[pivot], row[pivot] = x;
+        }
+        const double by = S[j * q + j];
+        for (whole r = 0; r < q + n; r++) (r < q ? S + r * q : L + (r - q) * q)[j] /= by;
+        for (whole i = 0; i < q; i++) {
+            const double share = S[j * q + i];
+            for (whole r = 0; i != j && r < q + n; r++) {
+                double *row = r < q ? S + r * q : L + (r - q) * q;
+                row[i] -= share * row[j];
+            }
+        }
+    }
+}
+
+int kros_kalman(const formulas *f, const kalman_job *s)
+{
+    const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, batch = s->batch, nl = f->n_lifted, inputs = f->n_inputs;
+    vec *reg = vectors(f->registers), *P = vectors(n * n), *L = vectors(n * q), *F = vectors(n * n), *FP = vectors(n * n), *next = vectors(n);
+    vec *older = vectors(ne), *nu = vectors(q), *drive = vectors(n);
+    const vec **lifted = room((nl + inputs) * (whole)sizeof(vec *));
+    double *S = room((q * q + n * q) * (whole)sizeof(double)), *PC = S ? S + q * q : NULL;
+    const int failed = !reg || !P || !L || !F || !FP || !next || !older || !nu || !drive || !lifted || !S;
+    for (whole first = 0; first < batch && !failed; first += WIDE * MOST) {
+        const whole lanes = batch - first < WIDE * MOST ? batch - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
+        settle(f, reg, first, batch, lanes);
+        for (whole j = 0; j < nl + inputs; j++) lifted[j] = reg + f->lifted[j] * MOST;
+        for (whole filter = 0; filter < s->filters; filter++) {
+            const double *Q = s->Q + filter * n * n;
+            for (whole i = 0; i < n * n; i++)
+                for (whole v = 0; v < MOST; v++) P[i * MOST + v] = (vec){0} + s->P[i];
+            memset(reg, 0, (size_t)(n + ne) * MOST * sizeof(vec));
+            for (whole j = 0; j < q; j++)
+                for (whole b = 0; b < lanes; b++) {
+                    const double y = s->y[(first + b) * q + j];
+                    LANES(reg + s->measured[j] * MOST)[b] = isfinite(y) ? y : 0.0;
+                }
+            for (whole k = 0; k < s->samples; k++) {
+                for (whole i = 0; i < n; i++) scatter(s->states + ((k * s->filters + filter) * n + i) * batch + first, reg + i * MOST, 1, lanes);
+                for (whole b = 0; b < lanes; b++) { /* a sample with a measurement missing is left out whole */
+                    int there = 1;
+                    for (whole j = 0; j < q; j++) there &= isfinite(s->y[(k * batch + first + b) * q + j]) != 0;
+                    for (whole j = 0; j < q; j++)
+                        LANES(nu + j * MOST)[b] = there ? s->y[(k * batch + first + b) * q + j] - LANES(reg + s->measured[j] * MOST)[b] : 0.0;
+                    for (whole i = 0; i < n; i++)
+                        for (whole j = 0; j < q; j++) PC[i * q + j] = LANES(P + (i * n + s->measured[j]) * MOST)[b];
+                    for (whole i = 0; i < q; i++)
+                        for (whole j = 0; j < q; j++) S[i * q + j] = PC[s->measured[i] * q + j] + s->R[i * q + j];
+                    divide(S, PC, n, q);
+                    for (whole i = 0; i < n * q; i++) LANES(L + i * MOST)[b] = there ? PC[i] : 0.0;
+                }
+                for (whole i = 0; i < n; i++)
+                    for (whole v = 0; v < w; v++) {
+                        vec more = {0};
+                        for (whole j = 0; j < q; j++) more += L[(i * q + j) * MOST + v] * nu[j * MOST + v];
+                        reg[i * MOST + v] += more;
+                    }
+                for (whole j = 0; j < n; j++) /* P - L PC', PC from P as it was: F has the room for it */
+                    for (whole i = 0; i < q; i++) memcpy(F + (j * q + i) * MOST, P + (j * n + s->measured[i]) * MOST, MOST * sizeof(vec));
+                for (whole i = 0; i < n; i++)
+                    for (whole j = 0; j < n; j++)
+                        for (whole v = 0; v < w; v++) {
+                            vec less = {0};
+                            for (whole l = 0; l < q; l++) less += L[(i * q + l) * MOST + v] * F[(j * q + l) * MOST + v];
+                            P[(i * n + j) * MOST + v] -= less;
+                        }
+                for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (k * batch + first) * m + j, m, lanes);
+                for (whole e = 0; e < ne && !k; e++) memcpy(reg + (n + e) * MOST, reg + f->present[e] * MOST, MOST * sizeof(vec));
+                evaluate(f, reg, lanes);
+                product(s->A, nl, lifted, next, n, w);
+                product(s->B, inputs, lifted + nl, drive, n, w);
+                for (whole i = 0; i < n; i++)
+                    for (whole j = 0; j < n; j++)
+                        for (whole v = 0; v < w; v++) F[(i * n + j) * MOST + v] = (vec){0} + s->A[i * nl + j];
+                for (whole t = 0; t < s->slopes; t++) {
+                    const int32_t *of = s->slope + 3 * t;
+                    for (whole i = 0; i < n; i++)
+                        for (whole v = 0; v < w; v++) F[(i * n + of[1]) * MOST + v] += s->A[i * nl + of[0]] * reg[of[2] * MOST + v];
+                }
+                for (whole i = 0; i < n; i++)
+                    for (whole j = 0; j < n; j++)
+                        for (whole v = 0; v < w; v++) {
+                            vec sum = {0};
+                            for (whole l = 0; l < n; l++) sum += F[(i * n + l) * MOST + v] * P[(l * n + j) * MOST + v];
+                            FP[(i * n + j) * MOST + v] = sum;
+                        }
+                for (whole i = 0; i < n; i++)
+                    for (whole j = 0; j < n; j++)
+                        for (whole v = 0; v < w; v++) {
+                            vec sum = {0};
+                            for (whole l = 0; l < n; l++) sum += FP[(i * n + l) * MOST + v] * F[(j * n + l) * MOST + v];
+                            P[(i * n + j) * MOST + v] = sum + Q[i * n + j];
+                        }
+                for (whole i = 0; i < n; i++)
+                    for (whole j = 0; j < i; j++)
+                        for (whole v = 0; v < w; v++) {
+                            const vec mean = (P[(i * n + j) * MOST + v] + P[(j * n + i) * MOST + v]) / 2;
+                            P[(i * n + j) * MOST + v] = P[(j * n + i) * MOST + v] = mean;
+                        }
+                shifted(f, reg, older);
+                for (whole i = 0; i < n; i++)
+                    for (whole v = 0; v < w; v++) reg[i * MOST + v] = next[i * MOST + v] + drive[i * MOST + v];
+                memcpy(reg + n * MOST, older, (size_t)ne * MOST * sizeof(vec));
+            }
+        }
+    }
+    free(reg), free(P), free(L), free(F), free(FP), free(next), free(older), free(nu), free(drive), free(lifted), free(S);
+    return failed;
+}

@@ -1,0 +1,214 @@
+"""Time loops: compiled and in NumPy, the same numbers; and what happens where they cannot be compiled."""
+
+import logging
+import multiprocessing
+import os
+import stat
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from families import FAMILIES, INPUT_FUNCTIONS, INPUTS, STATES
+from machines import LIMITS, MACHINES, drive, samples
+
+from kros.core.errors import ConfigError
+from kros.identify.free_run import free_run
+from kros.identify.refine.segments import Segments
+from kros.identify.refine.sensitivity import normal_equations
+from kros.lifting import Lifting
+from kros.loops import compiler, find_compiler, library
+from kros.observer import run_innovations, run_observer, run_observers
+from kros.observer.baselines.extended_kalman import ExtendedKalman
+
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
+MACHINE_COUNT = 37  # more than are side by side at once, and no multiple of a vector
+
+
+@pytest.fixture(name="both")
+def _both(monkeypatch):
+    """What a function returns compiled and in NumPy."""
+
+    def both(run):
+        found = []
+        for choice in ("compiled", "numpy"):
+            monkeypatch.setenv("KROS_LOOPS", choice)
+            library.cache_clear()
+            assert (library() is None) == (choice == "numpy")
+            found.append(run())
+        return found
+
+    yield both
+    library.cache_clear()
+
+
+def assert_same(found, wanted):
+    for ours, theirs in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(np.isfinite(ours), np.isfinite(theirs))
+        size = np.abs(theirs[np.isfinite(theirs)]).max(initial=0.0)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12 * size)
+
+
+def machines_of(count=700):
+    """Faulty samples of machines that differ, shape (count, machine, ...), and their phases."""
+    y, u = (np.stack(of, axis=1) for of in zip(*(samples(count, turns) for turns in np.linspace(0, 0.02, MACHINE_COUNT)), strict=True))
+    rng = np.random.default_rng(0)
+    y[rng.random(y.shape) < 0.02] = np.nan
+    u[np.repeat(rng.random(u.shape[:2]) < 2e-3, 8, axis=0)[:count]] = np.nan  # longer than inputs are held: a new start
+    return y, u, np.linspace(-2, 2, MACHINE_COUNT)
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", MACHINES)
+def test_observers_of_all_kinds_run_alike(kind, both):
+    observer, (y, u, phase) = MACHINES[kind](), machines_of()
+    own = {"phase": phase} if observer.lifting.parameters else None
+
+    def run():
+        nu, judged = run_innovations(observer, y, u, own)
+        return run_observer(observer, y, u, own), run_observer(observer, y, u, own, "filter"), nu, judged
+
+    assert_same(*both(run))
+
+
+@needs_compiler
+def test_observers_side_by_side_run_alike(both):
+    y, u, phase = machines_of()
+    observers = [drive(order=order, **LIMITS) for order in (0, 2, 5)]
+    assert_same(*both(lambda: run_observers(observers, y, u, {"phase": phase})))
+
+
+def model_of(lifting, units, rng):
+    """Models that keep the states in the middle of where all functions are defined, and the sizes of what they multiply."""
+    n, p = lifting.n_states, lifting.n_lifted + len(INPUTS) + len(lifting.input_functions)
+    size = np.ones(p)
+    size[n : lifting.n_lifted] += np.abs(lifting.lift(np.full(len(lifting.window.names), 0.7), {"phase": 0.5})[n:])
+    W = rng.uniform(-1, 1, size=(units, n, p)) * 0.02 / p / size
+    W[:, range(n), range(n)] += 0.5
+    W[..., lifting.n_lifted] = 0.25
+    return W, size
+
+
+def recorded(rng, count, batch):
+    return rng.uniform(0.6, 0.9, size=(count, batch, len(STATES))), rng.uniform(1.2, 1.8, size=(count, batch, len(INPUTS)))
+
+
+@needs_compiler
+@pytest.mark.parametrize("family", FAMILIES)
+def test_free_runs_and_sensitivities_of_all_liftings_are_alike(family, both):
+    lifting = Lifting(STATES, FAMILIES[family], ("phase",), INPUTS, INPUT_FUNCTIONS)
+    rng, units, per_unit, h = np.random.default_rng(2), 3, 13, lifting.history
+    (W, size), n = model_of(lifting, units, rng), lifting.n_states
+    x, u = recorded(rng, h + 12, units * per_unit)
+    segments = Segments(
+        *(np.moveaxis(a, 2, 1).reshape(len(a), -1, units, per_unit) for a in (x, u)), rng.random((len(x), units, per_unit)) > 0.1, h
+    )
+    T, phase = np.triu(rng.uniform(-0.1, 0.1, size=W.shape[2:] * 2)) + np.eye(len(size)), rng.uniform(0.2, 0.9, size=units)
+    T /= size[:, None]
+    V = np.linalg.solve(T, W.swapaxes(1, 2)).swapaxes(1, 2)
+
+    def run():
+        normal = normal_equations(V, T, lifting, {"phase": phase}, segments, np.array([0.5, 2.0]), 3)
+        AB = np.zeros((units, lifting.n_lifted, W.shape[2]))
+        AB[:, :n] = W
+        first, own = x[: h + 1, :units].swapaxes(0, 1), {"phase": phase}
+        free = [free_run(*np.split(M, [lifting.n_lifted], axis=-1), lifting, own, first, u[:, :units].swapaxes(0, 1)) for M in (AB, AB[0])]
+        return normal.matrix, normal.squares, normal.counts, *free
+
+    found, wanted = both(run)
+    assert all(np.isfinite(one).all() for one in wanted)
+    assert_same(found, wanted)
+
+
+@needs_compiler
+@pytest.mark.parametrize("measured", [(0,), (0, 1)])
+@pytest.mark.parametrize(
+    "functions", [(), ("sin(3*position + phase)", "velocity*position"), ("tanh(position[-2])", "voltage[-1]*velocity")]
+)
+def test_extended_kalman_filters_are_alike(functions, measured, both):
+    gamma = ("voltage*velocity",) if functions else ()
+    lifting = Lifting(STATES, functions, ("phase",) if any("phase" in f for f in functions) else (), INPUTS, gamma)
+    rng = np.random.default_rng(3)
+    W = model_of(lifting, 1, rng)[0][0]
+    A = np.vstack([W[:, : lifting.n_lifted], np.zeros((len(functions), lifting.n_lifted))])
+    B = np.vstack([W[:, lifting.n_lifted :], np.zeros((len(functions), 1 + len(gamma)))])
+    Q, R = np.stack([np.diag([0.01, 0.02]) * scale for scale in (0.1, 1.0, 10.0)]), np.diag([0.01, 0.03])[: len(measured), : len(measured)]
+    one = ExtendedKalman(lifting, A, B, measured, INPUTS, Q, R, np.eye(2), {"phase": 0.1} if lifting.parameters else {})
+    x, u = recorded(rng, 200, MACHINE_COUNT)
+    y = x[..., list(measured)]
+    y[rng.random(y.shape) < 0.05] = np.nan
+    filters = [one] if lifting.history else [one, replace(one, delay=3)]
+    assert_same(*both(lambda: [kalman.run_all(y, u) for kalman in filters]))
+
+
+SOURCE = "int kros_answer(void);\nint kros_answer(void) { return 42; }\n"
+FLAGS = ("-fPIC", "-shared")
+
+
+def answer(cache, start):
+    os.environ["XDG_CACHE_HOME"] = str(cache)
+    start.wait()
+    return os._exit(0 if compiler.load(SOURCE, FLAGS).kros_answer() == 42 else 1)
+
+
+@needs_compiler
+def test_two_processes_may_compile_at_once(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    start = context.Event()
+    both = [context.Process(target=answer, args=(tmp_path, start)) for _ in range(2)]
+    for process in both:
+        process.start()
+    start.set()
+    for process in both:
+        process.join(60)
+    assert [process.exitcode for process in both] == [0, 0]
+    assert [path.suffix for path in (tmp_path / "kros").iterdir()] == [".so"]
+
+
+@needs_compiler
+def test_a_home_that_cannot_be_written_is_no_obstacle(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr(compiler.tempfile, "gettempdir", lambda: str(tmp_path))
+    assert compiler.load(SOURCE, FLAGS).kros_answer() == 42
+    folder = tmp_path / f"kros-{os.getuid()}"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert len(list(folder.iterdir())) == 1
+
+
+@needs_compiler
+def test_no_library_is_loaded_from_where_others_may_put_one(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "open"))
+    monkeypatch.setattr(compiler.tempfile, "gettempdir", lambda: str(tmp_path))
+    for folder in (tmp_path / "open" / "kros", tmp_path / f"kros-{os.getuid()}"):
+        folder.mkdir(parents=True)
+        folder.chmod(0o777)
+    with caplog.at_level(logging.INFO, "kros"):
+        assert compiler.load(SOURCE, FLAGS) is None
+    assert "no folder for it" in caplog.text
+
+
+def test_without_a_compiler_that_works_numpy_takes_over_and_says_so_once(tmp_path, monkeypatch, caplog):
+    library.cache_clear()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with caplog.at_level(logging.INFO, "kros"):
+        assert library() is None
+        assert library() is None
+    assert len(caplog.records) == 1
+    assert "no C compiler" in caplog.text
+    (tmp_path / "cc").write_text("#!/bin/sh\necho 'no licence' >&2\nexit 3\n")
+    (tmp_path / "cc").chmod(0o755)
+    library.cache_clear()
+    with caplog.at_level(logging.INFO, "kros"):
+        assert library() is None
+    assert "no licence" in caplog.text
+    assert run_observer(drive(), *(a[:, None] for a in samples(20, faults=False))).shape == (20, 1, 3)
+    library.cache_clear()
+
+
+def test_an_unknown_choice_is_refused(monkeypatch):
+    monkeypatch.setenv("KROS_LOOPS", "fortran")
+    library.cache_clear()
+    with pytest.raises(ConfigError, match=r"KROS_LOOPS=fortran.*compiled, numpy"):
+        library()
+    library.cache_clear()

@@ -17,8 +17,8 @@ from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
 from kros.loops import compiler, find_compiler, library
-from kros.observer import run_innovations, run_observer, run_observers
 from kros.observer.baselines.extended_kalman import ExtendedKalman
+from kros.observer.simulate import run_innovations, run_observer, run_observers
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
 MACHINE_COUNT = 37  # more than are side by side at once, and no multiple of a vector

@@ -11,6 +11,8 @@ from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, conditioned, driven_coordinates, relift_certificate, run_observer, signal_bound, with_internal
+from kros.observer.certificate.error import ReliftScales, error_system
+from kros.observer.certificate.report import course, frozen_response
 from kros.observer.limits import Limit, limits_of
 from kros.observer.predictor.limited import with_limits
 from kros.synthesis import Injection
@@ -140,4 +142,24 @@ def test_recorded_signals_within_the_limits_have_the_bound_of_an_observer_withou
     assert with_them.within
     assert with_them.facts((0,))["set_within_limits"]
     np.testing.assert_allclose(with_them.cover, without.cover, rtol=1e-9)
-    assert not signal_bound(relift_certificate(found), found, loud).within
+
+
+def test_what_limits_cut_off_is_a_residual_of_the_observer_without_them(predictor):
+    batch = recorded(batch=3, n=1000)
+    batch = replace(batch, states=batch.states + 0.02 * np.random.default_rng(1).normal(size=batch.states.shape) * [0, 1])
+    held = np.clip(batch.states, [-np.inf, -LIMIT], [np.inf, LIMIT])
+    batch = replace(batch, states=held)
+    limited = with_limits(predictor, [-np.inf, -LIMIT], [np.inf, LIMIT])
+    A = limited.A.copy()
+    A[2:, 1], A[2:, 3] = A[2:, 1] + BACK / 2, A[2:, 3] - BACK / 2  # half of what the controller does
+    observer = replace(limited, A=A)
+    free, seen = replace(observer, runtime=Runtime()), course(observer, batch, cut=True)
+    system = error_system(free, ReliftScales.ones(free))
+    z, _ = frozen_response(system, seen.omega, seen.first)
+    assert np.abs(seen.omega - course(observer, batch).omega).max() > LIMIT  # they do cut off
+    np.testing.assert_allclose(z[..., :2], (batch.states - run_observer(observer, held[..., :1], batch.inputs)[..., :2]), atol=1e-9)
+    bound = signal_bound(relift_certificate(observer), observer, batch)
+    assert bound.facts((0,))["set_within_limits"] is False
+    assert np.all(bound.ratios[:, 1] >= 1)
+    assert np.all(bound.ratios[:, 1] <= 1.3)
+    assert np.all(bound.cover >= bound.bounds.max(axis=0) * (1 - 1e-9))

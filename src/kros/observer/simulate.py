@@ -102,10 +102,11 @@ def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, paramet
     return _run(observers, y, u, parameters, EstimateKind.PREDICT)
 
 
-def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None) -> tuple[Array, Array]:
-    """Return the first estimate, shape (batch, n), and what the first innovations add beside the observer's own correction, shape (count, batch, n).
+def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None, *, cut: bool = False) -> tuple[Array, Array]:
+    """Return the first estimate, shape (batch, n), and what is added to later ones beside the observer's own correction, shape (count, batch, n).
 
-    `y` and `u` as in `run_observer`, of which no sample is lost; the estimate is what the observer goes on from, within its limits.
+    That is what the first innovations add, and with `cut` what limits take from the estimates that an observer without delay goes on from. `y` and `u` as
+    in `run_observer`, of which no sample is lost; the first estimate is within the limits.
     """
     samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
     batch, start, late = samples.starts.shape[1], observer.start_in_motion, observer.runtime.delay
@@ -113,12 +114,14 @@ def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters |
     steps.begin(samples.y[0])
     steps.begin(samples.y[0], samples.starts[0], samples.u[0])
     first, count = steps.x[0].copy(), 0 if start is None else min(len(start), len(samples.y) - late)
-    added = np.zeros((count, batch, observer.lifting.n_states))
-    for k in range(count):
-        assert start is not None
+    added = np.zeros((max(count, len(samples.y) - 1 if cut else 0), batch, observer.lifting.n_states))
+    for k in range(len(added)):
         arrived = samples.y[k + late]
-        added[k] = start.correction(steps.since, steps.innovation(arrived)[0])
+        if start is not None and k < count:
+            added[k] = start.correction(steps.since, steps.innovation(arrived)[0])
         steps.step(arrived, samples.u[k], ~np.isfinite(arrived))
+        if cut:
+            added[k] += steps.cut[0]
     return first, added
 
 

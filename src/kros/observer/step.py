@@ -18,7 +18,7 @@ Parameters = Mapping[str, npt.ArrayLike]
 
 
 class Steps:
-    """Observers of one model, side by side over a batch of machines.
+    """Observers of one model, side by side over a batch of machines; `cut` is what limits took from the last estimates.
 
     ``[x_hat+; x^c+] = M [theta(x_hat); x^c; u; y]``, one column a machine, so that each quantity of all machines lies together in memory.
 
@@ -51,6 +51,7 @@ class Steps:
         self._start, self._starting, self._since = observer.start_in_motion, False, np.zeros(batch, dtype=int)
         self._limits = observer.runtime if observer.runtime.limited else None
         self.correction: Array | None = None
+        self.cut = np.zeros(self._next_x.shape)
 
     def begin(self, y: Array, machines: Flags | None = None, u: Array | None = None) -> None:
         """Start all machines, or some, at measurements, shape (batch, q), and inputs where these are known, shape (batch, m)."""
@@ -259,7 +260,9 @@ class Steps:
             self.correction = self._x_c @ K.C.T + (self._y - self.x[..., self._at]) @ K.D.T
             clipped = self._limits.clip_correction(self.correction)
             self._next_x += (clipped - self.correction) @ observer.into[:n].T
-        self._next_x[...] = self._limits.relifted(self._next_x)
+        within = self._limits.relifted(self._next_x)
+        np.subtract(within, self._next_x, out=self.cut)
+        self._next_x[...] = within
 
 
 def places(measured: Sequence[int]) -> Any:

@@ -146,8 +146,12 @@ class Course:
         return np.asarray((good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0))
 
 
-def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None) -> Course:
-    """Return what drove an observer along recorded episodes; recorded states stand for the true ones, and no sample is lost."""
+def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None, *, cut: bool = False) -> Course:
+    """Return what drove an observer along recorded episodes; recorded states stand for the true ones, and no sample is lost.
+
+    With `cut` what its limits took from its estimates counts as residual, with the other sign: without delay its error then obeys the equations of an
+    observer without these limits, exactly.
+    """
     inputs, at, late = batch.inputs, list(observer.measured), observer.runtime.delay
     states = observer.runtime.within(batch.states)
     values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
@@ -161,12 +165,12 @@ def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None 
         estimates = run_observer(observer, y, inputs, values)
     # Measurements beyond the limits of their states are taken at the limit: what is left of their noise is smaller.
     taken = screened(observer, y, inputs).y
-    start, early = started(observer, y, inputs, values)
+    start, early = started(observer, y, inputs, values, cut=cut)
     noise = np.where(np.isfinite(taken), taken, y)[:-1] - due[:-1]
     noise[:late] = 0.0
     truth = with_internal(observer, states, observer.runtime.clip_inputs(inputs), values, start, early)
     omega, recorded = held_residual(observer, truth, inputs, values), len(observer.recorded)
-    omega[: len(early), :, :recorded] -= early[: len(omega), :, :recorded]  # what the first samples correct beside the observer's gain
+    omega[: len(early), :, :recorded] -= early[: len(omega), :, :recorded]  # what is corrected beside the observer's gain
     return Course(omega, noise, first_error(observer, truth[0] - start), truth - estimates, batch.lengths, inputs, y, batch.states - states)
 
 

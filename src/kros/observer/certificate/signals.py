@@ -65,9 +65,10 @@ class SignalBound:
         Why there is no bound; empty where there is one.
     outside : tuple of str
         Units of which the observer refuses samples as implausible. Their rows are infinite.
-    within : bool
-        Whether it is for signals with which the estimate stays within its limits, as with all that were recorded. Energies say nothing of peaks: where
-        limits may bind at any sample, a gain that brings internal states back makes a bound as much larger as it makes their excess smaller.
+    within : bool, optional
+        Of an observer that goes on from limits: whether these change no estimate of the recordings, and the bound is for signals that keep it so. If
+        not, what they cut off along the recordings counts as residual. None where there are no such limits, or they may bind at any sample: with a delay.
+        Energies say nothing of peaks, and a gain that brings internal states back would make a bound as much larger as it makes their excess smaller.
     """
 
     states: tuple[str, ...]
@@ -79,7 +80,7 @@ class SignalBound:
     sizes: Array
     reason: str = ""
     outside: tuple[str, ...] = ()
-    within: bool = False
+    within: bool | None = None
 
     @property
     def certified(self) -> bool:
@@ -106,7 +107,7 @@ class SignalBound:
             ratios, over = self.ratios[:, hidden], (self.cover / self.errors)[:, hidden]
         ratios, over = (v[np.isfinite(self.bounds[:, hidden]) & np.isfinite(v)] for v in (ratios, over))
         facts: dict[str, Any] = {"set_certified": True, "set_bound_percent": self.percent()}
-        facts |= {"set_within_limits": True} if self.within else {}
+        facts |= {} if self.within is None else {"set_within_limits": self.within}
         least, most = (float(ratios.min()), float(ratios.max())) if ratios.size else (None, None)
         facts |= {"set_bound_to_error_min": least, "set_bound_to_error_max": most}
         return facts | {"set_cover_to_error_max": float(over.max()) if over.size else None, "set_outside": list(self.outside)}
@@ -156,8 +157,13 @@ def signal_bound(
         Also where there is none: `reason` says why.
     """
     seen = course(observer, batch, estimates)
-    n, free = len(observer.recorded), _without_limits(observer, batch, seen)
-    observer = free or observer
+    n, within, inside = len(observer.recorded), None, seen.taken(observer)
+    if observer.runtime.clipped_states(observer.lifting.n_states):
+        free = replace(observer, runtime=replace(observer.runtime, lower=None, upper=None))
+        if _alike(free, observer, batch, seen):
+            observer, within = free, True
+        elif not observer.runtime.delay:
+            seen, observer, within = course(observer, batch, estimates, cut=True), free, False
     units = list(dict.fromkeys(batch.units))
     member = np.array([[unit == name for unit in batch.units] for name in units], dtype=float)
     member /= member.sum(axis=1, keepdims=True)
@@ -172,7 +178,7 @@ def signal_bound(
         errors,
         nothing,
         certificate.scales.error[:n].copy(),
-        within=free is not None,
+        within=within,
     )
     if not certificate.certified:
         return replace(found, reason="it has no certificate as it runs")
@@ -198,7 +204,6 @@ def signal_bound(
     with np.errstate(invalid="ignore"):
         movement = np.where(kappa > 0, kappa * np.sqrt(len(acted)), 0.0)
         each = own[:, :n] + np.where(kappa > 0, kappa * np.linalg.norm(own[:, n:] / acted, axis=1)[:, None], 0.0)
-    inside = seen.taken(observer)
     left = tuple(unit for unit, rows in zip(units, member > 0, strict=True) if not inside[rows].all())
     each[[unit in left for unit in units]] = np.inf
     reason = "" if np.isfinite(kappa).all() else "what slopes and limits can add has no proven gain"
@@ -207,14 +212,11 @@ def signal_bound(
     return replace(found, cover=of_all, bounds=each * by + beyond, movement=movement * by, reason=reason, outside=left)
 
 
-def _without_limits(observer: ObserverData, batch: EpisodeBatch, seen: Course) -> ObserverData | None:
-    """Return the observer without the limits that it goes on from, where they change no estimate of the recordings."""
-    if not observer.runtime.clipped_states(observer.lifting.n_states):
-        return None
-    free = replace(observer, runtime=replace(observer.runtime, lower=None, upper=None))
-    ours, theirs = (run_observer(one, seen.y, seen.inputs, observer.own(batch.parameters)) for one in (free, observer))
+def _alike(one: ObserverData, other: ObserverData, batch: EpisodeBatch, seen: Course) -> bool:
+    """Whether two observers have the same estimates of the recordings."""
+    ours, theirs = (run_observer(o, seen.y, seen.inputs, o.own(batch.parameters)) for o in (one, other))
     beyond = np.arange(len(ours))[:, None] >= seen.lengths
-    return free if bool(((ours == theirs).all(axis=-1) | beyond).all()) else None
+    return bool(((ours == theirs).all(axis=-1) | beyond).all())
 
 
 def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:

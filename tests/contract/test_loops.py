@@ -16,9 +16,10 @@ from kros.identify.free_run import free_run
 from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
-from kros.loops import compiler, find_compiler, library
+from kros.loops import compiler, filtered, find_compiler, library, recursion
 from kros.observer.baselines.extended_kalman import ExtendedKalman
 from kros.observer.simulate import run_innovations, run_observer, run_observers
+from kros.observer.tuning.blocks import blocks_of, moved
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
 MACHINE_COUNT = 37  # more than are side by side at once, and no multiple of a vector
@@ -138,6 +139,23 @@ def test_extended_kalman_filters_are_alike(functions, measured, both):
     y[rng.random(y.shape) < 0.05] = np.nan
     filters = [one] if lifting.history else [one, replace(one, delay=3)]
     assert_same(*both(lambda: [kalman.run_all(y, u) for kalman in filters]))
+
+
+@needs_compiler
+@pytest.mark.parametrize("every", [1, 4, 70])
+def test_filters_and_recursions_are_alike(every, both):
+    rng = np.random.default_rng(4)
+    x, rest = rng.normal(size=(3, 13, 301)) + 1e3, 1e3 * np.ones((3, 13))
+    F, driven = 0.9 * np.eye(5) + 0.02 * rng.normal(size=(5, 5)), rng.normal(size=(200, MACHINE_COUNT, 5))
+    blocks = blocks_of(F, rng.normal(size=(5, 2)), rng.normal(size=(3, 5)))
+
+    def run():
+        return *filtered(x, rest, -1.99, 0.9902, every), recursion(F, driven, driven[0]), moved(blocks, x[:2] - 1e3, every, 2)
+
+    found, wanted = both(run)
+    assert_same(found, wanted)
+    whole = sum(np.tensordot(b.G.T, b.responses(x[:2] - 1e3, np.zeros((2, 13)), every), 1) for b in blocks)[..., 2:]
+    assert_same([found[-1]], [whole.reshape(found[-1].shape)])
 
 
 SOURCE = "int kros_answer(void);\nint kros_answer(void) { return 42; }\n"

@@ -59,6 +59,10 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 def plain(value: Any) -> Any:
     """Turn dataclasses, enums, NumPy scalars and arrays into JSON's own types; NaN and infinity become null."""
+    if type(value) is float:
+        return value if math.isfinite(value) else None
+    if value is None or type(value) in (str, int, bool):
+        return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, enum.Enum):

@@ -120,3 +120,8 @@ def formulas(lifting: Lifting, tape: Tape, values: Mapping[str, npt.ArrayLike] |
         "present": window.present,
         "values": own,
     }
+
+
+def linear_formulas(n: int, m: int) -> tuple[str, dict[str, Any]]:
+    """Return what the loops need to know of a model of n states and m inputs without lifted functions."""
+    return "formulas", {"n": n, "m": m, "registers": n + m, "lifted": np.arange(n + m), "n_lifted": n, "n_inputs": m}

@@ -113,6 +113,18 @@ typedef struct {
     double *states;           /* (samples, filters, n, batch) */
 } kalman_job;
 
+/* Signals, samples last, through 1 / (q + a1 + a2 / q), at rest before: held[k] = x[k - 1] - a1 held[k - 1] - a2 held[k - 2]. */
+typedef struct {
+    whole signals;
+    whole samples;
+    whole every;
+    const double *poles;      /* (2): a1 and a2 */
+    const double *x;          /* (signals, samples) */
+    const double *rest;       /* (signals): x before */
+    double *now;              /* (signals, samples / every): held at every so many samples */
+    double *before;           /* one sample before them; none */
+} filter_job;
+
 enum { ADD, MULTIPLY, DIVIDE, POWER, SIN, COS, TAN, EXP, LOG, SQRT, TANH, ABS, SIGN, ATAN };
 
 #define LANES(X) ((double *)(X))
@@ -526,5 +538,52 @@ int kros_kalman(const formulas *f, const kalman_job *s)
         }
     }
     free(reg), free(P), free(L), free(F), free(FP), free(next), free(older), free(nu), free(drive), free(lifted), free(S);
+    return failed;
+}
+
+#define TILE 64
+
+/* A signal's samples into, and out of, its place in a tile. */
+static void load(double *to, const double *from, whole count)
+{
+    for (whole i = 0; i < count; i++) to[i * WIDE * MOST] = from[i];
+}
+
+static void store(double *to, const double *from, whole count)
+{
+    for (whole i = 0; i < count; i++) to[i] = from[i * WIDE * MOST];
+}
+
+int kros_filter(const filter_job *s)
+{
+    const whole samples = s->samples, kept = (samples + s->every - 1) / s->every;
+    const double a1 = s->poles[0], a2 = s->poles[1], sum = 1.0 + a1 + a2;
+    vec *in = vectors(TILE), *out = vectors(TILE), *earlier = vectors(TILE); /* a tile of samples, so that memory is read and written in rows */
+    const int failed = !in || !out || !earlier;
+    for (whole first = 0; first < s->signals && !failed; first += WIDE * MOST) {
+        const whole lanes = s->signals - first < WIDE * MOST ? s->signals - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
+        vec rest[MOST] = {{0}}, x[MOST] = {{0}}, y1[MOST] = {{0}}, y2[MOST] = {{0}}; /* differences from what was at rest, which may be far larger */
+        gather(rest, s->rest + first, 1, lanes);
+        for (whole k = 0, done = 0; k < samples; k += TILE) {
+            const whole length = samples - k < TILE ? samples - k : TILE;
+            whole count = 0;
+            for (whole b = 0; b < lanes; b++) load(LANES(in) + b, s->x + (first + b) * samples + k, length);
+            for (whole i = 0; i < length; i++) {
+                const int wanted = (k + i) % s->every == 0;
+                for (whole v = 0; v < w; v++) {
+                    const vec y = x[v] - a2 * y2[v] - a1 * y1[v], held = rest[v] / sum;
+                    if (wanted) out[count * MOST + v] = y + held, earlier[count * MOST + v] = y1[v] + held;
+                    y2[v] = y1[v], y1[v] = y, x[v] = in[i * MOST + v] - rest[v];
+                }
+                count += wanted;
+            }
+            for (whole b = 0; b < lanes; b++) {
+                store(s->now + (first + b) * kept + done, LANES(out) + b, count);
+                if (s->before) store(s->before + (first + b) * kept + done, LANES(earlier) + b, count);
+            }
+            done += count;
+        }
+    }
+    free(in), free(out), free(earlier);
     return failed;
 }

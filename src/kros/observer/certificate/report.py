@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError
 from ...data import EpisodeBatch
+from ...loops import recursion
 from ..data import ObserverData
 from ..predictor.driven import with_internal
 from ..residual.one_step import one_step_residual
@@ -201,13 +202,10 @@ def frozen_response(system: ErrorSystem, w: Array, first: Array) -> tuple[Array,
     `w` is the scaled residual, shape (n_samples - 1, batch, k), with noise where k is as wide as the system's input; `first` has shape (batch, n_window).
     """
     plant = system.moved()
-    xi = np.zeros((len(w) + 1, w.shape[1], len(plant.A)))
-    xi[0] = first @ (np.eye(len(plant.A), first.shape[1]) if system.start is None else system.start).T
-    drive = w @ plant.B[:, : w.shape[2]].T
-    step = np.ascontiguousarray(plant.A.T)
-    for k in range(len(w)):
-        np.matmul(xi[k], step, out=xi[k + 1])
-        xi[k + 1] += drive[k]
+    start = first @ (np.eye(len(plant.A), first.shape[1]) if system.start is None else system.start).T
+    drive = np.zeros((len(w) + 1, w.shape[1], len(plant.A)))
+    np.matmul(w, plant.B[:, : w.shape[2]].T, out=drive[:-1])
+    xi = recursion(plant.A, drive, start)
     moved = xi @ plant.C.T
     moved[:-1] += w @ plant.D[:, : w.shape[2]].T
     return xi @ system.C.T, moved

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ...core.lti import gain
 from ...data import EpisodeBatch
 from ...lifting import Lifting
+from ...loops import recursion
 from ...synthesis.residual_shaped.shaping_filter import Basis
 from ...synthesis.result import Injection
 from ..observer import Observer
@@ -128,10 +129,7 @@ def embedded_with(
 
 def _measured_rows(F: Array, G: Array, z: Array, y: Array, truth: Array, ridges: Sequence[float]) -> list[Array]:
     """Fit the change of the measured states on h and z, shape (q, order + channels), by every ridge; the first states of h are the hidden ones."""
-    h = np.zeros((*z.shape[:2], len(F)))
-    driven = z @ G.T
-    for k in range(len(z) - 1):
-        h[k + 1] = h[k] @ F.T + driven[k]
+    h = recursion(F, z @ G.T, np.zeros((z.shape[1], len(F))))
     if in_motion(truth):
         missed = (truth - h[..., : truth.shape[-1]]).transpose(2, 1, 0)
         free = FreeStart.of(F, np.eye(truth.shape[-1], len(F)), len(h), FreeStart.by_size(missed))

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...data import EpisodeBatch
+from ...loops import recursion
 from ...synthesis.residual_shaped.shaping_filter import Basis
 from ..tuning.blocks import Array, Model
 from .free_start import FreeStart, in_motion
@@ -184,11 +185,7 @@ def estimates(model: Model, past: PastMoments, batch: EpisodeBatch) -> Array:
     held = np.zeros(z.shape[1:])
     lifted = slice(z.shape[-1] - len(past.lifting.functions), None)
     held[:, lifted] = z[0][:, lifted]
-    driven, own = z @ G.T, np.ascontiguousarray(F.T)
-    h = np.empty((*z.shape[:2], len(F)))
-    h[0] = np.linalg.solve(np.eye(len(F)) - F, G @ held.T).T
-    for k in range(len(z) - 1):
-        h[k + 1] = h[k] @ own + driven[k]
+    h = recursion(F, z @ G.T, np.asarray(np.linalg.solve(np.eye(len(F)) - F, G @ held.T).T))
     truth, found = batch.states[..., hidden_of(past.lifting, past.measured)], h @ H.T
     if in_motion(truth):
         missed = (truth - found).transpose(2, 1, 0)

@@ -31,6 +31,7 @@ import numpy.typing as npt
 from ...core.errors import DimensionError
 from ...core.norms import gramian
 from ...data import EpisodeBatch
+from ...loops import recursion
 from ..data import ObserverData
 from ..observer import Observer
 from .limited import limited_states
@@ -81,11 +82,10 @@ def with_internal(
     driven[0, :, recorded:] = first[:, recorded:]
     constant = observer.lifting.lift(driven, values)
     constant[..., recorded:n] = 0.0
-    drive, own = constant @ rows + inputs @ into, np.ascontiguousarray(rows[recorded:n])
+    drive = constant @ rows + inputs @ into
     if added is not None:
         drive[: len(added)] += added[: len(drive), :, recorded:]
-    for k in range(len(states) - 1):
-        driven[k + 1, :, recorded:] = driven[k, :, recorded:] @ own + drive[k]
+    driven[..., recorded:] = recursion(rows[recorded:n].T, drive, driven[0, :, recorded:])
     return driven
 
 

@@ -32,6 +32,7 @@ from ...core.linalg import least_squares
 from ...core.norms import gramian
 from ...data import EpisodeBatch
 from ...lifting import Lifting
+from ...loops import filtered
 from ...synthesis.residual_shaped.shaping_filter import Basis
 from .free_start import in_motion
 
@@ -374,14 +375,9 @@ def _channels(lifting: Lifting, measured: tuple[int, ...], static: Array, free: 
 
 def _basis_states(basis: Basis, z: Array, rows: npt.NDArray[np.intp], slow: int) -> Array:
     """States s of one episode at some samples: delays of all channels, then lags of the first few, shape (rows, N)."""
-    from scipy.signal import lfilter
-
     delayed = [z[np.maximum(rows - j, 0)] for j in range(1, basis.delays + 1)]
-    first = z[:1, :slow]  # what came before is taken to have been constant, as for delays
-    lags = [
-        (lfilter([0.0, np.sqrt(1 - p**2)], [1.0, -p], z[:, :slow] - first, axis=0) + np.sqrt(1 - p**2) / (1 - p) * first)[rows]
-        for p in basis.poles
-    ]
+    errors = z[:, :slow].T  # what came before is taken to have been constant, as for delays
+    lags = [np.sqrt(1 - p**2) * filtered(errors, errors[:, 0], -p, 0.0)[0].T[rows] for p in basis.poles]
     return np.concatenate([*delayed, *lags], axis=1)
 
 

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ...loops import filtered
+
 Array = npt.NDArray[np.float64]
 Model = tuple[Array, Array, Array]
 _PARALLEL, _NUDGE = 1e8, 1e-6
@@ -31,6 +33,11 @@ class Block:
     H: Array
 
     @property
+    def _poles(self) -> tuple[float, float]:
+        F = self.F
+        return (-float(F[0, 0]), 0.0) if len(F) == 1 else (-float(np.trace(F)), float(np.linalg.det(F)))
+
+    @property
     def _behind(self) -> Array:
         return np.trace(self.F) * np.eye(2) - self.F if len(self.F) == 2 else np.zeros((1, 1))
 
@@ -42,33 +49,34 @@ class Block:
     def run(self, z: Array, rest: Array) -> tuple[Array, Array]:
         """Return the states h along channels z (channels, batch, n_samples) that were `rest` (channels, batch) before, and at rest."""
         behind = self._behind
-        h, held_rest = self._through(np.tensordot(self.G, z, 1), self.G @ rest)
-        before = np.tensordot(behind, h[..., :-1], 1)
-        h[..., 1:] -= before
-        h[..., 0] -= behind @ held_rest
+        driven, rest = np.tensordot(self.G, z, 1), self.G @ rest
+        h, before = filtered(driven, rest, *self._poles)
+        h -= np.tensordot(behind, before, 1)
+        held_rest = rest / (1 + sum(self._poles))
         return h, held_rest - behind @ held_rest
 
     def responses(self, signals: Array, rest: Array, every: int) -> Array:
         """Return what signals added to each of its states do to the estimates, shape (d, signals, h, batch, n_samples / every)."""
-        held, held_rest = self._through(signals, rest)
-        now = held[..., ::every]
-        before = np.concatenate([held_rest[..., None], held[..., every - 1 : -1 : every]], axis=-1)[..., : now.shape[-1]]
+        now, before = filtered(signals, rest, *self._poles, every)
         behind, (outputs, n) = self.H @ self._behind, self.H.shape
         found = np.empty((n, len(now), outputs, *now.shape[1:]))
         for i, o in np.ndindex(n, outputs):
             found[i, :, o] = self.H[o, i] * now - behind[o, i] * before
         return found
 
-    def _through(self, signals: Array, rest: Array) -> tuple[Array, Array]:
-        """Signals through the scalar filter, and their rest."""
-        from scipy.signal import lfilter
 
-        F = self.F
-        poles = np.array([1.0, -F[0, 0]] if len(F) == 1 else [1.0, -np.trace(F), np.linalg.det(F)])
-        at_rest = rest / poles.sum()
-        held = np.asarray(lfilter([0.0, 1.0], poles, signals - rest[..., None]))
-        held += at_rest[..., None]
-        return held, at_rest
+def moved(blocks: Sequence[Block], signals: Array, every: int, first: int) -> Array:
+    """Return what signals (signals, batch, n_samples), zero before, do to the estimates of a model when they are added to each of its channels.
+
+    Shape (channels, signals, h, batch * kept): every so many samples, and of these from the `first` one on.
+    """
+    kept, rest = -(-signals.shape[-1] // every) - first, np.zeros(signals.shape[:2])
+    held = np.empty((len(signals), 2 * len(blocks), signals.shape[1], kept))
+    for i, block in enumerate(blocks):
+        for j, one in enumerate(filtered(signals, rest, *block._poles, every)):
+            held[:, 2 * i + j] = one[..., first:]
+    share = np.stack([part for b in blocks for part in (b.H @ b.G, -b.H @ b._behind @ b.G)], axis=-1)  # (h, channels, 2 * blocks)
+    return np.asarray(share.swapaxes(0, 1)[:, None] @ held.reshape(*held.shape[:2], -1))
 
 
 def blocks_of(F: Array, G: Array, H: Array) -> list[Block]:

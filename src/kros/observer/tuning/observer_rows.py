@@ -24,11 +24,12 @@ import numpy.typing as npt
 from ...core.errors import DataError, DimensionError
 from ...core.lti import StateSpace
 from ...data import EpisodeBatch
+from ...loops import recursion
 from ...synthesis.result import Injection
 from ..data import ObserverData
 from ..residual.one_step import mean_error_dynamics
 from ..simulate import run_observer
-from .blocks import blocks_of
+from .blocks import blocks_of, moved
 from .gauss_newton import SETTLED, Damping, mean_log, scaled, search, whitening
 
 Array = npt.NDArray[np.float64]
@@ -122,12 +123,9 @@ class _Tuning:
         rows = phi[_SKIP:].reshape(-1, phi.shape[2])
         back = whitening(rows.T @ rows / len(rows), _ALIKE)
         signals = np.ascontiguousarray((phi @ back).transpose(2, 1, 0))
-        psi: Array = np.zeros(1)
-        for block in blocks_of(F, np.eye(len(F), states), np.eye(len(F))[self.hidden]):
-            psi = psi + np.tensordot(block.G.T, block.responses(signals, np.zeros(signals.shape[:2]), _THIN), 1)
-        first = -(-_SKIP // _THIN)
-        weight = np.sqrt(self.share / point.errors)
-        X = (psi[..., first:] * weight[:, None, None]).reshape(states * len(signals), -1)
+        first, weight = -(-_SKIP // _THIN), np.sqrt(self.share / point.errors)
+        blocks = blocks_of(F, np.eye(len(F), states), weight[:, None] * np.eye(len(F))[self.hidden])
+        X = moved(blocks, signals, _THIN, first).reshape(states * len(signals), -1)
         missed = ((self.batch.states - point.estimate)[first * _THIN :: _THIN][..., self.hidden] * weight).transpose(2, 1, 0)
         H, g, size = scaled(X @ X.T, X @ missed.ravel())
         splits = np.cumsum([observer.lifting.n_lifted, m, q])
@@ -149,9 +147,7 @@ class _Tuning:
         lifting, K, measured = point.observer.lifting, point.observer.controller, list(point.observer.measured)
         innovation = self.batch.measurements(measured) - point.estimate[..., measured]
         innovation[~np.isfinite(innovation)] = 0.0  # nothing corrects where nothing arrives
-        x_c = np.zeros((*point.estimate.shape[:2], K.n_states))
-        for k in range(len(point.estimate) - 1 if K.n_states else 0):
-            x_c[k + 1] = x_c[k] @ K.A.T + innovation[k] @ K.B.T
+        x_c = recursion(K.A, innovation @ K.B.T, np.zeros((innovation.shape[1], K.n_states)))
         lifted_inputs = lifting.lift_inputs(self.batch.inputs, point.estimate, self.values)
         return np.concatenate([lifting.lift(point.estimate, self.values), lifted_inputs, innovation, x_c], axis=-1)
 

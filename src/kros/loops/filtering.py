@@ -1,0 +1,68 @@
+"""Linear recursions of many signals."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from .library import library, linear_formulas
+
+Array = npt.NDArray[np.float64]
+
+
+def filtered(x: Array, rest: Array, a1: float, a2: float, every: int = 1) -> tuple[Array, Array]:
+    """Return ``held[k] = x[k - 1] - a1 held[k - 1] - a2 held[k - 2]`` at every so many samples, and one sample before these.
+
+    Parameters
+    ----------
+    x : ndarray, shape (..., n_samples)
+    rest : ndarray, shape (...)
+        What x was before, for ever: the filter is stable.
+    a1, a2 : float
+    every : int
+
+    Returns
+    -------
+    now, before : ndarray, shape (..., n_samples / every)
+    """
+    kept = -(-x.shape[-1] // every)
+    if (loops := library()) is not None:
+        now, before = (np.empty((*x.shape[:-1], kept)) for _ in range(2))
+        job = {"signals": rest.size, "samples": x.shape[-1], "every": every, "poles": (a1, a2)}
+        loops.call("kros_filter", ("filter_job", job | {"x": x, "rest": rest, "now": now, "before": before}))
+        return now, before
+    from scipy.signal import lfilter
+
+    at_rest = (rest / (1.0 + a1 + a2))[..., None]
+    held = np.asarray(lfilter([0.0, 1.0], [1.0, a1, a2], x - rest[..., None])) + at_rest
+    return held[..., ::every], np.concatenate([at_rest, held[..., every - 1 : -1 : every]], axis=-1)[..., :kept]
+
+
+def recursion(F: Array, driven: Array, first: Array) -> Array:
+    """Return ``h[k + 1] = F h[k] + driven[k]``.
+
+    Parameters
+    ----------
+    F : ndarray, shape (n, n)
+    driven : ndarray, shape (n_samples, batch, n)
+        The last sample drives nothing.
+    first : ndarray, shape (batch, n)
+
+    Returns
+    -------
+    ndarray, shape (n_samples, batch, n)
+    """
+    n_samples, batch, n = driven.shape
+    if not n:
+        return np.zeros(driven.shape)
+    if (loops := library()) is not None:
+        states, column = np.empty((n_samples, n, batch)), np.zeros((2 * n, batch))
+        column[:n] = first.T
+        job = {"observers": 1, "samples": n_samples, "batch": batch, "map": np.hstack([F, np.eye(n)]), "u": driven, "column": column}
+        loops.call("kros_relift", linear_formulas(n, n), ("relift_job", job | {"states": states}))
+        return states.swapaxes(1, 2)
+    h, own = np.empty(driven.shape), np.ascontiguousarray(F.T)
+    h[0] = first
+    for k in range(n_samples - 1):
+        h[k + 1] = h[k] @ own + driven[k]
+    return h

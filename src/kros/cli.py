@@ -239,7 +239,7 @@ def estimate(
     from .study.commands.estimate import estimate_recordings
 
     found = estimate_recordings(run_folder, data, out, parameter or (), track)
-    _say(f"estimates of {found.episodes} episodes in {out}")
+    _say(f"estimates of {found.episodes} episode{'s' * (found.episodes != 1)} in {out}")
     for line in found.lines():
         _say(f"  {line}")
 

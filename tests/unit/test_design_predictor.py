@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kros.data.population import EpisodeKey
-from kros.design.certificates import certify_running
+from kros.design.certificates import certify_running, other_conditions
 from kros.design.methods.design import design
 from kros.design.methods.predictor import Plan, on_the_circle
 from kros.design.methods.residual_shaped import TUNED, tuned
@@ -15,7 +15,7 @@ from kros.design.methods.tuned import held_out, tuned_where_better
 from kros.design.settings import PredictorSettings, SynthesisSettings
 from kros.design.task import DesignResult, DesignTask
 from kros.design.uncertain_set import certificate
-from kros.design.validation import TrainingSet
+from kros.design.validation import TrainingSet, hidden_mean
 from kros.lifting import Lifting
 from kros.observer import Sensor, relift_certificate
 from kros.plants import PLANTS
@@ -113,6 +113,18 @@ def test_it_is_certified_as_it_runs_and_its_order_counts_the_memory(made):
     assert running.rows
     assert all(row.holds for row in running.rows)
     assert running.dropout_percent < 100
+
+
+def test_observers_are_compared_in_all_conditions_and_certified_in_one(made, tuning):
+    own, product = made
+    everything = replace(own, recordings=replace(tuning, keys=tuple(tuning.population.episodes)))
+    (loaded,) = other_conditions(everything)
+    assert {key.condition for key in loaded.batch.keys} == {"load"}
+    assert other_conditions(own) == []
+    home, both = (certify_running(task, [product])[0] for task in (own, everything))
+    away = hidden_mean(loaded.percent(product.observer), (0,))
+    assert both.hidden_percent == pytest.approx(np.sqrt(home.hidden_percent * away), rel=1e-9)
+    assert both.certificate.gain == home.certificate.gain
     facts = certificate(own, product, None)
     assert facts["order"] == 4
     assert "states of its own" in facts["reason"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from ..observer.residual.one_step import one_step_residual
 from ..observer.units import factors
 from ..uncertainty.coprime.bands import BandEnergies
 from .task import DesignResult, DesignTask
-from .validation import SHORT_S, ValidationSet, hidden_mean
+from .validation import SHORT_S, TrainingSet, ValidationSet, hidden_mean
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -46,7 +46,8 @@ _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has
 class Running:
     """What is known about one observer as it runs: its certificate, a row for every unit, bounds for recorded signals, and the size of its errors.
 
-    `hidden_percent` is the geometric mean over the states that are not measured of the mean error on training episodes, percent of the largest value;
+    `hidden_percent` is the geometric mean, over conditions and the states that are not measured, of the mean error on training episodes, percent of the
+    largest value;
     `dropout_percent` the largest error of a state in a short run in which measurements stop arriving, `dropout` what is proven of losses at the rate that is
     declared of the sensor.
     """
@@ -89,16 +90,28 @@ class Running:
 def certify_running(task: DesignTask, results: Sequence[DesignResult]) -> list[Running]:
     """Certify observers of one kind of model; `task` is that of any of them, and what could not be made is left out."""
     observers = [found.observer for found in results if found.observer is not None]
-    data = certified_on(task)
-    found = {r.name: r for group in by_lifting(observers) for r in running_of(group, data, task)}
+    data, others = certified_on(task), other_conditions(task)
+    found = {r.name: r for group in by_lifting(observers) for r in running_of(group, data, task, others)}
     return [found[observer.name] for observer in observers]
 
 
 def certified_on(task: DesignTask) -> ValidationSet:
     """Return the episodes whose signals make the set that observers are certified for: the beginning of the first one of every unit, or some short ones."""
-    first = task.training.first_of_units().read().first(_EPISODE_S / task.models.sample_period_s)
-    length_s = len(first.batch.states) * task.models.sample_period_s
-    return first if length_s > SHORT_S else task.training.read()
+    return _beginnings(task.training, task.models.sample_period_s)
+
+
+def other_conditions(task: DesignTask) -> list[ValidationSet]:
+    """Return the same episodes of the same units for every condition that observers are not certified for, on which they are compared as well."""
+    training, recordings = task.training, task.recordings or task.training
+    home, units = {k.condition for k in training.keys}, {k.unit for k in training.keys}
+    known = [k for k in recordings.keys if k.condition not in home and k.unit in units]
+    parts = [replace(recordings, keys=tuple(k for k in known if k.condition == c)) for c in dict.fromkeys(k.condition for k in known)]
+    return [_beginnings(part, task.models.sample_period_s) for part in parts]
+
+
+def _beginnings(training: TrainingSet, dt: float) -> ValidationSet:
+    first = training.first_of_units().read().first(_EPISODE_S / dt)
+    return first if len(first.batch.states) * dt > SHORT_S else training.read()
 
 
 def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:
@@ -109,8 +122,8 @@ def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:
     return list(groups.values())
 
 
-def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[Running]:
-    """Certify observers of one lifting, and compare with what they do; certificates come back in the recordings' units."""
+def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask, others: Sequence[ValidationSet] = ()) -> list[Running]:
+    """Certify observers of one lifting, and compare with what they do, in other conditions too; certificates come back in the recordings' units."""
     first, batch = observers[0], data.batch
     scales = scales_of(observers, data, task)
     certificates = [certify(observer, own, task) for observer, own in zip(observers, scales, strict=True)]
@@ -120,7 +133,8 @@ def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignT
         y = batch.measurements(first.measured, arrived=False)
         arrived = run_observers(observers, y, batch.inputs, first.own(batch.parameters))
     rows = [relift_report(c, o, batch, x) if c.certified else [] for o, c, x in zip(observers, certificates, arrived, strict=True)]
-    hidden = hidden_mean(data.compare(estimates), first.measured)
+    errors = [data.compare(estimates), *(other.percent_of_all(observers) for other in others)]
+    hidden = np.exp(np.mean([np.log(hidden_mean(percent, first.measured)) for percent in errors], axis=0))
     dropout = dropout_error_percent(observers, data, task.models.sample_period_s)
     rates = [task.sensor.get(first.lifting.states[i], Sensor()).dropout for i in first.measured]
     lost = [dropout_bound(c, o, rates) if any(rates) else None for o, c in zip(observers, certificates, strict=True)]

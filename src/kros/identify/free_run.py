@@ -100,7 +100,7 @@ def _compiled(
         "batch": batch,
         "own": rows.ndim == 3,
         "map": rows,
-        "u": np.swapaxes(u[:, h:], 0, 1),
+        "u": u[:, h:].transpose(1, 2, 0),
         "column": column,
         "past": np.ascontiguousarray(window[:, n:]),
         "states": states[h:],

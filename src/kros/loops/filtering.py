@@ -58,7 +58,14 @@ def recursion(F: Array, driven: Array, first: Array) -> Array:
     if (loops := library()) is not None:
         states, column = np.empty((n_samples, n, batch)), np.zeros((2 * n, batch))
         column[:n] = first.T
-        job = {"observers": 1, "samples": n_samples, "batch": batch, "map": np.hstack([F, np.eye(n)]), "u": driven, "column": column}
+        job = {
+            "observers": 1,
+            "samples": n_samples,
+            "batch": batch,
+            "map": np.hstack([F, np.eye(n)]),
+            "u": driven.swapaxes(1, 2),
+            "column": column,
+        }
         loops.call("kros_relift", linear_formulas(n, n), ("relift_job", job | {"states": states}))
         return states.swapaxes(1, 2)
     h, own = np.empty(driven.shape), np.ascontiguousarray(F.T)

@@ -47,8 +47,10 @@ check: $(INSTALLED_DEV)  ## lint, formatting, types, import layers and circles
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -q -p no:cacheprovider tests/contract/test_meta_circles.py
 
-bench: $(INSTALLED_DEV)  ## run the benchmarks
-	$(ONE_THREAD) $(BIN)/python -m pytest benchmarks --benchmark-only
+bench: $(INSTALLED_DEV)  ## compare every stage with other packages and write docs/benchmarks.md
+	@$(PIP) install -q --no-deps --upgrade --target build/peers -r benchmarks/peers.txt || echo "dkpy and slycot could not be installed: they are left out"
+	$(ONE_THREAD) PYTHONPATH=build/peers $(BIN)/python -m pytest -q benchmarks --benchmark-only --benchmark-json build/benchmarks.json --benchmark-quiet
+	PYTHONPATH=build/peers $(BIN)/python benchmarks/benchmarks_page.py build/benchmarks.json
 
 embedded: $(INSTALLED)  ## run an exported observer on a Cortex-M4F under QEMU, where the tools for it are there
 	$(BIN)/python benchmarks/embedded/measure.py

@@ -66,7 +66,7 @@ def observer(functions: tuple[str, ...], internal: int, order: int, **parts: Any
     ],
     ids=["linear", "filter_of_order_6", "predictor_15", "predictor_35", "predictor_15_limited"],
 )
-def test_step(benchmark, functions, internal, order, parts) -> None:
+def test_step(benchmark, request, functions, internal, order, parts) -> None:
     own = observer(functions, internal, order, **parts)
     rng = np.random.default_rng(1)
     y, u = 0.3 * np.clip(rng.normal(size=(SAMPLES, 1)), -3, 3), 0.3 * np.clip(rng.normal(size=(SAMPLES, 2)), -3, 3)
@@ -81,4 +81,5 @@ def test_step(benchmark, functions, internal, order, parts) -> None:
 
     benchmark(steps)
     if benchmark.stats is not None:
+        benchmark.extra_info["observer"] = request.node.callspec.id.replace("_", " ")
         benchmark.extra_info["us_a_step"] = round(1e6 * benchmark.stats.stats.median / SAMPLES, 1)

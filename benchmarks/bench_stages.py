@@ -110,7 +110,7 @@ def models() -> Stage:
 def predictions() -> Stage:
     x, u = problems.recording(500)
     rng = np.random.default_rng(1)
-    x0, inputs = 0.1 * rng.normal(size=(200, 3)), rng.normal(size=(200, 1000, 2))
+    x0, inputs = 0.1 * rng.normal(size=(200, 3)), rng.normal(size=(200, 500, 2))
 
     @cache
     def pipeline() -> Any:
@@ -126,7 +126,7 @@ def predictions() -> Stage:
         "plain": lambda: Entry(lambda: [plain.free_run(found.A, found.B, lift, x0[i], inputs[i]) for i in range(4)], share=4 / 200),
     }
     ours = Entry(lambda: free_run(*batch, QUADRATIC, {}, x0, inputs))
-    return Stage("200 episodes of 1000 samples, 9 lifted states", {"kros": lambda: ours, **others})
+    return Stage("200 episodes of 500 samples, 9 lifted states", {"kros": lambda: ours, **others})
 
 
 def frequency_responses() -> Stage:
@@ -143,7 +143,7 @@ def frequency_responses() -> Stage:
 
 
 def nominals() -> Stage:
-    G = problems.responses(16, 300, outputs=2)
+    G = problems.responses(12, 200, outputs=2)
 
     def dkpy() -> Entry:
         import dkpy
@@ -156,13 +156,13 @@ def nominals() -> Stage:
 
     others = {"dkpy": dkpy, "plain": lambda: Entry(lambda: plain.peaks(G).min())}
     return Stage(
-        "16 units, 2 × 2, 300 frequencies",
+        "12 units, 2 × 2, 200 frequencies",
         {"kros": lambda: Entry(lambda: np.max(choose_nominal(G, FORM).bound)), **others},
     )
 
 
 def covers() -> Stage:
-    G = problems.responses(10, 40, outputs=2)
+    G = problems.responses(10, 20, outputs=2)
     nominal = int(np.argmin(bounds("additive", G).max(axis=1)))
     E = np.delete(G, nominal, axis=0) - G[nominal]
 
@@ -183,7 +183,7 @@ def covers() -> Stage:
         left, right = sides
         return float(np.linalg.norm(E / left[:, :, None] / right[:, None, :], 2, axis=(-2, -1)).max())
 
-    return Stage("9 residuals, 2 × 2, 40 frequencies", {"kros": lambda: Entry(ours), "dkpy": dkpy}, largest)
+    return Stage("9 residuals, 2 × 2, 20 frequencies", {"kros": lambda: Entry(ours), "dkpy": dkpy}, largest)
 
 
 def magnitudes() -> Stage:
@@ -287,8 +287,8 @@ def structured_values() -> Stage:
         import dkpy
 
         blocks = [dkpy.ComplexFullBlock(2, 2)] * 3
-        few = np.moveaxis(M[:2], 0, -1)
-        return Entry(lambda: dkpy.SsvLmiBisection(n_jobs=None).compute_ssv(few, blocks)[0], share=2 / 60, within=1e-3)
+        few = np.moveaxis(M[:1], 0, -1)
+        return Entry(lambda: dkpy.SsvLmiBisection(n_jobs=None).compute_ssv(few, blocks)[0], share=1 / 60, within=1e-3)
 
     return Stage(
         "60 matrices, 6 × 6, three full blocks",
@@ -375,4 +375,4 @@ def test_stage(benchmark: Any, name: str, by: str) -> None:
     iterations = max(1, int(0.02 / max(seconds, 1e-6)))
     benchmark.group = name
     benchmark.extra_info |= {"by": by, "share": entry.share, "size": own.size, "deviation": deviation, "note": entry.note}
-    benchmark.pedantic(entry.run, rounds=int(np.clip(1.0 / max(seconds, 0.02), 3, 15)), iterations=iterations)
+    benchmark.pedantic(entry.run, rounds=int(np.clip(0.5 / max(seconds, 0.02), 3, 9)), iterations=iterations)

@@ -1,7 +1,6 @@
 """Uncertainty weights side by side: kros, dkpy where it can be imported, and the entrywise fit of the paper.
 
-    OMP_NUM_THREADS=1 python benchmarks/bench_weights.py [--cache FOLDER] [--seeds 200 205]     (prints the tables)
-    OMP_NUM_THREADS=1 python -m pytest benchmarks/bench_weights.py --benchmark-only
+    OMP_NUM_THREADS=1 python benchmarks/weights_beside_dkpy.py [--cache FOLDER] [--seeds 200 205]
 
 For dkpy put the site-packages of an environment that has it on ``PYTHONPATH``; without it its columns are left out. Both fit the same
 magnitudes at the same orders, with equal weight at all frequencies (by default dkpy weighs by the magnitude). kros fits continuous weights on
@@ -24,7 +23,6 @@ import numpy as np
 import numpy.typing as npt
 import outlier_rates
 import paper_slsqp
-import pytest
 
 from kros.core.lti import StateSpace
 from kros.identify import edmd
@@ -287,41 +285,6 @@ def at_dense(fitted: tuple[Array, Array, float], freqs_hz: Array, how: str) -> A
     if how == "before sampling":
         return paper_slsqp.response(fitted, 2 * np.pi * freqs_hz)
     return paper_slsqp.sampled(fitted, DT, how).frequency_response(freqs_hz)[:, 0, 0]
-
-
-@pytest.mark.parametrize("name", cases())
-def test_a_magnitude(benchmark: Any, name: str) -> None:
-    """A fit of the size of dkpy's examples: 100 points."""
-    omega, magnitude, order = cases()[name]
-    fitted = benchmark(kros_fit, omega, magnitude, order)
-    assert (fitted(omega) >= magnitude * (1 - 1e-9)).all()
-
-
-@pytest.mark.skipif(not HAS_DKPY, reason="dkpy cannot be imported: put the site-packages of an environment that has it on PYTHONPATH")
-@pytest.mark.parametrize("fit", [kros_fit, dkpy_fit], ids=["kros", "dkpy"])
-def test_dkpys_own_example(benchmark: Any, fit: Callable[..., Any]) -> None:
-    """The first left weight of dkpy's multi-model example."""
-    omega, magnitude, order = dkpy_covers()["multi-model, left 1"]
-    fitted = benchmark.pedantic(fit, (omega, magnitude, order), rounds=2, iterations=1)
-    assert (fitted(omega) >= magnitude * (1 - 1e-3)).all()
-
-
-@pytest.mark.parametrize("structure", ["scalar", "diagonal", "entrywise"])
-def test_weights_of_two_by_two_residuals(benchmark: Any, structure: str) -> None:
-    """Six units with lags in a rotated frame, 300 frequencies, as certified."""
-    rng = np.random.default_rng(0)
-    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
-    A = np.exp(-2 * np.pi * DT * np.array([3.0, 40.0]) * np.exp(0.1 * rng.normal(size=(6, 2))))[:, :, None] * np.eye(2)
-    units = StateSpace(A, (np.eye(2) - A) @ turn.T, np.broadcast_to(turn * [1.0, 0.1], A.shape), np.tile(0.01 * np.eye(2), (6, 1, 1)), DT)
-    nominal, freqs = units[0], np.geomspace(0.01, 500.0, 300)
-
-    def residuals(f: Array) -> Array:
-        return units.frequency_response(f) - nominal.frequency_response(f)
-
-    systems = ResidualSystems("additive", nominal, units)
-    options = {"structure": structure, "systems": systems}
-    weight = benchmark.pedantic(lambda: fit_weight(residuals, freqs, DT, **options)[0], rounds=2, iterations=1)
-    assert weight.cover_max <= 1
 
 
 def main() -> None:

@@ -44,6 +44,7 @@ def observer(functions: tuple[str, ...], internal: int, order: int, **parts: Any
     n, nl = lifting.n_states, lifting.n_lifted
     A = np.zeros((nl, nl))
     A[:n] = 0.3 * rng.normal(size=(n, nl)) / np.sqrt(nl)
+    A[:n, n:] *= 0.01  # contracting, since slopes of the lifted functions are 100: else rounding grows
     K = gain(0.1 * rng.normal(size=(nl, 1)), DT)
     if order:
         K = StateSpace(0.5 * np.eye(order), np.ones((order, 1)), 0.01 * rng.normal(size=(nl, order)), K.D, DT)

@@ -1,6 +1,6 @@
 """All observers and estimators over all test episodes of a population: 156 episodes of 19 000 samples, as in the paper's recordings.
 
-    python benchmarks/bench_observers.py [--episodes 156] [--samples 19000]
+    python benchmarks/observers_in_batch.py [--episodes 156] [--samples 19000]
 
 Signals are random: what is timed does not depend on them. Prints processor time, which other work on the machine does not inflate much.
 """

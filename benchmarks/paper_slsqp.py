@@ -1,4 +1,4 @@
-"""The fit behind the paper's Figure 8, its method written anew: what `bench_weights.py` compares with.
+"""The fit behind the paper's Figure 8, its method written anew: what `weights_beside_dkpy.py` compares with.
 
 Every entry of the residual is bounded by a continuous transfer function whose coefficients minimise the sum of errors over the grid, under the
 condition that no error is negative, by sequential quadratic programming from one start; roots in the right half-plane are reflected, and the

@@ -9,7 +9,11 @@ FAST = (
     "uncertainty.n_freqs=60",
     "uncertainty.max_order=1",
     "synthesis.input_weight=3.0",
+    'synthesis.methods=["worst_case_h2", "memory"]',
+    "predictor.effort=quick",
+    'observer.baselines=["open_loop", "learned"]',
     "evaluate.monte_carlo=0",
+    "evaluate.robustness=false",
 )
 
 

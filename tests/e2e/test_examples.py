@@ -19,11 +19,12 @@ def run_example(name, recordings, out, *options):
 
 
 def test_double_pendulum(recordings, tmp_path):
-    # EDMD models, a fixed weight of the inputs, no trials: the rest is most of the time, and tests of other studies do it
+    # EDMD models, a fixed weight of the inputs, a quick predictor, no trials: the rest is most of the time, and tests of other studies do it
     quick = [
         "identify.refine=false",
         "synthesis.input_weight=3.0",
-        "uncertainty.n_freqs=200",
+        "uncertainty.n_freqs=100",
+        "predictor.effort=quick",
         "evaluate.robustness=false",
         "evaluate.monte_carlo=0",
     ]
@@ -80,7 +81,7 @@ def test_a_drive_that_was_left_out_is_estimated_as_well_as_by_a_regression(recor
 
 
 def test_quanser_qube(recordings, tmp_path):
-    metrics = run_example("quanser_qube", recordings, tmp_path / "run")
+    metrics = run_example("quanser_qube", recordings, tmp_path / "run", "--set", "identify.refine=false")
     assert metrics["study"]["units"] == 1
     assert metrics["models"]["koopman_edmd"]["order"] == 6
     assert "evaluation" not in metrics

@@ -42,9 +42,35 @@ def grid(rows: int, columns: int, row_height_in: float, **options: Any) -> tuple
 def settle(figure: Figure) -> None:
     """Lay a figure out once and for all; otherwise every file written from it does so again."""
     engine = figure.get_layout_engine()
-    if engine is not None:
-        engine.execute(figure)
-        figure.set_layout_engine(None)  # a placeholder, "none", would still draw everything twice
+    if engine is None:
+        return
+    for axes in figure.axes:
+        _measure_once(axes)
+    engine.execute(figure)
+    figure.set_layout_engine(None)  # a placeholder, "none", would still draw everything twice
+    for axes in figure.axes:
+        del axes.get_tightbbox
+
+
+def _measure_once(axes: Axes) -> None:
+    """Let an axes tell its size with ticks and labels from one measurement: the layout asks twice, and most of its time goes there.
+
+    Ticks stay those that were measured; others might have wider labels.
+    """
+    from matplotlib.ticker import AutoLocator, FixedLocator
+    from matplotlib.transforms import Bbox
+
+    if not any(axes.get_title(where) for where in ("left", "center", "right")):
+        axes.set_title("", y=1.0)  # else its place is found from all ticks, for nothing; so is a label's
+    for axis in (axes.xaxis, axes.yaxis):
+        if not axis.label.get_text():
+            axis.set_label_coords(0, 0)
+    whole = axes.get_tightbbox(for_layout_only=True)
+    around = np.zeros(4) if whole is None else np.subtract(whole.extents, axes.bbox.extents)
+    for axis in (axes.xaxis, axes.yaxis):
+        if isinstance(axis.get_major_locator(), AutoLocator):
+            axis.set_major_locator(FixedLocator(list(axis.get_majorticklocs())))
+    vars(axes)["get_tightbbox"] = lambda *_, **__: Bbox(np.reshape(axes.bbox.extents + around, (2, 2)))
 
 
 def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:

@@ -7,6 +7,7 @@ import importlib
 import pkgutil
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -149,10 +150,27 @@ def test_the_page_of_keys_is_filled(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(f"### `{step}`\n" in page for step in kros.data.steps.parsing.STEPS)
 
 
-@pytest.mark.parametrize("name", [name for name in kros.__all__ if name != "__version__"])
-def test_every_public_object_has_an_example(name: str) -> None:
-    """Those of functions and packages run with their modules."""
-    assert ">>> " in (getattr(kros, name).__doc__ or "")
+def packages() -> Iterator[ModuleType]:
+    """Public packages of kros that list names."""
+    public = (m.name for m in pkgutil.walk_packages(kros.__path__, "kros.") if m.ispkg and m.name.split(".")[1] in kros.__all__)
+    return (package for package in map(importlib.import_module, public) if hasattr(package, "__all__"))
+
+
+def without_example(package: ModuleType) -> list[str]:
+    """Names that a package lists and that show nobody how they are used; `test_examples_run` runs the examples of the others."""
+    return [name for name in package.__all__ if name != "__version__" and ">>> " not in (getattr(package, name).__doc__ or "")]
+
+
+@pytest.mark.parametrize("package", [kros, *packages()], ids=lambda package: package.__name__)
+def test_every_public_object_has_an_example(package: ModuleType) -> None:
+    assert without_example(package) == []
+    assert ">>> " in (package.__doc__ or "") or package is kros
+
+
+def test_what_lacks_an_example_is_found() -> None:
+    package = ModuleType("wrong")
+    package.__dict__.update(__all__=["shown", "bare"], shown=kros.read, bare=lambda: None)
+    assert without_example(package) == ["bare"]
 
 
 OLD_WORDS = re.compile(

@@ -182,14 +182,28 @@ class StateSpace:
 
 
 def gain(matrix: npt.ArrayLike, dt: float) -> StateSpace:
-    """Return a static gain as a system without states."""
+    """Return a static gain as a system without states.
+
+    Examples
+    --------
+    >>> from kros.core import gain, hinf_norm
+    >>> hinf_norm(gain([[3.0, 4.0]], 0.01))
+    5.0
+    """
     D = np.atleast_2d(np.asarray(matrix, dtype=float))
     p, m = D.shape
     return StateSpace(np.zeros((0, 0)), np.zeros((0, m)), np.zeros((p, 0)), D, dt)
 
 
 def block_diagonal(systems: Sequence[StateSpace]) -> StateSpace:
-    """Stack systems side by side: inputs and outputs are concatenated."""
+    """Stack systems side by side: inputs and outputs are concatenated.
+
+    Examples
+    --------
+    >>> from kros.core import block_diagonal, gain
+    >>> block_diagonal([gain([[2.0]], 0.01), gain([[3.0]], 0.01)]).D.tolist()
+    [[2.0, 0.0], [0.0, 3.0]]
+    """
     from scipy.linalg import block_diag
 
     if not systems or len({s.dt for s in systems}) > 1:

@@ -33,6 +33,16 @@ class EpisodeBatch:
         Samples that do not arrive.
     truths : ndarray, shape (n_samples, batch, n_truths)
         What states really were, where the population has it and it was asked for; None otherwise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> arrays = {unit: [np.ones((n, 2)) for n in (4, 3)] for unit in ("a", "b")}
+    >>> population = kros.from_arrays(arrays, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> batch = kros.data.EpisodeBatch.read(population, population.keys())
+    >>> batch.states.shape, batch.lengths.tolist()
+    ((4, 4, 1), [4, 3, 4, 3])
     """
 
     keys: tuple[EpisodeKey, ...]

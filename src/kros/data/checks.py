@@ -254,6 +254,13 @@ def check_population(population: Population, allow_single: bool = False) -> None
     Raises
     ------
     DataError
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> alone = kros.from_arrays({"a": [np.ones((5, 2))]}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> kros.data.check_population(alone, allow_single=True)  # says nothing where nothing is wrong
     """
     check_structure(population.columns, population.episodes)
     if not population.measured:

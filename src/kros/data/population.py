@@ -28,7 +28,14 @@ AnyChannel = TypeVar("AnyChannel", bound="HasRole")
 
 
 class Role(str, Enum):
-    """What a channel is to the model."""
+    """What a channel is to the model.
+
+    Examples
+    --------
+    >>> from kros.data import Channel, Role
+    >>> Channel("torque", Role.INPUT, "N m").role is Role("input")
+    True
+    """
 
     STATE = "state"
     INPUT = "input"
@@ -76,6 +83,12 @@ class TrueChannel(Channel):
     ----------
     of : str
         The state that it is the truth of, in the same unit of measure.
+
+    Examples
+    --------
+    >>> from kros.data import Role, TrueChannel
+    >>> TrueChannel("true velocity", Role.TRUTH, "rad/s", of="velocity").of
+    'velocity'
     """
 
     of: str = ""
@@ -83,7 +96,14 @@ class TrueChannel(Channel):
 
 @dataclass(frozen=True)
 class Unit:
-    """One machine of the batch, with what is known about it."""
+    """One machine of the batch, with what is known about it.
+
+    Examples
+    --------
+    >>> from kros.data import Unit
+    >>> Unit("drive 7", group="outliers").group
+    'outliers'
+    """
 
     id: str
     group: str = ""
@@ -92,7 +112,15 @@ class Unit:
 
 @dataclass(frozen=True)
 class EpisodeKey:
-    """Where an episode stands in the population."""
+    """Where an episode stands in the population.
+
+    Examples
+    --------
+    >>> from kros.data import EpisodeKey
+    >>> key = EpisodeKey("drive 7", "noload", "3")
+    >>> key.unit, key.condition, key.episode
+    ('drive 7', 'noload', '3')
+    """
 
     unit: str
     condition: str
@@ -128,7 +156,15 @@ def part_columns(columns: Iterable[Channel]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Split:
-    """Training and test episodes, in natural order."""
+    """Training and test episodes, in natural order.
+
+    Examples
+    --------
+    >>> from kros.data import EpisodeKey, Split
+    >>> split = Split(train=(EpisodeKey("a", "default", "0"),), test=(EpisodeKey("a", "default", "1"),))
+    >>> split.test[0].episode
+    '1'
+    """
 
     train: tuple[EpisodeKey, ...]
     test: tuple[EpisodeKey, ...]
@@ -154,6 +190,17 @@ class Population:
         Further columns of the source, behind the inputs: what some states really were. No model and no observer sees them.
     scaling : mapping of str to Scaling
         The columns that channels were read from, and how; a channel that is not named is the column of its name, as it is.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> arrays = {unit: [np.ones((5, 2)), np.zeros((5, 2))] for unit in ("a", "b", "c")}
+    >>> population = kros.from_arrays(arrays, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> population.unit_ids, population.states, len(population.episodes)
+    (('a', 'b', 'c'), ('x',), 6)
+    >>> population.read(population.keys("b")[1]).shape
+    (5, 2)
     """
 
     channels: tuple[Channel, ...]
@@ -273,6 +320,15 @@ def split_episodes(population: Population, test: Iterable[str] | None = None) ->
     ------
     DataError
         When a unit and condition has fewer than two episodes, or is left without training or test episodes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> population = kros.from_arrays({"a": [np.ones((5, 2))] * 3}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> split = kros.data.split_episodes(population)["a", "default"]
+    >>> len(split.train), len(split.test)
+    (2, 1)
     """
     named = None if test is None else set(test)
     splits = {}

@@ -57,6 +57,15 @@ class Design:
         Of the observer as it runs, re-lifted at every step; it says itself whether it holds.
     facts : dict
         What the metrics of a study say.
+
+    Examples
+    --------
+    >>> import kros
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1, structure="scalar")
+    >>> design = kros.synthesize(uncertain, "kalman_tuned", methods=())
+    >>> design.observer.lifting.states, design.synthesis.status.value, design.facts["order"]
+    (('position', 'velocity', 'current'), 'optimal', 0)
     """
 
     name: str

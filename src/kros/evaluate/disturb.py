@@ -38,6 +38,12 @@ class Kind(str, Enum):
         The machine's lifting parameter is wrong, by so much in its own unit, rad for a phase.
     DELAY
         Measurements are delayed by so many samples, unknown to the observer.
+
+    Examples
+    --------
+    >>> from kros.evaluate import Kind
+    >>> [kind.value for kind in Kind]
+    ['dropped', 'gap', 'bias', 'quantisation', 'noise', 'phase', 'delay']
     """
 
     DROPPED = "dropped"
@@ -65,6 +71,12 @@ class Disturbance:
     ------
     ConfigError
         For a severity out of range.
+
+    Examples
+    --------
+    >>> from kros.evaluate import Disturbance
+    >>> Disturbance("dropped", 0.1).kind.value
+    'dropped'
     """
 
     kind: Kind
@@ -92,7 +104,14 @@ SEVERITIES: dict[Kind, tuple[float, ...]] = {
 
 
 def standard_disturbances(kinds: Sequence[Kind] = tuple(Kind)) -> list[Disturbance]:
-    """Return the disturbances of a study: five or six severities of every kind."""
+    """Return the disturbances of a study: five or six severities of every kind.
+
+    Examples
+    --------
+    >>> from kros.evaluate import Kind, standard_disturbances
+    >>> [disturbance.severity for disturbance in standard_disturbances([Kind.BIAS])]
+    [1e-06, 1e-05, 0.0001, 0.001, 0.01]
+    """
     return [Disturbance(kind, severity) for kind in kinds for severity in SEVERITIES[kind]]
 
 

@@ -86,14 +86,32 @@ def _signals(estimate: Array, truth: Array) -> Array:
 
 
 def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
-    """Return the root mean square error of every episode, shape (batch, n); arguments as in `summarise`."""
+    """Return the root mean square error of every episode, shape (batch, n); arguments as in `summarise`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.evaluate import error_rms
+    >>> recorded = np.array([0.0, 2.0, -4.0]).reshape(3, 1, 1)  # sample, episode, state
+    >>> error_rms(recorded + 0.1, recorded, np.array([3])).round(9).tolist()
+    [[0.1]]
+    """
     inside = np.arange(len(truth))[:, None, None] < lengths[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
         return np.sqrt(np.sum((estimate - truth) ** 2, axis=0, where=inside) / lengths[:, None])
 
 
 def error_percent(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
-    """Return ``100 rms(x_hat - x) / max|x|`` of every episode, shape (batch, n), NaN for a state at zero; arguments as in `summarise`."""
+    """Return ``100 rms(x_hat - x) / max|x|`` of every episode, shape (batch, n), NaN for a state at zero; arguments as in `summarise`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.evaluate import error_percent
+    >>> recorded = np.array([0.0, 2.0, -4.0]).reshape(3, 1, 1)  # sample, episode, state
+    >>> error_percent(recorded + 0.1, recorded, np.array([3])).round(9).tolist()
+    [[2.5]]
+    """
     return _of_range(error_rms(estimate, truth, lengths), truth, lengths)
 
 
@@ -123,6 +141,15 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int =
     freqs_hz : ndarray, shape (n_freqs,)
     density : ndarray, shape (n_freqs, ...)
         One-sided: the powers of a frequency and its negative together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.evaluate import error_spectrum
+    >>> tone = np.sin(2 * np.pi * 25 * 0.001 * np.arange(4000))
+    >>> freqs_hz, density = error_spectrum(tone, 0.001, segment=400)
+    >>> float(freqs_hz[density.argmax()])
+    25.0
     """
     from scipy.signal import welch
 

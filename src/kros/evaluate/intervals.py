@@ -36,6 +36,14 @@ def unit_interval(values: npt.ArrayLike, draws: int = 4000, seed: int = 0) -> tu
     ------
     DataError
         With fewer than two units, where nothing can be resampled.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.evaluate import unit_interval
+    >>> lower, upper = unit_interval(np.linspace(1.0, 2.0, 20))
+    >>> bool(lower < 1.5 < upper)
+    True
     """
     values = np.asarray(values, dtype=float)
     if values.ndim < 1 or len(values) < 2:

@@ -57,6 +57,14 @@ class MonteCarlo:
         Of the models of the population.
     noise : ndarray, shape (observer,)
         Norm of what measurement and process noise alone do.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.evaluate import MonteCarlo
+    >>> drawn = MonteCarlo(np.array([[1.0, 1.2, 1.1]]), largest=np.array([1.2]), units=np.empty((1, 0)), noise=np.array([0.4]))
+    >>> drawn.norms.max(axis=1).tolist()
+    [1.2]
     """
 
     norms: Array
@@ -89,6 +97,17 @@ def sample_errors(
     ------
     SynthesisError
         When the set is not well posed.
+
+    Examples
+    --------
+    >>> from kros.core import StateSpace, gain
+    >>> from kros.evaluate import sample_errors
+    >>> from kros.synthesis import Injection, ObserverProblem
+    >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
+    >>> problem = ObserverProblem(lag, [[1.0]], gain([[0.1]], 0.01), gain([[1.0]], 0.01), [1.0], [1.0], [0.1])
+    >>> drawn = sample_errors(problem, [(gain([[0.2]], 0.01), Injection.STATE)], members=20)
+    >>> drawn.norms.shape, drawn.largest.round(2).tolist()
+    ((1, 20), [0.12])
     """
     problem.require_sound()
     drawn, rests = draw_members(problem, members, seed)

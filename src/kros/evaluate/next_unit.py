@@ -54,6 +54,14 @@ def next_unit_bound(errors: npt.ArrayLike, scale: npt.ArrayLike, confidence: flo
     ------
     DataError
         When the scale is not positive and finite, shapes differ or the confidence is none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.evaluate import next_unit_bound
+    >>> errors = np.linspace(1.0, 2.0, 30)[:, None]  # of 30 units that were held in reserve
+    >>> next_unit_bound(errors, [1.0], confidence=0.95).tolist()
+    [2.0]
     """
     errors, scale = np.asarray(errors, dtype=float), np.asarray(scale, dtype=float)
     if not 0 < confidence < 1:

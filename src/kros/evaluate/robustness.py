@@ -30,6 +30,17 @@ class DisturbedEpisodes:
     measured : tuple of int
     disturbances : tuple of Disturbance
     seed : int
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.evaluate import Disturbance, DisturbedEpisodes
+    >>> arrays = {unit: [np.random.default_rng(0).normal(size=(50, 2))] for unit in ("a", "b")}
+    >>> population = kros.from_arrays(arrays, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> episodes = DisturbedEpisodes(kros.data.EpisodeBatch.read(population, population.keys()), (0,), (Disturbance("bias", 0.1),))
+    >>> episodes.errors(lambda given, inputs: given.y[None]).round(1).tolist()  # with the measurement as the estimate: disturbance, episode, state
+    [[[[0.0], [0.0]], [[10.0], [10.0]]]]
     """
 
     batch: EpisodeBatch
@@ -96,6 +107,18 @@ def robustness_rows(
     -------
     list of dict
         ``disturbance`` is "none" and ``severity`` 0 for the measurements as they are; errors are None where an estimate diverged.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.evaluate import Disturbance, DisturbedEpisodes, robustness_rows
+    >>> arrays = {unit: [np.random.default_rng(0).normal(size=(50, 2))] for unit in ("a", "b")}
+    >>> population = kros.from_arrays(arrays, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> episodes = DisturbedEpisodes(kros.data.EpisodeBatch.read(population, population.keys()), (0,), (Disturbance("bias", 0.1),))
+    >>> rows = robustness_rows("measurement", episodes.errors(lambda given, inputs: given.y[None])[0], episodes, population.states)
+    >>> [(row["disturbance"], row["severity"]) for row in rows]
+    [('none', 0.0), ('bias', 0.1)]
     """
     keys, rows = episodes.batch.keys, []
     severities = [(0, "none", 0.0)] + [(i, d.kind.value, float(d.severity)) for i, d in enumerate(episodes.disturbances, 1) if not d.draw]

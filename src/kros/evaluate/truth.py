@@ -29,6 +29,14 @@ class TrueErrors:
         As those of `ErrorSummary`.
     lag_s : ndarray, shape (batch, n_truths), s
         How late the signal is, see `delay_samples`; NaN where it cannot be told.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.evaluate import TrueErrors
+    >>> late = TrueErrors((1,), rms=np.array([[0.1]]), error_percent=np.array([[5.0]]), lag_s=np.array([[0.002]]))
+    >>> late.lag_s.item()
+    0.002
     """
 
     states: tuple[int, ...]
@@ -49,6 +57,15 @@ def true_errors(signals: Array, truths: Array, states: tuple[int, ...], lengths:
     lengths : ndarray, shape (batch,)
         Samples of every episode that count.
     dt : float, s
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.evaluate import true_errors
+    >>> truth = np.sin(0.02 * np.arange(1000)).reshape(1000, 1, 1)
+    >>> late = np.concatenate([truth[:1], truth[:1], truth[:-2]])  # a filtered sensor shows it two samples later
+    >>> true_errors(late, truth, (0,), np.array([1000]), 0.001).lag_s.round(4).item()
+    0.002
     """
     signals, lag = signals[..., list(states)], np.empty(truths.shape[1:])
     for length in np.unique(lengths):

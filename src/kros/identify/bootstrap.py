@@ -49,6 +49,15 @@ class ModelSamples:
     linear : bool
         The samples are first-order steps: they have the right spread, but what follows from them nonlinearly, such as a response or an
         eigenvalue, is to be taken to first order around the estimate as well (`responses` does).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import KoopmanMatrices, ModelSamples
+    >>> estimate = KoopmanMatrices(np.full((1, 1, 1), 0.9), np.ones((1, 1, 1)))
+    >>> draws = KoopmanMatrices(np.array([0.89, 0.9, 0.91]).reshape(1, 3, 1, 1), np.ones((1, 3, 1, 1)))
+    >>> ModelSamples(("a",), estimate, draws).n_draws
+    3
     """
 
     unit_ids: tuple[str, ...]
@@ -100,6 +109,13 @@ def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
     ------
     DataError
         With fewer than two episodes or draws.
+
+    Examples
+    --------
+    >>> from kros.identify import episode_weights
+    >>> weights = episode_weights([4, 3], draws=100, seed=0)
+    >>> weights.shape, weights.sum(axis=2).min(axis=1).tolist()
+    ((2, 100, 4), [4.0, 3.0])
     """
     counts = [int(e) for e in n_episodes]
     if not counts or min(counts) < 2 or draws < 2:
@@ -138,6 +154,18 @@ def bootstrap_edmd(R: Array, n_lifted: int, alpha: float, weights: Array, unit_i
         When factors and weights do not fit together.
     IdentificationError
         When the episodes drawn leave a column dependent and `alpha` is zero.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.identify import bootstrap_edmd, episode_factors, episode_weights
+    >>> from kros.lifting import Lifting
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=4, seconds=1.0, seed=3).simulate().population
+    >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
+    >>> factors = episode_factors(motors, keys, Lifting(motors.states))
+    >>> samples = bootstrap_edmd(factors.R, 3, 1e-3, episode_weights([4, 4], draws=20, seed=0), motors.unit_ids)
+    >>> samples.samples.A.shape
+    (2, 20, 3, 3)
     """
     units, episodes, width, _ = R.shape
     if weights.shape[0] != units or weights.shape[2] != episodes:
@@ -224,6 +252,19 @@ def bootstrap_refined(
         Marked `linear`: the prior keeps responses together along a curved set of (A, B), which a straight step leaves. Against full refits
         of three simulated drives, first-order bands were right to about 20 percent, bands of the steps' own responses 2.6 to 12 times too wide.
         The steps lead from a minimum: a search that ran out of iterations far from one makes them unreliable.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import KoopmanMatrices, bootstrap_refined, episode_weights
+    >>> rng = np.random.default_rng(0)
+    >>> rows = rng.normal(size=(4, 30, 3))  # Jacobian and residual of four episodes, by two parameters: A and B
+    >>> normal = np.swapaxes(rows, 1, 2) @ rows
+    >>> units = KoopmanMatrices(np.full((1, 1, 1), 0.9), np.ones((1, 1, 1)))
+    >>> information = normal[:, :2, :2].sum(axis=0)[None]
+    >>> found = bootstrap_refined(units, np.eye(2), information, normal[None], episode_weights([4], draws=20, seed=0))
+    >>> found.linear, found.samples.A.shape
+    (True, (1, 20, 1, 1))
     """
     n, p = units.A.shape[-1], len(whitening)
     dV = one_step_deviations(normal, information, weights).reshape(len(units.A), -1, n, p)

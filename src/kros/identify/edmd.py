@@ -33,7 +33,15 @@ _BISECTIONS = 30
 
 @dataclass(frozen=True, eq=False)
 class KoopmanMatrices:
-    """Koopman matrices of a batch of units, A (..., n, n) and B (..., n, m)."""
+    """Koopman matrices of a batch of units, A (..., n, n) and B (..., n, m).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import KoopmanMatrices
+    >>> KoopmanMatrices(np.array([[0.9, 1.0], [0.0, 0.5]]), np.ones((2, 1))).spectral_radius().item()
+    0.9
+    """
 
     A: Array
     B: Array
@@ -68,6 +76,17 @@ def edmd(R: Array, n_lifted: int, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices
     ------
     IdentificationError
         When a column of Psi depends on the others and `alpha` is zero.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import edmd
+    >>> rng = np.random.default_rng(0)
+    >>> psi = rng.normal(size=(40, 2))  # the state and the input
+    >>> after = psi @ [[0.9], [0.1]]
+    >>> found = edmd(np.linalg.qr(np.hstack([psi, after]), mode="r"), n_lifted=1)
+    >>> found.A.round(6).tolist(), found.B.round(6).tolist()
+    ([[0.9]], [[0.1]])
     """
     p = R.shape[-1] - n_lifted
     alpha = np.asarray(alpha, dtype=float)
@@ -113,6 +132,15 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
     -------
     float
         Zero where no regularisation is needed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import edmd, smallest_stabilising_alpha
+    >>> R = np.array([[[1.0, 1.02]]])  # least squares alone gives a pole of 1.02
+    >>> alpha = smallest_stabilising_alpha([(np.pad(R, ((0, 0), (0, 1), (0, 0))), 1)])
+    >>> round(alpha, 3)
+    0.02
     """
 
     def radius(alphas: Array) -> Array:

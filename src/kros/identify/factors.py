@@ -41,6 +41,16 @@ class Factor:
     n_samples : ndarray, shape (...)
     input_range : ndarray, shape (..., 2, m), optional
         Smallest and largest value of every recorded input.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import reduce_episode
+    >>> from kros.lifting import Lifting
+    >>> x, u = np.random.default_rng(0).normal(size=(50, 1)), np.ones((50, 1))
+    >>> factor = reduce_episode(x, u, Lifting(("x",)))
+    >>> factor.R.shape, int(factor.n_samples)
+    ((3, 3), 49)
     """
 
     R: Array
@@ -73,6 +83,17 @@ def reduce_episode(x: Array, u: Array, lifting: Lifting) -> Factor:
     ------
     DataError
         When the episode is too short for the lifting's history and one step.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import edmd, reduce_episode
+    >>> from kros.lifting import Lifting
+    >>> u, x = np.random.default_rng(0).normal(size=(50, 1)), np.zeros((50, 1))
+    >>> for k in range(49):
+    ...     x[k + 1] = 0.9 * x[k] + 0.1 * u[k]
+    >>> edmd(reduce_episode(x, u, Lifting(("x",))).R, n_lifted=1).A.round(6).tolist()
+    [[0.9]]
     """
     lifting.window.require(len(x), beyond=1)
     window = lifting.windows(x, u)
@@ -96,7 +117,18 @@ def triangular(rows: Array) -> Array:
 
 
 def combine(factors: Factor) -> Factor:
-    """Combine a batch of factors over its last batch axis, shape (..., episode, n, n) to (..., n, n)."""
+    """Combine a batch of factors over its last batch axis, shape (..., episode, n, n) to (..., n, n).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import Factor, combine, reduce_episode
+    >>> from kros.lifting import Lifting
+    >>> rng = np.random.default_rng(0)
+    >>> parts = [reduce_episode(rng.normal(size=(50, 1)), rng.normal(size=(50, 1)), Lifting(("x",))) for _ in range(3)]
+    >>> int(combine(Factor.stack(parts)).n_samples)
+    147
+    """
     *batch, episodes, width, _ = factors.R.shape
     stacked = factors.R.reshape(*batch, episodes * width, width)
     ends = factors.input_range
@@ -130,6 +162,16 @@ def episode_factors(
     ------
     DataError
         When there are no episodes at all.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.identify import episode_factors
+    >>> from kros.lifting import Lifting
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=3, seconds=1.0, seed=3).simulate().population
+    >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
+    >>> episode_factors(motors, keys, Lifting(motors.states)).R.shape[:2]
+    (2, 3)
     """
     most = max((len(episodes) for episodes in keys.values()), default=0)
     if most == 0:
@@ -156,6 +198,17 @@ def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array]
     parameters : dict of ndarray, shape (unit,)
     model : Lifting
         The model's lifting: that lifting itself, or the linear one with the same states.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import Factor, lifted_factor, reduce_episode
+    >>> from kros.lifting import Lifting
+    >>> gearbox = Lifting(("x",), ("sin(10*x + phase)",), ("phase",))
+    >>> x, u = np.random.default_rng(0).normal(size=(50, 1)), np.ones((50, 1))
+    >>> factor = Factor.stack([reduce_episode(x, u, gearbox)])  # holds sine and cosine, so that any phase is a linear map of it
+    >>> lifted_factor(factor, gearbox, {"phase": np.array([0.3])}, gearbox).R.shape
+    (1, 5, 5)
     """
     n, b, r = lifting.n_states, len(lifting.separation.basis), len(lifting.input_separation.basis)
     m = factor.R.shape[-1] - 2 * (n + b) - r

@@ -43,6 +43,15 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.
         When shapes do not fit together.
     DataError
         When there are fewer samples than the history needs.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import free_run
+    >>> from kros.lifting import Lifting
+    >>> run = free_run(np.array([[0.5]]), np.array([[1.0]]), Lifting(("x",)), {}, np.array([[8.0]]), np.zeros((1, 4, 1)))
+    >>> run.ravel().tolist()
+    [8.0, 4.0, 2.0, 1.0]
     """
     batch, n_samples, m = u.shape
     n, n_lifted, h = lifting.n_states, lifting.n_lifted, lifting.history

@@ -108,6 +108,15 @@ class IdentifiedModels:
         By condition.
     refined : mapping of str to RefinedModels
         What the refinement found out, by kind.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import kros
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> models = kros.identify(motors, refine=False)
+    >>> models.kinds, models.conditions, models.models("linear_edmd").unit_ids == motors.unit_ids
+    (('linear_edmd',), ('default',), True)
     """
 
     population: Population

@@ -52,6 +52,14 @@ class ModelSet:
         Per unit ``ok``, or what is wrong.
     longest_s : float or None, s
         Length of the longest episode behind the models, below whose inverse they know no frequency; None where it is not known.
+
+    Examples
+    --------
+    >>> import kros
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> models = kros.identify(motors, refine=False).sets["linear_edmd"]
+    >>> models.A.shape, models.alpha is not None, bool((models.spectral_radius() < 1).all())
+    ((2, 3, 3), True, True)
     """
 
     name: str

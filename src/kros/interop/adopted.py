@@ -31,6 +31,16 @@ class AdoptedModel:
     input_offset : ndarray, shape (n_inputs,)
     disagreement : float
         Largest difference from pykoop's one-step prediction at random rows, relative to the largest prediction of the state.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pykoop
+    >>> from kros.interop import from_pykoop
+    >>> X = np.column_stack([np.zeros(30), 0.9 ** np.arange(30), np.zeros(30)])  # episode, state, input
+    >>> model = from_pykoop(pykoop.KoopmanPipeline(regressor=pykoop.Edmd(alpha=1e-9)).fit(X, n_inputs=1, episode_feature=True))
+    >>> model.lifting.states, model.inputs, model.disagreement < 1e-9
+    (('x0',), ('u0',), True)
     """
 
     lifting: Lifting

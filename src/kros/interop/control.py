@@ -42,6 +42,15 @@ class UncertaintyForControl:
         Bounds of all forms, cover, misfit, names.
     certificate : str
         Where the bound is known to hold.
+
+    Examples
+    --------
+    >>> import control
+    >>> from kros.interop import quantify_models
+    >>> lags = [control.tf([1 - pole], [1, -pole], 0.01) for pole in (0.88, 0.9, 0.91)]
+    >>> found = quantify_models(lags, "additive")
+    >>> found.model.nominal_id, found.nominal.ninputs, found.left.dt
+    ('1', 1, 0.01)
     """
 
     nominal: Any
@@ -123,6 +132,13 @@ def from_control(system: Any) -> StateSpace:
         An unspecified sampling period, or neither of the two.
     DataError
         An improper transfer function.
+
+    Examples
+    --------
+    >>> import control
+    >>> from kros.interop import from_control
+    >>> from_control(control.tf([1.0], [1.0, -0.5], 0.01)).A.tolist()
+    [[0.5]]
     """
     if not is_system(system):
         raise DimensionError(f"from_control: needs a control.StateSpace or control.TransferFunction, found {type(system).__name__}.")
@@ -183,6 +199,15 @@ def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> d
     ------
     DimensionError
         An unknown unit.
+
+    Examples
+    --------
+    >>> import kros
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> models = kros.identify(motors, refine=False)
+    >>> systems = kros.interop.models_to_control(models.sets["linear_edmd"])
+    >>> len(systems), systems[motors.unit_ids[0]].input_labels
+    (2, ['voltage'])
     """
     asked = models.unit_ids if units is None else tuple(units)
     unknown = [unit for unit in asked if unit not in models.unit_ids]
@@ -194,7 +219,19 @@ def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> d
 
 
 def uncertainty_to_control(model: UncertainModel) -> UncertaintyForControl:
-    """Return the nominal and the weights of an uncertain model as `control.StateSpace`."""
+    """Return the nominal and the weights of an uncertain model as `control.StateSpace`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import StateSpace
+    >>> from kros.interop import uncertainty_to_control
+    >>> from kros.uncertainty import quantify_systems
+    >>> poles = np.array([0.88, 0.9, 0.91])[:, None, None]
+    >>> units = StateSpace(poles, 1 - poles, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
+    >>> uncertainty_to_control(quantify_systems(units, "additive")).nominal.dt
+    0.01
+    """
     nominal, scaled = to_control(model.nominal_system, name="nominal"), to_control(model.scaled_nominal(), name="scaled_nominal")
     certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
     if model.sample_period_s == 0:

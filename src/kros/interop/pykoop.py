@@ -49,6 +49,17 @@ def from_pykoop(pipeline: Any, *, states: Sequence[str] | None = None, inputs: S
         by more than 1e-9 of the largest one.
     MissingDependencyError
         Without pykoop.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pykoop
+    >>> from kros.interop import from_pykoop
+    >>> x = 0.9 ** np.arange(30)
+    >>> X = np.column_stack([np.zeros(30), x, np.zeros(30)])  # episode, state, input
+    >>> pipeline = pykoop.KoopmanPipeline(lifting_functions=None, regressor=pykoop.Edmd(alpha=1e-9)).fit(X, n_inputs=1, episode_feature=True)
+    >>> round(float(from_pykoop(pipeline).A[0, 0]), 6)
+    0.9
     """
     try:
         import pykoop

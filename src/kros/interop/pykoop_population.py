@@ -37,6 +37,20 @@ def models_from_pykoop(pipelines: Mapping[str, Any], population: Population, *, 
         A unit that the population does not have in this condition.
     ConfigError
         Pipelines with different lifting functions, or with offsets.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pykoop
+    >>> import kros
+    >>> from kros.interop import models_from_pykoop
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> pipelines = {}
+    >>> for unit in motors.unit_ids:
+    ...     pipeline = pykoop.KoopmanPipeline(regressor=pykoop.Edmd(alpha=1e-6))
+    ...     pipelines[unit] = pipeline.fit(kros.data.to_pykoop(motors, unit), n_inputs=1, episode_feature=True)
+    >>> models_from_pykoop(pipelines, motors).A.shape
+    (2, 3, 3)
     """
     condition = population.conditions[0] if condition is None else condition
     adopted = {unit: from_pykoop(p, states=population.states, inputs=population.inputs) for unit, p in pipelines.items()}

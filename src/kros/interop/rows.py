@@ -324,6 +324,14 @@ def one_step_pairs(X: Any, *, n_inputs: int = 0, episode_feature: bool = False) 
     ------
     DataError
         As `KoopmanRegressor.fit`.
+
+    Examples
+    --------
+    >>> from kros.interop import one_step_pairs
+    >>> X = [[0, 1.0, 0.1], [0, 2.0, 0.2], [1, 5.0, 0.3], [1, 6.0, 0.4]]  # episode, state, input
+    >>> now, after, episode = one_step_pairs(X, n_inputs=1, episode_feature=True)
+    >>> now.tolist(), after.ravel().tolist(), episode.tolist()
+    ([[1.0, 0.1], [5.0, 0.3]], [2.0, 6.0], [0, 1])
     """
     columns = split_columns(X, episode_feature=episode_feature, time=None)
     values = _numbers(columns)

@@ -25,6 +25,12 @@ def grid_centres(ranges: Sequence[Sequence[float]], counts: Sequence[int]) -> Ar
     ranges : sequence of (lower, upper)
     counts : sequence of int
         Points along every dimension; one point stands in the middle.
+
+    Examples
+    --------
+    >>> from kros.lifting import grid_centres
+    >>> grid_centres([(0, 1), (-1, 1)], [2, 3]).tolist()
+    [[0.0, -1.0], [0.0, 0.0], [0.0, 1.0], [1.0, -1.0], [1.0, 0.0], [1.0, 1.0]]
     """
     box = _box(ranges)
     if len(counts) != len(box) or not all(is_whole(c, 1) for c in counts):
@@ -37,13 +43,27 @@ def grid_centres(ranges: Sequence[Sequence[float]], counts: Sequence[int]) -> Ar
 
 
 def random_centres(ranges: Sequence[Sequence[float]], n: int, seed: int) -> Array:
-    """Return independent uniform centres, shape (n, d)."""
+    """Return independent uniform centres, shape (n, d).
+
+    Examples
+    --------
+    >>> from kros.lifting import random_centres
+    >>> random_centres([(0, 1), (-1, 1)], n=5, seed=0).shape
+    (5, 2)
+    """
     box = _box(ranges)
     return np.random.default_rng(seed).uniform(box[:, 0], box[:, 1], size=(_count(n), len(box)))
 
 
 def latin_hypercube_centres(ranges: Sequence[Sequence[float]], n: int, seed: int) -> Array:
-    """Return centres of which every dimension has exactly one in each of n equal slices, shape (n, d)."""
+    """Return centres of which every dimension has exactly one in each of n equal slices, shape (n, d).
+
+    Examples
+    --------
+    >>> from kros.lifting import latin_hypercube_centres
+    >>> sorted(int(x) for x in latin_hypercube_centres([(0, 4)], n=4, seed=0).ravel())  # one in every quarter
+    [0, 1, 2, 3]
+    """
     from scipy.stats import qmc
 
     box = _box(ranges)
@@ -59,6 +79,12 @@ def kmeans_centres(data: npt.ArrayLike, n: int, seed: int) -> Array:
     data : array_like, shape (n_samples, d)
     n : int
     seed : int
+
+    Examples
+    --------
+    >>> from kros.lifting import kmeans_centres
+    >>> sorted(kmeans_centres([[0.0], [0.2], [9.0], [9.2]], n=2, seed=0).round(9).ravel().tolist())
+    [0.1, 9.1]
     """
     from scipy.cluster.vq import ClusterError, kmeans2
 

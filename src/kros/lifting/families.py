@@ -105,7 +105,14 @@ def products(names: Sequence[str], others: Sequence[str]) -> Formulas:
 
 
 def formulas(functions: Sequence[str]) -> Formulas:
-    """Return formulas as they are written, for a place among families."""
+    """Return formulas as they are written, for a place among families.
+
+    Examples
+    --------
+    >>> from kros.lifting import formulas
+    >>> formulas(["sin(angle)", "rate*abs(rate)"])
+    ('sin(angle)', 'rate*abs(rate)')
+    """
     return require_names("formulas", functions)
 
 
@@ -116,6 +123,13 @@ def concatenate(*families: Sequence[str]) -> Formulas:
     ------
     ConfigError
         When a formula appears twice.
+
+    Examples
+    --------
+    >>> from kros.lifting import Lifting, concatenate, harmonics, polynomials
+    >>> functions = concatenate(harmonics("angle", 2), polynomials(["rate"], 2))
+    >>> Lifting(("angle", "rate"), functions).lift([[0.0, 3.0]]).tolist()
+    [[0.0, 3.0, 0.0, 1.0, 9.0]]
     """
     joined = tuple(text for family in families for text in family)
     repeated = sorted({text for text in joined if joined.count(text) > 1})

@@ -33,7 +33,14 @@ class Radial(str, Enum):
 
 
 class Kernel(str, Enum):
-    """Kernels that random Fourier features approximate."""
+    """Kernels that random Fourier features approximate.
+
+    Examples
+    --------
+    >>> from kros.lifting import Kernel
+    >>> [kernel.value for kernel in Kernel]
+    ['gaussian', 'laplacian']
+    """
 
     GAUSSIAN = "gaussian"
     LAPLACIAN = "laplacian"
@@ -104,6 +111,12 @@ def fourier_features(
     References
     ----------
     A. Rahimi and B. Recht, "Random features for large-scale kernel machines", Advances in Neural Information Processing Systems 20, 2007.
+
+    Examples
+    --------
+    >>> from kros.lifting import fourier_features
+    >>> len(fourier_features(["angle", "rate"], n=20, length=[0.5, 2.0], seed=0))
+    20
     """
     names = require_names("fourier", names)
     lengths = length_scales("fourier", length, len(names))

@@ -43,6 +43,19 @@ class LoadCalibration:
         Time after which a constant load is forgotten.
     used, left_out : tuple of int
         Episodes that count, and those in which the current came to its limit.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.motor_drive import calibrate_load
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
+    >>> batch = EpisodeBatch.read(motors, motors.keys())
+    >>> load = 0.01 * abs(batch.states[..., 0]) * [0, 1]  # the second episode carries a load
+    >>> calibration = calibrate_load(Lifting(motors.states), (0,), batch, load)
+    >>> calibration.used, calibration.left_out
+    ((0, 1), ())
     """
 
     past: PastMoments
@@ -87,6 +100,18 @@ def calibrate_load(
         When shapes do not fit, or a state is named "load".
     DataError
         When recordings of a kind are missing, or all come to the limit.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.motor_drive import calibrate_load
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
+    >>> batch = EpisodeBatch.read(motors, motors.keys())
+    >>> load = 0.01 * abs(batch.states[..., 0]) * [0, 1]  # the second episode carries a load
+    >>> calibrate_load(Lifting(motors.states), (0,), batch, load, level_s=5.0).level_s
+    5.0
     """
     states, dt = batch.states, batch.sample_period_s
     if states.shape[:2] != load.shape or LOAD in lifting.states:

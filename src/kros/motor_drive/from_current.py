@@ -30,6 +30,13 @@ class TorqueScale:
         Error of the current without load, in units of current.
     residual_percent : float
         What is left of the known load, low-passed, in percent of its deviation from its mean.
+
+    Examples
+    --------
+    >>> from kros.motor_drive import TorqueScale, load_from_current
+    >>> scale = TorqueScale(torque_constant=50.0, bias=0.1, residual_percent=3.0)
+    >>> load_from_current([0.5], [0.2], scale).round(9).tolist()
+    [10.0]
     """
 
     torque_constant: float
@@ -57,6 +64,15 @@ def calibrate_torque(
     ------
     DataError
         When the known load does not change, or the error does not follow it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.motor_drive import calibrate_torque
+    >>> known = np.sin(2 * np.pi * 0.5 * 0.001 * np.arange(8000))  # N m
+    >>> scale = calibrate_torque(0.1 + known / 50, known, 0.001)
+    >>> round(scale.torque_constant), round(scale.bias, 3)
+    (50, 0.1)
     """
     x, t = (low_passed(s, corner_hz, sample_period_s)[skip:].ravel() for s in (error, known))
     dx, dt = x - x.mean(), t - t.mean()
@@ -71,6 +87,13 @@ def calibrate_torque(
 
 
 def load_from_current(measured: npt.ArrayLike, estimated: npt.ArrayLike, scale: TorqueScale) -> Array:
-    """Return the load's torque, ``K (i - i_hat - bias)``, shape of the currents."""
+    """Return the load's torque, ``K (i - i_hat - bias)``, shape of the currents.
+
+    Examples
+    --------
+    >>> from kros.motor_drive import TorqueScale, load_from_current
+    >>> load_from_current([0.5, 0.3], [0.2, 0.2], TorqueScale(50.0, bias=0.1, residual_percent=3.0)).round(9).tolist()
+    [10.0, -0.0]
+    """
     error = np.asarray(measured, dtype=float) - np.asarray(estimated, dtype=float)
     return scale.torque_constant * (error - scale.bias)

@@ -48,6 +48,15 @@ class AngleLoad:
         Of the current; infinite where there is none.
     trusted : float
         Most that a load at the current's limit differs from what the angle says, as a share of the limit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.motor_drive import AngleLoad
+    >>> position = np.linspace(0.0, 3.0, 3000)[:, None]
+    >>> seen = 0.2 * np.sin(position)  # sample, episode
+    >>> AngleLoad(level_s=100.0, sample_period_s=0.001).run(seen, seen, position).load.shape
+    (3000, 1)
     """
 
     level_s: float

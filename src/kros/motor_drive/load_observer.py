@@ -44,6 +44,19 @@ def load_observer(
     -------
     Observer
         It runs, is saved and certified (`relift_certificate`) as all are. `load`, and under load the current, lack their level (`AngleLoad`).
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.motor_drive import calibrate_load, load_observer
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
+    >>> batch = EpisodeBatch.read(motors, motors.keys())
+    >>> load = 0.01 * abs(batch.states[..., 0]) * [0, 1]  # the second episode carries a load
+    >>> calibration = calibrate_load(Lifting(motors.states), (0,), batch, load)
+    >>> load_observer("motor/load", calibration, motors.inputs, internal=2, iterations=0).lifting.states
+    ('position', 'velocity', 'current', 'load', 'memory_1', 'memory_2')
     """
     past = calibration.past
     hidden = len(hidden_of(past.lifting, past.measured))

@@ -83,6 +83,13 @@ def known_load(
         Position at which the mass hangs at rest.
     corner_hz : float
         Of the acceleration.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.motor_drive import known_load
+    >>> known_load([0.0, np.pi / 2], 0.001, moment=0.2).round(9).tolist()  # a mass that hangs, and one held out
+    [0.0, 0.2]
     """
     position = np.asarray(position, dtype=float)
     load = moment * np.sin(position - angle_rad)

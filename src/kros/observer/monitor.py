@@ -65,6 +65,15 @@ class Monitor:
     ------
     DataError
         When a number is out of its range, or sizes do not fit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.observer import Monitor
+    >>> filters = np.array([[0.1, -1.6, 0.8]])  # one band
+    >>> monitor = Monitor(filters, 0.01, 100, np.ones(1), np.ones((1, 1)), np.array([[16]]), false_alarm_rate=0.01)
+    >>> monitor.settle, monitor.centres_hz(0.001).shape
+    (100, (1,))
     """
 
     filters: Array

@@ -22,7 +22,18 @@ Array = npt.NDArray[np.float64]
 
 
 class Estimate(Mapping[str, float]):
-    """Estimated states by name; ``np.asarray(estimate)`` has shape (n,)."""
+    """Estimated states by name; ``np.asarray(estimate)`` has shape (n,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer
+    >>> observer = Observer.open_loop("lag", Lifting(("x", "v")), 0.5 * np.eye(2), np.ones((2, 1)), (0,), ("u",), 0.01)
+    >>> estimate = observer.start([1.0]).step([1.0], [0.25])
+    >>> estimate["v"], np.asarray(estimate).tolist()
+    (0.25, [0.75, 0.25])
+    """
 
     __slots__ = ("_array", "_places")
 
@@ -55,6 +66,16 @@ class RunningObserver:
         First measurement.
     parameters : mapping of str to float
         The machine's own lifting parameters; they may be changed between steps.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer, SampleStatus
+    >>> observer = Observer.open_loop("lag", Lifting(("x", "v")), 0.5 * np.eye(2), np.ones((2, 1)), (0,), ("u",), 0.01)
+    >>> running = observer.start([1.0])
+    >>> running.step([np.nan], [0.25])["x"], SampleStatus(running.status) == SampleStatus.MISSING
+    (0.75, True)
     """
 
     def __init__(self, observer: ObserverData, y: npt.ArrayLike, parameters: Mapping[str, float]) -> None:

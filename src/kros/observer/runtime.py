@@ -29,6 +29,13 @@ class Seen:
     ------
     DataError
         When a size is negative or not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.observer import Seen
+    >>> Seen(measured=np.array([3.1]), inputs=np.array([1.0])).measured.tolist()
+    [3.1]
     """
 
     measured: Array
@@ -71,6 +78,14 @@ class Runtime:
     ------
     DataError
         When the delay is negative, or a limit is not a number or crosses its partner.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.observer import Runtime
+    >>> runtime = Runtime(delay=2, upper=np.array([np.inf, 1.0]))  # the second state has a limit
+    >>> runtime.delay, runtime.upper.tolist()
+    (2, [inf, 1.0])
     """
 
     delay: int = 0

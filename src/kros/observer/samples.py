@@ -31,6 +31,13 @@ class SampleStatus(IntFlag):
         A sample is beyond its limit or 1.5 times its range, or the estimate or the correction met a limit that is declared.
     UNCERTIFIED
         Outside what the observer is certified for: the innovation is beyond the envelope of the population (see `monitor`).
+
+    Examples
+    --------
+    >>> from kros.observer import SampleStatus
+    >>> status = SampleStatus.MISSING | SampleStatus.LIMIT
+    >>> SampleStatus.MISSING in status, SampleStatus.UNCERTIFIED in status
+    (True, False)
     """
 
     GOOD = 0

@@ -143,7 +143,18 @@ class Screen:
 
 
 def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:
-    """Return the bits of `SampleStatus` of every sample, shape (n_samples, batch), as the observer takes y and u in a batch."""
+    """Return the bits of `SampleStatus` of every sample, shape (n_samples, batch), as the observer takes y and u in a batch.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer, SampleStatus, sample_status
+    >>> observer = Observer.open_loop("lag", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), 0.01)
+    >>> y = np.array([1.0, np.nan, 0.5]).reshape(3, 1, 1)
+    >>> [SampleStatus(int(bits)).name for bits in sample_status(observer, y, np.zeros((3, 1, 1))).ravel()]
+    ['GOOD', 'MISSING', 'GOOD']
+    """
     return screened(observer, y, u).status
 
 

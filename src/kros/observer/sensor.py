@@ -19,7 +19,15 @@ from ..core.settings import Settings
 
 
 class Sensor(Settings):
-    """The sensor of one measured channel; noise, resolution and bias in the channel's unit of measure."""
+    """The sensor of one measured channel; noise, resolution and bias in the channel's unit of measure.
+
+    Examples
+    --------
+    >>> from kros.observer import Sensor
+    >>> sensor = Sensor(noise=1e-3, resolution=1e-2, delay_samples=1)
+    >>> round(sensor.variance() ** 0.5, 6), sensor.dropout
+    (0.003055, 0.0)
+    """
 
     noise: float = Field(0.0, ge=0, description="standard deviation of white noise")
     resolution: float | None = Field(None, ge=0, description="step; that found in the recordings where none is declared")

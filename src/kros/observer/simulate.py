@@ -26,6 +26,12 @@ class EstimateKind(str, Enum):
         Of the state at k from what arrived up to k - 1, as in the paper.
     FILTER
         Of the state at k from what arrived up to k.
+
+    Examples
+    --------
+    >>> from kros.observer import EstimateKind
+    >>> EstimateKind("filter") is EstimateKind.FILTER
+    True
     """
 
     PREDICT = "predict"
@@ -64,6 +70,18 @@ def run_observer(
         When measurements and inputs do not fit to each other or to the observer.
     ConfigError
         When a parameter is unknown, missing or not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import gain
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer, run_observer
+    >>> from kros.synthesis import Injection
+    >>> observer = Observer("x", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), gain([[0.5]], 0.01), Injection.STATE, 0.01)
+    >>> y = np.array([4.0, 8.0, np.nan, 0.0]).reshape(4, 1, 1)  # sample, episode, measurement; one is missing
+    >>> run_observer(observer, y, np.zeros((4, 1, 1))).ravel().tolist()
+    [4.0, 2.0, 4.0, 2.0]
     """
     return _run([observer], y, u, parameters, EstimateKind(estimate))[0]
 
@@ -82,6 +100,18 @@ def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, paramet
     -------
     ndarray, shape (observer, n_samples, batch, n)
         A view with the samples outermost in memory.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import gain
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer, run_observers
+    >>> from kros.synthesis import Injection
+    >>> plant = Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",)
+    >>> observers = [Observer(f"gain {L}", *plant, gain([[L]], 0.01), Injection.STATE, 0.01) for L in (0.0, 0.5)]
+    >>> run_observers(observers, np.array([4.0, 8.0, 0.0]).reshape(3, 1, 1), np.zeros((3, 1, 1))).reshape(2, 3).tolist()
+    [[4.0, 2.0, 1.0], [4.0, 2.0, 4.0]]
     """
     first = observers[0]
     if any((o.lifting, o.measured, o.inputs) != (first.lifting, first.measured, first.inputs) for o in observers[1:]):

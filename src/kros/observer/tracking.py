@@ -45,6 +45,14 @@ class Tracked:
         Row k from what arrived up to k - 1.
     values : ndarray, shape (n_samples, batch)
         The parameter, row k from what arrived up to k - 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.observer import Tracked
+    >>> run = Tracked(estimates=np.zeros((100, 2, 3)), values=np.zeros((100, 2)))
+    >>> run.values[-1].tolist()
+    [0.0, 0.0]
     """
 
     estimates: Array
@@ -158,6 +166,23 @@ def track_parameter(
     ------
     ConfigError
         When the observer cannot be followed (`PhaseLockedLoop`), or a parameter is unknown or not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import gain
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer, track_parameter
+    >>> from kros.synthesis import Injection
+    >>> lifting = Lifting(("x",), ("sin(10*x + phase)",), ("phase",))
+    >>> A, K = np.array([[1.0, 0.002], [0.0, 0.0]]), gain([[0.2], [0.0]], 0.001)
+    >>> observer = Observer("x", lifting, A, np.array([[0.001], [0.0]]), (0,), ("u",), K, Injection.STATE, 0.001, {"phase": 0.0})
+    >>> x = np.zeros((8000, 1, 1))
+    >>> for k in range(7999):
+    ...     x[k + 1] = x[k] + 0.001 + 0.002 * np.sin(10 * x[k] + 0.5)
+    >>> found = track_parameter(observer, x, np.ones((8000, 1, 1)), settle_s=0.5)
+    >>> found.values[-1].round(2).tolist()
+    [0.5]
     """
     batch = np.shape(y)[1]
     loop = PhaseLockedLoop(observer, name, batch, settle_s)

@@ -100,7 +100,15 @@ class DcMotorTruth:
 
 
 class DcMotorPopulation(Batch[DcMotorTruth]):
-    """Settings of a simulated batch of DC motors, see `Batch`; a spread of 1 means 5 to 15 percent, the outlier has a tired magnet and a dry bearing."""
+    """Settings of a simulated batch of DC motors, see `Batch`; a spread of 1 means 5 to 15 percent, the outlier has a tired magnet and a dry bearing.
+
+    Examples
+    --------
+    >>> from kros.plants import DcMotorPopulation
+    >>> motors = DcMotorPopulation(n_units=3, n_episodes=2, seconds=1.0, seed=3, outlier=True).simulate()
+    >>> [unit.group for unit in motors.population.units]
+    ['outliers', 'population', 'population', 'population']
+    """
 
     plant = "dc-motor"
     channels, truths, sample_period_s, noise = CHANNELS, TRUTHS, SAMPLE_PERIOD_S, (VELOCITY_NOISE, CURRENT_NOISE)

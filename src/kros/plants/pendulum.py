@@ -63,7 +63,14 @@ class PendulumTruth:
 
 
 class PendulumPopulation(Batch[PendulumTruth]):
-    """Settings of a simulated batch of pendulums, see `Batch`; a spread of 1 means deviations of 8 to 15 percent, the outlier has a stiff joint."""
+    """Settings of a simulated batch of pendulums, see `Batch`; a spread of 1 means deviations of 8 to 15 percent, the outlier has a stiff joint.
+
+    Examples
+    --------
+    >>> from kros.plants import PendulumPopulation
+    >>> PendulumPopulation(n_units=2, n_episodes=1, seconds=1.0, seed=3).simulate().population
+    Population(2 units, 1 condition, 2 episodes every 0.01 s; states position (measured), velocity; inputs torque)
+    """
 
     plant = "pendulum"
     channels, sample_period_s, noise = CHANNELS, SAMPLE_PERIOD_S, (VELOCITY_NOISE,)

@@ -29,6 +29,13 @@ class SimulatedPopulation(Generic[T]):
     raw : Population
         As recorded, before preparation; the same as `population` where a plant needs none.
     truth : object with ``as_dict()``
+
+    Examples
+    --------
+    >>> from kros.plants import DcMotorPopulation
+    >>> simulated = DcMotorPopulation(n_units=2, n_episodes=1, seconds=1.0, seed=3).simulate()
+    >>> list(simulated.truth.as_dict()["units"])
+    ['001', '002']
     """
 
     population: Population

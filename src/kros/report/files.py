@@ -52,6 +52,17 @@ def write_figures(run: Path, out: Path, progress: Progress | None = None) -> lis
     ------
     ConfigError
         When `out` is a file.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import kros
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> with TemporaryDirectory() as folder:
+    ...     result = kros.run(motors, f"{folder}/run", until="read", identify={"refine": False})
+    ...     written = kros.report.write_figures(result.folder, f"{folder}/figures")
+    >>> "signals.png" in written
+    True
     """
     out = Path(out)
     if out.exists() and not out.is_dir():

@@ -55,6 +55,16 @@ def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map, out: Pat
     ------
     DataError
         When an artifact is broken or of another version.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import kros
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> with TemporaryDirectory() as folder:
+    ...     result = kros.run(motors, f"{folder}/run", until="identify", identify={"refine": False})
+    ...     print(kros.report.render(result.folder, result.metrics).name)
+    report.html
     """
     path = out if out is not None else Path(run) / "report.html"
     write_bytes(path, page(RunFolder(Path(run)), metrics, mapped).encode())

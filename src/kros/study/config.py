@@ -23,7 +23,14 @@ RENAMED = {"memory": "predictor"}  # sections of a study, old and new
 
 
 class Stage(str, Enum):
-    """Stages in the order in which data flow."""
+    """Stages in the order in which data flow.
+
+    Examples
+    --------
+    >>> from kros.study import Stage
+    >>> [stage.value for stage in Stage]
+    ['read', 'calibrate', 'identify', 'quantify', 'synthesize', 'evaluate', 'left_out', 'report']
+    """
 
     READ = "read"
     CALIBRATE = "calibrate"
@@ -121,7 +128,16 @@ class RequireConfig(Settings):
 
 
 class StudyConfig(Settings):
-    """A whole study."""
+    """A whole study.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from kros.study import validate_config
+    >>> study = validate_config({"data": {"source": "recordings", "reader": "parquet"}}, Path())
+    >>> study.name, study.synthesis.methods
+    ('study', ('mixed', 'worst_case_h2', 'residual_h2', 'memory'))
+    """
 
     name: str = Field("study", description="of the study")
     data: DataConfig
@@ -151,6 +167,17 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
     ------
     ConfigError
         When the file is missing, not TOML, or holds unknown keys or values out of range.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from kros.study import load_config
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder, "study.toml")
+    ...     _ = file.write_text("[data]{0}source = 'recordings'{0}reader = 'parquet'".format(chr(10)))
+    ...     print(load_config(file, ["evaluate.confidence=0.9"]).evaluate.confidence)
+    0.9
     """
     path = Path(path)
     raw = read_toml(path, "Study")
@@ -159,7 +186,16 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
 
 
 def validate_config(raw: dict[str, Any], base: Path, origin: str = "study", overrides: Sequence[str] = ()) -> StudyConfig:
-    """Validate a study given as nested tables, with overrides as in `load_config`; a relative source is relative to `base`."""
+    """Validate a study given as nested tables, with overrides as in `load_config`; a relative source is relative to `base`.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from kros.study import validate_config
+    >>> study = validate_config({"data": {"source": "recordings", "reader": "parquet"}}, Path(), overrides=["identify.alpha=90"])
+    >>> study.identify.alpha
+    90.0
+    """
     for override in overrides:
         _apply(raw, override)
     config = _validated(raw, f"Study {origin}")

@@ -36,7 +36,18 @@ STEPS = (
 
 @dataclass(frozen=True, repr=False)
 class RunResult:
-    """What a run left behind."""
+    """What a run left behind.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import kros
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> with TemporaryDirectory() as folder:
+    ...     result = kros.run(motors, f"{folder}/run", until="identify", identify={"refine": False})
+    >>> result.folder.name, result.violations
+    ('run', ())
+    """
 
     folder: Path
     metrics: dict[str, Any]
@@ -86,6 +97,19 @@ def run_study(
     ------
     KrosError
         Bad input leaves no folder behind that was not there before; so does a folder in which another study lives, or another run is at work.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from kros.plants import DcMotorPopulation
+    >>> from kros.study import run_study, validate_config
+    >>> motors = DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> with TemporaryDirectory() as folder:
+    ...     study = validate_config({"data": {"source": "recordings"}, "identify": {"refine": False}}, Path(folder))
+    ...     result = run_study(study, f"{folder}/run", until="identify", population=motors)
+    >>> result.metrics["study"]["units"]
+    2
     """
     out, until = (
         Path(out) if scheduler is None else Path(out).absolute(),

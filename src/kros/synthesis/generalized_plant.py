@@ -61,6 +61,16 @@ class GeneralizedPlant:
     ------
     DimensionError
         When shapes do not fit together, or a partition is out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import gain, h2_norm
+    >>> from kros.synthesis import GeneralizedPlant
+    >>> D11, D12 = np.zeros((2, 2)), [[0.0], [1.0]]
+    >>> plant = GeneralizedPlant([[0.9]], [[1.0, 0.0]], [[1.0]], [[1.0], [0.0]], [[1.0]], D11, D12, [[0.0, 1.0]], [[0.0]], 1.0)
+    >>> bool(h2_norm(plant.close(gain([[-0.5]], 1.0))) < h2_norm(plant.open_loop()))
+    True
     """
 
     A: Array

@@ -25,6 +25,12 @@ class Injection(str, Enum):
         ``x_hat+ = A x_hat + B u + K (y - C x_hat)``.
     NONE
         The controller belongs to a general plant, not to an observer.
+
+    Examples
+    --------
+    >>> from kros.synthesis import Injection
+    >>> Injection("state") is Injection.STATE
+    True
     """
 
     INPUT = "input"
@@ -43,6 +49,12 @@ class Status(str, Enum):
     INACCURATE
         The solver stopped early (time limit, or reduced accuracy), but what it returned passed the same verification.
         Raise the time limit, or add measurement noise and penalty, to come closer to the optimum.
+
+    Examples
+    --------
+    >>> from kros.synthesis import Status, kalman
+    >>> kalman([[1.0]], [[1.0]], [[1.0]], [[2.0]]).status is Status.OPTIMAL
+    True
     """
 
     OPTIMAL = "optimal"
@@ -84,6 +96,13 @@ class Synthesis:
         Time of the numerical solution, without the fitting of weights.
     solver : str
     notes : tuple of str
+
+    Examples
+    --------
+    >>> from kros.synthesis import kalman
+    >>> found = kalman([[1.0]], [[1.0]], [[1.0]], [[2.0]])
+    >>> found.method, found.status.value, round(found.spectral_radius, 6)
+    ('kalman', 'optimal', 0.5)
     """
 
     method: str

@@ -40,7 +40,14 @@ MAX_CONDITION = 1e12  # beyond this an inverse form cannot rebuild the plant
 
 
 class Form(str, Enum):
-    """Where the perturbation acts."""
+    """Where the perturbation acts.
+
+    Examples
+    --------
+    >>> from kros.uncertainty import Form
+    >>> Form.ADDITIVE.inverse, Form("inverse_additive").inverse, len(Form)
+    (False, True, 6)
+    """
 
     ADDITIVE = "additive"
     INPUT_MULTIPLICATIVE = "input_multiplicative"
@@ -137,7 +144,17 @@ def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike,
 
 
 def rebuild(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) -> Array:
-    """Return the perturbed plants, shape (..., p, m), that a nominal and residuals stand for; NaN where an inverse form's matrix is singular."""
+    """Return the perturbed plants, shape (..., p, m), that a nominal and residuals stand for; NaN where an inverse form's matrix is singular.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import rebuild, residual
+    >>> nominal, unit = np.array([[2.0]]), np.array([[2.5]])
+    >>> E = residual("output_multiplicative", nominal, unit)
+    >>> E.tolist(), rebuild("output_multiplicative", nominal, E).tolist()
+    ([[0.25]], [[2.5]])
+    """
     form, G, E = as_form(form), np.asarray(nominal), np.asarray(E)
     if form is Form.ADDITIVE:
         return G + E
@@ -157,7 +174,16 @@ def inverted_matrix(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) 
 
 
 def existence(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> Array:
-    """Tell where, shape (...), a residual of this form rebuilds the perturbed plant exactly."""
+    """Tell where, shape (...), a residual of this form rebuilds the perturbed plant exactly.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import existence
+    >>> nominal = np.array([[1.0], [0.0]])  # two outputs, one input
+    >>> bool(existence("input_multiplicative", nominal, 1.2 * nominal)), bool(existence("input_multiplicative", nominal, nominal + [[0], [0.1]]))
+    (True, False)
+    """
     form = as_form(form)
     G, Gp = _plants(nominal, perturbed)
     if form is Form.ADDITIVE:
@@ -189,6 +215,14 @@ def bounds(form: Form | str, responses: Array, *, paper: bool = False, nominals:
     Returns
     -------
     ndarray, shape (nominal, frequency)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import bounds
+    >>> responses = np.array([1.0, 1.1, 0.8]).reshape(3, 1, 1, 1)  # unit, frequency, output, input
+    >>> bounds("additive", responses).round(9).ravel().tolist()
+    [0.2, 0.3, 0.3]
     """
     form, G = as_form(form), check_responses(responses)
     rows = range(len(G)) if nominals is None else nominals
@@ -211,6 +245,14 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
     -------
     ndarray, shape (unit, frequency)
         NaN where the matrix that the form inverts has a condition number above 1e12; zero where the plant itself is zero.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import misfit
+    >>> nominal = np.array([[[1.0], [0.0]]])  # frequency, two outputs, one input
+    >>> misfit("input_multiplicative", nominal, np.array([[[[1.0], [0.1]]]])).round(3).tolist()
+    [[0.1]]
     """
     form = as_form(form)
     E = residual(form, nominal, responses) if E is None else E
@@ -237,6 +279,15 @@ def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLik
         As `residual`, but zero where the matrix that the form inverts has a condition number above 1e12.
     R : ndarray, shape (..., p, m)
         Zero but for rounding where the form is exact, and `Gp - G` where E was set to zero.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import completion, rebuild
+    >>> nominal, unit = np.array([[1.0], [0.0]]), np.array([[1.2], [0.1]])
+    >>> E, R = completion("input_multiplicative", nominal, unit)
+    >>> (rebuild("input_multiplicative", nominal, E) + R).round(9).ravel().tolist(), R.round(9).ravel().tolist()
+    ([1.2, 0.1], [0.0, 0.1])
     """
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
     E = residual(form, G, Gp)

@@ -107,6 +107,16 @@ class ResponseUncertainty(Uncertainty):
     unresolved_hz : ndarray, shape (n,), Hz
         Frequencies of local maxima of the bound that fall by more than 3 dB to a neighbouring frequency: peaks that the grid does not resolve, and
         that may be higher beside it. All other fields are those of `Uncertainty`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import quantify_responses
+    >>> freqs_hz = np.geomspace(0.1, 40, 30)
+    >>> lags = np.array([0.9, 1.0, 1.2])[:, None] / (1 + 1j * freqs_hz / 5)
+    >>> found = quantify_responses(lags[:, :, None, None], freqs_hz, "additive", sample_period_s=0.01)
+    >>> found.nominal_id, found.cover_max <= 1
+    ('1', True)
     """
 
     nominal_response: Array
@@ -123,6 +133,17 @@ class UncertainModel(Uncertainty):
     ----------
     nominal_system : StateSpace
         In physical units; all others are those of `Uncertainty`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import StateSpace
+    >>> from kros.uncertainty import quantify_systems
+    >>> gains = np.array([0.9, 1.0, 1.2])[:, None, None]
+    >>> units = StateSpace(np.full((3, 1, 1), 0.5), gains, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
+    >>> found = quantify_systems(units, "output_multiplicative")
+    >>> found.nominal_id, found.form.value, round(found.peak_db[found.form], 1)
+    ('1', 'output_multiplicative', -14.0)
     """
 
     nominal_system: StateSpace

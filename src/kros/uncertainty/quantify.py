@@ -56,6 +56,14 @@ class UncertainModels:
         Highest order of a weight.
     pooled : bool
         Whether observers whose nominal need not be a unit may have the mean of the units' models.
+
+    Examples
+    --------
+    >>> import kros
+    >>> motors = kros.plants.DcMotorPopulation(n_units=3, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1, structure="scalar")
+    >>> list(uncertain.sets), uncertain.nominal in motors.unit_ids
+    (['linear_edmd'], True)
     """
 
     models: IdentifiedModels

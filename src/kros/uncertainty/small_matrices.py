@@ -55,7 +55,14 @@ def squared(values: Array) -> Array:
 
 
 def sigma_max(matrices: npt.ArrayLike) -> Array:
-    """Return the largest singular value, shape (...), of matrices of shape (..., p, m)."""
+    """Return the largest singular value, shape (...), of matrices of shape (..., p, m).
+
+    Examples
+    --------
+    >>> from kros.uncertainty import sigma_max
+    >>> sigma_max([[[3.0, 0.0], [0.0, 4.0]], [[0.0, 1.0], [0.0, 0.0]]]).tolist()
+    [4.0, 1.0]
+    """
     return sigma_max_first(entries_first(np.asarray(matrices)))
 
 

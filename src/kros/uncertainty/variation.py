@@ -57,6 +57,18 @@ class VariationAndNoise:
         What the largest singular value of the residual between a unit and a resampled model of its own stays below with probability `level`.
     total, noise : ndarray, shape (frequency,)
         Mean squared Frobenius norms of residuals between units, and between resampled models of the same unit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import KoopmanMatrices, ModelSamples
+    >>> from kros.uncertainty import variation_and_noise
+    >>> poles = np.array([0.8, 0.9]).reshape(2, 1, 1)
+    >>> draws = poles[:, None] + 0.001 * np.random.default_rng(0).normal(size=(2, 30, 1, 1))
+    >>> samples = ModelSamples(("a", "b"), KoopmanMatrices(poles, np.ones((2, 1, 1))), KoopmanMatrices(draws, np.ones((2, 30, 1, 1))))
+    >>> found = variation_and_noise(samples, np.geomspace(0.1, 40, 20), 0.01)
+    >>> found.residual.shape, found.level
+    ((2, 20), 0.95)
     """
 
     form: Form
@@ -144,6 +156,18 @@ def variation_and_noise(
         When scales do not fit, or are not positive.
     ConfigError
         When `level` is no probability, the nominal no unit, or the frequencies no grid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify import KoopmanMatrices, ModelSamples
+    >>> from kros.uncertainty import variation_and_noise
+    >>> poles = np.array([0.8, 0.9]).reshape(2, 1, 1)
+    >>> draws = poles[:, None] + 0.001 * np.random.default_rng(0).normal(size=(2, 30, 1, 1))
+    >>> samples = ModelSamples(("a", "b"), KoopmanMatrices(poles, np.ones((2, 1, 1))), KoopmanMatrices(draws, np.ones((2, 30, 1, 1))))
+    >>> found = variation_and_noise(samples, np.geomspace(0.1, 40, 20), 0.01)
+    >>> bool((found.noise < found.total).all())  # these units differ by more than recordings of this length explain
+    True
     """
     form, freqs = as_form(form), check_grid(freqs_hz, sample_period_s)
     units, draws, n, m = _require(models, nominal, level)

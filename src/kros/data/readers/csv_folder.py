@@ -103,6 +103,19 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
         A mapping that is not valid.
     DataError
         No file matches, a column is missing, or two files are the same episode.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from kros.data import read_csv_folder
+    >>> mapping = {"files": "(?P<unit>[a-z]+)[.]csv", "time": "t", "channel": [{"name": "x", "role": "state", "measured": True}]}
+    >>> with TemporaryDirectory() as folder:
+    ...     for unit in ("left", "right"):
+    ...         np.savetxt(Path(folder, f"{unit}.csv"), [[0, 1], [0.01, 2], [0.02, 3]], delimiter=",", header="t,x", comments="")
+    ...     read_csv_folder(folder, mapping).unit_ids
+    ('left', 'right')
     """
     chosen, source = load_mapping(mapping), Path(source)
     dialect, table = chosen.dialect, None if chosen.lookup is None else read_lookup(source, chosen.lookup, chosen)

@@ -93,6 +93,17 @@ def read_motor_drive_raw(source: Path | str) -> Population:
     ------
     DataError
         A folder or file that does not fit the layout, missing or extra columns, duplicate episodes, a unit in two groups.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from kros.data import read_motor_drive_raw, write_raw
+    >>> from kros.plants import HarmonicDrivePopulation
+    >>> simulated = HarmonicDrivePopulation(n_units=1, n_episodes=1, seconds=2.0, conditions=("noload",)).simulate()
+    >>> with TemporaryDirectory() as folder:
+    ...     write_raw(simulated.raw, f"{folder}/raw")
+    ...     print(read_motor_drive_raw(f"{folder}/raw").states)
+    ('position', 'velocity', 'current')
     """
     root = find_root(Path(source))
     if root is None:

@@ -51,6 +51,13 @@ def from_pykoop(
     ------
     DataError
         Wrong sizes, or episodes that are not whole numbers.
+
+    Examples
+    --------
+    >>> from kros.data import from_pykoop
+    >>> X = [[0, 1.0, 0.5], [0, 1.1, 0.5], [1, 2.0, 0.0], [1, 1.9, 0.0]]  # episode, state, input
+    >>> from_pykoop({"a": X, "b": X}, n_inputs=1, sample_period_s=0.01)
+    Population(2 units, 1 condition, 4 episodes every 0.01 s; states x0 (measured); inputs u0)
     """
     try:
         arrays = {str(u): np.asarray(x) for u, x in X.items()} if isinstance(X, Mapping) else {"0": np.asarray(X)}
@@ -94,6 +101,14 @@ def to_pykoop(population: Population, unit: str | None = None, condition: str | 
     ------
     DataError
         When there is no such episode.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> population = kros.from_arrays({"a": [np.ones((3, 2)), np.zeros((3, 2))]}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> kros.data.to_pykoop(population).tolist()
+    [[0.0, 1.0, 1.0], [0.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
     """
     keys = population.keys(unit, condition)
     if not keys:

@@ -3,6 +3,15 @@
 Each step tells what it does to the channels and the sampling period (`channels_after`, `period_after`), so that a population
 can be described before anything is read, and does it to one recording at a time (`apply`). No step changes its argument.
 In TOML a step is a table with its name under `step`: ``[[data.prepare]] step = "trim" start = 1000``.
+
+Examples
+--------
+>>> import numpy as np
+>>> import kros
+>>> population = kros.from_arrays({"a": [np.arange(6.0)[:, None]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+>>> prepared = kros.data.prepare(population, [kros.data.steps.Trim(start=2)])
+>>> len(prepared.read(prepared.keys()[0]))
+4
 """
 
 from .events import ByDirection, Cut

@@ -24,6 +24,16 @@ class Cut(Step):
 
     From the first crossing in the direction `start`, and `before` samples before it, to the first one behind it in the direction `stop`, and `after`
     samples behind that; without one of them, from the first sample or to the last.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.data.steps import Cut
+    >>> population = kros.from_arrays({"a": [np.arange(10.0)[:, None]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> between = kros.data.prepare(population, [Cut("x", 3.5, start="rising")])
+    >>> between.read(between.keys()[0]).ravel().tolist()
+    [4.0, 5.0, 6.0, 7.0, 8.0, 9.0]
     """
 
     channel: str
@@ -72,6 +82,17 @@ class ByDirection(Step):
 
     For sensors that know no sign, and for two sides that change their parts. Backwards is where `channel` is below zero, sample by sample, or in
     the mean of the whole episode (``each = "episode"``).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.data.steps import ByDirection
+    >>> arrays = {"a": [np.array([[1.0, 3.0], [-1.0, 3.0], [-2.0, 4.0]])]}
+    >>> population = kros.from_arrays(arrays, states=["v", "force"], measured=["v"], sample_period_s=0.01)
+    >>> signed = kros.data.prepare(population, [ByDirection("v", negate=("force",))])
+    >>> signed.read(signed.keys()[0])[:, 1].tolist()
+    [3.0, -3.0, -4.0]
     """
 
     channel: str

@@ -80,6 +80,16 @@ class Resample(Step):
     All channels are treated alike, so linear relations between them survive. At the same or a higher rate this is linear interpolation.
     When the rate falls, the samples are interpolated to a grid that is an integer number of times finer, filtered without delay below the
     new Nyquist frequency, and thinned. A gap longer than `max_gap_s` (default: ten median steps) is an error rather than a straight line.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.data.steps import Resample
+    >>> population = kros.from_arrays({"a": [np.arange(4.0)[:, None]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> finer = kros.data.prepare(population, [Resample(0.005)])
+    >>> finer.read(finer.keys()[0]).ravel().tolist()
+    [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
     """
 
     period_s: float
@@ -124,6 +134,17 @@ class Differentiate(Step):
 
     Central differences after a low-pass filter without delay: it looks ahead, so the result is for identification and evaluation,
     never something a running observer could have measured.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.data.steps import Differentiate
+    >>> time_s = 0.01 * np.arange(200)
+    >>> population = kros.from_arrays({"a": [time_s[:, None] ** 2]}, states=["angle"], measured=["angle"], sample_period_s=0.01)
+    >>> with_rate = kros.data.prepare(population, [Differentiate("angle", "rate", cutoff_hz=5.0)])
+    >>> with_rate.states, float(with_rate.read(with_rate.keys()[0])[100, 1].round(6))
+    (('angle', 'rate'), 2.0)
     """
 
     channel: str

@@ -29,6 +29,12 @@ def parse_steps(tables: Iterable[Step | Mapping[str, Any]], where: str = "data.p
     ------
     ConfigError
         An unknown step or key, a missing key, or a value of the wrong type.
+
+    Examples
+    --------
+    >>> from kros.data.steps import parse_steps
+    >>> parse_steps([{"step": "trim", "start": 1000}])
+    (Trim(start=1000, stop=None, tail=0),)
     """
     return tuple(table if isinstance(table, Step) else _parse_step(table, f"{where}[{i}]") for i, table in enumerate(tables))
 

@@ -18,7 +18,18 @@ from .step import Step
 
 @dataclass(frozen=True)
 class Scale(Step):
-    """Multiply channels by a factor; `unit` names the new unit of measure."""
+    """Multiply channels by a factor; `unit` names the new unit of measure.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.data.steps import Scale
+    >>> population = kros.from_arrays({"a": [np.full((3, 1), 180.0)]}, states=["angle"], measured=["angle"], sample_period_s=0.01)
+    >>> turned = kros.data.prepare(population, [Scale(("angle",), np.pi / 180, unit="rad")])
+    >>> turned.channels[0].unit, turned.read(turned.keys()[0]).ravel().round(3).tolist()
+    ('rad', [3.142, 3.142, 3.142])
+    """
 
     channels: tuple[str, ...]
     factor: float
@@ -52,6 +63,17 @@ class Shift(Step):
 
     The value recorded at sample ``k + lag`` is moved to sample ``k``; the ends that have no partner are cut. A negative `lag`
     moves channels that run ahead.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.data.steps import Shift
+    >>> arrays = {"a": [np.array([[0.0, 9.0], [1.0, 0.0], [2.0, 1.0], [3.0, 2.0]])]}
+    >>> population = kros.from_arrays(arrays, states=["x", "late"], measured=["x"], sample_period_s=0.01)
+    >>> aligned = kros.data.prepare(population, [Shift(("late",), lag=1)])
+    >>> aligned.read(aligned.keys()[0]).tolist()
+    [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]
     """
 
     channels: tuple[str, ...]
@@ -83,7 +105,20 @@ class Shift(Step):
 
 @dataclass(frozen=True)
 class Offset(Step):
-    """Remove a channel's constant offset: ``channel += mean(reference - channel)`` over samples ``[start, stop)`` of each episode."""
+    """Remove a channel's constant offset: ``channel += mean(reference - channel)`` over samples ``[start, stop)`` of each episode.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.data.steps import Offset
+    >>> target = np.arange(4.0)
+    >>> arrays = {"a": [np.column_stack([target + 0.5, target])]}
+    >>> population = kros.from_arrays(arrays, states=["x"], measured=["x"], inputs=["target"], sample_period_s=0.01)
+    >>> shifted = kros.data.prepare(population, [Offset("x", "target", 0, 2)])
+    >>> shifted.read(shifted.keys()[0])[:, 0].tolist()
+    [0.0, 1.0, 2.0, 3.0]
+    """
 
     channel: str
     reference: str
@@ -121,7 +156,18 @@ class Offset(Step):
 
 @dataclass(frozen=True)
 class Tare(Step):
-    """Set channels to zero in the mean over samples ``[start, stop)`` of each episode; all of it by default."""
+    """Set channels to zero in the mean over samples ``[start, stop)`` of each episode; all of it by default.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.data.steps import Tare
+    >>> population = kros.from_arrays({"a": [np.array([[5.0], [5.0], [7.0]])]}, states=["force"], measured=["force"], sample_period_s=0.01)
+    >>> tared = kros.data.prepare(population, [Tare(("force",), stop=2)])
+    >>> tared.read(tared.keys()[0]).ravel().tolist()
+    [0.0, 0.0, 2.0]
+    """
 
     channels: tuple[str, ...]
     start: int = 0
@@ -152,7 +198,18 @@ class Tare(Step):
 
 @dataclass(frozen=True)
 class Trim(Step):
-    """Keep samples ``[start, stop)``, without the last `tail`."""
+    """Keep samples ``[start, stop)``, without the last `tail`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.data.steps import Trim
+    >>> population = kros.from_arrays({"a": [np.arange(6.0)[:, None]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> trimmed = kros.data.prepare(population, [Trim(start=2, tail=1)])
+    >>> trimmed.read(trimmed.keys()[0]).ravel().tolist()
+    [2.0, 3.0, 4.0]
+    """
 
     start: int = 0
     stop: int | None = None

@@ -15,7 +15,21 @@ from ..scaling import Scalings
 
 @dataclass(frozen=True)
 class Step:
-    """Base of all steps; `step` is the word that selects one in TOML, `makes_even` says that recordings of uneven time may enter."""
+    """Base of all steps; `step` is the word that selects one in TOML, `makes_even` says that recordings of uneven time may enter.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import numpy as np
+    >>> import kros
+    >>> class Magnitude(kros.data.steps.Step):
+    ...     def apply(self, recording, channels, period_s):
+    ...         return replace(recording, values=abs(recording.values))
+    >>> population = kros.from_arrays({"a": [-np.ones((3, 1))]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> positive = kros.data.prepare(population, [Magnitude()])
+    >>> positive.read(positive.keys()[0]).ravel().tolist()
+    [1.0, 1.0, 1.0]
+    """
 
     step: ClassVar[str] = ""
     makes_even: ClassVar[bool] = False

@@ -164,6 +164,18 @@ def write_parquet(population: Population, out: Path | str, *, on_nan: str = "err
     ------
     DataError
         `out` exists, or an episode cannot be used.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> import kros
+    >>> population = kros.from_arrays({"a": [np.eye(5, 2)]}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> with TemporaryDirectory() as folder:
+    ...     kros.data.write_parquet(population, f"{folder}/recordings")
+    ...     print(sorted(path.name for path in Path(folder, "recordings").iterdir()))
+    ['a@default.parquet', 'population.json']
     """
     groups = [(unit, condition) for unit, condition, _ in population.groups()]
     with whole_folder(Path(out), overwrite) as folder:

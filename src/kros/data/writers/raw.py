@@ -39,6 +39,18 @@ def write_raw(population: Population, out: Path | str) -> None:
     ------
     DataError
         Other channels, serials that are not six digits, conditions other than load and noload, episodes that are not numbers below 1000.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from kros.data import write_raw
+    >>> from kros.plants import HarmonicDrivePopulation
+    >>> simulated = HarmonicDrivePopulation(n_units=2, n_episodes=1, seconds=2.0, conditions=("noload",)).simulate()
+    >>> with TemporaryDirectory() as folder:
+    ...     write_raw(simulated.raw, f"{folder}/raw")  # as recorded, before preparation
+    ...     print(len(list(Path(folder).rglob("*.csv"))))
+    2
     """
     names = tuple(c.name for c in population.channels)
     expected = tuple(c.name for c in CHANNELS)

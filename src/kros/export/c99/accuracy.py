@@ -28,6 +28,14 @@ class HeldOut:
     states : ndarray, shape (n_samples, batch, n_recorded)
         The truth.
     parameters : mapping of str to ndarray, shape (batch,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.export import HeldOut
+    >>> recordings = HeldOut(np.zeros((100, 2, 1)), np.zeros((100, 2, 1)), np.zeros((100, 2, 3)))  # for export_c(..., held_out=recordings)
+    >>> recordings.y.shape
+    (100, 2, 1)
     """
 
     y: Array

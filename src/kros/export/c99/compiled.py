@@ -46,6 +46,19 @@ class CompiledObserver:
         What `export_c` wrote.
     library : Path
         Where the shared library lies.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from kros.export import CompiledObserver, export_c
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer
+    >>> lag = Observer.open_loop("lag", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), 0.01)
+    >>> with TemporaryDirectory() as folder:  # needs a C compiler
+    ...     print(CompiledObserver.build(export_c(lag, Path(folder) / "c")).selftest())
+    0
     """
 
     def __init__(self, folder: Path, library: Path) -> None:

@@ -32,6 +32,13 @@ class LoadOutput:
     level : AngleLoad
     load, current : str
         Names of the observer's states.
+
+    Examples
+    --------
+    >>> from kros.export import LoadOutput
+    >>> from kros.motor_drive import AngleLoad
+    >>> LoadOutput(AngleLoad(level_s=2.0, sample_period_s=0.001), current="current").load
+    'load'
     """
 
     level: AngleLoad

@@ -72,6 +72,20 @@ def export_c(
     ------
     ConfigError
         When the name is no C identifier, the folder holds something, a lifted function has no expression in C, or the parameter cannot be followed.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from kros.export import export_c
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer
+    >>> lag = Observer.open_loop("lag", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), 0.01)
+    >>> with TemporaryDirectory() as folder:
+    ...     written = export_c(lag, Path(folder) / "c", name="lag", precision="float")
+    ...     print("lag_step" in (written / "lag.h").read_text())
+    True
     """
     require_identifier(name)
     if precision not in _TOLERANCE:

@@ -57,6 +57,20 @@ def export_fmu(
     ------
     ConfigError
         When the file exists or ends differently, the version or the name is none, or a lifted function has no expression in C.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from zipfile import ZipFile
+    >>> import numpy as np
+    >>> from kros.export import export_fmu
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer
+    >>> lag = Observer.open_loop("lag", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), 0.01)
+    >>> with TemporaryDirectory() as folder:
+    ...     print("modelDescription.xml" in ZipFile(export_fmu(lag, Path(folder) / "lag.fmu", fmi=3)).namelist())
+    True
     """
     out, known = Path(out), units_of_measure(observer)
     require_identifier(name)

@@ -1,4 +1,11 @@
-"""Population refinement: a pooled model on free-run error, then every unit with a prior centred on it."""
+"""Population refinement: a pooled model on free-run error, then every unit with a prior centred on it.
+
+Examples
+--------
+>>> from kros.identify.refine import RefineOptions
+>>> RefineOptions().segments > 0
+True
+"""
 
 from .model import RefinedModels
 from .options import RefineOptions

@@ -65,6 +65,20 @@ class RefinedModels:
     whitening : ndarray, shape (p, p)
         T.
     spectral_radius : ndarray, shape (unit,)
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.identify import combine, episode_factors
+    >>> from kros.identify.refine import RefineOptions, refine_population
+    >>> from kros.lifting import Lifting
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=3, seconds=1.0, seed=3).simulate().population
+    >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
+    >>> factor = combine(episode_factors(motors, keys, Lifting(motors.states)))
+    >>> options = RefineOptions(horizons=(20,), segments=4, iterations=3, path_iterations=3)
+    >>> refined = refine_population(motors, keys, Lifting(motors.states), {}, factor, options=options)
+    >>> refined.pooled.A.shape, refined.strength > 0, refined.converged.shape
+    ((3, 3), True, (2,))
     """
 
     unit_ids: tuple[str, ...]

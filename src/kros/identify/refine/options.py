@@ -53,6 +53,12 @@ class RefineOptions:
     ------
     ConfigError
         When a setting is out of its range.
+
+    Examples
+    --------
+    >>> from kros.identify.refine import RefineOptions
+    >>> RefineOptions(horizons=(10, 100), segments=8).horizons
+    (10, 100)
     """
 
     horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)

@@ -74,6 +74,21 @@ def refine_population(
         When no stable start exists, free runs diverge or leave their bound; names the unit where there is one.
     DimensionError
         When keys, parameters and factors do not fit together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.identify import combine, episode_factors
+    >>> from kros.identify.refine import RefineOptions, refine_population
+    >>> from kros.lifting import Lifting
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=3, seconds=1.0, seed=3).simulate().population
+    >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
+    >>> factor = combine(episode_factors(motors, keys, Lifting(motors.states)))
+    >>> options = RefineOptions(horizons=(20,), segments=4, iterations=3, path_iterations=3)
+    >>> refined = refine_population(motors, keys, Lifting(motors.states), {}, factor, options=options)
+    >>> refined.units.A.shape, bool(refined.spectral_radius.max() < 1)
+    ((2, 3, 3), True)
     """
     options = RefineOptions() if options is None else options
     pooled = np.ones(len(keys), dtype=bool) if pooled is None else np.asarray(pooled, dtype=bool)

@@ -34,6 +34,15 @@ class FilteredDifference:
     sample_period_s : float
     scales : tuple of float
         Of every pair: the state over the rate, which their units of measure decide; one by default.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.observer import FilteredDifference
+    >>> position = 2.0 * 0.001 * np.arange(500).reshape(500, 1, 1)  # 2 rad/s
+    >>> difference = FilteredDifference(2, pairs=((0, 1),), cutoff_hz=50.0, sample_period_s=0.001)
+    >>> difference.run(position, np.zeros((500, 1, 1)))[-1, 0].round(6).tolist()  # the position itself is not estimated
+    [nan, 2.0]
     """
 
     n_states: int

@@ -51,6 +51,16 @@ class ExtendedKalman:
         Default values of the lifting's parameters, the nominal unit's.
     delay : int
         Samples by which measurements arrive late: the filter corrects as of then, and predicts forward through the model.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import ExtendedKalman
+    >>> A, B = np.array([[1.0, 0.01], [0.0, 0.9]]), np.array([[0.0], [0.1]])
+    >>> kalman = ExtendedKalman(Lifting(("x", "v")), A, B, (0,), ("u",), np.diag([1e-6, 1e-2]), np.array([[1e-4]]), np.diag([1e-4, 1.0]))
+    >>> kalman.run(np.zeros((100, 1, 1)), np.zeros((100, 1, 1))).shape
+    (100, 1, 2)
     """
 
     lifting: Lifting

@@ -75,6 +75,17 @@ class ReliftCertificate:
     method : str
         By which method.
     solve_s : float
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer, relift_certificate
+    >>> lifting = Lifting(("x",), ("sin(x)",))
+    >>> plant = Observer.open_loop("x", lifting, np.array([[0.5, 0.2], [0, 0]]), np.ones((2, 1)), (0,), ("u",), 1.0)
+    >>> certificate = relift_certificate(plant)
+    >>> certificate.certified, certificate.status.value, certificate.lower_bound <= certificate.gain
+    (True, 'certified', True)
     """
 
     scales: ReliftScales

@@ -57,6 +57,14 @@ class ReliftScales:
         Size of the one-step residual in every state; zero for a state without.
     noise : ndarray, shape (q,)
         Size of every measurement's noise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.observer import ReliftScales
+    >>> scales = ReliftScales(error=np.array([2.0, 30.0]), residual=np.array([0.01, 0.2]), noise=np.array([1e-3]))
+    >>> scales.error.tolist()
+    [2.0, 30.0]
     """
 
     error: Array

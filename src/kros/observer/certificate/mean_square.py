@@ -53,6 +53,12 @@ class DropoutBound:
         In mean square, in the units of the certificate's sizes; None where nothing is proven.
     reason : str
         Why not.
+
+    Examples
+    --------
+    >>> from kros.observer import DropoutBound
+    >>> DropoutBound(rate=0.1, gain=3.2).gain
+    3.2
     """
 
     rate: float
@@ -71,6 +77,18 @@ def dropout_bound(certificate: ReliftCertificate, observer: ObserverData, rates:
         While a measurement is missing its innovation is zero; the filter runs on.
     rates : array_like, shape (q,) or ()
         Probability that a sample of a measurement is lost.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import gain
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer, dropout_bound, relift_certificate
+    >>> from kros.synthesis import Injection
+    >>> observer = Observer("x", Lifting(("x",)), np.array([[0.9]]), np.ones((1, 1)), (0,), ("u",), gain([[0.5]], 0.01), Injection.STATE, 0.01)
+    >>> certificate = relift_certificate(observer)
+    >>> certificate.gain < dropout_bound(certificate, observer, 0.1).gain
+    True
     """
     rates = np.broadcast_to(np.asarray(rates, dtype=float), (len(observer.measured),))
     worst = float(rates.max(initial=0.0))

@@ -69,6 +69,18 @@ class SignalBound:
         Of an observer that goes on from limits: whether these change no estimate of the recordings, and the bound is for signals that keep it so. If
         not, what they cut off along the recordings counts as residual. None where there are no such limits, or they may bind at any sample: with a delay.
         Energies say nothing of peaks, and a gain that brings internal states back would make a bound as much larger as it makes their excess smaller.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.observer import relift_certificate, signal_bound
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1, structure="scalar")
+    >>> observer = kros.synthesize(uncertain, "kalman_tuned", methods=()).observer
+    >>> bound = signal_bound(relift_certificate(observer), observer, EpisodeBatch.read(motors, motors.keys()))
+    >>> bound.states, bound.bounds.shape, bool((bound.errors <= bound.bounds).all())
+    (('position', 'velocity', 'current'), (2, 3), True)
     """
 
     states: tuple[str, ...]
@@ -155,6 +167,22 @@ def signal_bound(
     -------
     SignalBound
         Also where there is none: `reason` says why.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.core import gain
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Observer, relift_certificate, signal_bound
+    >>> from kros.synthesis import Injection
+    >>> x = np.random.default_rng(0).normal(size=(2, 200, 2)).cumsum(axis=1)
+    >>> population = kros.from_arrays({"a": [x[0]], "b": [x[1]]}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> batch = kros.data.EpisodeBatch.read(population, population.keys())
+    >>> observer = Observer("x", Lifting(("x",)), np.array([[0.9]]), np.ones((1, 1)), (0,), ("u",), gain([[0.5]], 0.01), Injection.STATE, 0.01)
+    >>> bound = signal_bound(relift_certificate(observer), observer, batch)
+    >>> bool((bound.errors <= bound.bounds).all())
+    True
     """
     seen = course(observer, batch, estimates)
     n, within, inside = len(observer.recorded), None, seen.taken(observer)

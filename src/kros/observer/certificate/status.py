@@ -20,6 +20,12 @@ class ReliftStatus(str, Enum):
     NOT_COVERED
         The observer runs in a way that the equations of the error do not know. No observer of this version does; it is kept for the reading of
         earlier certificates.
+
+    Examples
+    --------
+    >>> from kros.observer import ReliftStatus
+    >>> [status.value for status in ReliftStatus]
+    ['certified', 'unstable', 'unbounded', 'not_found', 'not_covered']
     """
 
     CERTIFIED = "certified"
@@ -40,6 +46,12 @@ class Dropped(str, Enum):
         The innovation is zero and nothing is applied; the filter runs on.
     EITHER
         One or the other, from step to step.
+
+    Examples
+    --------
+    >>> from kros.observer import Dropped
+    >>> [dropped.value for dropped in Dropped]
+    ['never', 'innovation', 'correction', 'either']
     """
 
     NEVER = "never"

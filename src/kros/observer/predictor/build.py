@@ -68,6 +68,17 @@ def identify_predictor(
         When the lifting reads hidden or earlier values, or has functions of inputs.
     DataError
         When every state is measured, or an episode is too short.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import identify_predictor
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
+    >>> batch = EpisodeBatch.read(motors, motors.keys())
+    >>> identify_predictor("motor", Lifting(motors.states), (0,), motors.inputs, batch, internal=2, iterations=0).lifting.states
+    ('position', 'velocity', 'current', 'memory_1', 'memory_2')
     """
     units = batch.units
     slowest = 1 - (SHORT / int(batch.lengths.min()) if longest_s is None else batch.sample_period_s / longest_s)

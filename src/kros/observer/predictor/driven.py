@@ -66,6 +66,19 @@ def with_internal(
     ------
     DimensionError
         When there are neither as many states as are recorded nor as many as the observer has.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import driven_coordinates, identify_predictor, with_internal
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
+    >>> batch = EpisodeBatch.read(motors, motors.keys())
+    >>> predictor = identify_predictor("motor", Lifting(motors.states), (0,), motors.inputs, batch, internal=2, iterations=0)
+    >>> stable = driven_coordinates(predictor, batch, abs(batch.states).max(axis=(0, 1)))
+    >>> with_internal(stable, batch.states, batch.inputs).shape
+    (1000, 2, 5)
     """
     n, recorded = observer.lifting.n_states, len(observer.recorded)
     if states.shape[-1] == n:
@@ -103,6 +116,18 @@ def driven_coordinates(observer: Observer, batch: EpisodeBatch, sizes: npt.Array
     -------
     Observer
         Of the same estimates; the observer itself where it has no internal states, or is not stable.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import driven_coordinates, identify_predictor
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
+    >>> batch = EpisodeBatch.read(motors, motors.keys())
+    >>> predictor = identify_predictor("motor", Lifting(motors.states), (0,), motors.inputs, batch, internal=2, iterations=0)
+    >>> driven_coordinates(predictor, batch, abs(batch.states).max(axis=(0, 1))).lifting.states
+    ('position', 'velocity', 'current', 'memory_1', 'memory_2')
     """
     recorded, n = len(observer.recorded), observer.lifting.n_states
     if recorded == n or not observer.replaces:

@@ -80,6 +80,21 @@ def conditioned(observer: Observer, batch: EpisodeBatch, importance: npt.ArrayLi
         Weights of the hidden states' logarithmic errors.
     iterations : int
         Most steps.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import conditioned, identify_predictor
+    >>> from kros.observer.predictor.limited import with_limits
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
+    >>> batch = EpisodeBatch.read(motors, motors.keys())
+    >>> predictor = identify_predictor("motor", Lifting(motors.states), (0,), motors.inputs, batch, internal=2, iterations=0)
+    >>> limit = np.array([np.inf, np.inf, 0.8 * abs(batch.states[..., 2]).max()])  # of the current
+    >>> conditioned(with_limits(predictor, -limit, limit), batch, iterations=1).lifting.states
+    ('position', 'velocity', 'current', 'memory_1', 'memory_2', 'memory_3')
     """
     problem = _Conditioning(observer, batch, importance)
     start = problem.at(np.zeros((len(problem.F), len(problem.raw))), problem.stability.first)

@@ -70,6 +70,17 @@ class PastMoments:
         Mean squares of the hidden states.
     conditions : tuple of str
         Condition of every row; one and the same where none is given.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import PastMoments
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
+    >>> moments = PastMoments.of(Lifting(motors.states), (0,), EpisodeBatch.read(motors, motors.keys()))
+    >>> moments.units, moments.power.shape
+    (('001', '002'), (2, 2))
     """
 
     lifting: Lifting

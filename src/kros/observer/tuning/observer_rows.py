@@ -63,6 +63,18 @@ def tune_observer(observer: O, batch: EpisodeBatch, iterations: int = 25) -> tup
         When the observer corrects through the input, has internal states, or its lifting reads earlier values.
     DataError
         When every state is measured, recordings are too short, or the observer diverges on them.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.observer import tune_observer
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=2.0, seed=3).simulate().population
+    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1, structure="scalar")
+    >>> observer = kros.synthesize(uncertain, "kalman_tuned", methods=()).observer
+    >>> tuned, criterion = tune_observer(observer, EpisodeBatch.read(motors, motors.keys()), iterations=2)
+    >>> criterion[-1] <= criterion[0]
+    True
     """
     if observer.injection is not Injection.STATE or observer.lifting.history or observer.internal:
         raise DimensionError(

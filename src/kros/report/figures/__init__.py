@@ -18,8 +18,6 @@ from .see import SEE
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["FIGURES", "ON_THE_PAGE", "Drawn", "Row", "draw", "draw_all"]
-
 
 @dataclass(frozen=True)
 class Row:

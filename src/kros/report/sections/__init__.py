@@ -43,5 +43,3 @@ EVIDENCE: tuple[Maker, ...] = (
     other_conditions.section,
     making.section,
 )
-
-__all__ = ["EVIDENCE", "SECTIONS"]

@@ -88,6 +88,15 @@ class ObserverProblem:
     ------
     DimensionError
         When sizes or sampling periods do not fit, or a scale or noise level is not positive.
+
+    Examples
+    --------
+    >>> from kros.core import StateSpace, gain
+    >>> from kros.synthesis import ObserverProblem
+    >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
+    >>> problem = ObserverProblem(lag, [[1.0]], W_L=gain([[0.1]], 0.01), W_R=gain([[1.0]], 0.01), input_scale=[1.0], output_scale=[1.0], noise=[0.1])
+    >>> problem.form.value, problem.injection.value
+    ('inverse_input_multiplicative', 'state')
     """
 
     nominal: StateSpace

@@ -63,6 +63,18 @@ def reduce_controller(
         When an option is out of range.
     SynthesisError
         When no controller of the order asked for stabilises.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import StateSpace
+    >>> from kros.synthesis import GeneralizedPlant, h2, reduce_controller
+    >>> A, D11, D12 = np.diag([0.9, 1e-4]), np.zeros((2, 2)), [[0.0], [1.0]]
+    >>> B1, C1 = [[1.0, 0.0], [1e-3, 0.0]], [[1.0, 0.0], [0.0, 0.0]]
+    >>> plant = GeneralizedPlant(A, B1, [[1.0], [0.0]], C1, [[1.0, 1e-3]], D11, D12, [[0.0, 1.0]], [[0.0]], 1.0)
+    >>> optimum = h2(plant)
+    >>> optimum.controller.n_states, reduce_controller(plant, optimum).controller.n_states
+    (2, 0)
     """
     if largest_loss_percent < 0 or (order is not None and order < 0):
         raise ConfigError(f"Order reduction: order = {order} and largest_loss_percent = {largest_loss_percent} should not be negative.")

@@ -116,6 +116,12 @@ def luenberger(A: npt.ArrayLike, C: npt.ArrayLike, poles: npt.ArrayLike, dt: flo
     ------
     SynthesisError
         When a pole is not inside the unit circle, the pair is not observable enough to move it, or the poles cannot be placed.
+
+    Examples
+    --------
+    >>> from kros.synthesis import luenberger
+    >>> luenberger([[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.0]], [0.5, 0.6]).controller.D.round(6).ravel().tolist()
+    [0.9, 2.0]
     """
     from scipy.signal import place_poles
 

@@ -37,6 +37,12 @@ class Block:
     ------
     DimensionError
         When a size is not positive, or a repeated scalar is not square.
+
+    Examples
+    --------
+    >>> from kros.synthesis import Block
+    >>> Block.full(2, 3), Block(2, 2, repeated=True).columns
+    (Block(rows=2, columns=3, repeated=False), 2)
     """
 
     rows: int

@@ -63,6 +63,14 @@ class MuBounds:
     everywhere : float or None
         Upper bound at every frequency, between the points too (`kros.synthesis.structured.between`): perturbations smaller than ``1 / everywhere``
         cannot make the loop singular at all. Usually one percent above `peak`. None where it was not asked for.
+
+    Examples
+    --------
+    >>> from kros.core import StateSpace
+    >>> from kros.synthesis import Block, mu_bounds
+    >>> bounds = mu_bounds(StateSpace([[0.5]], [[0.4]], [[1.0]], [[0.0]], 0.01), [Block.full(1)])
+    >>> round(bounds.peak, 3), bounds.everywhere >= bounds.peak
+    (0.8, True)
     """
 
     freqs_hz: Array
@@ -118,6 +126,13 @@ def mu_lower(M: npt.ArrayLike, blocks: Sequence[Block]) -> tuple[Array, Array]:
     -------
     ndarray, shape (...)
     ndarray, shape (..., w, z)
+
+    Examples
+    --------
+    >>> from kros.synthesis import Block, mu_lower
+    >>> bound, perturbation = mu_lower([[2, 2], [-1, -1]], [Block.scalar(), Block.scalar()])
+    >>> round(float(bound), 6), perturbation.shape
+    (3.0, (2, 2))
     """
     matrices, structure = _checked(M, blocks)
     value, Delta = power_iteration(matrices.reshape(-1, *matrices.shape[-2:]), structure)
@@ -148,6 +163,14 @@ def mu_bounds(system: StateSpace, blocks: Sequence[Block], freqs_hz: npt.ArrayLi
         When the blocks do not fit the system.
     SynthesisError
         When the system is unstable: then no perturbation is needed.
+
+    Examples
+    --------
+    >>> from kros.core import StateSpace
+    >>> from kros.synthesis import Block, mu_bounds
+    >>> lag = StateSpace([[0.5]], [[0.4]], [[1.0]], [[0.0]], 0.01)  # its gain is largest at zero frequency: 0.4 / (1 - 0.5)
+    >>> round(mu_bounds(lag, [Block.full(1)]).peak, 3)
+    0.8
     """
     system = as_state_space(system)
     structure = Structure.of(blocks, system.D.shape)

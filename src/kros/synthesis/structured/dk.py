@@ -106,6 +106,16 @@ def dk_iteration(
         When the blocks do not fit the plant.
     SynthesisError
         When the first K-step fails.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.synthesis import Block, GeneralizedPlant, dk_iteration
+    >>> D11, D12 = np.zeros((2, 2)), [[0.0], [1.0]]
+    >>> plant = GeneralizedPlant([[0.9]], [[1.0, 0.0]], [[1.0]], [[1.0], [0.0]], [[1.0]], D11, D12, [[0.0, 1.0]], [[0.0]], 1.0)
+    >>> found = dk_iteration(plant, [Block.full(1), Block.full(1)], iterations=1, freqs_hz=np.geomspace(1e-3, 0.49, 20))
+    >>> found.method, found.spectral_radius < 1
+    ('dk_iteration', True)
     """
     if iterations < 0 or max_order < 0 or max_order % 2 or not tolerance > 0:
         raise ConfigError(

@@ -58,6 +58,12 @@ class RobustGain:
     attained : float
         Gain that some member has at `freq_hz`; the difference is the margin of the proof.
     freq_hz : float, Hz
+
+    Examples
+    --------
+    >>> from kros.synthesis import RobustGain
+    >>> RobustGain(value=0.41, attained=0.40, freq_hz=3.0).freq_hz
+    3.0
     """
 
     value: float
@@ -149,6 +155,16 @@ def robust_gain(problem: ObserverProblem, controller: StateSpace) -> RobustGain:
     ------
     SynthesisError
         When the set is not well posed, the nominal observer loop is unstable, or the proof does not get through.
+
+    Examples
+    --------
+    >>> from kros.core import StateSpace, gain
+    >>> from kros.synthesis import ObserverProblem, robust_gain
+    >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
+    >>> problem = ObserverProblem(lag, [[1.0]], gain([[0.1]], 0.01), gain([[1.0]], 0.01), [1.0], [1.0], [0.1])
+    >>> found = robust_gain(problem, gain([[0.2]], 0.01))
+    >>> found.attained <= found.value < 1.01 * found.attained
+    True
     """
     problem.require_sound()
     loop = problem.error_system(controller)

@@ -49,6 +49,13 @@ class UnitCheck:
         norms may hide a frequency.
     worst_case_h2, worst_case_hinf : float
         The certified bounds, noise included; infinite where none is proven.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.synthesis import UnitCheck
+    >>> UnitCheck(("a",), np.array([0.1]), np.array([0.2]), np.array([0.9]), worst_case_h2=0.3, worst_case_hinf=0.4).holds
+    True
     """
 
     units: tuple[str, ...]
@@ -98,6 +105,17 @@ def check_units(problem: ObserverProblem, controller: StateSpace, units: StateSp
         When models and nominal do not fit together.
     SynthesisError
         When there is no H2 certificate: see `certify`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import StateSpace, gain
+    >>> from kros.synthesis import ObserverProblem, check_units
+    >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
+    >>> problem = ObserverProblem(lag, [[1.0]], gain([[0.1]], 0.01), gain([[1.0]], 0.01), [1.0], [1.0], [0.1])
+    >>> units = StateSpace(np.full((2, 1, 1), 0.5), np.array([[[0.98]], [[1.02]]]), np.ones((2, 1, 1)), np.zeros((2, 1, 1)), 0.01)
+    >>> check_units(problem, gain([[0.2]], 0.01), units).holds
+    True
     """
     n, m = problem.nominal.n_states, problem.nominal.n_inputs
     if units.A.shape[1:] != (n, n) or units.B.shape[1:] != (n, m) or units.dt != problem.nominal.dt:

@@ -67,6 +67,15 @@ class FittedMagnitude:
     proven_db : float, dB
         No system of this order stays closer to the data on the same grid than this: proven by the alternation of the fit around them,
         whatever the programs did.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import fit_magnitude
+    >>> freqs_hz = np.geomspace(0.1, 50, 30)
+    >>> fitted = fit_magnitude(freqs_hz, 1 / (1 + freqs_hz / 5), 0.01, max_order=2)
+    >>> fitted.within_tolerance, fitted.overbound_db >= fitted.proven_db
+    (True, True)
     """
 
     system: StateSpace

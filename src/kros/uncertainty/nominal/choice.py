@@ -41,6 +41,14 @@ class NominalChoice:
     evaluated : ndarray of bool, shape (candidate,)
         Where a score is exact; elsewhere it is a lower bound, which proves that the candidate is no better.
     criterion : Criterion
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import choose_nominal
+    >>> choice = choose_nominal(np.array([0.8, 1.0, 1.1]).reshape(3, 1, 1, 1), "additive")
+    >>> choice.index, choice.bound.round(9).tolist()
+    (1, [0.2])
     """
 
     form: Form
@@ -118,7 +126,16 @@ def choose_nominals(
     extra: npt.ArrayLike | None = None,
     freqs_hz: npt.ArrayLike | None = None,
 ) -> dict[Form, NominalChoice]:
-    """Return the best nominal of every form; arguments and errors as of `choose_nominal`."""
+    """Return the best nominal of every form; arguments and errors as of `choose_nominal`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import Form, choose_nominals
+    >>> responses = np.array([0.8, 1.0, 1.1]).reshape(3, 1, 1, 1)
+    >>> choose_nominals(responses)[Form.ADDITIVE].index
+    1
+    """
     return {form: choose_nominal(responses, form, criterion, extra=extra, freqs_hz=freqs_hz) for form in Form}
 
 

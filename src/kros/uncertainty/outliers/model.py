@@ -74,6 +74,17 @@ class OutlierModel:
         Units that were the nominal in turn: all, or 64 of them.
     by_nominal_db : ndarray, shape (nominal, scored unit), dB
         The excess with one unit as the only nominal, NaN of a unit against itself.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import score_outliers
+    >>> rng, freqs_hz = np.random.default_rng(0), np.geomspace(0.1, 40, 20)
+    >>> gains, corners_hz = 1 + 0.02 * rng.normal(size=20), 5 + 0.2 * rng.normal(size=20)
+    >>> responses = gains[:, None] / (1 + 1j * freqs_hz / corners_hz[:, None])
+    >>> model = score_outliers(responses[:, :, None, None], freqs_hz)
+    >>> model.score("new", 1.5 * responses[0][:, None, None]).outlier
+    True
     """
 
     form: Form
@@ -218,6 +229,16 @@ def score_outliers(
         When units have responses of different shapes.
     ConfigError
         When the rate is not between 0 and 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import score_outliers
+    >>> rng, freqs_hz = np.random.default_rng(0), np.geomspace(0.1, 40, 20)
+    >>> gains, corners_hz = np.append(1 + 0.02 * rng.normal(size=20), 1.5), 5 + 0.2 * rng.normal(size=21)  # the last gain is not like the others
+    >>> responses = gains[:, None] / (1 + 1j * freqs_hz / corners_hz[:, None])
+    >>> [score.unit for score in score_outliers(responses[:, :, None, None], freqs_hz).scores if score.outlier]
+    ['20']
     """
     G, ids, freqs = _population(responses, unit_ids, freqs_hz)
     form, rate = as_form(form), float(false_alarm_rate)

@@ -65,6 +65,17 @@ class OutlierScore:
         Output and input of the entry.
     more_data : float
         How many times as long the unit would have to be recorded for its own noise to hide little; one where the recordings suffice.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import score_outliers
+    >>> rng, freqs_hz = np.random.default_rng(0), np.geomspace(0.1, 40, 20)
+    >>> gains, corners_hz = 1 + 0.02 * rng.normal(size=20), 5 + 0.2 * rng.normal(size=20)
+    >>> responses = gains[:, None] / (1 + 1j * freqs_hz / corners_hz[:, None])
+    >>> score = score_outliers(responses[:, :, None, None], freqs_hz).scores[0]
+    >>> score.unit, score.score_db < score.threshold_db, score.outlier
+    ('0', True, False)
     """
 
     unit: str

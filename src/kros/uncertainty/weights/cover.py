@@ -69,6 +69,14 @@ class Cover:
     left : ndarray, shape (frequency, p')
     right : ndarray, shape (frequency, m')
         One entry is one at every frequency: the scale between left and right is free.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import optimal_cover
+    >>> cover = optimal_cover(np.array([0.1, -0.2]).reshape(2, 1, 1, 1))
+    >>> cover.left.shape, round(float(cover.left[0, 0] * cover.right[0, 0]), 3)
+    ((1, 1), 0.2)
     """
 
     left: Array
@@ -118,6 +126,15 @@ def optimal_cover(
     -------
     Cover
         Sound at every frequency; all zero where all residuals are. The right entry with the largest median is one at every frequency.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import optimal_cover, sigma_max
+    >>> E = np.random.default_rng(0).normal(size=(5, 3, 2, 2))  # unit, frequency, output, input
+    >>> cover = optimal_cover(E)
+    >>> bool((sigma_max(E / cover.left[:, :, None] / cover.right[:, None]) <= 1 + 1e-9).all())
+    True
     """
     first = entries_first(E)
     p, m = first.shape[:2]

@@ -80,6 +80,15 @@ def fit_weight(
     Weight
     Cover
         The optimal cover at `freqs_hz`, against which the overbound is measured.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.uncertainty import fit_weight
+    >>> shape = lambda freqs_hz: (0.1 * np.array([-1, 1])[:, None] / (1 + np.asarray(freqs_hz) / 5))[..., None, None]
+    >>> weight, cover = fit_weight(shape, np.geomspace(0.1, 50, 30), 0.01, structure="scalar", max_order=2)
+    >>> weight.cover_max <= 1, weight.within_tolerance
+    (True, True)
     """
     structure = as_structure(structure)
     checks = Checks(density, None if also_hz is None else np.asarray(also_hz, float), systems, sampled)

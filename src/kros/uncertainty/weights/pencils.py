@@ -54,6 +54,16 @@ class ResidualSystems:
         Row and column of the residual where that entry alone is bounded.
     part : Part
         The residual of the form, or the additive remainder that it leaves.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import StateSpace
+    >>> from kros.uncertainty import ResidualSystems
+    >>> nominal = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
+    >>> units = StateSpace(np.full((2, 1, 1), 0.5), np.array([[[0.9]], [[1.2]]]), np.ones((2, 1, 1)), np.zeros((2, 1, 1)), 0.01)
+    >>> ResidualSystems("additive", nominal, units).form
+    'additive'
     """
 
     form: Form | str

@@ -58,6 +58,17 @@ class Weight:
         How the bound between grid points is known, see `certificate`.
     remaining_margin : float
         One minus the largest ratio over all frequencies: by level sets a bound on it, on a grid what was found.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import StateSpace
+    >>> from kros.uncertainty import quantify_systems
+    >>> gains = np.array([0.9, 1.0, 1.2])[:, None, None]
+    >>> units = StateSpace(np.full((3, 1, 1), 0.5), gains, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
+    >>> weight = quantify_systems(units, "output_multiplicative").weight
+    >>> weight.structure.value, weight.cover_max <= 1
+    ('diagonal', True)
     """
 
     left: StateSpace

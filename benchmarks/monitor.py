@@ -24,10 +24,11 @@ from scipy.stats import beta
 
 import kros
 from kros.data import EpisodeBatch, Unit
-from kros.design.monitor import MOVING, fit_monitor, monitor_facts, poisson_interval
+from kros.design.monitor import MOVING, fit_monitor, monitor_facts
 from kros.design.validation import TrainingSet
 from kros.identify.identified import IdentifiedModels
 from kros.observer import Observer
+from kros.observer.monitor import poisson_interval
 from kros.observer.simulate import run_innovations
 from kros.plants.harmonic_drive.parameters import DriveParameters, concatenate, draw_outlier, draw_parameters
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation

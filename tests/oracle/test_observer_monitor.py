@@ -8,11 +8,11 @@ from machines import DT, LIMITS, drive, moving, samples, watched
 
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
-from kros.design.monitor import fit_monitor, monitor_facts, poisson_interval, steady, weighted
+from kros.design.monitor import bound_of_peaks, fit_monitor, monitor_facts, steady, weighted
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import Monitor, Observer, SampleStatus, in_sizes
-from kros.observer.monitor import RECOVERY, WEIGHT, octaves
+from kros.observer.monitor import RECOVERY, WEIGHT, octaves, poisson_interval
 from kros.observer.simulate import run_innovations
 from kros.plants import HarmonicDrivePopulation
 from kros.synthesis import Injection
@@ -115,8 +115,8 @@ def test_poisson_interval_is_that_of_the_tables():
 
 
 def test_the_bound_is_that_of_one_more_unit():
-    """Peaks by the running observer, the bound by hand; a unit whose gearbox is ten times as rough is outside."""
-    simulated = HarmonicDrivePopulation(n_units=6, n_episodes=2, seconds=4.0, conditions=("noload",), seed=3).simulate()
+    """Peaks by the running observer, the bound by hand; a unit that shakes is outside."""
+    simulated = HarmonicDrivePopulation(n_units=6, n_episodes=3, seconds=3.0, conditions=("noload",), seed=3).simulate()
     A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.zeros((2, 2))
     K = gain(np.array([[0.2], [10.0]]), DT)
     observer = Observer(
@@ -128,16 +128,35 @@ def test_the_bound_is_that_of_one_more_unit():
     own = replace(observer, monitor=monitor)
     records = {key: population.read(key) for key in population.episodes}
     found = {key: levels(own, r[:, :1], r[:, 3:])[0].max() for key, r in records.items()}
-    peaks = np.array([max(v for key, v in found.items() if key.unit == unit) for unit in population.unit_ids])
-    assert abs(prediction_bound(peaks, 0.05)) < 1e-6  # levels are over the bound already
+    peaks = np.array([[v for key, v in found.items() if key.unit == unit] for unit in population.unit_ids])
+    of_motions, student = peaks.mean(axis=0), {5: 2.015048, 2: 2.919986}
+    apart = [(of_motions[i] - of_motions[j]) ** 2 for i, j in ((0, 1), (0, 2), (1, 2))]
+    highest, wider = peaks.max(axis=1), (student[2] ** 2 - student[5] ** 2) * np.mean(apart)
+    over = prediction_bound(highest, 0.05) - highest.mean()
+    assert abs(highest.mean() + np.sqrt(over**2 + wider)) < 1e-5  # levels are over the bound already
     facts = monitor_facts(monitor)
     assert (facts["units"], facts["alarms"]) == (6, 0)
-    assert 0.75 * 48 < 3600 * facts["hours"] < 48
-    y, u = next(iter(records.values()))[:, :1], next(iter(records.values()))[:, 3:]
-    shaken = y + 3e-4 * np.sin(100 * y)
+    assert 0.75 * 54 < 3600 * facts["hours"] < 54
+    loudest = records[max(found, key=found.get)]
+    y, u = loudest[:, :1], loudest[:, 3:]
+    shaken = y + 1e-2 * np.sin(100 * y)  # three short motions differ so much that the bound is wide
     assert not (levels(own, y, u)[1] & SampleStatus.UNCERTIFIED).any()
     assert (levels(own, shaken, u)[1] & SampleStatus.UNCERTIFIED).any()
     assert fit_monitor(observer, replace(training, keys=training.keys[:4]), 0.05) is None
+
+
+@pytest.mark.parametrize(("units", "motions"), [(5, 3), (8, 4), (12, 3)])
+def test_few_motions_widen_the_bound_until_its_rate_holds(units, motions):
+    """Units and motions that are drawn, the motions for all units alike; a further unit has motions of its own."""
+    rng, rate, draws = np.random.default_rng(7), 0.05, 2000
+    own, shared = rng.normal(size=(draws, units + 1, 1)), 0.7 * rng.normal(size=(draws, 2, 1, motions))
+    peaks = own[:, :units] + shared[:, 0]
+    new = (own[:, units] + shared[:, 1, 0]).max(axis=1)
+    bounds = np.array([bound_of_peaks(one.tolist(), rate) for one in peaks])
+    assert np.mean(new > bounds) < rate
+    assert np.mean(new > prediction_bound(peaks.max(axis=2), rate)) > np.mean(new > bounds)
+    many = peaks[0].repeat(3, axis=1)
+    assert bound_of_peaks(many.tolist(), rate) == prediction_bound(many.max(axis=1), rate)
 
 
 def test_weights_are_those_of_the_steadiest_mean():

@@ -194,6 +194,14 @@ def octaves(count: int = 6, quality: float = 1.4) -> Array:
     return np.stack([alpha / (1 + alpha), -2 * np.cos(w) / (1 + alpha), (1 - alpha) / (1 + alpha)], axis=-1)
 
 
+def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
+    """Return the exact (Garwood) interval of the mean of a Poisson count."""
+    from scipy.stats import chi2
+
+    tail = (1 - level) / 2
+    return (float(chi2.ppf(tail, 2 * count) / 2) if count else 0.0), float(chi2.ppf(1 - tail, 2 * count + 2) / 2)
+
+
 def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:
     """Return which samples are judged, shape (n_samples, batch), as a running observer does it.
 

@@ -13,7 +13,7 @@ from ...core.errors import ConfigError
 from ...lifting.c_code import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
-from ...observer.monitor import LARGEST, QUIET, RECOVERY
+from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval
 from ...observer.samples import LONGEST
 from ...observer.screen import Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
@@ -228,6 +228,8 @@ class Source:
             "conditions": [_comment(c) for c in own.bounds],
             "products": [self.precision.literal(own.product(c)) for c in (None, *own.bounds)],
             "recovery": RECOVERY,
+            "rates": {"percent": f"{100 * own.false_alarm_rate:g}", "units": own.units, "alarms": own.alarms, "hours": f"{own.hours:.3g}"}
+            | {"interval": [f"{v / own.hours:.3g}" for v in poisson_interval(own.alarms)] if own.hours else None},
         }
 
     def start_in_motion(self) -> dict[str, Any] | None:

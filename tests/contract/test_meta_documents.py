@@ -173,6 +173,21 @@ def test_what_lacks_an_example_is_found() -> None:
     assert without_example(package) == ["bare"]
 
 
+def formulas_of(text: str) -> list[str]:
+    """Formulas in a document, in lines and between them."""
+    prose = re.sub(r"^```.*?^```$|`[^`]*`", "", text, flags=re.MULTILINE | re.DOTALL)
+    return [a or b for a, b in re.findall(r"\$\$(.+?)\$\$|\$([^$\n]+)\$", prose, flags=re.DOTALL)]
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_formulas_become_mathml(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the documentation's extension cannot convert would be missing in a browser."""
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    mathml = importlib.import_module("mathml")
+    for formula in formulas_of(path.read_text(encoding="utf-8")):
+        assert mathml.tex2mathml(mathml.TAG.sub("", formula)).startswith("<math")
+
+
 OLD_WORDS = re.compile(
     r"surroundings|\boutlying\b|\bladders?\b|bears? gaps|careful step|observer with a memory|models? with a memory", re.IGNORECASE
 )

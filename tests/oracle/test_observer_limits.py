@@ -14,8 +14,11 @@ from kros.observer import Observer, Runtime, conditioned, driven_coordinates, re
 from kros.observer.certificate.error import ReliftScales, error_system
 from kros.observer.certificate.report import course, frozen_response
 from kros.observer.limits import Limit, limits_of
+from kros.observer.predictor.choice import filled_in
 from kros.observer.predictor.limited import with_limits
+from kros.observer.predictor.moments import PastMoments
 from kros.synthesis import Injection
+from kros.synthesis.residual_shaped.shaping_filter import Basis
 
 BACK, LEAK, LIMIT = 0.1, 0.995, 0.4  # of the controller: share of the excess taken off its integrator, its leak, the current's limit
 
@@ -163,3 +166,28 @@ def test_what_limits_cut_off_is_a_residual_of_the_observer_without_them(predicto
     assert np.all(bound.ratios[:, 1] >= 1)
     assert np.all(bound.ratios[:, 1] <= 1.3)
     assert np.all(bound.cover >= bound.bounds.max(axis=0) * (1 - 1e-9))
+
+
+def test_what_a_limit_hides_is_filled_in_where_a_machine_forgets_it():
+    rng, n, units = np.random.default_rng(0), 4000, 3
+    u = np.repeat(rng.uniform(-1, 1, (n // 20, units)), 20, axis=0)
+    y, v, raw = np.zeros(u.shape), np.zeros(u.shape), np.zeros(u.shape)
+    for k in range(n - 1):  # a current that voltage drives at once, an amplifier that limits it, and nothing that remembers the limit
+        raw[k + 1] = 2.0 * u[k] - 0.5 * v[k - 1] * (k > 0)
+        v[k + 1] = 0.9 * v[k] + 0.1 * np.clip(raw[k], -1.0, 1.0)
+        y[k + 1] = y[k] + 0.05 * v[k]
+    states = np.stack([y, np.clip(raw, -1.0, 1.0) + 1e-3 * rng.normal(size=raw.shape) * (np.abs(raw) < 1.0)], axis=-1)
+    batch = EpisodeBatch(tuple(EpisodeKey(str(i), "c", "0") for i in range(units)), np.full(units, n), states, u[..., None], 1e-3)
+    assert 0.2 < np.mean(np.abs(raw) >= 1.0) < 0.6
+    cut = PastMoments.of(Lifting(("y", "current")), (0,), batch, Basis(6, ()))
+    whole, fill = filled_in(cut, batch, np.array([-np.inf, -1.0]), np.array([np.inf, 1.0]))
+    found = fill(batch).states
+    np.testing.assert_array_equal(found[..., 0], y)
+    within = np.abs(raw) < 0.9
+    np.testing.assert_array_equal(found[..., 1][within], states[..., 1][within])
+    z, rows, missed = cut.channels(batch), np.arange(300, n), []
+    for moments in (whole, cut):  # what a regression on the past misses of the current without its limit
+        said = [moments.states_at(z[:, i], rows) @ moments.regression()[0][0] for i in range(units)]
+        missed.append(np.sqrt(np.mean((np.stack(said, axis=1) - raw[rows]) ** 2)))
+    assert missed[0] < 0.03
+    assert missed[0] < 0.1 * missed[1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -21,7 +21,7 @@ from ...observer.certificate.error import error_system
 from ...observer.certificate.search import quick_gain
 from ...observer.limits import sides
 from ...observer.predictor.build import embedded_with
-from ...observer.predictor.choice import AT_LIMITS, Recipe, choose
+from ...observer.predictor.choice import AT_LIMITS, Recipe, at_limits, choose, filled_in
 from ...observer.predictor.limited import with_limits
 from ...observer.predictor.moments import limited
 from ...observer.predictor.start import with_start
@@ -31,7 +31,7 @@ from ...synthesis.residual_shaped.shaping_filter import Basis
 from ..certificates import DIVERGED, dropout_error_percent, scales_of
 from ..task import DesignResult, DesignTask
 from ..validation import TrainingSet, ValidationSet, hidden_mean
-from .tuned import tuned_where_better
+from .tuned import held_out, tuned_where_better
 
 _PARTS = ((25.0,), (60.0, 12.0), (60.0, 12.0, 2.4))  # of an episode: sets of time constants of slow lags
 _TUNED = 6000  # samples
@@ -41,9 +41,9 @@ log = logging.getLogger(__name__)
 _SAMPLES, _EPISODES = 6000, 12  # that an observer is conditioned on, at most
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.1)  # of the gain that is best, until a certificate covers it
 _CLOSE, _SHARE = 0.01, 0.001  # share of a limit that counts as at it, and how much of an episode has to be
-_NEAR = 0.03  # share of a limit that may have touched it, noise taken off
 _TINY = np.finfo(float).tiny
 _AS_GOOD = 1.01  # ratio of errors that is no reason to do without a start in motion
+Settle = Callable[[ValidationSet, Observer], Observer]
 _CIRCLE = {"sin": "cos", "cos": "sin"}
 
 
@@ -85,12 +85,15 @@ def design_predictor(task: DesignTask) -> DesignResult:
     began, effort = time.perf_counter(), EFFORTS[task.predictor.effort]
     try:
         data, settle = recordings(task, effort).read_whole(), partial(settled, task, reaching(task))
-        plan = Plan.of(task, effort, data.on_time.batch)
-        start, facts = plan.observer(task, data), dict[str, Any]()
-        if steps := effort.steps if task.predictor.steps is None else task.predictor.steps:
-            kept, facts = tuned_where_better(task, data, start, lambda seen, _: plan.observer(task, seen, steps), settle, plan.score)
-        else:
-            kept = settle(data.part(firsts(data.batch)), start)
+        batch, steps = data.on_time.batch, effort.steps if task.predictor.steps is None else task.predictor.steps
+        plans = [Plan.of(task, effort, batch)]
+        if (before_limits(task, batch) < batch.lengths).any():
+            plans.append(Plan.of(task, effort, batch, whole=True))
+        found, best = [plan.made(task, data, settle, steps) for plan in plans], 0
+        if len(plans) > 1:
+            unseen = data.part(np.flatnonzero(held_out(batch.keys)).tolist())
+            best = int(np.argmin(plans[0].score(unseen, [kept for kept, _ in found])))
+        plan, (kept, facts) = plans[best], found[best]
     except (KrosError, np.linalg.LinAlgError) as error:
         raise SynthesisError(str(error)) from error
     percent = float(hidden_mean(task.training.read().percent(kept), kept.measured))
@@ -115,37 +118,53 @@ def recordings(task: DesignTask, effort: Effort) -> TrainingSet:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a predictor is made by: moments of the recordings, the recipe that units which were left out have chosen, and what counts how much."""
+    """What a predictor is made by.
+
+    Moments of the recordings, the recipe that units which were left out have chosen, what counts how much, and what fills in what limits hide.
+    """
 
     past: PastMoments
     recipe: Recipe
     importance: list[float]
     emphasis: dict[str, tuple[float, ...]]
+    fill: Callable[[EpisodeBatch], EpisodeBatch] | None = None
 
     @classmethod
-    def of(cls, task: DesignTask, effort: Effort, batch: EpisodeBatch) -> Plan:
-        """Choose it."""
+    def of(cls, task: DesignTask, effort: Effort, batch: EpisodeBatch, *, whole: bool = False) -> Plan:
+        """Choose it, from recordings until machines come to a limit or from whole ones."""
         models, asked, shortest = task.models, task.predictor, int(batch.lengths.min())
         first = task.training.keys[0].condition
         others = sorted({key.condition for key in batch.keys} - {first})
         delays = tuple(d for d in effort.delays if 8 * d <= shortest) or (max(2, min(effort.delays[0], shortest // 8)),)
         lags = tuple(tuple(1 - part / max(shortest, 2 * part) for part in parts) for parts in _PARTS)
         every = Basis(delays[-1], tuple(dict.fromkeys(pole for poles in lags for pole in poles)))
-        importance, until = importance_of(task), before_limits(task, batch)
+        importance, until, fill = importance_of(task), None if whole else before_limits(task, batch), None
         past = PastMoments.of(on_the_circle(models.lifting), models.measured, batch, every, until)
+        if whole:
+            past, fill = filled_in(past, batch, *sides(task.limits, models.lifting.states[: batch.states.shape[-1]]))
+            batch = fill(batch)
         internal = effort.internal if asked.states is None else (asked.states,)
         counts = {first: 1.0, **dict.fromkeys(others, asked.others)}
         free = np.array([name not in task.limits for i, name in enumerate(models.lifting.states) if i not in models.measured])
-        at_limits = {limited(c): AT_LIMITS * count * free for c, count in counts.items() if limited(c) in past.conditions}
+        beyond = {limited(c): AT_LIMITS * count * free for c, count in counts.items() if limited(c) in past.conditions}
         rows = firsts(batch)
-        recipe = choose(past, batch.take(rows), {**counts, **at_limits}, importance, delays, lags, internal, until[rows])
+        recipe = choose(
+            past, batch.take(rows), {**counts, **beyond}, importance, delays, lags, internal, None if until is None else until[rows]
+        )
         tuned = {c: tuple(count if share > 0 else 0.0 for share in recipe.weights[c]) for c, count in counts.items()}
-        return cls(past.restricted(recipe.basis), recipe, importance, tuned)
+        return cls(past.restricted(recipe.basis), recipe, importance, tuned, fill)
+
+    def made(self, task: DesignTask, data: ValidationSet, settle: Settle, steps: int) -> tuple[Observer, dict[str, Any]]:
+        """Return the observer as it is deployed, tuned where that is better, with what the records say of that."""
+        start = self.observer(task, data)
+        if steps:
+            return tuned_where_better(task, data, start, lambda seen, _: self.observer(task, seen, steps), settle, self.score)
+        return settle(data.part(firsts(data.batch)), start), {}
 
     def observer(self, task: DesignTask, data: ValidationSet, steps: int = 0) -> Observer:
         """Return the observer, tuned by some steps on recordings, that of the moments without any."""
         batch, model, asked, models = data.on_time.batch, self.recipe.model(self.past, self.importance), task.predictor, task.models
-        few = some(batch, asked.episodes if steps else 1)
+        few = some(batch if self.fill is None else self.fill(batch), asked.episodes if steps else 1)
         if steps:
             slowest, recipe = max(self.recipe.basis.poles), self.recipe
             model, _ = tune_predictor(model, self.past, few, self.importance, recipe.deviation, slowest, steps, weights=self.emphasis)
@@ -222,8 +241,7 @@ def some(batch: EpisodeBatch, count: int) -> EpisodeBatch:
 def before_limits(task: DesignTask, batch: EpisodeBatch) -> npt.NDArray[np.int64]:
     """Return how many samples of every episode there are before a state comes to a limit, shape (batch,)."""
     lower, upper = sides(task.limits, task.models.lifting.states[: batch.states.shape[-1]])
-    lower, upper = lower * (1 + _NEAR * np.sign(lower)), upper * (1 - _NEAR * np.sign(upper))
-    met = np.any((batch.states <= lower) | (batch.states >= upper), axis=-1)
+    met = np.any(at_limits(batch.states, lower, upper), axis=(0, -1))
     return np.where(met.any(axis=0), np.minimum(met.argmax(axis=0), batch.lengths), batch.lengths)
 
 

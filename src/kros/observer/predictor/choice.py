@@ -2,12 +2,17 @@
 
 What is regressed on the whole basis costs no run: the moments of the units that are left out say what it misses there. So the lags, the delays, the
 weight of every condition for every hidden state, and the deviation of lifted functions are compared with all of the past; orders then with models that run.
+
+What recordings say of machines that come to a limit of a hidden state depends on these. Where a controller winds up, what it does later says little of what
+it does within: such recordings count until the limit is met (`until`). A machine without one forgets its limit, and all of its recordings count
+(`filled_in`): an estimate that will be cut off is right at the limit however far beyond it is, so that what the limit hides is what the regression says of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -19,10 +24,13 @@ from ..tuning.blocks import Array, Model
 from .free_start import FreeStart, in_motion
 from .moments import PastMoments, hidden_of, limited
 
+Flags = npt.NDArray[np.bool_]
 FOLDS = 3
 SHARES = (0.0, 0.3, 1.0)  # of the other conditions in training
 DEVIATIONS = (0.0, 0.2, 0.4)
 AS_GOOD = 0.003  # difference of logarithms that is worth no longer memory, and no more states
+NEAR = 0.03  # share of a limit that may have touched it, noise taken off
+_FILLED = 2  # times that what limits hide is filled in
 AT_LIMITS = 0.25  # weight of what machines do after they have come to a limit, beside what they do before
 
 
@@ -53,6 +61,38 @@ class Recipe:
         """Return the model that the moments of all units give."""
         order = past.power.shape[1] + self.internal
         return past.restricted(self.basis).model(order, (), importance, self.deviation, self.weights)
+
+
+def filled(past: PastMoments, W: Array, lower: Array, upper: Array, batch: EpisodeBatch) -> EpisodeBatch:
+    """Return recordings with hidden states beyond their limits, shape (n_states,), where they are at them and a regression on the past says so."""
+    hidden, z, states = hidden_of(past.lifting, past.measured), past.channels(batch), batch.states.copy()
+    low, high = at_limits(batch.states, lower, upper)
+    for i in range(len(batch.keys)):
+        rows = np.flatnonzero((low | high)[:, i][:, hidden].any(axis=1))
+        said, own = past.states_at(z[:, i], rows) @ W.T, states[rows, i][:, hidden]
+        own = np.where(high[rows, i][:, hidden], np.maximum(own, said), own)
+        states[rows[:, None], i, hidden] = np.where(low[rows, i][:, hidden], np.minimum(own, said), own)
+    return replace(batch, states=states)
+
+
+def at_limits(states: Array, lower: Array, upper: Array) -> tuple[Flags, Flags]:
+    """Return which states are at their lower limits, and which at the upper ones."""
+    return states <= lower * (1 + NEAR * np.sign(lower)), states >= upper * (1 - NEAR * np.sign(upper))
+
+
+def filled_in(
+    past: PastMoments, batch: EpisodeBatch, lower: Array, upper: Array
+) -> tuple[PastMoments, Callable[[EpisodeBatch], EpisodeBatch]]:
+    """Return the moments of whole recordings in which what limits hide is filled in, and what does so: censored regression by its EM iteration.
+
+    It begins without the samples at limits. `past` says of what and how much of the past.
+    """
+    of = partial(PastMoments.of, past.lifting, past.measured, basis=past.basis)
+    whole = of(batch, without=np.any(at_limits(batch.states, lower, upper), axis=(0, -1)))
+    for _ in range(_FILLED):
+        fill = partial(filled, whole, whole.regression()[0], lower, upper)
+        whole = of(fill(batch))
+    return whole, fill
 
 
 def choose(
@@ -90,7 +130,7 @@ def choose(
     share = np.broadcast_to(np.asarray(importance, dtype=float), past.power.shape[1:])
     share = share / share.sum()
     first = next(iter(stressed))
-    at_limits = {limited(c) for c in stressed}
+    beyond = {limited(c) for c in stressed}
     others = [c for c in stressed if c not in (first, limited(first))]
     delays, lags = delays or (past.basis.delays,), lags or (past.basis.poles,)
     shares = SHARES if others else (0.0,)
@@ -98,8 +138,7 @@ def choose(
     def weights(of_states: npt.ArrayLike) -> dict[str, tuple[float, ...]]:
         own = {c: of_states if c in others else 1.0 for c in stressed}
         return {
-            c: tuple(map(float, np.where(counts > 0, own[c], 0.0) * (AT_LIMITS if c in at_limits else 1.0)))
-            for c, counts in stressed.items()
+            c: tuple(map(float, np.where(counts > 0, own[c], 0.0) * (AT_LIMITS if c in beyond else 1.0))) for c, counts in stressed.items()
         }
 
     def judged(basis: Basis, of_states: npt.ArrayLike, deviation: float) -> Array:

@@ -102,6 +102,7 @@ class PastMoments:
         batch: EpisodeBatch,
         basis: Basis | None = None,
         until: npt.ArrayLike | None = None,
+        without: npt.NDArray[np.bool_] | None = None,
     ) -> PastMoments:
         """Collect moments of recordings.
 
@@ -116,6 +117,8 @@ class PastMoments:
             integrate.
         until : array_like of int, shape (batch,), optional
             Samples of every episode before its machine comes to a limit; those behind are rows of their own, of the condition `limited`.
+        without : ndarray of bool, shape (n_samples, batch), optional
+            Samples that do not count.
 
         Raises
         ------
@@ -154,12 +157,13 @@ class PastMoments:
         counts = np.zeros(len(names))
         for i, name, start, end in pieces:
             rows, k = np.arange(start, end, THIN), names.index(name)
+            rows = rows if without is None else rows[~without[rows, i]]
             s, truth = _basis_states(basis, z[:, i], rows, len(measured)), states[rows, i][:, hidden]
             gram[k] += s.T @ s
             cross[k] += s.T @ truth
             power[k] += np.sum(truth**2, axis=0)
             counts[k] += len(rows)
-        each, (units, conditions) = counts[:, None], zip(*names, strict=True)
+        each, (units, conditions) = np.maximum(counts, 1)[:, None], zip(*names, strict=True)
         moments = gram / each[:, None], cross / each[:, None], power / each
         return cls(lifting, tuple(measured), basis, static, free, tuple(units), *moments, tuple(conditions))
 
@@ -281,6 +285,10 @@ class PastMoments:
     def channels(self, batch: EpisodeBatch) -> Array:
         """Return the channels z along recordings, shape (n_samples, batch, channels)."""
         return _channels(self.lifting, self.measured, self.static, self.free, batch)
+
+    def states_at(self, z: Array, rows: npt.NDArray[np.intp]) -> Array:
+        """Return the basis's states of one episode's channels, shape (n_samples, channels), at some samples: (rows, N)."""
+        return _basis_states(self.basis, z, rows, len(self.measured))
 
     def _channel_sizes(self, P: Array) -> Array:
         """Size of the channel that every state of the basis is of: what is negligible must not depend on units of measure."""

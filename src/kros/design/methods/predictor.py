@@ -86,14 +86,13 @@ def design_predictor(task: DesignTask) -> DesignResult:
     try:
         data, settle = recordings(task, effort).read_whole(), partial(settled, task, reaching(task))
         batch, steps = data.on_time.batch, effort.steps if task.predictor.steps is None else task.predictor.steps
-        plans = [Plan.of(task, effort, batch)]
+        plan = Plan.of(task, effort, batch)
+        kept, facts = plan.made(task, data, settle, steps)
         if (before_limits(task, batch) < batch.lengths).any():
-            plans.append(Plan.of(task, effort, batch, whole=True))
-        found, best = [plan.made(task, data, settle, steps) for plan in plans], 0
-        if len(plans) > 1:
-            unseen = data.part(np.flatnonzero(held_out(batch.keys)).tolist())
-            best = int(np.argmin(plans[0].score(unseen, [kept for kept, _ in found])))
-        plan, (kept, facts) = plans[best], found[best]
+            other = Plan.of(task, effort, batch, whole=True)
+            forgets = other.made(task, data, settle, steps)
+            if no_worse(data.part(np.flatnonzero(held_out(batch.keys)).tolist()), forgets[0], kept):
+                plan, (kept, facts) = other, forgets
     except (KrosError, np.linalg.LinAlgError) as error:
         raise SynthesisError(str(error)) from error
     percent = float(hidden_mean(task.training.read().percent(kept), kept.measured))
@@ -106,6 +105,17 @@ def design_predictor(task: DesignTask) -> DesignResult:
     nominal = {name: float(values[task.models.index(task.unit)]) for name, values in task.models.parameters.items()}
     observer = replace(kept, parameters=nominal, seen=task.training.seen)
     return DesignResult(task.name, observer, synthesis, {**plan.facts(task), **facts}, task.problem, UNCOVERED)
+
+
+def no_worse(unseen: ValidationSet, one: Observer, other: Observer) -> bool:
+    """Whether an observer misses no more than another of any hidden state in any condition."""
+    conditions = [key.condition for key in unseen.batch.keys]
+    for condition in dict.fromkeys(conditions):
+        part = unseen.part([i for i, c in enumerate(conditions) if c == condition])
+        ours, theirs = (np.delete(part.percent(o), list(o.measured)) for o in (one, other))
+        if not np.all(ours <= _AS_GOOD * theirs):
+            return False
+    return True
 
 
 def recordings(task: DesignTask, effort: Effort) -> TrainingSet:

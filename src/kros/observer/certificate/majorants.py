@@ -117,14 +117,14 @@ def _some(rows: Array) -> Array:
 
 def _least_above(rows: Array) -> Array:
     """Return the shape of the matrix of least trace above the squares of rows, (b, s, p, m); shape (b, p, m, m), to be scaled."""
-    b, s, p, m = rows.shape
-    mu = np.full((b, s, p), 1 / s)
-    ridge = _RIDGE * np.sum(np.abs(rows) ** 2, axis=(1, 3)) + _TINY
+    rows = np.ascontiguousarray(np.swapaxes(rows, 1, 2))  # (b, p, s, m)
+    columns, count, m = adjoint(rows), *rows.shape[2:]
+    mu = np.full(rows.shape[:3], 1 / count)
+    ridge = (_RIDGE * np.sum(np.abs(rows) ** 2, axis=(2, 3)) + _TINY)[..., None, None] * np.eye(m)
     for _ in range(_ITERATIONS):
-        total = np.einsum("bsp,bspi,bspj->bpij", mu, rows.conj(), rows, optimize=True) + ridge[..., None, None] * np.eye(m)
-        values, vectors = np.linalg.eigh(total)
-        along = np.einsum("bspi,bpij->bspj", rows, vectors, optimize=True)
-        height = np.sum(np.abs(along) ** 2 / np.sqrt(values)[:, None], axis=-1)
+        values, vectors = np.linalg.eigh((columns * mu[..., None, :]) @ rows + ridge)
+        along = rows @ vectors
+        height = ((along.real**2 + along.imag**2) @ (1 / np.sqrt(values))[..., None])[..., 0]
         mu = mu * height
-        mu = mu / np.maximum(mu.sum(axis=1, keepdims=True), _TINY)
+        mu = mu / np.maximum(mu.sum(axis=-1, keepdims=True), _TINY)
     return np.asarray((vectors * np.sqrt(values)[..., None, :]) @ adjoint(vectors))

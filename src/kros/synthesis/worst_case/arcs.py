@@ -56,14 +56,16 @@ class Enclosure:
         return self._enclosed(theta, half, np.abs)
 
     def _enclosed(self, theta: Array, half: Array, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
-        response = self.system.frequency_response(theta / (2 * np.pi * self.system.dt))
-        size, n = measure(response), self.system.n_states
+        n = self.system.n_states
+        R = np.linalg.inv(np.expm1(1j * theta)[:, None, None] * np.eye(n) - self._A)
+        CR, RB = self._C @ R, R @ self._B
+        response = CR @ self._B + self.system.D
+        size = measure(response)
         if not n:
             return response, _ROUNDING * size
         shape = (-1, *[1] * (size.ndim - 1))
-        R = np.linalg.inv(np.expm1(1j * theta)[:, None, None] * np.eye(n) - self._A)
-        size_R = np.sqrt(np.linalg.norm(R, 1, axis=(-2, -1)) * np.linalg.norm(R, np.inf, axis=(-2, -1)))
-        CR, RB = self._C @ R, R @ self._B
+        moduli = np.abs(R)
+        size_R = np.sqrt(moduli.sum(axis=-1).max(axis=-1) * moduli.sum(axis=-2).max(axis=-1))
         twice, reach = np.linalg.norm(CR @ R, axis=-1), half * size_R
         # Over the rows' entries: either their norm, or those of single columns.
         reached = np.linalg.norm(RB, axis=(-2, -1))[:, None] if size.ndim == 2 else np.linalg.norm(RB, axis=-2)[:, None]

@@ -102,6 +102,8 @@ def bound_of_peaks(peaks: Sequence[Sequence[float]], rate: float) -> float:
     ----------
     peaks : sequence of sequence of float
         Highest levels in the episodes of every unit, in the order of their motions, dB.
+    rate : float
+        Share of good units that may exceed the bound.
     """
     from scipy.special import stdtrit
 

@@ -195,12 +195,13 @@ def episode_moments(z: Array, truth: Array, taps: int) -> tuple[Array, Array, Ar
     (n_samples, c), h, behind = z.shape, truth.shape[1], taps - 1
     step = np.zeros((c, behind + n_samples))
     step[:, behind + 1 :] = (z[:-1] - z[1:]).T
-    lagged = np.lib.stride_tricks.sliding_window_view(step, n_samples, axis=1)[:, :behind][:, ::-1]  # (c, lag, sample)
+    lagged = [step[:, behind - j : behind - j + n_samples].T for j in range(1, taps)]
     latest = np.concatenate([z[:1], z[:-1]])
-    signals = np.concatenate([np.ones((1, n_samples)), latest.T, truth.T, *lagged[:, :1].swapaxes(0, 1)])
+    signals = np.concatenate([np.ones((n_samples, 1)), latest, truth, *lagged[:1]], axis=1).T.copy()
     known, state, own = slice(1 + c), slice(1 + c, 1 + c + h), slice(1 + c + h, None)
     level = signals[known] @ signals[: 1 + c + h].T
-    product = (signals @ lagged.reshape(-1, n_samples).T).reshape(len(signals), c, behind).transpose(2, 0, 1)
+    product = np.stack([signals @ d for d in lagged]) if lagged else np.zeros((0, len(signals), c))
+
     ends = step[:, n_samples - 1 : n_samples + behind - 1].T[::-1]  # what leaves the sum with every further lag
     between = np.zeros((behind, behind, c, c))
     between[:1] = product[None, :, own]

@@ -395,8 +395,9 @@ def _channels(lifting: Lifting, measured: tuple[int, ...], static: Array, free: 
 def _basis_states(basis: Basis, z: Array, rows: npt.NDArray[np.intp], slow: int) -> Array:
     """States s of one episode at some samples: delays of all channels, then lags of the first few, shape (rows, N)."""
     delayed = [z[np.maximum(rows - j, 0)] for j in range(1, basis.delays + 1)]
-    errors = z[:, :slow].T  # what came before is taken to have been constant, as for delays
-    lags = [np.sqrt(1 - p**2) * filtered(errors, errors[:, 0], -p, 0.0)[0].T[rows] for p in basis.poles]
+    first = z[:1, :slow]  # what came before is taken to have been constant, as for delays
+    none, moved = np.zeros(slow), (z[:, :slow] - first).T
+    lags = [filtered(np.sqrt(1 - p**2) * moved, none, -p, 0.0)[0].T[rows] + np.sqrt(1 - p**2) / (1 - p) * first for p in basis.poles]
     return np.concatenate([*delayed, *lags], axis=1)
 
 

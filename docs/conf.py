@@ -4,14 +4,14 @@ import sys
 from importlib.metadata import version as installed
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))  # keys.py, mathml.py
+sys.path.insert(0, str(Path(__file__).parent))  # keys.py, mathml.py, objects.py
 
 project = "kros"
 author = "The kros developers"
 copyright = "2026, The kros developers"
 release = version = installed("kros")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "keys", "mathml"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "keys", "mathml", "objects"]
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
@@ -19,6 +19,8 @@ exclude_patterns = ["_build"]
 
 html_theme = "furo"
 html_title = f"kros {release}"
+html_static_path = ["_static"]
+html_css_files = ["kros.css"]
 
 # Docstrings: numpydoc, single backticks for code, annotations said once, in the list of parameters.
 default_role = "literal"
@@ -28,7 +30,10 @@ napoleon_use_rtype = False
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 autodoc_class_signature = "separated"
-autodoc_default_options = {"members": True}
+autodoc_default_options = {
+    "members": True,
+    "exclude-members": "set_fit_request, set_score_request",
+}  # of scikit-learn, without docstrings of ours
 
 # The one-line docstring of a property may begin "Gain: ..."; what has a space in it is no class.
 nitpick_ignore_regex = [("py:class", ".* .*")]

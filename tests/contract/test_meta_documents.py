@@ -150,6 +150,32 @@ def test_the_page_of_keys_is_filled(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(f"### `{step}`\n" in page for step in kros.data.steps.parsing.STEPS)
 
 
+def pages_of_objects(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The extension that writes a page for every public object."""
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    return importlib.import_module("objects")
+
+
+def test_every_public_object_has_a_page_and_a_row(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    objects = pages_of_objects(monkeypatch)
+    public = {f"{p.__name__}.{name}": getattr(p, name) for p in packages() for name in p.__all__}
+    expected = {name for name, found in public.items() if not isinstance(found, ModuleType)}
+    assert len(expected) > 200
+    (tmp_path / "kros.core.gone.rst").touch()
+    objects.write(tmp_path)
+    assert {path.stem for path in tmp_path.iterdir()} == expected | {package.__name__ for package in packages()}
+    rows = re.findall(r"^\| \{py:obj\}`~(\S+)` \| (.+) \|$", objects.tables(), flags=re.MULTILINE)
+    assert {name for name, _ in rows} == expected
+    assert [name for name, says in rows if not says.endswith(".") or not 10 < len(says) < 150] == []
+
+
+def test_the_page_of_a_function_is_not_that_of_a_module_of_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    objects = pages_of_objects(monkeypatch)
+    assert ".. autofunction:: prepare\n" in objects.object_page("kros.data.prepare")
+    assert ".. autoexception:: DataError\n" in objects.object_page("kros.core.DataError")
+    assert "| {py:obj}`~kros.data.prepare` | Declare preparation steps" in objects.tables()
+
+
 def packages() -> Iterator[ModuleType]:
     """Public packages of kros that list names."""
     public = (m.name for m in pkgutil.walk_packages(kros.__path__, "kros.") if m.ispkg and m.name.split(".")[1] in kros.__all__)

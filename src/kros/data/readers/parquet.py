@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ...core import limits
 from ...core.artifacts import load_artifact
@@ -16,6 +17,7 @@ from ...core.errors import DataError
 from ...core.files import require_regular, shortened
 from ..arrow import fill
 from ..checks import check_period
+from ..kept import Kept
 from ..population import Channel, EpisodeKey, Population, Role, TrueChannel, Unit
 from ..prepare import assemble
 from ..recording import Recording, Recordings
@@ -24,6 +26,7 @@ from ..tables import build
 
 INDEX = "population"  # kind of the artifact, hence population.json
 KEYS = ("unit", "condition", "episode")
+_KEPT = Kept(limit=2**28)  # the demo's recordings fit, those of a factory do not have to
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +41,14 @@ class ParquetRecordings(Recordings):
         name, group, samples = place
         path = Path(self.folder) / name
         require_regular(path, sys.maxsize)
+        file = path.stat()
+        version = (file.st_ino, file.st_size, file.st_mtime_ns)  # a file written anew is read anew
+        return Recording(
+            key, _KEPT.take((str(path), version, group, samples, key, self.columns), lambda: self._values(key, path, group, samples))
+        )
+
+    def _values(self, key: EpisodeKey, path: Path, group: int, samples: int) -> npt.NDArray[np.float64]:
+        """Return the samples of an episode from its file."""
         try:
             table = _read_group(path, group, samples, [*KEYS, *self.columns])
             values = np.empty((table.num_rows, len(self.columns)))
@@ -50,7 +61,7 @@ class ParquetRecordings(Recordings):
             raise
         except (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError, MemoryError) as error:  # and Arrow's own
             raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; convert the recordings again.") from error
-        return Recording(key, values)
+        return values
 
 
 def _read_group(path: Path, group: int, samples: int, columns: list[str]) -> Any:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 T = TypeVar("T")
+Usable = Callable[[Any, Any], bool]  # of a task and its result
 
 
 class Executor(Protocol):
@@ -51,12 +52,30 @@ class Silent:
         """Ignore."""
 
 
+class Recalls(Protocol):
+    """Knows results of earlier maps."""
+
+    def recall(
+        self,
+        work: Work,
+        title: str,
+        function: Callable[[Any], T],
+        tasks: Sequence[Any],
+        marks: Sequence[str | None],
+        kinds: Iterable[type] = (),
+        usable: Usable | None = None,
+    ) -> Iterator[T]:
+        """Yield results in the order of the tasks."""
+        ...
+
+
 @dataclass(frozen=True)
 class Work:
-    """An executor and a progress listener; by default everything runs here, in silence."""
+    """An executor, a progress listener and what is known from earlier; by default everything runs here, in silence, and nothing is known."""
 
     executor: Executor = field(default_factory=SerialExecutor)
     progress: Progress = field(default_factory=Silent)
+    seen: Recalls | None = None
 
     def map(self, title: str, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
         """Map a function over tasks, in order."""
@@ -65,6 +84,34 @@ class Work:
         for result in self.executor.map(function, tasks):
             self.progress.advance()
             yield result
+
+    def recall(
+        self,
+        title: str,
+        function: Callable[[Any], T],
+        tasks: Iterable[Any],
+        marks: Iterable[str | None],
+        kinds: Iterable[type] = (),
+        usable: Usable | None = None,
+    ) -> Iterator[T]:
+        """Map a function over tasks, in order, without those whose results are known from earlier.
+
+        Parameters
+        ----------
+        title : str
+            Of the map; two different ones must not share a title.
+        function : callable
+        tasks : iterable
+        marks : iterable of str or None
+            Digest of everything that the result of each task follows from; None where that cannot be told, and the task is computed.
+        kinds : iterable of type
+            Dataclasses that results are made of, beside arrays and plain types.
+        usable : callable, optional
+            Told a task and its known result; False where that does not do.
+        """
+        if self.seen is None:
+            return self.map(title, function, tasks)
+        return self.seen.recall(self, title, function, list(tasks), list(marks), kinds, usable)
 
     def run(self, title: str, work: Iterable[Callable[[], T]]) -> list[T]:
         """Run independent pieces of work, in order."""

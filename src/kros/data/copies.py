@@ -26,7 +26,7 @@ _LOOKED_AT = 8 * KEPT  # smallest hashes among which those of moving machines ar
 _PRIME, _MIX = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Print:
     """What one episode is recognised by.
 
@@ -34,12 +34,12 @@ class Print:
     ----------
     digest : bytes
         Of all samples.
-    hashes : tuple of int
+    hashes : ndarray, shape (at most KEPT,)
         The smallest hashes of its stretches.
     """
 
     digest: bytes
-    hashes: tuple[int, ...]
+    hashes: npt.NDArray[np.uint64]
 
 
 def print_of(values: npt.NDArray[np.float64], channels: Sequence[Channel]) -> Print:
@@ -55,28 +55,40 @@ def print_of(values: npt.NDArray[np.float64], channels: Sequence[Channel]) -> Pr
     digest = sha256(repr(values.shape).encode() + values.tobytes()).digest()
     states = [i for i, c in enumerate(channels) if c.role is Role.STATE]
     if len(values) <= STRETCH:
-        return Print(digest, ())
+        return Print(digest, np.zeros(0, np.uint64))
     hashes = _stretches(values)
     smallest = np.argpartition(hashes, min(_LOOKED_AT, len(hashes)) - 1)[:_LOOKED_AT]
     stretches = values[smallest[:, None] + np.arange(STRETCH)][..., states]
     moving = (np.diff(stretches, axis=1) != 0).sum(axis=1).min(axis=1) >= STRETCH // 2
-    return Print(digest, tuple(np.unique(hashes[smallest[moving]])[:KEPT].tolist()))
+    return Print(digest, np.unique(hashes[smallest[moving]])[:KEPT])
 
 
 def copies_among(prints: Iterable[tuple[EpisodeKey, Print]]) -> Iterator[tuple[EpisodeKey, EpisodeKey, float]]:
     """Yield the episodes that are copies of earlier ones with these, and the share of samples that both have: 1 for a whole copy."""
+    prints = list(prints)
     whole: dict[bytes, EpisodeKey] = {}
     holders: dict[int, EpisodeKey] = {}
-    for key, found in prints:
+    for (key, found), repeated in zip(prints, _repeated([found.hashes for _, found in prints]), strict=True):
         if found.digest in whole:
             yield key, whole[found.digest], 1.0
             continue
-        common = Counter(holders[h] for h in found.hashes if h in holders).most_common(1)
+        common = Counter(holders[h] for h in repeated if h in holders).most_common(1)
         if common and common[0][1] >= SHARED * KEPT:
             yield key, common[0][0], min(common[0][1] / len(found.hashes), 0.99)
         whole[found.digest] = key
-        for h in found.hashes:
+        for h in repeated:
             holders.setdefault(h, key)
+
+
+def _repeated(hashes: Sequence[npt.NDArray[np.uint64]]) -> list[list[int]]:
+    """Return of every episode's hashes those that another one has too: no others can be shared, and there are few."""
+    if not hashes:
+        return []
+    flat = np.concatenate(hashes)
+    _, place, count = np.unique(flat, return_inverse=True, return_counts=True)
+    often = count[place] > 1
+    ends = np.cumsum([len(own) for own in hashes])[:-1]
+    return [own[some].tolist() for own, some in zip(hashes, np.split(often, ends), strict=True)]
 
 
 def refuse_copies(prints: Iterable[tuple[EpisodeKey, Print]]) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -59,6 +60,10 @@ class Recordings:
         if key not in self.places:
             raise DataError(f"Asked for {key}; this source has {len(self.places)} other episodes; take keys from population.episodes.")
         return self.read(key, self.places[key])
+
+    def file(self, place: Any) -> Path | None:
+        """Return the one file that an episode is in; None where it is in none, or cannot be told."""
+        return None
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> Self:
         """Return the same for fewer episodes, cheaper to send to another process."""

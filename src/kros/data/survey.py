@@ -8,6 +8,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,15 @@ import numpy.typing as npt
 from ..core.artifacts import load_artifact
 from ..core.errors import DataError
 from ..core.loading import loader
+from ..core.records import is_file
 from ..core.work import Work
 from .alerts import period_alerts
 from .checks import check_population, scan_prints
 from .copies import Print, refuse_copies
-from .flat_tops import Ends, FoundLimit, ends_of, found_limit
+from .flat_tops import Ends, FlatTops, FoundLimit, ends_of, found_limit
+from .marks import recording_marks
 from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
+from .writers.folders import same_file
 from .writers.parquet import GroupRecord, write_group, write_index
 
 log = logging.getLogger(__name__)
@@ -49,6 +54,8 @@ class RecordingFacts:
         Limits that states which are not measured were seen at.
     reserve : tuple of str
         Units that were recorded and take part in nothing: none of the above speaks of them but `dropped` and `alerts`.
+    digests : mapping of EpisodeKey to str
+        Of all samples of every training and test episode, by which results of earlier runs are known again.
     """
 
     identify_on: str
@@ -60,20 +67,39 @@ class RecordingFacts:
     alerts: tuple[str, ...] = ()
     reserve: tuple[str, ...] = ()
     limits: Mapping[str, FoundLimit] = field(default_factory=dict)
+    digests: Mapping[EpisodeKey, str] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def pooled(self) -> tuple[str, ...]:
         """Units that take part in pooled results."""
         return tuple(u for u, group in self.groups.items() if group != OUTLIERS)
 
     def keys(self, part: str, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
         """Return the episodes of a part, ``train`` or ``test``, of a unit, a condition or both."""
-        return tuple(k for k in getattr(self, part) if unit in (None, k.unit) and condition in (None, k.condition))
+        own: tuple[EpisodeKey, ...] = getattr(self, part) if unit is None else self._by_unit[part].get(unit, ())
+        return own if condition is None else tuple(k for k in own if k.condition == condition)
+
+    @cached_property
+    def _by_unit(self) -> dict[str, dict[str, tuple[EpisodeKey, ...]]]:
+        """Episodes of every part and unit: asking for one unit does not walk through those of all."""
+        found: dict[str, dict[str, list[EpisodeKey]]] = {"train": {}, "test": {}}
+        for part, units in found.items():
+            for key in getattr(self, part):
+                units.setdefault(key.unit, []).append(key)
+        return {part: {unit: tuple(keys) for unit, keys in units.items()} for part, units in found.items()}
+
+    def marks(self, keys: Iterable[EpisodeKey]) -> tuple[str, ...] | None:
+        """Return what some episodes are known again by; None where it is not known of one of them."""
+        found = tuple(self.digests.get(key) for key in keys)
+        return None if None in found else tuple(str(digest) for digest in found)
 
     def content(self) -> dict[str, Any]:
         """Return the facts in JSON's types."""
         rows = {part: [[k.unit, k.condition, k.episode] for k in getattr(self, part)] for part in ("train", "test")}
-        return asdict(self) | rows
+        names = ("identify_on", "groups", "resolution", "dropped", "alerts", "reserve")
+        limits = {name: asdict(limit) for name, limit in self.limits.items()}
+        digests = {part: [self.digests.get(k) for k in getattr(self, part)] for part in rows} if self.digests else {}
+        return {name: getattr(self, name) for name in names} | rows | {"limits": limits} | ({"digests": digests} if digests else {})
 
     @classmethod
     @loader
@@ -83,7 +109,9 @@ class RecordingFacts:
         train, test = (tuple(EpisodeKey(*row) for row in content[part]) for part in ("train", "test"))
         texts = {name: tuple(content.get(name, ())) for name in ("dropped", "alerts", "reserve")}
         limits = {name: FoundLimit(**{**own, "units": tuple(own["units"])}) for name, own in content.get("limits", {}).items()}
-        return cls(content["identify_on"], content["groups"], train, test, content["resolution"], **texts, limits=limits)
+        known = content.get("digests", {})
+        digests = {k: d for part, keys in (("train", train), ("test", test)) for k, d in zip(keys, known.get(part, ()), strict=False) if d}
+        return cls(content["identify_on"], content["groups"], train, test, content["resolution"], **texts, limits=limits, digests=digests)
 
 
 @dataclass(frozen=True)
@@ -99,15 +127,19 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Found:
-    """What a worker found in one unit and condition."""
+    """What a worker found in one unit and condition; `written` is the digest of the file that it wrote."""
 
     record: GroupRecord | None
+    written: str | None
     episodes: tuple[EpisodeKey, ...]
     resolution: dict[str, float]
     prints: list[tuple[EpisodeKey, Print]]
     alerts: tuple[str, ...]
     ends: dict[str, list[Ends]]
     inputs: npt.NDArray[np.float64]
+
+
+_KINDS = (_Found, GroupRecord, EpisodeKey, Print, Ends, FlatTops)
 
 
 def survey(
@@ -118,8 +150,9 @@ def survey(
     folder: Path | None = None,
     work: Work | None = None,
     reserve: Sequence[str] = (),
+    earlier: Path | None = None,
 ) -> tuple[Population, RecordingFacts]:
-    """Read all recordings once.
+    """Read all recordings once, without those that `work` knows from earlier.
 
     Parameters
     ----------
@@ -135,6 +168,8 @@ def survey(
         Where it runs.
     reserve : sequence of str
         Units that are read, checked and written, and of which the facts say nothing else.
+    earlier : Path, optional
+        What an earlier survey wrote as its `folder`: files of recordings that have not changed are taken from there.
 
     Returns
     -------
@@ -150,10 +185,16 @@ def survey(
     if folder is not None:
         folder.mkdir(parents=True)
     tasks = [_Group(population.select([u], [c]), u, c, folder, on_nan) for u, c, _ in population.groups()]
-    found = list((work or Work()).map("read", _read_group, tasks))
+    marks = recording_marks(population.source, (keys for _, _, keys in population.groups()), on_nan, folder is None)
+
+    def usable(task: _Group, known: _Found) -> bool:
+        return folder is None or _taken(known, earlier, folder)
+
+    found = list((work or Work()).recall("read", _read_group, tasks, marks, _KINDS, usable))
     kept = _kept(population, found, folder)
-    taking_part = [u for u in kept.unit_ids if u not in reserve]
-    own = [f for task, f in zip(tasks, found, strict=True) if task.unit not in reserve]
+    left, aside = set(kept.episodes), set(reserve)
+    taking_part = [u for u in kept.unit_ids if u not in aside]
+    own = [f for task, f in zip(tasks, found, strict=True) if task.unit not in aside]
     splits = split_episodes(kept.select(taking_part), test)
     facts = RecordingFacts(
         identify_on=condition_of(population.select(taking_part), identify_on),
@@ -161,12 +202,13 @@ def survey(
         train=tuple(k for s in splits.values() for k in s.train),
         test=tuple(k for s in splits.values() for k in s.test),
         resolution={m: min(f.resolution[m] for f in own) for m in kept.measured},
-        dropped=tuple(str(k) for k in population.episodes if k not in set(kept.episodes)),
+        dropped=tuple(str(k) for k in population.episodes if k not in left),
         alerts=tuple(dict.fromkeys(alert for f in found for alert in f.alerts)),
         reserve=tuple(reserve),
         limits=_limits(
-            [f for task, f in zip(tasks, found, strict=True) if task.unit in taking_part and kept.unit(task.unit).group != OUTLIERS]
+            [f for task, f in zip(tasks, found, strict=True) if task.unit not in aside and kept.unit(task.unit).group != OUTLIERS]
         ),
+        digests={key: mark.digest.hex() for f in own for key, mark in f.prints},
     )
     for name, limit in facts.limits.items():
         log.info("%s is limited at %s.", name, limit)
@@ -216,7 +258,7 @@ def _read_group(task: _Group) -> _Found:
         prints = scan_prints(population.select([task.unit], [task.condition]), on_nan=task.on_nan, look=look)
     else:
         record = write_group(population, task.unit, task.condition, task.folder, task.on_nan, look)
-        prints = record.recognised
+        prints, record = record.recognised, replace(record, prints=())
     episodes = tuple(key for key, _ in prints)
     if not episodes:
         raise DataError(f"Unit {task.unit} ({task.condition}): every episode was dropped; fix the source or leave the unit out.")
@@ -224,7 +266,23 @@ def _read_group(task: _Group) -> _Found:
     names = population.states + population.inputs
     steps = {m: resolution(first[:, names.index(m)]) for m in population.measured}
     alerts = period_alerts(first, population.channels, population.sample_period_s)
-    return _Found(record, episodes, steps, prints, alerts, ends, reach)
+    written = None if record is None or task.folder is None else _digest(task.folder / record.file)
+    return _Found(record, written, episodes, steps, prints, alerts, ends, reach)
+
+
+def _digest(path: Path) -> str:
+    return sha256(path.read_bytes()).hexdigest()
+
+
+def _taken(known: _Found, earlier: Path | None, folder: Path) -> bool:
+    """Take the file of recordings that are known from an earlier folder, where it is as it was written; tell whether it was."""
+    if earlier is None or known.record is None:
+        return False
+    path = earlier / known.record.file
+    if not is_file(path) or _digest(path) != known.written:
+        return False
+    same_file(path, folder / known.record.file)
+    return True
 
 
 def _limits(found: Sequence[_Found]) -> dict[str, FoundLimit]:
@@ -240,7 +298,8 @@ def _kept(population: Population, found: Sequence[_Found], folder: Path | None) 
     if folder is not None:
         from .readers.parquet import read_parquet
 
-        write_index(population, [f.record for f in found if f.record is not None], folder)
+        records = [replace(f.record, prints=tuple(mark for _, mark in f.prints)) for f in found if f.record is not None]
+        write_index(population, records, folder)
         return read_parquet(folder)
     refuse_copies(pair for f in found for pair in f.prints)
     present = {key for f in found for key in f.episodes}

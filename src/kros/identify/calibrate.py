@@ -9,6 +9,7 @@ import numpy as np
 from ..core.errors import IdentificationError
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
+from ..data.seen import mark_of
 from ..data.survey import RecordingFacts
 from .calibration import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
 
@@ -26,7 +27,12 @@ def calibrate(population: Population, facts: RecordingFacts, spec: PhaseSpec, wo
     """
     tasks = [(population.select([u]), calibration_keys(facts, u), spec) for u in facts.groups]
     units: dict[str, UnitPhase] = {}
-    for unit, segments in zip(facts.groups, (work or Work()).map("calibrate", segments_of, tasks), strict=True):
+    marks = [
+        None if (known := facts.marks(keys)) is None else mark_of(own.columns, own.sample_period_s, spec, keys, known)
+        for own, keys, _ in tasks
+    ]
+    found = (work or Work()).recall("calibrate", segments_of, tasks, marks, (Segment,))
+    for unit, segments in zip(facts.groups, found, strict=True):
         try:
             units[unit] = unit_phase(segments, unit)
         except IdentificationError as error:

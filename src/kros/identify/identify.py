@@ -21,6 +21,7 @@ from ..core.linalg import radius_text
 from ..core.settings import require_kind
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
+from ..data.seen import mark_of
 from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibrate import calibrate
@@ -137,7 +138,7 @@ def identify_condition(
     population, facts, own = base.population, base.facts, base.parameters
     units = [u for u in facts.groups if u in own and facts.keys("train", u, condition)]
     tasks = [(population.select([u], [condition]), facts.keys("train", u, condition), base.lifting) for u in units]
-    episodes = list(work.map(f"identify ({condition})", reduce_episodes, tasks))
+    episodes = list(work.recall(f"identify ({condition})", reduce_episodes, tasks, factor_marks(facts, tasks), (Factor,)))
     factor = Factor.stack([combine(f) for f in episodes])
     parameters = {name: np.array([own[u][name] for u in units]) for name in base.lifting.parameters}
     models, refined = identify_models(base, condition, units, factor, parameters, settings), dict[str, RefinedModels]()
@@ -148,6 +149,12 @@ def identify_condition(
     rows = tuple((k.unit, k.episode) for u in units for k in facts.keys("train", u, condition))
     together = Factor(*(np.concatenate([getattr(f, name) for f in episodes]) for name in ("R", "peak", "n_samples")))
     return EpisodeFactors(condition, rows, together), [replace(m, longest_s=longest_s) for m in models], refined
+
+
+def factor_marks(facts: RecordingFacts, tasks: Iterable[Task]) -> list[str | None]:
+    """Return what the factors of each task follow from: samples, what they are of, and the lifting but for its parameters' values."""
+    found = [(facts.marks(keys), population, keys, lifting) for population, keys, lifting in tasks]
+    return [None if known is None else mark_of(known, keys, own.channels, repr(lifting)) for known, own, keys, lifting in found]
 
 
 def reduce_episodes(task: Task) -> Factor:

@@ -21,7 +21,7 @@ from .engine.executors import open_executor
 from .engine.run_folder import load_run as load_run  # where readers of runs look for it
 from .engine.run_folder import open_run, require_own
 from .engine.steps import Step, run_steps
-from .engine.store import Store
+from .engine.store import Store, code_key
 from .learning import LEARNING
 from .metrics import collect_metrics
 from .stages import evaluate, left_out, read, report
@@ -201,7 +201,7 @@ def run_in(
     """Run a study in its run folder, which is open."""
     began = time.perf_counter()
     with open_executor(workers, scheduler) as executor:
-        context = Context(config, store, Work(executor, progress or Silent()), given)
+        context = Context(config, store, Work(executor, progress or Silent(), store.seen(code_key())), given)
         run_steps(context, STEPS, until)
         metrics = kept_metrics(store, collect_metrics(context, until, time.perf_counter() - began))
     return RunResult(store.folder, metrics, violations(config, metrics))

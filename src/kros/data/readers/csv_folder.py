@@ -47,6 +47,10 @@ class CsvRecordings(Recordings):
     time_scale: float | None
     timestamp: str | None = None
 
+    def file(self, place: FilePlace) -> Path:
+        """Return the file of an episode."""
+        return Path(place.path)
+
     def read(self, key: EpisodeKey, place: FilePlace) -> Recording:
         """Return one episode as recorded."""
         path, (i, n) = Path(place.path), place.piece

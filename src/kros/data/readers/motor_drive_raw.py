@@ -61,6 +61,10 @@ class RawRecordings(Recordings):
 
     time_scale: float = 1.0
 
+    def file(self, place: str) -> Path:
+        """Return the file of an episode."""
+        return Path(place)
+
     def read(self, key: EpisodeKey, place: str) -> Recording:
         """Return one episode as recorded."""
         columns = read_columns(Path(place), COLUMNS, COLUMNS)

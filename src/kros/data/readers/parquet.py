@@ -36,6 +36,10 @@ class ParquetRecordings(Recordings):
     folder: str
     columns: tuple[str, ...]
 
+    def file(self, place: tuple[str, int, int]) -> Path:
+        """Return the file of a unit and condition."""
+        return Path(self.folder) / place[0]
+
     def read(self, key: EpisodeKey, place: tuple[str, int, int]) -> Recording:
         """Return one episode."""
         name, group, samples = place

@@ -24,10 +24,12 @@ from ...core.artifacts import plain, write_json
 from ...core.errors import ConfigError, DataError
 from ...core.locks import NAME as LOCK
 from ...core.records import OWN, Record
+from ...data.seen import Seen
 
 log = logging.getLogger(__name__)
 
 PARTIAL = ".kros.partial"
+SEEN = "seen"
 BOOKKEEPING = frozenset({PARTIAL, LOCK})
 """What a process that works in a run folder keeps there meanwhile, and a killed one leaves."""
 
@@ -113,7 +115,7 @@ class Store:
         DataError
             When a record cannot be believed, or a file is gone or has changed, by name.
         """
-        for stage in (*map(_name, stages), OWN) if stages else [r.stage for r in records.records(self.folder)]:
+        for stage in (*map(_name, stages), OWN) if stages else [r.stage for r in records.records(self.folder) if r.stage != SEEN]:
             record = records.read_record(self.folder, stage)
             for name in record.all if record is not None else ():
                 if record is not None and not record.matches(self.folder, name):
@@ -204,6 +206,16 @@ class Store:
         if own.pop(name, None) is not None:
             self._write(Record(OWN, own=own))
         records.place(self.folder, name).unlink(missing_ok=True)
+
+    def seen(self, key: str) -> Seen:
+        """Return what stages of earlier runs computed unit by unit, with the same code by its key; it is of no stage, and stays when they go."""
+
+        def note(path: Path) -> None:
+            record = self.record(SEEN)
+            files = dict(record.files) if record is not None else {}
+            self._write(Record(SEEN, files=dict(sorted((files | {f"{SEEN}/{path.name}": records.digest(path)}).items()))))
+
+        return Seen(self.path(SEEN), key, note)
 
     def _own(self) -> dict[str, str]:
         record = self.record(OWN)

@@ -21,6 +21,7 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, IdentificationError, KrosError
 from ...core.work import Progress
 from ...data.population import OUTLIERS, Population, split_episodes
+from ...data.seen import Seen
 from ...data.survey import RecordingFacts
 from ...design.task import is_robust
 from ...evaluate import next_unit_bound
@@ -108,7 +109,8 @@ def run_folds(context: Context, folds: Sequence[Sequence[str]]) -> None:
 def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> dict[str, Any]:
     """Make the study without some units, and run its observers on these; a fold that fails is a result too, with its reason."""
     progress = Fold(whole.work.progress, f"{number + 1}/{folds} ")
-    context = Context(without(whole, held), whole.store.nested(FOLDER, str(number)), replace(whole.work, progress=progress))
+    known = whole.work.seen.read_only() if isinstance(whole.work.seen, Seen) else None  # factors of the same episodes are the same
+    context = Context(without(whole, held), whole.store.nested(FOLDER, str(number)), replace(whole.work, progress=progress, seen=known))
     steps = (*LEARNING, Step(Stage.EVALUATE, partial(estimate_held, whole, held), ()))
     try:
         run_steps(context, steps, Stage.EVALUATE)

@@ -78,7 +78,8 @@ def run(context: Context) -> None:
     in_place = config.data.reader == PARQUET and not config.data.prepare
     folder = None if in_place else context.store.draft("recordings")
     population, data = open_source(config, context.given), config.data
-    _, facts = survey(population, config.split.test, data.identify_on, data.on_nan, folder, context.work, draw(config, population))
+    reserve, earlier = draw(config, population), context.store.path("recordings")
+    _, facts = survey(population, config.split.test, data.identify_on, data.on_nan, folder, context.work, reserve, earlier)
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them first with on_nan = 'drop_episode'.")
     content = {"recordings": config.data.source if in_place else "recordings", **facts.content()}

@@ -1,0 +1,209 @@
+"""Results of earlier maps, kept by what they were computed from, so that a run whose recordings grew computes what is new alone.
+
+    task --mark--> known already: read back from <run>/seen/<map>.gz
+                   new or changed: computed, and kept beside the others
+
+A mark is a digest of everything that a result follows from, beside the code, whose key is the first line of the file. Nothing is believed that
+cannot be read back whole: a damaged file is as good as none. Numbers come back bit by bit, so that results do not tell how they were obtained.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import gzip
+import hashlib
+import json
+import logging
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import quote
+
+import numpy as np
+
+from ..core.work import Usable, Work
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+_DAMAGED = (OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, zlib.error)
+_LEVEL = 1  # of compression
+
+
+def mark_of(*content: Any) -> str:
+    """Return a digest of plain content, dataclasses among it by their `repr`.
+
+    Examples
+    --------
+    >>> from kros.data.seen import mark_of
+    >>> mark_of("unit 7", 3) == mark_of("unit 7", 3) != mark_of("unit 7", 4)
+    True
+    """
+    return hashlib.sha256(repr(content).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was computed earlier.
+
+    Parameters
+    ----------
+    folder : Path
+        One file a map; it need not exist.
+    key : str
+        Of the code; results of another one are not known.
+    changed : callable or None
+        Told the path of every file that was written; None where nothing is written.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from kros.core.work import Work
+    >>> from kros.data.seen import Seen
+    >>> with TemporaryDirectory() as folder:
+    ...     work = Work(seen=Seen(Path(folder), "1", changed=lambda path: None))
+    ...     squares = list(work.recall("square", lambda x: x**2, [2, 3], ["two", "three"]))
+    ...     more = list(work.recall("square", lambda x: print(x) or x**2, [2, 3, 4], ["two", "three", "four"]))
+    4
+    >>> squares, more
+    ([4, 9], [4, 9, 16])
+    """
+
+    folder: Path
+    key: str
+    changed: Callable[[Path], None] | None = None
+
+    def read_only(self) -> Seen:
+        """Return the same, which keeps nothing new."""
+        return replace(self, changed=None)
+
+    def recall(
+        self,
+        work: Work,
+        title: str,
+        function: Callable[[Any], T],
+        tasks: Sequence[Any],
+        marks: Sequence[str | None],
+        kinds: Iterable[type] = (),
+        usable: Usable | None = None,
+    ) -> Iterator[T]:
+        """Yield results in the order of the tasks; see `Work.recall`."""
+        known, named = self._read(title), {kind.__name__: kind for kind in kinds}
+        found: list[Any] = [self._restored(known, mark, named, usable, task) for task, mark in zip(tasks, marks, strict=True)]
+        new = [task for task, result in zip(tasks, found, strict=True) if result is None]
+        computed = work.map(title, function, new)
+        if not new and set(marks) == set(known):
+            yield from found
+            return
+        log.info("%s: %d of %d are new or changed", title, len(new), len(tasks))
+        with self._kept(title) as keep:
+            left = {mark: known[mark] for mark, result in zip(marks, found, strict=True) if mark is not None and result is not None}
+            try:
+                for mark, result in zip(marks, found, strict=True):
+                    value = next(computed) if result is None else result
+                    if mark is not None:
+                        keep(mark, left.pop(mark, "") or json.dumps(_packed(value), separators=(",", ":")))
+                    yield value
+                next(computed, None)  # its progress is told to the end
+            finally:  # where it ends early, what is known stays known
+                for mark, text in left.items():
+                    keep(mark, text)
+
+    def _path(self, title: str) -> Path:
+        return self.folder / f"{quote(title, safe=' ()')}.gz"
+
+    def _read(self, title: str) -> dict[str, str]:
+        """Return results by their marks, as text."""
+        path = self._path(title)
+        if not path.is_file():
+            return {}
+        try:
+            with gzip.open(path, "rt", encoding="utf-8") as lines:
+                if next(lines).rstrip("\n") != self.key:
+                    return {}
+                return {mark: text for mark, _, text in (line.rstrip("\n").partition("\t") for line in lines)}
+        except (*_DAMAGED, StopIteration) as error:
+            log.warning("%s: cannot be read (%s), so everything is computed", path, error)
+            return {}
+
+    def _restored(self, known: Mapping[str, str], mark: str | None, kinds: Mapping[str, type], usable: Usable | None, task: Any) -> Any:
+        if mark is None or mark not in known:
+            return None
+        try:
+            value = _unpacked(json.loads(known[mark]), kinds)
+        except _DAMAGED as error:
+            log.warning("%s: a result cannot be read (%s), and is computed again", self.folder, error)
+            return None
+        return value if usable is None or usable(task, value) else None
+
+    @contextmanager
+    def _kept(self, title: str) -> Iterator[Callable[[str, str], None]]:
+        """Give what writes one result; the file is in its place once all are there."""
+        if self.changed is None:
+            yield lambda mark, text: None
+            return
+        path = self._path(title)
+        temporary = path.with_name(f".{path.name}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            # Without a name and a time, the bytes depend on the content alone.
+            with temporary.open("wb") as raw, gzip.GzipFile("", "wb", _LEVEL, raw, mtime=0) as file:
+                file.write(f"{self.key}\n".encode())
+                yield lambda mark, text: _write(file, mark, text)
+        except BaseException:
+            with suppress(OSError):
+                self._place(temporary, path)
+            raise
+        self._place(temporary, path)
+
+    def _place(self, temporary: Path, path: Path) -> None:
+        temporary.replace(path)
+        assert self.changed is not None
+        self.changed(path)
+
+
+def _write(file: gzip.GzipFile, mark: str, text: str) -> None:
+    file.write(f"{mark}\t{text}\n".encode())
+
+
+def _packed(value: Any) -> Any:
+    """Turn a result into what JSON can hold: arrays and bytes in base 64, everything else under the name of its kind."""
+    if value is None or type(value) in (str, int, bool, float):
+        return value
+    if isinstance(value, np.ndarray | np.generic):
+        kind = "array" if isinstance(value, np.ndarray) else "number"
+        return {kind: [value.dtype.str, value.shape, base64.b64encode(value.tobytes()).decode()]}
+    if isinstance(value, bytes):
+        return {"bytes": base64.b64encode(value).decode()}
+    if dataclasses.is_dataclass(value):
+        return {"is": type(value).__name__, "with": {f.name: _packed(getattr(value, f.name)) for f in dataclasses.fields(value)}}
+    if isinstance(value, tuple):
+        return {"tuple": [_packed(v) for v in value]}
+    if isinstance(value, dict):
+        return {"dict": {k: _packed(v) for k, v in value.items()}}
+    if isinstance(value, list):
+        return [_packed(v) for v in value]
+    raise TypeError(f"Keeping a result: {type(value).__name__} is of no kind that can be kept.")
+
+
+def _unpacked(value: Any, kinds: Mapping[str, type]) -> Any:
+    if isinstance(value, list):
+        return [_unpacked(v, kinds) for v in value]
+    if not isinstance(value, dict):
+        return value
+    if "is" in value:
+        return kinds[value["is"]](**{name: _unpacked(v, kinds) for name, v in value["with"].items()})
+    ((kind, content),) = value.items()
+    if kind in ("array", "number"):
+        dtype, shape, text = content
+        found = np.frombuffer(base64.b64decode(text), np.dtype(dtype)).reshape(shape).copy()
+        return found if kind == "array" else found[()]
+    if kind == "bytes":
+        return base64.b64decode(content)
+    if kind == "tuple":
+        return tuple(_unpacked(v, kinds) for v in content)
+    return {k: _unpacked(v, kinds) for k, v in content.items()}

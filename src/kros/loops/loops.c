@@ -54,7 +54,7 @@ typedef struct {
     const whole *begun_since; /* (begins) */
     const int32_t *pending;   /* (samples, batch): samples between a state and its row; with `before` alone */
     const double *start;      /* (starts, n, q) */
-    const double *lower;      /* (n); none where estimates go on without limits */
+    const double *lower;      /* (n, batch); none where estimates go on without limits */
     const double *upper;
     const double *limit;      /* (width): largest corrections */
     const double *limit_c;    /* (width, order) */
@@ -259,13 +259,15 @@ static void limit_corrections(const relift_job *s, whole n, const vec *c, const 
         }
 }
 
-static void limit_states(const relift_job *s, whole n, vec *next, whole lanes)
+static void limit_states(const relift_job *s, whole n, vec *next, whole first, whole lanes)
 {
-    for (whole i = 0; i < n; i++)
+    for (whole i = 0; i < n; i++) {
+        const double *lower = s->lower + i * s->batch + first, *upper = s->upper + i * s->batch + first;
         for (whole b = 0; b < lanes; b++) {
             double *x = LANES(next + i * MOST) + b;
-            *x = *x < s->lower[i] ? s->lower[i] : *x > s->upper[i] ? s->upper[i] : *x;
+            *x = *x < lower[b] ? lower[b] : *x > upper[b] ? upper[b] : *x;
         }
+    }
 }
 
 int kros_relift(const formulas *f, const relift_job *s)
@@ -354,7 +356,7 @@ int kros_relift(const formulas *f, const relift_job *s)
                         since[b] += moving ? moving[b] : 1;
                     }
                 if (s->width) limit_corrections(s, n, c, nu, next, w);
-                if (s->lower) limit_states(s, n, next, lanes);
+                if (s->lower) limit_states(s, n, next, first, lanes);
                 shifted(f, reg, older);
                 if (going == lanes) {
                     memcpy(reg, next, (size_t)n * MOST * sizeof(vec));

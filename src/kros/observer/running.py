@@ -15,7 +15,7 @@ from .data import ObserverData
 from .monitor import Watch
 from .samples import LONGEST, Held, SampleStatus, Screened
 from .screen import Screen
-from .step import Steps, places
+from .step import Steps
 from .tracking import SETTLE_S, PhaseLockedLoop
 
 Array = npt.NDArray[np.float64]
@@ -83,7 +83,7 @@ class RunningObserver:
         self._screen = Screen.of(observer)
         self._steps, self._ahead = Steps([observer], 1, {}), Steps([observer], 1, {})
         self._places = {name: i for i, name in enumerate(observer.lifting.states)}
-        self._measured, self._at = tuple(observer.lifting.states[i] for i in observer.measured), places(observer.measured)
+        self._measured = tuple(observer.lifting.states[i] for i in observer.measured)
         self._limits = observer.runtime if observer.runtime.binding else None
         self._filter_gain: Array | None = None
         self._unknown = np.ones((1, len(observer.measured)), dtype=bool)
@@ -207,7 +207,7 @@ class RunningObserver:
             if self._status and not (there := np.isfinite(measurement)).all():
                 absent = ~there
             if self._watch is not None:
-                self._watch.take((measurement[0] - steps.x[0, 0, self._at]).tolist(), not self._status)
+                self._watch.take(steps.apart(measurement)[0, 0].tolist(), not self._status)
             if self._loop is None:
                 steps.step(measurement, taken, absent)
             else:

@@ -72,11 +72,17 @@ class Start:
             return np.zeros(shown.shape[:-1], dtype=bool)
         return np.asarray((np.abs(shown @ self.rest.T) <= 1).all(axis=-1))
 
-    def moved(self, y: Array, u: Array) -> Array:
-        """Return what motion adds to the first estimate, shape (..., n): nothing at rest, or where a measurement or an input is not known."""
-        adds = np.isfinite(y).all(axis=-1) & np.isfinite(u).all(axis=-1) & ~self.at_rest(y, u)
-        first = np.where(adds[..., None], np.concatenate([y, u], axis=-1), 0.0)
-        return np.asarray(first @ self.gain.T)
+    def moved(self, y: Array, u: Array, origin: tuple[Array, Array] | None = None) -> Array:
+        """Return what motion adds to the first estimate, shape (..., n): nothing at rest, or where a measurement or an input is not known.
+
+        What is large in y and u alike is better taken off first: `origin`, shape (...), of the measurement, and how inputs move with it, shape (m,).
+        """
+        adds = (np.isfinite(y).all(axis=-1) & np.isfinite(u).all(axis=-1) & ~self.at_rest(y, u))[..., None]
+        if origin is None:
+            return np.asarray(np.where(adds, np.concatenate([y, u], axis=-1), 0.0) @ self.gain.T)
+        at, along = origin[0][..., None], np.concatenate([[1.0], origin[1]])
+        first = np.where(adds, np.concatenate([y, u], axis=-1) - at * along, 0.0)
+        return np.asarray(first @ self.gain.T + np.where(adds, at, 0.0) * (self.gain @ along))
 
     def correction(self, since: npt.NDArray[np.int64], innovation: Array) -> Array:
         """Return what is added to the next estimate, shape (batch, n), `since` so many samples after the start, shape (batch,)."""

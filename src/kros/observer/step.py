@@ -10,15 +10,20 @@ import numpy.typing as npt
 
 from ..loops import formulas, library, tape_of
 from .data import ObserverData
+from .origin import Origins
+from .runtime import Runtime
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 Whole = npt.NDArray[np.intp]
 Parameters = Mapping[str, npt.ArrayLike]
+_PIECE = 256  # samples until the origins of machines that turn on are moved along
 
 
 class Steps:
     """Observers of one model, side by side over a batch of machines; `cut` is what limits took from the last estimates.
+
+    The states `near` are relative to origins that follow machines which have moved far away (`origin`); all signals that come and go are not.
 
     ``[x_hat+; x^c+] = M [theta(x_hat); x^c; u; y]``, one column a machine, so that each quantity of all machines lies together in memory.
 
@@ -42,7 +47,7 @@ class Steps:
         self._next = np.empty((len(observers), n + order, batch))
         row, self._following = np.swapaxes(self._column, 1, 2), np.swapaxes(self._next, 1, 2)
         self._next_x, self._next_c = self._following[..., :n], self._following[..., n:]
-        self.x, self._lifted = row[..., :n], row[..., :n_lifted]
+        self.near, self._lifted = row[..., :n], row[..., :n_lifted]
         self._x_c, self._u = row[..., n_lifted : n_lifted + order], row[..., n_lifted + order : n_lifted + order + m]
         self._y, self._at = row[..., n_lifted + order + m :], places(observer.measured)
         self._plain = not (lifting.history or lifting.input_functions)
@@ -50,14 +55,21 @@ class Steps:
         self._fresh = np.ones(batch, dtype=bool)
         self._start, self._starting, self._since = observer.start_in_motion, False, np.zeros(batch, dtype=int)
         self._limits = observer.runtime if observer.runtime.limited else None
+        self._origins = Origins(observer, batch)
         self.correction: Array | None = None
         self.cut = np.zeros(self._next_x.shape)
+
+    @property
+    def x(self) -> Array:
+        """Estimates of the states, shape (observer, batch, n)."""
+        return self.near if self._origins.at is None else self.near + self._origins.states
 
     def begin(self, y: Array, machines: Flags | None = None, u: Array | None = None) -> None:
         """Start all machines, or some, at measurements, shape (batch, q), and inputs where these are known, shape (batch, m)."""
         rows = slice(None) if machines is None else machines
-        for own, observer in zip(self.x, self.observers, strict=True):
-            own[rows] = observer.runtime.relifted(observer.initial(y, self.values, u))[rows]
+        self._origins.put(y[:, 0], rows)
+        for own, observer in zip(self.near, self.observers, strict=True):
+            own[rows] = self._first(observer, y, u, self.values, slice(None))[rows]
         self._x_c[:, rows] = 0.0
         self._fresh[rows] = True
         self._since[rows] = 0
@@ -66,9 +78,33 @@ class Steps:
             self._since[rows] = np.where(resting, len(self._start), 0)[rows]
         self._starting = self._start is not None and bool(self._since.min() < len(self._start))
 
+    def _first(self, observer: ObserverData, y: Array, u: Array | None, values: Parameters, machines: Any) -> Array:
+        """First estimates of some machines, relative to their origins."""
+        origins = self._origins
+        if origins.at is None:
+            return observer.runtime.relifted(observer.initial(y, values, u))
+        moved = origins.states[machines]
+        moved[..., self._at] = 0.0  # what is measured starts at the measurement
+        first = observer.initial(y - origins.at[machines, None], values) - moved
+        if observer.start_in_motion is not None and u is not None:
+            assert origins.shift is not None
+            first = first + observer.start_in_motion.moved(y, u, (origins.at[machines], origins.shift.whole))
+        return self._relifted(observer.runtime, first, machines)
+
+    def _relifted(self, limits: Runtime, x: Array, machines: Any) -> Array:
+        """Estimates that go on, relative to the origins of some machines, within limits."""
+        if self._origins.at is None:
+            return limits.relifted(x)
+        at = limits.clipped_states(x.shape[-1])
+        moved, within = self._origins.states[machines], x.copy()
+        within[..., at] = limits.relifted(x + moved)[..., at] - moved[..., at]
+        return within
+
     def place(self, x: Array, earlier: Array) -> None:
         """Put states, shape (batch, n), and earlier values in place; corrections start at rest."""
-        self.x[...], self._x_c[...], self._earlier[...], self._fresh[:] = x, 0.0, earlier, False
+        self._origins.at = None
+        self.near[...], self._x_c[...], self._earlier[...], self._fresh[:] = x, 0.0, earlier, False
+        self._origins.follow(self.near)
         self._starting = False
 
     @property
@@ -79,14 +115,19 @@ class Steps:
     def earlier(self, u: Array) -> Array:
         """Return the earlier values that the lifting reads, shape (observer, batch, n_earlier); after a start they equal the present ones."""
         if self._fresh.any():
-            held = self.lifting.window.hold(self.x, np.broadcast_to(u, (*self.x.shape[:2], u.shape[-1])))
+            held = self.lifting.window.hold(self.near, np.broadcast_to(u, (*self.near.shape[:2], u.shape[-1])))
             return np.where(self._fresh[:, None], held, self._earlier)
         return self._earlier
 
     def innovation(self, y: Array) -> Array:
         """Return ``y - C x_hat``, shape (observer, batch, q); zero where a measurement is missing."""
-        predicted = self.x[..., self._at]
-        return np.where(np.isfinite(y), y, predicted) - predicted
+        apart = self.apart(y)
+        return np.where(np.isfinite(y), apart, 0.0)
+
+    def apart(self, y: Array) -> Array:
+        """Return ``y - C x_hat``, shape (observer, batch, q), not finite where y is not."""
+        y = y if self._origins.at is None else y - self._origins.at[:, None]
+        return np.asarray(y - self.near[..., self._at])
 
     def step(self, y: Array, u: Array, missing: Flags | None = None, moving: Flags | None = None) -> None:
         """Take measurements, shape (batch, q), and inputs, shape (batch, m).
@@ -100,35 +141,37 @@ class Steps:
             Machines that take the sample; all by default.
         """
         lifting, following_earlier = self.lifting, None
+        y, u = self._origins.take_off(y, u)
         if self._plain:
             lifting.lift_into(self._lifted, self.values)
             self._u[...] = u
         else:
-            u = np.broadcast_to(u, (*self.x.shape[:2], u.shape[-1]))
+            u = np.broadcast_to(u, (*self.near.shape[:2], u.shape[-1]))
             earlier = self.earlier(u)
-            window = np.concatenate([self.x, earlier], axis=-1)
+            window = np.concatenate([self.near, earlier], axis=-1)
             lifting.lift_into(self._lifted, self.values, earlier)
             self._u[...] = lifting.lift_inputs(u, window, self.values)
             following_earlier = lifting.window.advance(window, u)
         self._y[...] = y
         if missing is not None:  # what is predicted stands for what is missing, so that it corrects nothing
-            np.copyto(self._y, self.x[..., self._at], where=missing)
+            np.copyto(self._y, self.near[..., self._at], where=missing)
         np.matmul(self.map, self._column, out=self._next)
         if self._start is not None and self._starting:
-            self._next_x[0] += self._start.correction(self._since, (self._y - self.x[..., self._at])[0])
+            self._next_x[0] += self._start.correction(self._since, (self._y - self.near[..., self._at])[0])
             self._since += True if moving is None else moving
             self._starting = bool(self._since.min() < len(self._start))
         if self._limits is not None:
             self._limit()
         if moving is None:
-            self.x[...] = self._next_x
+            self.near[...] = self._next_x
             self._x_c[...] = self._next_c
         else:
-            np.copyto(self.x, self._next_x, where=moving[:, None])
+            np.copyto(self.near, self._next_x, where=moving[:, None])
             np.copyto(self._x_c, self._next_c, where=moving[:, None])
         if following_earlier is not None:
             np.copyto(self._earlier, following_earlier, where=True if moving is None else moving[:, None])
             self._fresh &= False if moving is None else ~moving
+        self._origins.follow(self.near)
 
     def through(
         self,
@@ -160,10 +203,56 @@ class Steps:
             Filled with the first observer's earlier values before every sample, which after a start equal the present ones with the inputs of
             so many samples before.
         """
-        loops, batch = library(), u.shape[1]
-        if loops is None:
+        if library() is None:
             self._one_by_one(y, u, late, moving, starts, states, innovation, before)
-            return
+        elif self._origins.at is None and (y is None or not self._origins.beyond(y)):
+            self._compiled(y, u, late, moving, starts, states, innovation, before, self._begins(y, u, starts))
+        else:
+            self._in_pieces(y, u, late, moving, starts, states, innovation)
+
+    def _in_pieces(
+        self,
+        y: Array | None,
+        u: Array,
+        late: int,
+        moving: Flags | None,
+        starts: Flags | None,
+        states: Array | None,
+        innovation: Array | None,
+    ) -> None:
+        """`through` for machines that turn on and on: between pieces the origins follow. A start is not the first sample of a piece."""
+        taken, first = u[np.maximum(np.arange(len(u)) - late, 0)] if late else u, 0
+        while first < len(u):
+            last = min(first + _PIECE, len(u))
+            while starts is not None and last < len(u) and starts[last].any():
+                last += 1
+            if first:
+                self._origins.follow(self.near)
+            rows = slice(first, last)
+            given, inputs = self._origins.take_off(np.zeros((1, u.shape[1], 1)) if y is None else y[rows], taken[rows])
+            flags, anew = (None if every is None else every[rows] for every in (moving, starts))
+            found, apart = (None if every is None else every[rows] for every in (states, innovation))
+            begins = None if y is None else self._begins(y[rows], u[rows], anew)
+            self._compiled(None if y is None else given, inputs, 0, flags, anew, found, apart, None, begins)
+            if found is not None and self._origins.at is not None:
+                found += self._origins.states.T
+            first = last
+
+    def _compiled(
+        self,
+        y: Array | None,
+        u: Array,
+        late: int,
+        moving: Flags | None,
+        starts: Flags | None,
+        states: Array | None,
+        innovation: Array | None,
+        before: tuple[Array, Whole] | None,
+        begins: dict[str, Any] | None,
+    ) -> None:
+        """Take many samples relative to the origins, compiled; machines start anew with `begins`."""
+        loops, batch = library(), u.shape[1]
+        assert loops is not None
         observer, lifting, limits = self.observers[0], self.lifting, self._limits
         job: dict[str, Any] = {
             "observers": len(self.observers),
@@ -186,9 +275,7 @@ class Steps:
         }
         if before is not None:
             job |= {"before": before[0], "pending": before[1]}
-        if starts is not None and starts[1:].any():
-            assert y is not None
-            job |= self._begins(y, u, starts)
+        job |= begins or {}
         if self._start is not None and (self._starting or "begin" in job):
             job |= {"starts": len(self._start), "start": self._start.corrections}
         if limits is not None:
@@ -203,19 +290,24 @@ class Steps:
                 }
             if limits.relift and not (limits.lower is None and limits.upper is None):
                 sides = ((limits.lower, -np.inf), (limits.upper, np.inf))
-                job |= dict(zip(("lower", "upper"), (np.full(n, none) if side is None else side for side, none in sides), strict=True))
+                moved = 0.0 if self._origins.at is None else self._origins.states.T
+                sizes = (np.full(n, none) if side is None else side for side, none in sides)
+                job |= dict(zip(("lower", "upper"), (np.tile(side[:, None], batch) - moved for side in sizes), strict=True))
         loops.call("kros_relift", formulas(lifting, tape_of(lifting, u.shape[2]), self.values, u.shape[2], batch), ("relift_job", job))
         self._starting = self._start is not None and "starts" in job and bool(self._since.min() < len(self._start))
 
-    def _begins(self, y: Array, u: Array, starts: Flags) -> dict[str, Any]:
-        """Estimates of machines that start after the first sample, and which they are."""
+    def _begins(self, y: Array | None, u: Array, starts: Flags | None) -> dict[str, Any]:
+        """Estimates of machines that start after the first sample, and which they are; nothing where none does."""
+        if starts is None or not starts[1:].any():
+            return {}
+        assert y is not None
         rows, machines = np.nonzero(starts)
         rows, machines = rows[rows > 0], machines[rows > 0]
         number = np.zeros(starts.shape, dtype=np.int32)
         number[rows, machines] = 1 + np.arange(len(rows))
         own = {name: np.broadcast_to(np.asarray(v, dtype=float), starts.shape[1:])[machines] for name, v in self.values.items()}
         first = y[rows, machines], u[rows, machines]
-        begun = np.stack([o.runtime.relifted(o.initial(first[0], own, first[1])) for o in self.observers])
+        begun = np.stack([self._first(o, *first, own, machines) for o in self.observers])
         since = np.zeros(len(rows), dtype=np.int64)
         if self._start is not None:
             since[self._start.at_rest(*first)] = len(self._start)
@@ -254,13 +346,13 @@ class Steps:
     def _limit(self) -> None:
         """Keep corrections and estimates within their limits."""
         assert self._limits is not None
-        observer, n = self.observers[0], self.x.shape[2]
+        observer, n = self.observers[0], self.near.shape[2]
         K = observer.controller
         if self._limits.correction is not None:
-            self.correction = self._x_c @ K.C.T + (self._y - self.x[..., self._at]) @ K.D.T
+            self.correction = self._x_c @ K.C.T + (self._y - self.near[..., self._at]) @ K.D.T
             clipped = self._limits.clip_correction(self.correction)
             self._next_x += (clipped - self.correction) @ observer.into[:n].T
-        within = self._limits.relifted(self._next_x)
+        within = self._relifted(self._limits, self._next_x, slice(None))
         np.subtract(within, self._next_x, out=self.cut)
         self._next_x[...] = within
 

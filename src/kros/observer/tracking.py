@@ -104,7 +104,7 @@ class PhaseLockedLoop:
     def step(self, steps: Steps, y: Array, u: Array, missing: Flags | None = None) -> Array:
         """Move the observer on by a sample, as `Steps.step` does, and return the parameter for the next one, shape (batch,)."""
         K, n, values = self.observer.controller, self._model.shape[0], steps.values
-        x, nu, psi = steps.x[0].copy(), steps.innovation(y)[0], self._s[:, self._C]
+        x, nu, psi = steps.near[0].copy(), steps.innovation(y)[0], self._s[:, self._C]
         slopes, by_value = steps.lifting.slopes(x, values)[..., :n], steps.lifting.parameter_slopes(x, values, self.name)
         steps.step(y, u, missing)
         lifted = np.concatenate([self._s, (slopes @ self._s[..., None])[..., 0] + by_value], axis=-1)

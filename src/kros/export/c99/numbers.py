@@ -14,13 +14,14 @@ from ...lifting.c_code import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
 from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval
+from ...observer.origin import FAR, Shift
 from ...observer.samples import LONGEST
 from ...observer.screen import Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from .realise import Realised
-from .shift import Shift, find_shift
 
 Array = npt.NDArray[np.float64]
+FAR_SINGLE = 8  # periods from the origin, as far as single precision goes
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Source:
         Prefix of everything that is public, a C identifier.
     precision : Precision
     shift : Shift or None
-        Of a single-precision build whose origin can move.
+        Where the origin can move.
     loop : PhaseLockedLoop or None
         Of a parameter that follows the machine.
     load : LoadOutput or None
@@ -78,7 +79,7 @@ class Source:
         realised = Realised.of(observer)
         observer = realised.observer
         loop = None if track is None else PhaseLockedLoop(observer, track, 1)
-        return cls(realised, name, Precision(precision), find_shift(observer) if precision == "float" else None, loop, load)
+        return cls(realised, name, Precision(precision), realised.shift, loop, load)
 
     @property
     def observer(self) -> Observer:
@@ -143,11 +144,14 @@ class Source:
             "load": self.load_torque(),
             "shift": self.shift,
             "shift_states": None if self.shift is None else self.wide(self.shift.states),
-            "shift_inputs": None if self.shift is None else self.wide(self.shift.inputs),
+            "shift_whole": None if self.shift is None else self.wide(self.shift.whole),
+            "shift_rest": None if self.shift is None else self.wide(self.shift.rest),
             "shift_others": []
             if self.shift is None
             else [i for i in range(len(o.recorded)) if i != o.measured[0] and self.shift.states[i] != 0],
-            "far": None if self.shift is None else self.precision.literal(8 * self.shift.period),
+            "far": None
+            if self.shift is None
+            else self.precision.literal((FAR_SINGLE if self.precision.type == "float" else FAR) * self.shift.period),
             "period": None if self.shift is None else Precision().literal(self.shift.period),
             "sample_period_s": Precision().literal(o.sample_period_s),
         }
@@ -237,11 +241,9 @@ class Source:
         start, q = self.observer.start_in_motion, len(self.observer.measured)
         if start is None or not len(start):
             return None
-        rows = np.flatnonzero(np.any(start.gain, axis=1) | np.any(start.corrections, axis=(0, 2)))
-        gain, places = start.gain[rows], self.observer.measured
-        less = [(j, places.index(i), factor) for j, i, factor in self.realised.less]
-        for j, i, factor in less:  # as in the model, differences first
-            gain[:, i] += factor * gain[:, q + j]
+        rows, places = np.flatnonzero(np.any(start.gain, axis=1) | np.any(start.corrections, axis=(0, 2))), self.observer.measured
+        assert self.realised.start_gain is not None
+        gain, less = self.realised.start_gain[rows], [(j, places.index(i), factor) for j, i, factor in self.realised.less]
         rest = start.rest.reshape(-1, gain.shape[1]).copy()
         for j, i, factor in less:
             rest[:, i] += factor * rest[:, q + j]

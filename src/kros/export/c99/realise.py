@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...observer import Observer
+from ...observer.origin import Shift, find_shift
 from ...observer.predictor.driven import in_coordinates
 
 Array = npt.NDArray[np.float64]
@@ -38,11 +39,17 @@ class Realised:
         From the lifted state and the inputs, of which some are differences, to the next state.
     less : tuple of (int, int, float)
         Input, state, factor: of the input the state times the factor is taken off.
+    shift : Shift or None
+        How the signals move with the origin, in these coordinates.
+    start_gain : ndarray, shape (n, q + m), or None
+        Of the start in motion, in these coordinates, from measurements and inputs of which some are differences.
     """
 
     observer: Observer
     model: Array
     less: tuple[tuple[int, int, float], ...]
+    shift: Shift | None
+    start_gain: Array | None
 
     @classmethod
     def of(cls, observer: Observer) -> Realised:
@@ -50,9 +57,9 @@ class Realised:
         n, less, A = observer.lifting.n_states, differences(observer), observer.A.copy()
         for j, i, factor in less:
             A[:, i] += factor * observer.B[:, j]
-        turn = to_modes(observer)
+        turn, shift, gain = to_modes(observer), find_shift(observer), _start_gain(observer, less)
         if turn is None:
-            return cls(observer, np.hstack([A[:n], observer.B[:n]]), less)
+            return cls(observer, np.hstack([A[:n], observer.B[:n]]), less, shift, gain)
         turned = in_coordinates(observer, turn)
         first, own = len(observer.recorded), turned.A.copy()
         measured = list(observer.measured)
@@ -61,7 +68,9 @@ class Realised:
         own[first:n, first:n][block < 1e-12 * block.max()] = 0.0
         model = np.hstack([own[:n], turned.B[:n]])
         model[:, measured] = A[:n, measured]
-        return cls(replace(turned, A=own), model, less)
+        if shift is not None:
+            shift = replace(shift, states=turn[:n, :n] @ shift.states)
+        return cls(replace(turned, A=own), model, less, shift, None if gain is None else turn[:n, :n] @ gain)
 
 
 def differences(observer: Observer) -> tuple[tuple[int, int, float], ...]:
@@ -80,6 +89,16 @@ def differences(observer: Observer) -> tuple[tuple[int, int, float], ...]:
             found.append((best, i, left[best][1]))
             free.remove(best)
     return tuple(found)
+
+
+def _start_gain(observer: Observer, less: tuple[tuple[int, int, float], ...]) -> Array | None:
+    """Return the gain of the start in motion for differences in place of inputs, shape (n, q + m)."""
+    if observer.start_in_motion is None:
+        return None
+    gain, places = observer.start_in_motion.gain.copy(), observer.measured
+    for j, i, factor in less:
+        gain[:, places.index(i)] += factor * gain[:, len(places) + j]
+    return gain
 
 
 def to_modes(observer: Observer) -> Array | None:

@@ -84,7 +84,7 @@ def with_start(
             innovation = steps.innovation(y_w[k])[0]
             steps.step(y_w[k], u_w[k])
             corrections[k] = regressed(innovation, np.where(hidden, known[k + 1] - steps.x[0], 0.0))
-            steps.x[0] += innovation @ corrections[k].T
+            steps.near[0] += innovation @ corrections[k].T
         start = Start(gain, corrections, still)
     return replace(observer, start_in_motion=start)
 

@@ -1,0 +1,124 @@
+"""Observers far from zero: a moving origin changes nothing but rounding, against extended precision and generated code."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from machines import LIMITS, apart, drive, in_python, moving, replaced, samples
+
+from kros.export import CompiledObserver, export_c
+from kros.export.c99.compiled import find_compiler
+from kros.observer import run_observer, step
+from kros.observer.origin import Origins, find_shift
+from kros.observer.runtime import Runtime
+
+TURN = 2 * np.pi
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler is on the PATH")
+
+
+def unbound(observer, **changes):
+    """Without a range of plausible angles."""
+    return replace(observer, seen=None, **changes)
+
+
+KINDS = {
+    "lifted": lambda: unbound(drive()),
+    "linear": lambda: unbound(drive(())),
+    "replaced": lambda: unbound(replaced()),
+    "in motion": lambda: unbound(moving(drive())),
+    "limits": lambda: cancelling(unbound(drive(correction=np.full(5, 0.004), **LIMITS)), 0.0),
+    "late": lambda: unbound(drive(delay=3)),
+}
+
+
+def far_away(turns, count=1500, on=0.0):
+    """Motion many turns away, which goes on by so many turns meanwhile; several machines."""
+    y, u = samples(count, faults=False)
+    ramp = TURN * on * np.linspace(0, 1, count)[:, None]
+    away = TURN * np.array([turns, 0.0, -turns])
+    y = y[:, None] + ramp[:, None] + away[:, None]
+    u = np.repeat(u[:, None], 3, axis=1)
+    u[..., 0] += ramp + away
+    return y, u
+
+
+def cancelling(observer, size=300.0):
+    """With large columns of reference and measurement that cancel, as those of a machine under control do."""
+    A, B, n = observer.A.copy(), observer.B.copy(), observer.lifting.n_states
+    B[:n, 0] = -(A[:n, 0] - np.eye(n)[0]) + size * (np.arange(n) > 0)
+    A[1:n, 0] -= size
+    return replace(observer, A=A, B=B)
+
+
+def in_extended_precision(observer, y, u):
+    """Return estimates of the recorded states, step by step."""
+    real, n, K = np.longdouble, observer.lifting.n_states, observer.controller
+    A, B, into = (np.asarray(M, dtype=real) for M in (observer.A[:n], observer.B[:n], observer.into[:n]))
+    x, x_c = run_observer(observer, y[:2], u[:2])[0].astype(real), np.zeros((y.shape[1], K.n_states), dtype=real)
+    found, phase = np.empty((*y.shape[:2], n), dtype=real), real(observer.parameters.get("phase", 0.0))
+    for k in range(len(y)):
+        found[k] = x
+        angle = 100 * x[:, :1] + phase
+        theta = np.hstack([x, np.sin(angle), np.cos(angle)][: 3 if observer.lifting.functions else 1])
+        nu = y[k].astype(real) - x[:, :1]
+        corrected = (x_c @ K.C.T + nu @ K.D.T) @ into.T
+        x, x_c = theta @ A.T + u[k].astype(real) @ B.T + corrected, x_c @ K.A.T + nu @ K.B.T
+    return found[..., : len(observer.recorded)]
+
+
+@pytest.mark.parametrize("kind", ["lifted", "linear"])
+def test_the_direction_leaves_the_model_where_it_is(kind):
+    observer = cancelling(KINDS[kind]())
+    shift, n = find_shift(observer), observer.lifting.n_states
+    A, B = observer.A[:n, :n].astype(np.longdouble), observer.B[:n].astype(np.longdouble)
+    left = (A - np.eye(n)) @ shift.states + B @ shift.whole + B @ shift.rest
+    assert np.abs(left).max() < 1e-15
+    assert shift.whole.tolist() == [1.0, 0.0]
+    assert shift.states[0] == 1.0
+
+
+@pytest.mark.parametrize("kind", ["lifted", "linear"])
+def test_as_exact_as_in_the_first_turn(kind, monkeypatch):
+    observer = cancelling(KINDS[kind]())
+    y, u = far_away(1000)
+    exact = in_extended_precision(observer, y, u)
+
+    def off():
+        found = run_observer(observer, y, u)[..., : len(observer.recorded)] - exact
+        return float((np.sqrt(np.mean(found**2, axis=(0, 1))) / np.std(np.asarray(exact[:, 1], dtype=float), axis=0)).max())
+
+    with_origin = off()
+    monkeypatch.setattr(Origins, "beyond", lambda self, values: False)
+    assert with_origin < 1e-10
+    assert off() > 10 * with_origin
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_machine_that_turns_on_and_on(kind, tmp_path, monkeypatch):
+    """Batches, sample by sample, without a compiler and in C, with samples that are lost."""
+    observer = KINDS[kind]()
+    y, u = far_away(900, 1500, on=100)
+    u[700:720], y[900, 1], y[1200:1250] = np.nan, np.nan, np.nan
+    batch = run_observer(observer, y, u)[..., : len(observer.recorded)]
+    monkeypatch.setattr(step, "library", lambda: None)
+    np.testing.assert_allclose(run_observer(observer, y[:800], u[:800])[..., : batch.shape[2]], batch[:800], rtol=0, atol=1e-8)
+    builds = {p: CompiledObserver.build(export_c(observer, tmp_path / p, "drive", p)) for p in ("double", "float")}
+    for machine in range(2):
+        one, _ = in_python(observer, y[:, machine], u[:, machine])
+        assert apart(one[:-1], batch[1:, machine]) < 1e-9
+        for precision, compiled in builds.items():
+            assert apart(compiled.run(y[:, machine], u[:, machine])[0], one) < (1e-9 if precision == "double" else 1e-4)
+
+
+def test_nothing_moves_within_reach():
+    observer = unbound(drive())
+    origins = Origins(observer, 2)
+    origins.put(np.array([60.0, -60.0]))
+    assert origins.at is None
+    origins.put(np.array([6000.0, np.nan]))
+    assert abs(origins.at[0] - 6000) < np.pi / 100
+    assert origins.at[1] == 0
+    assert find_shift(unbound(drive(("position**2",)))) is None
+    assert Origins(unbound(drive(("position**2",))), 1).beyond(np.array([6000.0])) is False
+    assert find_shift(unbound(drive(), runtime=Runtime(delay=3))) is not None

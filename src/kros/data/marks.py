@@ -6,6 +6,7 @@ An episode follows from its file, known by path, size and time as whole runs are
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +15,18 @@ from typing import Any
 from .population import EpisodeKey
 from .prepare import EvenRecordings, PreparedSource
 from .recording import Recordings
-from .seen import mark_of
+
+
+def mark_of(*content: Any) -> str:
+    """Return a digest of plain content, dataclasses among it by their `repr`.
+
+    Examples
+    --------
+    >>> from kros.data.marks import mark_of
+    >>> mark_of("unit 7", 3) == mark_of("unit 7", 3) != mark_of("unit 7", 4)
+    True
+    """
+    return hashlib.sha256(repr(content).encode()).hexdigest()
 
 
 def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:

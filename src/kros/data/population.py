@@ -250,7 +250,7 @@ class Population:
         """Identifiers of the units, in order."""
         return tuple(u.id for u in self.units)
 
-    @property
+    @cached_property
     def conditions(self) -> tuple[str, ...]:
         """Conditions, in natural order."""
         return tuple(sorted({condition for _, condition in self._positions}, key=natural_key))

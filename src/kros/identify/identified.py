@@ -68,7 +68,14 @@ class EpisodeFactors:
 
     def rows_of(self, unit: str) -> list[int]:
         """Return where the episodes of a unit are."""
-        return [row for row, (name, _) in enumerate(self.rows) if name == unit]
+        return self._places.get(unit, [])
+
+    @cached_property
+    def _places(self) -> dict[str, list[int]]:
+        found: dict[str, list[int]] = {}
+        for row, (unit, _) in enumerate(self.rows):
+            found.setdefault(unit, []).append(row)
+        return found
 
     def save(self, folder: Path, lifting: Lifting, inputs: tuple[str, ...]) -> None:
         """Write them with the names of what they are of."""

@@ -20,8 +20,8 @@ from ..core.errors import DataError, IdentificationError
 from ..core.linalg import radius_text
 from ..core.settings import require_kind
 from ..core.work import Work
+from ..data.marks import mark_of
 from ..data.population import EpisodeKey, Population
-from ..data.seen import mark_of
 from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibrate import calibrate
@@ -176,7 +176,8 @@ def identify_models(
     population, on = base.population, condition == base.facts.identify_on
     liftings = {kind.name: kind.lifting(base.lifting) for kind in kinds_for(base.lifting, refined=False)}
     factors = {kind: lifted_factor(factor, base.lifting, parameters, lifting) for kind, lifting in liftings.items()}
-    pooled = np.array([u in base.facts.pooled for u in units])
+    in_pool = set(base.facts.pooled)
+    pooled = np.array([u in in_pool for u in units])
     rows = pooled if pooled.any() else slice(None)
     ranges = {kind: Ranges.of(factors[kind], lifting.n_lifted, rows) for kind, lifting in liftings.items()}
     alpha = settings.alpha
@@ -259,7 +260,8 @@ def refine_models(
     """
     facts = base.facts
     keys = {u: facts.keys("train", u, facts.identify_on) for u in units}
-    pooled = np.array([u in facts.pooled for u in units])
+    in_pool = set(facts.pooled)
+    pooled = np.array([u in in_pool for u in units])
     factors = [lifted_factor(factor, base.lifting, parameters, start.lifting) for start in starts]
     tasks = [
         partial(refine_population, base.population, keys, start.lifting, start.parameters, lifted, pooled, refine_options(settings))

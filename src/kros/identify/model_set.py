@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +154,11 @@ class ModelSet:
 
     def index(self, unit: str) -> int:
         """Return the row of a unit."""
-        return self.unit_ids.index(unit)
+        return self._rows[unit]
+
+    @cached_property
+    def _rows(self) -> dict[str, int]:
+        return {unit: row for row, unit in enumerate(self.unit_ids)}
 
     def unit_parameters(self, units: Sequence[str]) -> dict[str, Array]:
         """Return the lifting's parameters for some units, each of shape (len(units),)."""

@@ -38,6 +38,12 @@ def filtered(x: Array, rest: Array, a1: float, a2: float, every: int = 1) -> tup
     return held[..., ::every], np.concatenate([at_rest, held[..., every - 1 : -1 : every]], axis=-1)[..., :kept]
 
 
+def all_pole(x: Array, a1: float, a2: float = 0.0) -> Array:
+    """Return ``y[k] = x[k] - a1 y[k - 1] - a2 y[k - 2]`` from rest, shape (..., n_samples); SciPy's filters take a second to load."""
+    ahead = np.concatenate([x, np.zeros((*x.shape[:-1], 1))], axis=-1)
+    return filtered(ahead, np.zeros(x.shape[:-1]), a1, a2)[0][..., 1:]
+
+
 def recursion(F: Array, driven: Array, first: Array) -> Array:
     """Return ``h[k + 1] = F h[k] + driven[k]``.
 

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError
+from ..loops import all_pole
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -140,8 +141,6 @@ class Monitor:
         -------
         ndarray, shape (n_samples, batch, q, bands)
         """
-        from scipy.signal import lfilter
-
         found = np.zeros((*innovation.shape, len(self.filters)))
         scaled = innovation / self.size
         scaled = np.clip(np.where(np.isnan(scaled), LARGEST, scaled), -LARGEST, LARGEST)
@@ -149,9 +148,9 @@ class Monitor:
             taken = np.flatnonzero(judged[:, machine])
             if not len(taken):
                 continue
-            own = scaled[taken, machine]
-            bands = np.stack([lfilter([b, 0.0, -b], [1.0, a1, a2], own, axis=0) for b, a1, a2 in self.filters], axis=-1)
-            squares = lfilter([self.forget], [1.0, self.forget - 1.0], bands**2, axis=0)
+            own = scaled[taken, machine].T
+            bands = np.stack([b * _apart(all_pole(own, a1, a2)) for b, a1, a2 in self.filters], axis=1)
+            squares = np.moveaxis(self.forget * all_pole(bands**2, self.forget - 1.0), -1, 0)
             latest = np.searchsorted(taken, np.arange(len(judged)), side="right")
             found[:, machine] = np.concatenate([np.zeros((1, *squares.shape[1:])), squares])[latest]
         return found
@@ -187,6 +186,11 @@ class Monitor:
         return float(10 ** (self.bound(condition) * WEIGHT / 10))
 
 
+def _apart(signal: Array) -> Array:
+    """Return every sample minus that two before."""
+    return np.asarray(signal - np.concatenate([np.zeros((*signal.shape[:-1], 2)), signal], axis=-1)[..., : signal.shape[-1]])
+
+
 def octaves(count: int = 6, quality: float = 1.4) -> Array:
     """Return band-pass filters of the second order an octave apart, shape (count, 3); the highest is centred at half of the Nyquist frequency."""
     w = 2 * np.pi * 0.256 / 2.0 ** np.arange(count)
@@ -196,10 +200,10 @@ def octaves(count: int = 6, quality: float = 1.4) -> Array:
 
 def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
     """Return the exact (Garwood) interval of the mean of a Poisson count."""
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv  # halves of quantiles of chi-squared: its own module takes a second to load
 
     tail = (1 - level) / 2
-    return (float(chi2.ppf(tail, 2 * count) / 2) if count else 0.0), float(chi2.ppf(1 - tail, 2 * count + 2) / 2)
+    return (float(gammaincinv(count, tail)) if count else 0.0), float(gammaincinv(count + 1, 1 - tail))
 
 
 def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:

@@ -161,7 +161,8 @@ def quantify(models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: 
     outliers, scores = score_population(models, asked)
     dropped = {row["unit"] for row in scores if row["outlier"]} if asked.drop_outliers else set()
     first = models.models()
-    units = [u for u in models.facts.pooled if u in first.unit_ids and u not in dropped]
+    modelled = set(first.unit_ids) - dropped
+    units = [u for u in models.facts.pooled if u in modelled]
     if len(units) < 2:
         raise IdentificationError(
             f"Uncertainty: {len(units)} units are left of {len(models.facts.pooled)}, at least two are needed; dropped are {sorted(dropped)}. "

@@ -12,9 +12,10 @@ from ..core.frequency import check_grid, dense_grid, log_grid
 from ..core.lti import StateSpace
 from .bilinear import BilinearAxis, beyond, continuous_grid
 from .forms import Form
+from .many import bound_many, is_many
 from .model import UncertainModel, scale_system
 from .nominal.choice import Criterion
-from .quantification import AUTO, Quantification
+from .quantification import AUTO, Bounded, Quantification
 from .validation import check_candidate, find_nominal, read_candidates, read_models
 from .weights.check import checking_grid
 from .weights.cover import Structure
@@ -115,17 +116,22 @@ def quantify_systems(
         index = find_nominal(nominal, names, choices[asked.form].index)
         chosen = system[index] if index < len(ids) else others[names[index]]
     base = scale_system(chosen, *scales)
+    found = bound_many(asked, base, units, freqs) if is_many(asked, len(ids), time) else _bound_all(asked, base, units, freqs, time)
+    return UncertainModel(nominal_system=chosen, **asked.fields(ids, names, index, freqs, scales, choices, found))
+
+
+def _bound_all(asked: Quantification, base: StateSpace, units: StateSpace, freqs: Array, time: float | BilinearAxis) -> Bounded:
+    """Return weights from the residuals of all units at once."""
     if isinstance(time, BilinearAxis):
         residuals = ResidualSystems(asked.form, time.discrete(base), time.discrete(units))
-        grid, dt = dense_grid(time.discrete_hz(freqs), time.period_s, density), time.period_s
+        grid, dt = dense_grid(time.discrete_hz(freqs), time.period_s, asked.density), time.period_s
         grid = grid[grid <= time.discrete_hz(freqs[-1])]
         exact = None  # beyond the end of the grid residuals count as constant, which those of the mapped systems are not
     else:
         residuals, dt = ResidualSystems(asked.form, base, units), time
-        grid, exact = checking_grid(freqs, dt, density, filled=True), residuals
+        grid, exact = checking_grid(freqs, dt, asked.density, filled=True), residuals
     also = peaks_hz(residuals, grid, dt)
-    found = asked.bound(base.frequency_response, units.frequency_response, freqs, time, systems=exact, also_hz=also)
-    return UncertainModel(nominal_system=chosen, **asked.fields(ids, names, index, freqs, scales, choices, found))
+    return asked.bound(base.frequency_response, units.frequency_response, freqs, time, systems=exact, also_hz=also)
 
 
 def _axis(system: StateSpace, freqs_hz: npt.ArrayLike | None, longest_s: float | None) -> tuple[Array, float | BilinearAxis]:

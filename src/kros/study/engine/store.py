@@ -24,7 +24,7 @@ from ...core.artifacts import plain, write_json
 from ...core.errors import ConfigError, DataError
 from ...core.locks import NAME as LOCK
 from ...core.records import OWN, Record
-from ...data.seen import Seen
+from .seen import Seen
 
 log = logging.getLogger(__name__)
 

@@ -21,7 +21,6 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, IdentificationError, KrosError
 from ...core.work import Progress
 from ...data.population import OUTLIERS, Population, split_episodes
-from ...data.seen import Seen
 from ...data.survey import RecordingFacts
 from ...design.task import is_robust
 from ...evaluate import next_unit_bound
@@ -31,6 +30,7 @@ from ...identify.identified import recordings_of, recordings_path
 from ...observer import Observer
 from ..config import RequireConfig, Stage, StudyConfig
 from ..engine.context import Context
+from ..engine.seen import Seen
 from ..engine.steps import Step, run_steps
 from ..learning import LEARNING
 from . import calibrate

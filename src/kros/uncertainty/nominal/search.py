@@ -1,10 +1,4 @@
-r"""Exact search for the best nominal among many candidates, without visiting all pairs.
-
-A candidate's bound is the largest residual over the units, `b_c(f) = max_k sigma(E(c, k, f))`; any units and frequencies that were looked at give a bound of
-`b_c` from below. The search evaluates the candidate with the lowest such bound over *all* units, asks which unit was the worst at every frequency, and
-raises the lower bounds of all other candidates by these witnesses. A candidate whose lower bound exceeds the best score so far is never evaluated;
-when none is left below, the best is the best of all: nothing is assumed about the population. A population has few extreme units, so that
-few rounds are needed; each visits as many pairs as there are units, not their square.
+r"""Exact search for the best nominal among many candidates (`identify.refine.minimax`).
 
 Plants are tall here: wide ones are transposed, with the dual form; as `E_ia(G^T, Gp^T) = -E_ia(Gp, G)^T`, the inverse additive form then has nominal
 and perturbed plant exchanged. With `G^+ = L Q^H`, L small and triangular, `sigma(D G^+) = sigma(D L)`.
@@ -12,21 +6,19 @@ and perturbed plant exchanged. With `G^+ = L Q^H`, L small and triangular, `sigm
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ...identify.refine.minimax import Score, smallest_largest
 from ..forms import Form
 from ..small_matrices import entries_first, lower_factor, multiply, pseudo_inverse_first, sigma_max_first
 
 Array = npt.NDArray[Any]
-Score = Callable[[Array], Array]
 
 _VECTOR = 16000  # complex numbers in a vector
-_TIE = 1e-9  # relative; scores closer than rounding are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,20 +108,15 @@ def search(geometry: Geometry, candidates: Plants, units: Plants, score: Score) 
         Which scores are exact.
     """
     count, n_freqs = candidates.G.shape[2:]
-    lower, scores, evaluated = np.zeros((count, n_freqs)), np.zeros(count), np.zeros(count, bool)
-    best, row = np.inf, _central(candidates)
-    while scores[row] <= best * (1 + _TIE):
-        lower[row], witness = bound_of(geometry, candidates.one(row), units)
-        scores[row], evaluated[row] = float(score(lower[row])), True
-        best = min(best, scores[row])
-        rows = np.flatnonzero(~evaluated & (scores <= best * (1 + _TIE)))
-        if not rows.size:
-            break
-        _raise_by(geometry, candidates, units.part(witness, np.arange(n_freqs)), rows, lower)
-        scores[rows] = np.maximum(scores[rows], score(lower[rows]))
-        row = int(rows[np.argmin(scores[rows])])
-    index = first_best(np.where(evaluated, scores, np.inf))
-    return index, lower[index], scores, evaluated
+
+    def against(rows: Array, witness: Array) -> Array:
+        one_each = units.part(witness, np.arange(n_freqs))
+        parts = blocks(len(rows), n_freqs)
+        return np.concatenate([geometry.sigma(candidates.part(rows[part]), one_each.part(None)) for part in parts])
+
+    return smallest_largest(
+        (count, n_freqs), _central(candidates), lambda row: bound_of(geometry, candidates.one(row), units), against, score
+    )
 
 
 def bound_of(geometry: Geometry, nominal: Plants, units: Plants) -> tuple[Array, Array]:
@@ -145,24 +132,10 @@ def bound_of(geometry: Geometry, nominal: Plants, units: Plants) -> tuple[Array,
     return largest, who
 
 
-def first_best(scores: Array) -> int:
-    """Return the first of the lowest scores, which rounding may have told apart."""
-    least = scores.min()
-    return int(np.argmax(scores <= least + _TIE * np.abs(least))) if np.isfinite(least) else int(np.argmin(scores))
-
-
 def blocks(n_rows: int, n_freqs: int) -> list[slice]:
     """Return slices of rows that make vectors of a good length."""
     step = max(1, _VECTOR // n_freqs)
     return [slice(start, min(start + step, n_rows)) for start in range(0, n_rows, step)]
-
-
-def _raise_by(geometry: Geometry, candidates: Plants, witnesses: Plants, rows: Array, lower: Array) -> None:
-    """Raise lower bounds by one unit at every frequency."""
-    one_each = witnesses.part(None)
-    for part in blocks(len(rows), lower.shape[1]):
-        chosen = rows[part]
-        lower[chosen] = np.maximum(lower[chosen], geometry.sigma(candidates.part(chosen), one_each))
 
 
 def _central(candidates: Plants) -> int:

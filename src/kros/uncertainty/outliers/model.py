@@ -35,7 +35,7 @@ from ..forms import Form, as_form, check_responses
 from ..validation import check_scale
 from .distances import balance, distances
 from .groups import separate
-from .noise import AS_GOOD, Others, spread, times_noisier
+from .noise import AS_GOOD, Others, noisier_than, spread
 from .score import OutlierScore
 from .scoring import Nominals, margins_of, scores_of, with_noise
 
@@ -244,14 +244,23 @@ def score_outliers(
     form, rate = as_form(form), float(false_alarm_rate)
     if not 0 < rate < 1:
         raise ConfigError(f"Outlier scores: need a false alarm rate between 0 and 1, found {rate}; 0.003 is usual.")
-    rows = np.unique(np.linspace(0, len(freqs) - 1, _FREQUENCIES).round().astype(int))
+    rows = _scored(len(freqs))
     freqs, G = freqs[rows], G[:, rows]
     given = output_scale is not None or input_scale is not None
     scales = (check_scale("output", output_scale, G.shape[2]), check_scale("input", input_scale, G.shape[3])) if given else balance(G)
     model = _compared(G / scales[0][:, None] * scales[1], ids, freqs, form, rate, scales)
     if deviations is None:
         return model
-    return _with_deviations(model, G, ids, _draws(deviations, ids, rows, G.shape[1:]))
+    return _with_deviations(model, G, ids, _Draws(deviations, ids, rows, G.shape[1:]))
+
+
+def scored_frequencies(freqs_hz: Array) -> Array:
+    """Return the frequencies that scores look at, where they are given more."""
+    return np.asarray(freqs_hz[_scored(len(freqs_hz))])
+
+
+def _scored(count: int) -> Array:
+    return np.unique(np.linspace(0, count - 1, _FREQUENCIES).round().astype(int))
 
 
 def _compared(G: Array, ids: tuple[str, ...], freqs: Array, form: Form, rate: float, scales: tuple[Array, ...]) -> OutlierModel:
@@ -279,11 +288,12 @@ def _compared(G: Array, ids: tuple[str, ...], freqs: Array, form: Form, rate: fl
     )
 
 
-def _with_deviations(model: OutlierModel, G: Array, ids: tuple[str, ...], draws: list[Array]) -> OutlierModel:
+def _with_deviations(model: OutlierModel, G: Array, ids: tuple[str, ...], draws: Sequence[Array]) -> OutlierModel:
     """Score units that are known less well than most by themselves, G and draws in physical units, all others among themselves."""
     scales = model.output_scale, model.input_scale
     noise = np.stack([spread(d) for d in draws]) * (scales[1] / scales[0][:, None]) ** 2
-    worse = np.array([times_noisier(own, noise) for own in noise])
+    middle = np.median(noise, axis=0)
+    worse = np.array([noisier_than(middle, own) for own in noise])
     well = np.flatnonzero(worse <= _NOISY)
     if len(well) < _FEWEST + 1:
         well = np.arange(len(G))
@@ -296,7 +306,8 @@ def _with_deviations(model: OutlierModel, G: Array, ids: tuple[str, ...], draws:
             model.false_alarm_rate,
             scales,
         )
-    model = replace(model, noise=np.stack([noise[ids.index(u)] for u in model.unit_ids]))
+    places = {unit: k for k, unit in enumerate(ids)}
+    model = replace(model, noise=np.stack([noise[places[u]] for u in model.unit_ids]))
     scores = {s.unit: s for s in model.scores}
     for k, unit in enumerate(ids):
         if unit not in scores or (scores[unit].outlier and worse[k] > AS_GOOD):
@@ -306,17 +317,27 @@ def _with_deviations(model: OutlierModel, G: Array, ids: tuple[str, ...], draws:
     return replace(model, scores=tuple(scores[u] for u in ids), by_nominal_db=by_nominal)
 
 
-def _draws(deviations: Sequence[npt.ArrayLike], ids: tuple[str, ...], rows: Array, shape: tuple[int, ...]) -> list[Array]:
-    """Checked deviations of all units at the chosen frequencies."""
-    if len(deviations) != len(ids):
-        raise DataError(f"Outlier scores: need the deviations of every unit, found {len(deviations)} for {len(ids)} units.")
-    listed = []
-    for unit, draws in zip(ids, deviations, strict=True):
-        found = np.asarray(draws)
+@dataclass(frozen=True, eq=False)
+class _Draws(Sequence[Array]):
+    """Checked deviations of all units at the chosen frequencies, each when it is asked for: together they may be too large for memory."""
+
+    deviations: Sequence[npt.ArrayLike]
+    ids: tuple[str, ...]
+    rows: Array
+    shape: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.deviations) != len(self.ids):
+            raise DataError(f"Outlier scores: need the deviations of every unit, found {len(self.deviations)} for {len(self.ids)} units.")
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, k: Any) -> Any:
+        found, shape, rows = np.asarray(self.deviations[k]), self.shape, self.rows
         if found.ndim == len(shape) + 1 and found.shape[2:] == shape[1:] and found.shape[1] > rows[-1]:
             found = found[:, rows]
-        listed.append(_deviations(unit, found, shape))
-    return listed
+        return _deviations(self.ids[k], found, shape)
 
 
 def _deviations(unit: str, draws: npt.ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -108,7 +108,11 @@ def times_noisier(variance: Array, noise: Array) -> float:
 
     The median over frequencies and entries; infinity where only the one has noise, zero where it has none.
     """
-    middle = np.median(noise, axis=0)
+    return noisier_than(np.median(noise, axis=0), variance)
+
+
+def noisier_than(middle: Array, variance: Array) -> float:
+    """Return the same of the middle one's variance, shape (frequency, p, m)."""
     known = variance > 0
     if not known.any():
         return 0.0

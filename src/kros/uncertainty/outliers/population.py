@@ -10,7 +10,7 @@ import numpy as np
 
 from ...identify.identified import IdentifiedModels
 from ..settings import UncertaintySettings
-from .model import OutlierModel, score_outliers
+from .model import OutlierModel, score_outliers, scored_frequencies
 from .recorded import Recorded
 from .score import OutlierScore
 
@@ -37,7 +37,7 @@ def score_population(models: IdentifiedModels, settings: UncertaintySettings) ->
         if len(own.unit_ids) < 3:
             log.info("%s: outlier scores need at least three units, found %d", condition, len(own.unit_ids))
             continue
-        freqs = own.frequencies(settings.n_freqs)
+        freqs = scored_frequencies(own.frequencies(settings.n_freqs))
         recorded = Recorded.of(models.factors[condition], own, freqs)
         evidence = list(recorded.units.values())
         outliers = score_outliers(
@@ -48,7 +48,7 @@ def score_population(models: IdentifiedModels, settings: UncertaintySettings) ->
             output_scale=own.output_scale,
             input_scale=own.input_scale,
             false_alarm_rate=settings.false_alarm_rate,
-            deviations=[recorded.deviations(e) for e in evidence],
+            deviations=recorded.all_deviations(),
         )
         qualified = tuple(recorded.qualified(*pair) for pair in zip(outliers.scores, evidence, strict=True))
         found[place] = outliers = replace(outliers, scores=qualified)

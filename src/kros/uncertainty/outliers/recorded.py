@@ -115,15 +115,19 @@ class Recorded:
         own = len(evidence.lifted)
         if own < 2:
             return draws
-        from scipy.stats import chi2
+        from scipy.special import gammaincinv  # half a quantile of chi-squared, whose own module takes a second to load
 
         without = self.response([evidence.part(np.delete(np.arange(own), k).tolist()) for k in range(own)])
         jackknife = (own - 1) / own * (np.abs(without - without.mean(axis=0)) ** 2).sum(axis=0)
         usual = (np.abs(draws) ** 2).mean(axis=0)
         known = usual > 0
         ratio = float(np.median(jackknife[known] / usual[known])) if known.any() else 1.0
-        clearly = ratio > chi2.ppf(_UNLIKELY, own - 1) / (own - 1)
+        clearly = ratio > 2 * gammaincinv((own - 1) / 2, _UNLIKELY) / (own - 1)
         return draws * np.sqrt(ratio) if clearly else draws
+
+    def all_deviations(self) -> Sequence[Array]:
+        """Return the deviations of all units of the study, each computed when it is asked for."""
+        return _Deviations(self, list(self.units.values()))
 
     def qualified(self, score: OutlierScore, evidence: Evidence) -> OutlierScore:
         """Return what can be said about a unit; nothing where it was recorded for less than any episode of the study, of which none can be drawn."""
@@ -175,6 +179,18 @@ class Recorded:
         sizes = np.array([e.n_samples for e in self.units.values()])
         apart = (everyone - np.roll(everyone, 1, axis=0)) / np.sqrt(2)
         return np.asarray(apart * np.sqrt(sizes / n_samples)[:, None, None, None])
+
+
+@dataclass(frozen=True, eq=False)
+class _Deviations(Sequence[Array]):
+    recorded: Recorded
+    evidence: Sequence[Evidence]
+
+    def __len__(self) -> int:
+        return len(self.evidence)
+
+    def __getitem__(self, k: Any) -> Any:
+        return self.recorded.deviations(self.evidence[k])
 
 
 def _alike(stored: Factor, found: Factor, row: int) -> bool:

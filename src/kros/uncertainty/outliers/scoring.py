@@ -7,7 +7,7 @@ to first order, so what it takes to reach the bound follows in percent.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -94,14 +94,14 @@ def scores_of(
     rows = where[list(units)]
     entries = largest_entries(form, G, found, np.asarray(units), rows)
     change = change_levels(form, G[inliers], found, freqs)
+    cover = _without_one(found.levels, inliers)
     scores = []
     for k, unit, margin, row, entry in zip(units, ids, margins, rows, entries, strict=True):
         known = np.isfinite(threshold) and np.isfinite(margin)
         referred = threshold + margin if known else float(value[k])
         beyond = bool(np.isfinite(threshold) and margin > 0)
         bound = float(value[k]) - margin if known else float("inf")
-        others = inliers & (np.arange(len(G)) != k)
-        percent, at, changed = smallest_change(change, held(found.levels[others].max(axis=0)), bound)
+        percent, at, changed = smallest_change(change, held(cover(k)), bound)
         status = Status.OUTLIER if beyond else Status.OK if room_db(bound, percent) >= 0 else Status.CANNOT_TELL
         found_score = OutlierScore(
             unit=unit,
@@ -120,6 +120,15 @@ def scores_of(
         )
         scores.append(found_score)
     return tuple(scores)
+
+
+def _without_one(levels: Array, inliers: npt.NDArray[np.bool_]) -> Callable[[int], Array]:
+    """Return what gives the largest levels of all inliers but one unit, shape (frequency,)."""
+    here = np.flatnonzero(inliers)
+    ordered = np.argpartition(levels[here], max(len(here) - 2, 0), axis=0)[-2:]
+    largest, top = levels[here].max(axis=0), here[ordered[-1]]
+    second = levels[here[ordered[0]], np.arange(levels.shape[1])]
+    return lambda unit: np.where(top == unit, second, largest)
 
 
 def with_noise(score: OutlierScore, G: Array, others: Others, draws: Array) -> OutlierScore:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import base64
 import dataclasses
 import gzip
-import hashlib
 import json
 import logging
 import zlib
@@ -25,24 +24,12 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ..core.work import Usable, Work
+from ...core.work import Usable, Work
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 _DAMAGED = (OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, zlib.error)
 _LEVEL = 1  # of compression
-
-
-def mark_of(*content: Any) -> str:
-    """Return a digest of plain content, dataclasses among it by their `repr`.
-
-    Examples
-    --------
-    >>> from kros.data.seen import mark_of
-    >>> mark_of("unit 7", 3) == mark_of("unit 7", 3) != mark_of("unit 7", 4)
-    True
-    """
-    return hashlib.sha256(repr(content).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -63,7 +50,7 @@ class Seen:
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
     >>> from kros.core.work import Work
-    >>> from kros.data.seen import Seen
+    >>> from kros.study.engine.seen import Seen
     >>> with TemporaryDirectory() as folder:
     ...     work = Work(seen=Seen(Path(folder), "1", changed=lambda path: None))
     ...     squares = list(work.recall("square", lambda x: x**2, [2, 3], ["two", "three"]))

@@ -1,0 +1,148 @@
+"""Many units through read, calibrate, identify, outliers, nominal and weights: processor time and memory a stage, and how they grow.
+
+    python benchmarks/fleet.py --units 100 1000 --seconds 5
+
+Each size is run in a process of its own on recordings that are simulated once (`--folder`): harmonic drives, 2 conditions x 4 episodes, Parquet,
+read in place. Prints a table of processor time a unit in milliseconds with the fitted exponent of the time over the number of units
+(1 is linear), and the largest memory after each stage. The search for the nominal and the weights are also counted by themselves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+EPISODES = 4
+POINTS, ORDER = 200, 2  # of the weights: frequencies and order
+BLOCK = 50  # units simulated at once
+Times = dict[str, float]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--units", type=int, nargs="+", default=[100, 1000])
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of an episode")
+    parser.add_argument("--folder", type=Path, help="where recordings are kept; default a temporary one")
+    parser.add_argument("--refine", action="store_true", help="refine the models too")
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.one is not None:
+        print(json.dumps(measured(options.folder / "recordings", options.one, options.refine)))
+        return
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.folder or Path(temporary)
+        found = {}
+        for units in options.units:
+            place = folder / f"{units}x{options.seconds:g}"
+            simulate(place / "recordings", units, options.seconds)
+            command = [sys.executable, __file__, "--one", str(units), "--folder", str(place), *(["--refine"] if options.refine else [])]
+            found[units] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+            print(json.dumps({"units": units, **found[units]}), flush=True)
+    print(table(found))
+
+
+def simulate(folder: Path, units: int, seconds: float) -> None:
+    """Write recordings of drives; every block of them is drawn from a seed of its own."""
+    from kros.core.artifacts import read_json
+    from kros.data.population import EpisodeKey, Population, Unit
+    from kros.data.writers.parquet import write_group, write_index
+    from kros.plants import HarmonicDrivePopulation
+
+    if (folder / "population.json").exists() and len(read_json(folder / "population.json")["units"]) == units:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    records: list[Any] = []
+    names: tuple[Unit, ...] = ()
+    for block in range(0, units, BLOCK):
+        count = min(BLOCK, units - block)
+        made = HarmonicDrivePopulation(n_units=count, n_episodes=EPISODES, seconds=seconds, seed=1000 + block).simulate().population
+        own = tuple(Unit(f"{block + k + 1:06d}", "population") for k in range(count))
+        renamed = dict(zip(made.unit_ids, own, strict=True))
+        keys = {EpisodeKey(renamed[k.unit].id, k.condition, k.episode): k for k in made.episodes}
+        whole: Population = replace(made, units=own, episodes=tuple(keys), source=lambda key, keys=keys, made=made: made.source(keys[key]))
+        records += [write_group(whole, *group[:2], folder) for group in whole.groups()]
+        names += own
+    write_index(replace(whole, units=names), records, folder)
+
+
+def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
+    """Run the stages and return processor time, s, and the largest memory after each, GB."""
+    import kros
+    from kros.data.survey import survey
+    from kros.identify.calibrate import calibrate
+    from kros.identify.identify import identify
+    from kros.identify.presets import resolve_lifting, resolve_phase
+    from kros.identify.settings import CalibrationSettings, LiftingSettings
+    from kros.uncertainty.outliers.population import score_population
+    from kros.uncertainty.quantify import choose_unit, quantify_models
+    from kros.uncertainty.settings import UncertaintySettings
+
+    times: Times = {}
+    memory: Times = {}
+
+    @contextmanager
+    def stage(name: str) -> Iterator[None]:
+        began, wall = time.process_time(), time.perf_counter()
+        yield
+        times[name] = time.process_time() - began
+        times[f"{name} (wall)"] = time.perf_counter() - wall
+        memory[name] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+    settings = UncertaintySettings.of({"n_freqs": POINTS, "max_order": ORDER}, "fleet")
+    with stage("open"):
+        population = kros.read(recordings)
+    lifting = resolve_lifting(LiftingSettings(), CalibrationSettings(), population)
+    spec = resolve_phase(CalibrationSettings(), population, lifting)
+    assert spec is not None
+    with stage("read"):
+        population, facts = survey(population)
+    with stage("calibrate"):
+        calibration = calibrate(population, facts, spec)
+    with stage("identify"):
+        models = identify(population, lifting, facts=facts, calibration=calibration, refine=refine)
+    with stage("outliers"):
+        _, scores = score_population(models, settings)
+    with stage("nominal"):
+        first = models.models()
+        nominal = choose_unit(first, list(first.unit_ids), settings)
+    with stage("weights"):
+        found = quantify_models(first, list(first.unit_ids), settings, nominal)
+    return {
+        "times": times,
+        "memory": memory,
+        "nominal": nominal,
+        "outliers": sum(bool(row["outlier"]) for row in scores),
+        "cover_max": found.weight.cover_max,
+    }
+
+
+def table(found: dict[int, dict[str, Any]]) -> str:
+    """Return milliseconds a unit for every stage and size, and the exponent between the smallest and the largest size."""
+    import numpy as np
+
+    sizes = sorted(found)
+    stages = [name for name in found[sizes[0]]["times"] if not name.endswith("(wall)")]
+    lines = ["| stage | " + " | ".join(f"{n} units, ms each" for n in sizes) + " | exponent | GB |", "|---" * (len(sizes) + 3) + "|"]
+    for name in stages:
+        own = [found[n]["times"][name] for n in sizes]
+        slope = np.log(own[-1] / own[0]) / np.log(sizes[-1] / sizes[0]) if len(sizes) > 1 else float("nan")
+        cells = " | ".join(f"{1000 * t / n:.2f}" for t, n in zip(own, sizes, strict=True))
+        lines.append(f"| {name} | {cells} | {slope:.2f} | {found[sizes[-1]]['memory'][name]:.2f} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    main()

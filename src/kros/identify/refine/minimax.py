@@ -1,0 +1,90 @@
+r"""Exact search for the candidate whose largest residual is smallest, without visiting all pairs of candidates and units.
+
+A candidate's bound is the largest residual over the units, `b_c(f) = max_k sigma(E(c, k, f))`; any units and frequencies that were looked at give a bound of
+`b_c` from below. The search evaluates the candidate with the lowest such bound over *all* units, asks which unit was the worst at every frequency, and
+raises the lower bounds of all other candidates by these witnesses. A candidate whose lower bound exceeds the best score so far is never evaluated;
+when none is left below, the best is the best of all: nothing is assumed about the population. A population has few extreme units, so that
+few rounds are needed; each visits as many pairs as there are units, not their square.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+Score = Callable[[Array], Array]
+
+TIE = 1e-9  # relative; scores closer than rounding are one
+
+
+def smallest_largest(
+    shape: tuple[int, int],
+    first: int,
+    bound_of: Callable[[int], tuple[Array, Array]],
+    against: Callable[[Array, Array], Array],
+    score: Score,
+) -> tuple[int, Array, Array, Array]:
+    """Return the candidate whose bound has the lowest score.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Numbers of candidates and frequencies.
+    first : int
+        Candidate to begin with.
+    bound_of : callable
+        From a candidate to its largest residual over all units and which unit that is of, both of shape (frequency,).
+    against : callable
+        From candidates, shape (n,), and one unit a frequency to the candidates' residuals with these, shape (n, frequency).
+    score : callable
+        From bounds (..., frequency) to scores (...), non-negative and never falling when a bound rises.
+
+    Returns
+    -------
+    index : int
+        Best candidate; of several equal ones the first.
+    bound : ndarray, shape (frequency,)
+        Its largest residual over the units.
+    scores : ndarray, shape (candidate,)
+        Where a candidate was evaluated its score, elsewhere a lower bound.
+    evaluated : ndarray of bool, shape (candidate,)
+        Which scores are exact.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify.refine.minimax import smallest_largest
+    >>> gains = np.array([1.0, 2.0, 2.1, 9.0])
+    >>> def bound_of(row):
+    ...     apart = np.abs(gains - gains[row])
+    ...     return apart.max(keepdims=True), np.array([apart.argmax()])
+    >>> def against(rows, witness):
+    ...     return np.abs(gains[rows][:, None] - gains[witness])
+    >>> index, bound, _, evaluated = smallest_largest((4, 1), 0, bound_of, against, lambda b: b.max(axis=-1))
+    >>> index, bound.round(9).tolist()
+    (2, [6.9])
+    """
+    lower, scores, evaluated = np.zeros(shape), np.zeros(shape[0]), np.zeros(shape[0], bool)
+    best, row = np.inf, first
+    while scores[row] <= best * (1 + TIE):
+        lower[row], witness = bound_of(row)
+        scores[row], evaluated[row] = float(score(lower[row])), True
+        best = min(best, scores[row])
+        rows = np.flatnonzero(~evaluated & (scores <= best * (1 + TIE)))
+        if not rows.size:
+            break
+        lower[rows] = np.maximum(lower[rows], against(rows, witness))
+        scores[rows] = np.maximum(scores[rows], score(lower[rows]))
+        row = int(rows[np.argmin(scores[rows])])
+    index = first_best(np.where(evaluated, scores, np.inf))
+    return index, lower[index], scores, evaluated
+
+
+def first_best(scores: Array) -> int:
+    """Return the first of the lowest scores, which rounding may have told apart."""
+    least = scores.min()
+    return int(np.argmax(scores <= least + TIE * np.abs(least))) if np.isfinite(least) else int(np.argmin(scores))

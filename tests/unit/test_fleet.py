@@ -1,0 +1,128 @@
+"""Many units: quicker ways give what the ordinary ones give."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kros.core.lti import StateSpace
+from kros.identify.refine.minimax import smallest_largest
+from kros.identify.refine.spread import peak_residual_db
+from kros.uncertainty import Form, many, quantify_systems, residual, sigma_max
+from kros.uncertainty.forms import completion
+from kros.uncertainty.nominal.choice import choose_nominals
+from kros.uncertainty.weights.certificate import Method
+from kros.uncertainty.weights.cover import cover_ratio
+
+UNITS, DT = 210, 0.01
+
+
+def fleet(n_units: int = UNITS, outputs: int = 2, seed: int = 0) -> StateSpace:
+    """Systems of two states and one input that differ in poles and gains."""
+    rng = np.random.default_rng(seed)
+    A = np.zeros((n_units, 2, 2))
+    A[:, 0, 0], A[:, 1, 1] = 0.9 + 0.01 * rng.normal(size=n_units), 0.6 + 0.03 * rng.normal(size=n_units)
+    A[:, 1, 0] = 0.1 * (1 + 0.1 * rng.normal(size=n_units))
+    B = np.stack([0.1 * (1 + 0.05 * rng.normal(size=n_units)), np.full(n_units, 0.02)], axis=1)[:, :, None]
+    C = np.broadcast_to(np.eye(2)[:outputs], (n_units, outputs, 2))
+    return StateSpace(A, B, C, np.zeros((n_units, outputs, 1)), DT)
+
+
+@pytest.fixture
+def ordinary(monkeypatch) -> Any:
+    """Quantify as few units are."""
+
+    def quantified(*arguments: Any, **options: Any) -> Any:
+        with monkeypatch.context() as patch:
+            patch.setattr(many, "MANY", 10**9)
+            return quantify_systems(*arguments, **options)
+
+    return quantified
+
+
+@pytest.mark.parametrize("structure", ["scalar", "diagonal"])
+@pytest.mark.parametrize(("form", "outputs"), [("inverse_input_multiplicative", 2), ("additive", 2), ("output_multiplicative", 1)])
+def test_weights_of_a_fleet_cover_all_of_it_and_are_those_of_all_units_together(ordinary, form, outputs, structure):
+    units, freqs = fleet(outputs=outputs), np.geomspace(0.05, 49, 50)
+    options = {"structure": structure, "max_order": 2}
+    found, expected = quantify_systems(units, form, freqs, **options), ordinary(units, form, freqs, **options)
+    assert found.nominal == expected.nominal
+    np.testing.assert_allclose(found.bounds[found.form], expected.bounds[found.form], rtol=1e-9)
+    np.testing.assert_allclose(found.misfit, expected.misfit, rtol=1e-9, atol=1e-12)
+    assert found.weight.method is expected.weight.method is Method.LEVEL_SETS
+    own, theirs = (w.magnitudes(freqs).cost_db() for w in (found.weight, expected.weight))
+    assert (own - theirs).max() <= (
+        0.05 if structure == "scalar" else 0.5
+    )  # dB; diagonal fits of few units have other ends, here lower ones
+    dense = np.geomspace(1e-3, 49.9, 1500)
+    G, Gp = found.nominal_system.frequency_response(dense), units.frequency_response(dense)
+    pairs = [(residual(form, G, Gp), found.weight)] + ([(completion(form, G, Gp)[1], found.remainder)] if found.remainder else [])
+    assert (found.remainder is None) == (expected.remainder is None)
+    for E, weight in pairs:
+        used = weight.magnitudes(dense)
+        assert cover_ratio(E, used.left, used.right).max() <= 1 + 1e-9
+        best = found.cover if weight is found.weight else found.remainder_cover
+        assert best is not None
+    E = residual(form, *(s.frequency_response(freqs) for s in (found.nominal_system, units)))
+    assert cover_ratio(E, found.cover.left, found.cover.right).max() <= 1 + 1e-9
+
+
+def test_units_that_nobody_looked_at_join_the_fit_or_lift_the_weights(monkeypatch, ordinary):
+    units, freqs = fleet(), np.geomspace(0.05, 49, 60)
+    expected = ordinary(units, "additive", freqs, structure="scalar", max_order=2)
+    for rounds in (3, 1):
+        monkeypatch.setattr(many, "_ROUNDS", rounds)
+        monkeypatch.setattr(many._Many, "deciding", lambda self: np.arange(3))
+        found = quantify_systems(units, "additive", freqs, structure="scalar", max_order=2)
+        size = sigma_max(residual("additive", *(s.frequency_response(freqs) for s in (found.nominal_system, units)))).max(axis=0)
+        assert np.all(found.weight.magnitudes(freqs).left[:, 0] >= size * (1 - 1e-9))
+        assert found.cover_max <= 1
+        np.testing.assert_allclose(found.cover.left[:, 0], size, rtol=1e-9)
+    np.testing.assert_allclose(expected.cover.left[:, 0], size, rtol=1e-9)
+
+
+def test_a_fleet_of_units_that_are_all_the_same():
+    one = fleet(1)
+    same = StateSpace(*(np.repeat(M, UNITS, axis=0) for M in (one.A, one.B, one.C, one.D)), DT)
+    assert quantify_systems(same, "additive", np.geomspace(0.1, 49, 50), max_order=1).cover_max == 0
+
+
+@pytest.mark.parametrize("form", list(Form))
+def test_the_best_nominal_is_that_of_all_pairs(form):
+    responses = fleet(60, seed=3).frequency_response(np.geomspace(0.1, 49, 20))
+    peaks = [sigma_max(residual(form, responses[k], responses)).max() for k in range(len(responses))]
+    found = choose_nominals(responses)[form]
+    assert found.index == int(np.argmin(peaks))
+    assert found.bound.max() == pytest.approx(min(peaks), rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_pruned_search_is_the_search_of_all(seed):
+    rng = np.random.default_rng(seed)
+    apart = rng.uniform(size=(40, 40, 7)) ** rng.uniform(0.2, 3)  # candidate, unit, frequency: no geometry at all
+
+    def bound_of(row: int) -> tuple[Any, Any]:
+        return apart[row].max(axis=0), apart[row].argmax(axis=0)
+
+    def against(rows: Any, witness: Any) -> Any:
+        return apart[rows][:, witness, np.arange(7)]
+
+    index, bound, scores, evaluated = smallest_largest((40, 7), 0, bound_of, against, lambda b: b.max(axis=-1))
+    every = apart.max(axis=(1, 2))
+    assert index == every.argmin()
+    np.testing.assert_array_equal(bound, apart[index].max(axis=0))
+    assert np.all(scores <= every)
+    np.testing.assert_array_equal(scores[evaluated], every[evaluated])
+
+
+def test_the_spread_of_models_is_that_of_all_pairs():
+    units = fleet(30, seed=4)
+    z = np.exp(1j * np.pi * np.logspace(-6, 0, 50))
+    G = np.linalg.solve(z[:, None, None] * np.eye(2) - units.A[:, None], units.B[:, None] + 0j)
+    peaks = [np.linalg.norm(np.linalg.pinv(G) @ (g - G), ord=2, axis=(-2, -1)).max() for g in G]
+    found = peak_residual_db(units.A, units.B, np.ones(2), np.ones(1), 50)
+    assert found == pytest.approx(20 * np.log10(min(peaks)), abs=1e-9)
+    alike = units[np.zeros(5, int)]
+    assert peak_residual_db(alike.A, alike.B, np.ones(2), np.ones(1), 50) == -np.inf

@@ -145,6 +145,17 @@ def test_without_groups_twins_would_stay_hidden() -> None:
     np.testing.assert_array_equal(np.flatnonzero(~separate(levels, 0.003).inliers), [10, 11])
 
 
+def test_units_that_differ_in_nothing_but_gain_are_flagged_at_the_rate() -> None:
+    """All their scores come from one and the same frequency, so that the upper ones look like a group."""
+    rng, flagged, found = np.random.default_rng(21), 0, 0
+    for _ in range(100):
+        gains = np.append(1 + 0.02 * rng.normal(size=20), 1.5)
+        outliers = [s.outlier for s in score_outliers((gains[:, None] / (1 + 1j * FREQS / 5))[:, :, None, None], FREQS).scores]
+        flagged, found = flagged + sum(outliers[:-1]), found + outliers[-1]
+    assert found == 100
+    assert flagged <= stats.binom.ppf(0.999, 2000, 0.003)
+
+
 def test_the_entry_and_frequency_where_a_unit_sticks_out() -> None:
     """Unit 11 has a resonance of its own at 5 Hz in the entry (1, 0)."""
     G = population([*GOOD, 1.0])

@@ -216,7 +216,7 @@ def test_another_rate(folder: Path) -> None:
         ({"channel": [{"name": "x", "role": "state", "column": "pos", "measurd": True}]}, r"channel\[0\]: unknown key 'measurd'"),
         (
             {"channel": [{"name": "x", "role": "output", "column": "pos"}]},
-            r"role: should be one of \['state', 'input', 'truth'\], found 'output'",
+            r"role: should be one of \['state', 'input', 'truth', 'covariate'\], found 'output'",
         ),
         ({"channel": []}, r"there is no \[\[channel\]\]"),
         ({"files": "("}, r"files = '\(' is not a regular expression"),

@@ -85,7 +85,7 @@ def _check_moving(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
     still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
     if not still:
         return
-    moving = [c.name for i, c in enumerate(channels) if i not in still and not is_constant(values[:, i])]
+    moving = [c.name for i, c in enumerate(channels) if i not in still and c.role is not Role.COVARIATE and not is_constant(values[:, i])]
     if moving:
         raise DataError(
             f"{title(key)}: state {channels[still[0]].name!r} stays at {values[0, still[0]]:g} in all {len(values)} samples while "

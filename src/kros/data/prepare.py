@@ -41,7 +41,7 @@ class PreparedSource:
     recordings : callable
         Returns a `Recording` for an `EpisodeKey`.
     channels : tuple of Channel
-        As recorded: states, inputs, truths.
+        As recorded: states, inputs, truths, covariates.
     period_s : float
         As recorded, found in the episode `reference`.
     reference : EpisodeKey
@@ -105,7 +105,7 @@ def assemble(
     check_structure(channels, list(recordings.places))
     if channels != columns_in_order(channels):
         raise DataError(
-            f"Channels should list states before inputs, and truths last, found {[(c.name, c.role.value) for c in channels]}; reorder them."
+            f"Channels should list states before inputs, and truths and covariates last, found {[(c.name, c.role.value) for c in channels]}; reorder them."
         )
     episodes = tuple(sorted(recordings.places, key=episode_order))
     facts = {unit.id: unit for unit in units}

@@ -157,8 +157,8 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
 
 
 def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:
-    """Return the channels that are not there and need not be: those that are optional, and truths."""
-    spared = [c for c in mapping.channel if c.name in optional or c.role is Role.TRUTH]
+    """Return the channels that are not there and need not be: those that are optional, truths and covariates."""
+    spared = [c for c in mapping.channel if c.name in optional or c.role in (Role.TRUTH, Role.COVARIATE)]
     columns = {(c.name, mapping.column(c, unit)) for c in spared for unit in mapping.units}
     absent = {name for name, column in columns if (column > len(fields) if isinstance(column, int) else column not in fields)}
     return absent | {c.name for c in mapping.channel if c.of in absent}

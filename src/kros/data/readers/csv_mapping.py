@@ -32,7 +32,7 @@ class ChannelMapping:
     name : str
         Of the channel, in everything that follows.
     role : Role
-        What it is to the observer; a truth serves evaluation alone.
+        What it is to the observer; a truth serves evaluation alone, a covariate `kros check`.
     column : str or int, optional
         Name in the header or number from 1; default: the channel's name.
     measured : bool
@@ -211,7 +211,7 @@ class CsvMapping:
 
     @property
     def ordered(self) -> tuple[ChannelMapping, ...]:
-        """Channels, states before inputs and truths behind them."""
+        """Channels, states before inputs, truths and covariates behind them."""
         return columns_in_order(self.channel)
 
     @property

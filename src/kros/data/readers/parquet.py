@@ -18,7 +18,7 @@ from ...core.files import require_regular, shortened
 from ..arrow import fill
 from ..checks import check_period
 from ..kept import Kept
-from ..population import Channel, EpisodeKey, Population, Role, TrueChannel, Unit
+from ..population import Channel, EpisodeKey, Population, Role, TrueChannel, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings
 from ..scaling import Scaling
@@ -130,8 +130,10 @@ def read_parquet(folder: Path | str) -> Population:
     """
     content, _ = load_artifact(Path(folder), INDEX)
     try:
-        channels = tuple(Channel(c["name"], Role(c["role"]), _text(c["unit"]), c["measured"] is True) for c in content["channels"])
+        listed = *content["channels"], *content.get("covariates", ())
+        channels = tuple(Channel(c["name"], Role(c["role"]), _text(c["unit"]), c["measured"] is True) for c in listed)
         channels += tuple(TrueChannel(t["name"], Role.TRUTH, _text(t["unit"]), of=_text(t["of"])) for t in content.get("truths", ()))
+        channels = columns_in_order(channels)
         units = [Unit(_text(u["id"]), _text(u["group"]), dict(u["metadata"])) for u in content["units"]]
         places = _places(content["groups"])
         period = check_period(content["sample_period_s"], f"Reading {Path(folder) / 'population.json'}")

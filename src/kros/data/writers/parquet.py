@@ -1,7 +1,7 @@
 """Write a population in kros's native format.
 
     <out>/population.json                    channels, period, units, episodes with their lengths
-    <out>/<unit>@<condition>.parquet         one row group an episode: unit, condition, episode, k, then the channels, then truths
+    <out>/<unit>@<condition>.parquet         one row group an episode: unit, condition, episode, k, then the channels, truths, covariates
 
 Names of files are percent-encoded, so any id works. A study writes groups from several processes (`write_group`), then the index.
 """
@@ -142,6 +142,7 @@ def write_index(population: Population, records: Iterable[GroupRecord], folder: 
         "units": [u for u in population.units if u.id in written],
         "metadata": population.metadata,
         **({"truths": population.truths} if population.truths else {}),
+        **({"covariates": population.covariates} if population.covariates else {}),
         **({"scaling": population.scaling} if population.scaling else {}),
         "groups": [{name: getattr(g, name) for name in _INDEXED} for g in groups],
     }

@@ -17,6 +17,8 @@ from .tail import group_factors, group_statistics, gumbel
 Array = npt.NDArray[Any]
 
 _FLOOR_DB = 40.0
+_ALIKE = 0.25  # of the gap below a group, what its members may differ by
+_AMONG_OTHERS = 0.9  # of the factor; with it good units of populations that differ in gain alone are flagged at the rate, as others are
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +82,19 @@ def _smallest_group(levels: Array, rate: float, most: int) -> tuple[Array, Array
         bound = float(location + factor * scale)
         if size == 1:
             threshold, margins = bound, scores - bound
-        if size <= most and group_statistics(scores)[size - 1] > factor:
+        if size <= most and group_statistics(scores)[size - 1] > factor and (size == 1 or _stands_apart(levels, order, size, factor)):
             return order[:size], scores - bound, bound
     return none, margins, threshold
+
+
+def _stands_apart(levels: Array, order: Array, size: int, factor: float) -> bool:
+    """Whether a group's members are alike, above a gap, or beyond the bound that the scores of the others make when the group is gone.
+
+    The others' scores among all are lower by what the group is above them, so that one and the same gap counts twice: where all units have their
+    largest excess at the same frequencies, as those that differ in nothing but gain, the upper ones of a good population would be such a group.
+    """
+    group, others = levels[order[:size]], levels[order[size:]]
+    location, scale = gumbel(excess(others)[0])
+    over = (group - held(others.max(axis=0))).max(axis=1)
+    alike = np.ptp(over) < _ALIKE * over.min()
+    return bool(alike or over.min() > location + _AMONG_OTHERS * factor * scale)

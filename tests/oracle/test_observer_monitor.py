@@ -12,7 +12,7 @@ from kros.design.monitor import bound_of_peaks, fit_monitor, monitor_facts, stea
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import Monitor, Observer, SampleStatus, in_sizes
-from kros.observer.monitor import RECOVERY, WEIGHT, octaves, poisson_interval
+from kros.observer.monitor import RECOVERY, WEIGHT, Watch, octaves, poisson_interval
 from kros.observer.simulate import run_innovations
 from kros.plants import HarmonicDrivePopulation
 from kros.synthesis import Injection
@@ -53,6 +53,19 @@ def test_bands_pass_the_power_that_their_filters_say():
     np.testing.assert_allclose(monitor.centres_hz(0.01), 25.6 / 2.0 ** np.arange(6), rtol=1e-9)
     powers = monitor.mean_squares(noise, np.ones((400_000, 1), dtype=bool))[-1, 0, 0]
     np.testing.assert_allclose(powers, np.mean(np.abs(response) ** 2, axis=1) * (1 - (1 - 1e-5) ** 400_000), rtol=0.05)
+
+
+def test_in_the_beginning_mean_squares_are_means():
+    """Against the mean of what was, with ten quiet samples before it; from a hundred on as an exponential mean."""
+    filters, rng = octaves(), np.random.default_rng(4)
+    monitor = Monitor(filters, 0.01, 0, np.ones(1), np.ones((1, 6)), np.array([[16, 0, 0, 0, 0, 0]]), 0.02, first=0.1)
+    noise, judged = rng.normal(size=(500, 1, 1)), np.ones((500, 1), dtype=bool)
+    squares = replace(monitor, forget=1.0, first=0.0).mean_squares(noise, judged)[:, 0, 0]
+    found = monitor.mean_squares(noise, judged)[:, 0, 0]
+    np.testing.assert_allclose(found[:91], np.cumsum(squares, axis=0)[:91] / (10 + np.arange(91))[:, None], rtol=1e-12)
+    np.testing.assert_allclose(found[91:], 0.99 * found[90:-1] + 0.01 * squares[91:], rtol=1e-9)
+    halves = [(noise[:200, 0], judged[:200, 0]), (noise[200:, 0], judged[200:, 0])]
+    np.testing.assert_array_equal(np.concatenate(monitor.in_turn(halves))[:, 0], found)
 
 
 def test_what_is_missing_holds_the_monitor_and_a_reset_clears_it():
@@ -115,7 +128,7 @@ def test_poisson_interval_is_that_of_the_tables():
 
 
 def test_the_bound_is_that_of_one_more_unit():
-    """Peaks by the running observer, the bound by hand; a unit that shakes is outside."""
+    """Peaks sample by sample, episodes one after the other, the bound by hand; a unit that shakes is outside."""
     simulated = HarmonicDrivePopulation(n_units=6, n_episodes=3, seconds=3.0, conditions=("noload",), seed=3).simulate()
     A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.zeros((2, 2))
     K = gain(np.array([[0.2], [10.0]]), DT)
@@ -127,7 +140,16 @@ def test_the_bound_is_that_of_one_more_unit():
     monitor = fit_monitor(observer, training, 0.05)
     own = replace(observer, monitor=monitor)
     records = {key: population.read(key) for key in population.episodes}
-    found = {key: levels(own, r[:, :1], r[:, 3:])[0].max() for key, r in records.items()}
+    found, watches = {}, {unit: Watch(monitor) for unit in population.unit_ids}
+    for key, r in records.items():
+        watch = watches[key.unit]
+        watch.begin()
+        innovation, _ = run_innovations(observer, r[:, None, :1], r[:, None, 3:], settle=0)
+        course = []
+        for nu in innovation[:, 0]:
+            watch.take(nu, good=True)
+            course.append(watch.level_db)
+        found[key] = max(course)
     peaks = np.array([[v for key, v in found.items() if key.unit == unit] for unit in population.unit_ids])
     of_motions, student = peaks.mean(axis=0), {5: 2.015048, 2: 2.919986}
     apart = [(of_motions[i] - of_motions[j]) ** 2 for i, j in ((0, 1), (0, 2), (1, 2))]

@@ -98,7 +98,7 @@ def watched(observer, bound=1.0):
     """With a monitor that is exceeded now and then by what `samples` does."""
     filters, weights = octaves(), np.array([[4, 3, 3, 0, 3, 3]])
     limits = bound * np.full(weights.shape, 0.02)
-    monitor = Monitor(filters, 0.02, 50, np.array([0.7]), limits, weights, 0.02, {"with load": 1.0, "*/": -8.0})
+    monitor = Monitor(filters, 0.02, 50, np.array([0.7]), limits, weights, 0.02, {"with load": 1.0, "*/": -8.0}, first=0.1)
     return replace(observer, monitor=monitor)
 
 

@@ -1,8 +1,9 @@
 """The monitor of a deployed observer: its bound from what the innovation does on the machines of training.
 
-Of every unit the highest level over its training episodes counts, so that a unit is one draw however long it was recorded; the bound is what one more
-unit exceeds with the stated probability on motions of its own (`bound_of_peaks`). It holds for units that move as those in training did, for as
-long. Where the observer was designed on the same units, new ones have larger innovations by what it learned of those.
+Of every unit the highest level over its training episodes counts, one after the other as on a machine that goes on, so that a unit is one draw however
+long it was recorded; the bound is what one more unit exceeds with the stated probability on motions of its own (`bound_of_peaks`). It holds for units
+that move as those in training did, for as long. Where the observer was designed on the same units, new ones have larger innovations by what it learned
+of those.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from .validation import TrainingSet, spread
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 UNITS, EPISODES, TOGETHER = 60, 12, 60  # most units, most episodes of each in every condition, and episodes in memory
-MEMORY = 1000  # samples that mean squares remember
+MEMORY, BEGINNING = 8000, 500  # samples that mean squares remember, and that they count as quiet in the beginning
 FORGOTTEN = 1e-3  # of a start, when innovations are judged
 SETTLE = (100, 1000)
 SHRINK, QUIETEST = 0.7, 0.5  # of covariances to their diagonal; of the median variance
@@ -68,8 +69,8 @@ def fit_monitor(observer: Observer, training: TrainingSet, rate: float) -> Monit
         return None
     filters = octaves()
     even = np.ones((len(size), len(filters)))
-    free = Monitor(filters, 1 / MEMORY, settle, size, even, weighted(even), rate, units=len(units))
-    squares = {group: [free.mean_squares(nu[:, None], j[:, None])[:, 0] for nu, j, _ in found] for group, found in own.items()}
+    free = Monitor(filters, 1 / MEMORY, settle, size, even, weighted(even), rate, units=len(units), first=1 / BEGINNING)
+    squares = {group: free.in_turn([(nu, judged) for nu, judged, _ in found]) for group, found in own.items()}
     largest = {group: 10 * np.log10(np.maximum(np.max([p.max(axis=0) for p in found], axis=0), 1e-30)) for group, found in squares.items()}
     weights = weighted(steady(largest))
     courses = {group: [_decibels(p, weights) for p in found] for group, found in squares.items()}

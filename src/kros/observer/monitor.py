@@ -1,7 +1,8 @@
 r"""The monitor: whether a machine still moves as the population does, by the level of the innovation over octaves.
 
 The innovation :math:`\nu = y - C\hat x` of every measured channel goes through band-pass filters an octave apart, and the mean square of each band is
-remembered exponentially, :math:`p \leftarrow p + g\,(b^2 - p)`. The machine is outside the population's envelope while
+remembered, :math:`p \leftarrow p + g\,(b^2 - p)`, with a gain :math:`g \leftarrow \max(g / (1 + g), g_\infty)`: it is the mean of all samples so far, and
+an exponential one from :math:`1/g_\infty` samples on. The machine is outside the population's envelope while
 
 .. math:: \prod_{c,b} \max(p_{cb} / \ell_{cb},\ 0.01)^{k_{cb}} > 1,
 
@@ -42,7 +43,7 @@ class Monitor:
     filters : ndarray, shape (bands, 3)
         ``b, a1, a2`` of ``b (1 - z^-2) / (1 + a1 z^-1 + a2 z^-2)``.
     forget : float
-        Share of a mean square that a sample replaces.
+        Share of a mean square that a sample replaces in the long run.
     settle : int
         Samples after a start that are not judged.
     size : ndarray, shape (q,)
@@ -61,6 +62,8 @@ class Monitor:
         Motion of these machines that was judged.
     alarms : int
         How often the bound was exceeded in it.
+    first : float
+        Share that the first sample replaces, later ones less; `forget` from the beginning where it is not larger.
 
     Raises
     ------
@@ -88,6 +91,7 @@ class Monitor:
     units: int = 0
     hours: float = 0.0
     alarms: int = 0
+    first: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("filters", "size", "limits", "weights"):
@@ -106,8 +110,10 @@ class Monitor:
                 f"Monitor of an observer: filters (bands, 3), size (q), limits and weights (q, bands) do not fit together, found "
                 f"{self.filters.shape}, {self.size.shape}, {self.limits.shape} and {self.weights.shape}."
             )
-        if np.any(self.size <= 0) or np.any(self.limits <= 0) or not 0 < self.forget <= 1 or self.settle < 0:
-            raise DataError("Monitor of an observer: size and limits should be positive, forget within 0 and 1, settle at least 0.")
+        if np.any(self.size <= 0) or np.any(self.limits <= 0) or not 0 < self.forget <= 1 or not 0 <= self.first <= 1 or self.settle < 0:
+            raise DataError(
+                "Monitor of an observer: size and limits should be positive, forget and first within 0 and 1, settle at least 0."
+            )
         if np.any(self.weights != np.round(self.weights)) or np.any(self.weights < 0) or self.weights.sum() != WEIGHT:
             raise DataError(
                 f"Monitor of an observer: weights should be whole numbers of at least 0 that sum to {WEIGHT}, found {self.weights}."
@@ -150,10 +156,35 @@ class Monitor:
                 continue
             own = scaled[taken, machine].T
             bands = np.stack([b * _apart(all_pole(own, a1, a2)) for b, a1, a2 in self.filters], axis=1)
-            squares = np.moveaxis(self.forget * all_pole(bands**2, self.forget - 1.0), -1, 0)
+            squares = np.moveaxis(self._remembered(bands**2), -1, 0)
             latest = np.searchsorted(taken, np.arange(len(judged)), side="right")
             found[:, machine] = np.concatenate([np.zeros((1, *squares.shape[1:])), squares])[latest]
         return found
+
+    def in_turn(self, episodes: Sequence[tuple[Array, Flags]]) -> list[Array]:
+        """Return the mean squares of every episode, of a machine that has them one after the other.
+
+        Parameters
+        ----------
+        episodes : sequence of (ndarray, shape (n_samples, q); ndarray of bool, shape (n_samples,))
+            Innovations, and which samples are judged.
+
+        Returns
+        -------
+        list of ndarray, shape (n_samples, q, bands)
+        """
+        innovation, judged = (np.concatenate(parts)[:, None] for parts in zip(*episodes, strict=True))
+        return np.split(self.mean_squares(innovation, judged)[:, 0], np.cumsum([len(own) for _, own in episodes])[:-1])
+
+    def _remembered(self, squares: Array) -> Array:
+        """Return the means of squares, shape (..., n_samples), after every sample."""
+        first, count = max(self.first, self.forget), squares.shape[-1]
+        falling = min(count, max(0, int(np.ceil(1 / self.forget - 1 / first))))  # samples until the gain stays as it is
+        begun = np.cumsum(squares[..., :falling], axis=-1) / (1 / first + np.arange(falling))
+        rest = self.forget * squares[..., falling:]
+        if 0 < falling < count:
+            rest[..., 0] += (1 - self.forget) * begun[..., -1]
+        return np.concatenate([begun, all_pole(rest, self.forget - 1.0)], axis=-1)
 
     def level(self, mean_squares: Array, condition: str | None = None) -> Array:
         """Return the level over the bound in dB, shape (...), of mean squares of shape (..., q, bands), in one condition or any."""
@@ -234,7 +265,7 @@ class Watch:
     """A monitor with its memory, on one machine."""
 
     def __init__(self, monitor: Monitor) -> None:
-        self._settle, self._forget = monitor.settle, monitor.forget
+        self._settle, self._forget, self._first = monitor.settle, monitor.forget, max(monitor.first, monitor.forget)
         self._inverse = (1 / monitor.size).tolist()
         self._filters: list[list[float]] = monitor.filters.tolist()
         self._limits = (1 / monitor.limits).tolist()
@@ -256,6 +287,7 @@ class Watch:
     def reset(self) -> None:
         """Forget everything."""
         self._memory = [[[0.0, 0.0, 0.0] for _ in self._filters] for _ in self._inverse]
+        self._gain = self._first
         self.begin()
         self.outside = False
 
@@ -271,7 +303,7 @@ class Watch:
         if self._wait > 0:
             self._wait -= 1
             return
-        product, forget = 1.0, self._forget
+        product, gain = 1.0, self._gain
         for value, inverse, channel, limits, weights in zip(
             innovation, self._inverse, self._memory, self._limits, self._weights, strict=True
         ):
@@ -284,12 +316,14 @@ class Watch:
                 band = b * v + memory[0]
                 memory[0] = memory[1] - a1 * band
                 memory[1] = -b * v - a2 * band
-                memory[2] += forget * (band * band - memory[2])
+                memory[2] += gain * (band * band - memory[2])
                 share = memory[2] * limit
                 if share < QUIET:
                     share = QUIET
                 for _ in range(weight):
                     product *= share
+        gain /= 1.0 + gain
+        self._gain = gain if gain > self._forget else self._forget
         self.outside = product > self._bound
 
     @property

@@ -226,6 +226,7 @@ class Source:
             "weights": own.weights.astype(int).tolist(),
             "quiet": self.precision.literal(QUIET),
             "forget": self.precision.literal(own.forget),
+            "first": self.precision.literal(max(own.first, own.forget)),
             "largest": self.precision.literal(LARGEST),
             "one": self.precision.literal(1.0),
             "settle": own.settle,

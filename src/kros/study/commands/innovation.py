@@ -14,6 +14,7 @@ from ...uncertainty.outliers.score import Status
 from .field import Arriving, FieldRecordings
 
 Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 FEWEST = 8  # units behind a bound that calls one an outlier: of studies of five up to a third of the good ones were beyond it
 
 
@@ -28,18 +29,15 @@ def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
     population, observer = recordings.population, recordings.observer
     monitor, rows = observer.monitor, []
     for unit, condition, keys in population.groups():
-        levels: list[float] = []
-        bands: list[Array] = []
+        innovations: list[tuple[Array, Flags]] = []
         counts: dict[str, dict[str, int]] = {}
         samples = 0
         for found in recordings.batches(keys):
             samples += int(found.batch.lengths.sum())
             recordings.count_status(found, counts)
             if monitor is not None:
-                for level, of_bands in highest_levels(recordings, monitor, found, condition):
-                    levels.append(level)
-                    bands.append(of_bands)
-        highest = max(levels, default=None)
+                innovations += judged_innovations(recordings, monitor, found)
+        highest, bands = highest_levels(monitor, innovations, condition)
         outlier = monitor is not None and monitor.units >= FEWEST and highest is not None and highest > 0
         row: dict[str, Any] = {"unit": unit, "condition": condition, "score": None, "threshold": None, "outlier": outlier}
         row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "detectable": None, "episodes": len(keys)}
@@ -47,7 +45,7 @@ def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
         row |= {"missing": [name for name in observer.recorded if name not in population.states], "level_db": highest}
         rate, units = (None, None) if monitor is None else (monitor.false_alarm_rate, monitor.units)
         row |= {"level_rate": rate, "level_units": units, "samples": counts.get(unit, {})}
-        row |= {"bands_db": by_band(observer, monitor, np.max(bands, axis=0)) if monitor is not None and bands else None}
+        row |= {"bands_db": by_band(observer, monitor, bands) if monitor is not None and bands is not None else None}
         rows.append(row | {"parameters": recordings.sources.get(unit)})
     return rows
 
@@ -58,17 +56,20 @@ def by_band(observer: Observer, monitor: Monitor, levels: Array) -> dict[str, di
     return {name: {f"{hz:.3g}": float(v) for hz, v in zip(centres, row, strict=True)} for name, row in zip(names, levels, strict=True)}
 
 
-def highest_levels(recordings: FieldRecordings, monitor: Monitor, found: Arriving, condition: str) -> list[tuple[float, Array]]:
-    """Return the highest level over the bound in every episode, dB, and that of every band; an episode in which nothing is judged has none."""
+def judged_innovations(recordings: FieldRecordings, monitor: Monitor, found: Arriving) -> list[tuple[Array, Flags]]:
+    """Return the innovations of every episode, shape (n_samples, q), and which samples are judged."""
     observer, every = recordings.observer, list(range(len(found.batch.keys)))
     nu, judged = run_innovations(observer, found.y, found.u, found.parameters(observer, every), monitor.settle)
+    return [(nu[:length, i], judged[:length, i]) for i, length in enumerate(found.batch.lengths)]
+
+
+def highest_levels(monitor: Monitor | None, innovations: list[tuple[Array, Flags]], condition: str) -> tuple[float | None, Array | None]:
+    """Return the highest level over the bound, dB, and that of every band, as the episodes come one after the other; None where nothing is judged."""
+    if monitor is None or not any(judged.any() for _, judged in innovations):
+        return None, None
+    squares = np.concatenate(monitor.in_turn(innovations))
     own = condition if condition in monitor.bounds else None
-    levels: list[tuple[float, Array]] = []
-    for i, length in enumerate(found.batch.lengths):
-        if judged[:length, i].any():
-            squares = monitor.mean_squares(nu[:length, [i]], judged[:length, [i]])
-            levels.append((float(monitor.level(squares, own).max()), monitor.band_levels(squares.max(axis=(0, 1)))))
-    return levels
+    return float(monitor.level(squares, own).max()), monitor.band_levels(squares.max(axis=0))
 
 
 def level_text(row: dict[str, Any]) -> str:

@@ -81,15 +81,13 @@ class Looked:
     def _gains(self, population: Population, found: Arriving) -> tuple[Array, Array]:
         """Static gains and their deviations, row by row; those of states that inputs do not explain are not known."""
         ranges, batch = np.array([self.ranges[u] for u in self.observer.inputs]), found.batch
-        x = np.full((*batch.states.shape[:2], len(self.states)), np.nan)
         there = [i for i, s in enumerate(self.states) if s in population.states]
-        x[..., there] = batch.states[..., [population.states.index(self.states[i]) for i in there]]
+        x = batch.states[..., [population.states.index(self.states[i]) for i in there]]
+        episodes = list(enumerate(batch.lengths))
+        own = static_gains([x[:n, e] for e, n in episodes], [found.u[:n, e] for e, n in episodes], self.block, ranges)
         gains, deviations = np.full((2, len(self.states), len(ranges)), np.nan)
-        for i in there:  # each by itself: samples may be missing in one
-            parts = [(x[:n, e, [i]], found.u[:n, e]) for e, n in enumerate(batch.lengths)]
-            own = static_gains([p[0] for p in parts], [p[1] for p in parts], self.block, ranges)
-            if own.explained[0] >= _EXPLAINED:
-                gains[i], deviations[i] = own.gains[0], own.deviations[0]
+        explained = (own.explained >= _EXPLAINED)[:, None]
+        gains[there], deviations[there] = np.where(explained, own.gains, np.nan), np.where(explained, own.deviations, np.nan)
         return gains.ravel(), deviations.ravel()
 
     def _powers(self, found: Arriving) -> tuple[Array, Array]:

@@ -151,7 +151,11 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int =
     >>> float(freqs_hz[density.argmax()])
     25.0
     """
-    from scipy.signal import welch
-
-    freqs, density = welch(error, fs=1 / dt, nperseg=min(segment, error.shape[axis]), nfft=segment, axis=axis)
-    return freqs, density
+    signal = np.moveaxis(np.asarray(error, dtype=float), axis, -1)
+    size = min(segment, signal.shape[-1])
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size)
+    pieces = np.lib.stride_tricks.sliding_window_view(signal, size, axis=-1)[..., :: size - size // 2, :]
+    spectra = np.fft.rfft((pieces - pieces.mean(axis=-1, keepdims=True)) * window, segment)
+    density = np.mean(spectra.real**2 + spectra.imag**2, axis=-2) * (dt / max(np.sum(window**2), np.finfo(float).tiny))
+    density[..., 1 : (segment + 1) // 2] *= 2  # all but zero and, of an even number, Nyquist
+    return np.asarray(np.fft.rfftfreq(segment, dt), dtype=float), np.moveaxis(density, -1, axis)

@@ -47,6 +47,8 @@ def settle(figure: Figure) -> None:
     for axes in figure.axes:
         _measure_once(axes)
     engine.execute(figure)
+    for axes in figure.axes:
+        _draw_unmeasured(axes)
     figure.set_layout_engine(None)  # a placeholder, "none", would still draw everything twice
     for axes in figure.axes:
         del axes.get_tightbbox
@@ -70,7 +72,34 @@ def _measure_once(axes: Axes) -> None:
     for axis in (axes.xaxis, axes.yaxis):
         if isinstance(axis.get_major_locator(), AutoLocator):
             axis.set_major_locator(FixedLocator(list(axis.get_majorticklocs())))
+        if axis.label.get_text():
+            _keep_label(axes, axis)
     vars(axes)["get_tightbbox"] = lambda *_, **__: Bbox(np.reshape(axes.bbox.extents + around, (2, 2)))
+
+
+def _draw_unmeasured(axes: Axes) -> None:
+    """Let an axes be drawn without measuring its tick labels again: with labels in place, they matter for a factor that stands beside an axis alone."""
+    if any(axis.get_offset_text().get_text() for axis in (axes.xaxis, axes.yaxis)):
+        return
+    vars(axes)["_autotitlepos"] = False
+    for axis in (axes.xaxis, axes.yaxis):
+        vars(axis)["_get_ticklabel_bboxes"] = lambda *_: ([], [])
+
+
+def _keep_label(axes: Axes, axis: Axis) -> None:
+    """Leave an axis's label as far from the axes as it was measured; it would be found from all ticks of all axes beside it again."""
+    from matplotlib.figure import Figure
+    from matplotlib.transforms import ScaledTranslation, blended_transform_factory
+
+    figure, place = axes.get_figure(root=True), axis.label.get_position()
+    assert isinstance(figure, Figure)
+    # one coordinate is a share of the axes, the other one a place on the figure, in dots
+    if axis is axes.yaxis:
+        beside = ScaledTranslation((place[0] - axes.bbox.x0) / figure.dpi, 0.0, figure.dpi_scale_trans)
+        axis.set_label_coords(0.0, place[1], blended_transform_factory(axes.transAxes + beside, axes.transAxes))
+    else:
+        below = ScaledTranslation(0.0, (place[1] - axes.bbox.y0) / figure.dpi, figure.dpi_scale_trans)
+        axis.set_label_coords(place[0], 0.0, blended_transform_factory(axes.transAxes, axes.transAxes + below))
 
 
 def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:

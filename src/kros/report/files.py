@@ -28,7 +28,10 @@ log = logging.getLogger(__name__)
 _DPI = 200
 _FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 _FAMILY = re.compile(r"(?<=px )'DejaVu Sans'(?:, [^;\"]*)?|(?<=font-family: )'?DejaVu Sans'?(?:, [^;\"]*)?")
-_SHORTER = re.compile(r"\s*([A-Z])\s*|(\.\d)\d+")
+# What is left out; looking around is fast, filling in what was found is not.
+_ALONG = re.compile(r"\s+(?=[A-Z])|(?<=[A-Z])\s+|(?<=\.\d)\d+")
+_BEYOND = re.compile(r"(?<=\d\.\d\d)\d+")
+_WRITTEN = re.compile(r"(>[^<>]*[^<>\s][^<>]*<)")
 
 
 def write_figures(run: Path, out: Path, progress: Progress | None = None) -> list[str]:
@@ -106,8 +109,10 @@ def to_svg(figure: Figure, name: str) -> str:
         text = text.replace(tone.light, f"var({tone.variable})")
     text = _FAMILY.sub(_FONTS, text)
     # coordinates stand inside tags; a hundredth of a point is enough, along lines a tenth
-    text = re.sub(r"<[^>]*>", lambda tag: re.sub(r"(\d\.\d{2})\d+", r"\1", tag.group()), text)
-    return re.sub(r'(?<= d=")[^"]*', lambda path: _SHORTER.sub(r"\1\2", path.group()), text).strip()
+    text = re.sub(r'(?<= d=")[^"]*', lambda path: _ALONG.sub("", path.group()), text)
+    parts = _WRITTEN.split(text)
+    parts[::2] = [_BEYOND.sub("", tags) for tags in parts[::2]]
+    return "".join(parts).strip()
 
 
 def _named_units(text: str) -> str:

@@ -29,11 +29,11 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
         own = Observer.load(run.folder / "observers" / f"{name}/{_METHOD}.json")
         models = run.models[name]
         row = models.index(run.uncertain[name].nominal_id)
+        nominal, chosen = (_signals(own, A, B, batch) for A, B in ((models.A[row], models.B[row]), (own.A, own.B)))
+        freqs, dt = _centres(chosen, batch.sample_period_s), batch.sample_period_s
         for panel, state in zip(axes[:, column], hidden, strict=True):
             i = states.index(state)
             size = models.output_scale[i]
-            nominal, chosen = (_signals(own, A, B, batch) for A, B in ((models.A[row], models.B[row]), (own.A, own.B)))
-            freqs, dt = _centres(chosen, batch.sample_period_s), batch.sample_period_s
             lines_of_units(panel, freqs, _density(chosen, chosen.energies.energy, i, dt) / size, Tone.BLUE.light, "units", chosen.unit_ids)
             panel.plot(freqs, _density(chosen, chosen.cover.energy, i, dt) / size, color=Tone.INK.light, lw=1.8, label="cover")
             unit = _density(nominal, nominal.cover.energy, i, dt) / size

@@ -29,6 +29,7 @@ from ...observer.predictor.tuning import tune_predictor
 from ...synthesis import Status, Synthesis
 from ...synthesis.residual_shaped.shaping_filter import Basis
 from ..certificates import DIVERGED, dropout_error_percent, scales_of
+from ..estimators import make_learned
 from ..task import DesignResult, DesignTask
 from ..validation import TrainingSet, ValidationSet, hidden_mean
 from .tuned import held_out, tuned_where_better
@@ -42,7 +43,8 @@ _SAMPLES, _EPISODES = 6000, 12  # that an observer is conditioned on, at most
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.1)  # of the gain that is best, until a certificate covers it
 _CLOSE, _SHARE = 0.01, 0.001  # share of a limit that counts as at it, and how much of an episode has to be
 _TINY = np.finfo(float).tiny
-_AS_GOOD = 1.01  # ratio of errors that is no reason to do without a start in motion
+_AS_GOOD = 1.01  # ratio of errors that is no reason to prefer one to another
+_BEYOND = 1.5  # times the learned estimator's error, beyond which another predictor is looked for
 Settle = Callable[[ValidationSet, Observer], Observer]
 _CIRCLE = {"sin": "cos", "cos": "sin"}
 
@@ -88,12 +90,15 @@ def design_predictor(task: DesignTask) -> DesignResult:
         batch, steps = data.on_time.batch, effort.steps if task.predictor.steps is None else task.predictor.steps
         plan = Plan.of(task, effort, batch)
         kept, facts = plan.made(task, data, settle, steps)
-        # Where a measurement follows an input there is a controller, which winds up.
-        if (before_limits(task, batch) < batch.lengths).any() and not plan.past.static.any():
-            other = Plan.of(task, effort, batch, whole=True)
-            forgets = other.made(task, data, settle, steps)
-            if no_worse(data.part(np.flatnonzero(held_out(batch.keys)).tolist()), forgets[0], kept):
-                plan, (kept, facts) = other, forgets
+        if (before_limits(task, batch) < batch.lengths).any():
+            errors = errors_beside_learned(task, data.part(np.flatnonzero(held_out(batch.keys)).tolist()))
+            # Where a measurement follows an input there is a controller, which winds up: recordings until the limit are the better guide, mostly.
+            if not plan.past.static.any() or errors(kept)[1] > _BEYOND:
+                other = Plan.of(task, effort, batch, whole=True)
+                forgets = other.made(task, data, settle, steps)
+                (ours, most), (theirs, limit) = errors(forgets[0]), errors(kept)
+                if np.all(ours <= _AS_GOOD * theirs) or most < limit > _BEYOND:
+                    plan, (kept, facts) = other, forgets
     except (KrosError, np.linalg.LinAlgError) as error:
         raise SynthesisError(str(error)) from error
     percent = float(hidden_mean(task.training.read().percent(kept), kept.measured))
@@ -108,15 +113,19 @@ def design_predictor(task: DesignTask) -> DesignResult:
     return DesignResult(task.name, observer, synthesis, {**plan.facts(task), **facts}, task.problem, UNCOVERED)
 
 
-def no_worse(unseen: ValidationSet, one: Observer, other: Observer) -> bool:
-    """Whether an observer misses no more than another of any hidden state in any condition."""
+def errors_beside_learned(task: DesignTask, unseen: ValidationSet) -> Callable[[Observer], tuple[npt.NDArray[np.float64], float]]:
+    """Return what gives an observer's errors of hidden states by condition, in percent, and how many times those of the learned estimator they are at most."""
     conditions = [key.condition for key in unseen.batch.keys]
-    for condition in dict.fromkeys(conditions):
-        part = unseen.part([i for i, c in enumerate(conditions) if c == condition])
-        ours, theirs = (np.delete(part.percent(o), list(o.measured)) for o in (one, other))
-        if not np.all(ours <= _AS_GOOD * theirs):
-            return False
-    return True
+    parts = [unseen.part([i for i, c in enumerate(conditions) if c == condition]) for condition in dict.fromkeys(conditions)]
+    learned = make_learned(task.recordings or task.training, task.models.lifting, task.models.measured)
+    hidden = list(learned.estimated)
+    rival = np.array([part.compare([learned.run(part.batch, part.parameters)])[0][hidden] for part in parts])
+
+    def errors(observer: Observer) -> tuple[npt.NDArray[np.float64], float]:
+        own = np.array([part.percent(observer)[hidden] for part in parts])
+        return own, float((own / rival).max())
+
+    return errors
 
 
 def recordings(task: DesignTask, effort: Effort) -> TrainingSet:

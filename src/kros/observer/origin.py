@@ -28,6 +28,7 @@ Rows = slice | npt.NDArray[np.bool_]
 FAR = 1024  # periods from the origin, as far as double precision goes
 _EXACT, _NOTHING = 1e-11, 1e-13
 _SAME = 1e-18  # nothing, in extended precision
+_WHOLE = 0.01  # from a whole number, what is taken for one
 _ROUNDS = 4  # each leaves a share of what the one before left that double precision's rounding is
 _NEAR = 16.0  # whatever the unit of measure: nothing is looked for below
 _MOST = 64  # periods of the first function until all others repeat
@@ -85,7 +86,8 @@ def _direction(moving: Long, at: int, n: int, sizes: Array) -> tuple[Array, Arra
         left = np.asarray(moving @ whole + moving @ rest, dtype=float)
         rest[free] += np.linalg.lstsq(scaled, -left, rcond=1e-13)[0] * sizes[free]
         if step == 0:
-            whole[n:], rest = np.round(rest[n:]), np.zeros(len(sizes))
+            near = np.round(rest[n:])
+            whole[n:], rest = np.where(np.abs(rest[n:] - near) < _WHOLE, near, 0.0), np.zeros(len(sizes))
     return whole, rest
 
 

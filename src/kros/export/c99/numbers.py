@@ -146,6 +146,7 @@ class Source:
             "shift_states": None if self.shift is None else self.wide(self.shift.states),
             "shift_whole": None if self.shift is None else self.wide(self.shift.whole),
             "shift_rest": None if self.shift is None else self.wide(self.shift.rest),
+            "relative_inputs": self.relative_inputs(),
             "shift_others": []
             if self.shift is None
             else [i for i in range(len(o.recorded)) if i != o.measured[0] and self.shift.states[i] != 0],
@@ -155,6 +156,18 @@ class Source:
             "period": None if self.shift is None else Precision().literal(self.shift.period),
             "sample_period_s": Precision().literal(o.sample_period_s),
         }
+
+    def relative_inputs(self) -> list[str]:
+        """Return the inputs relative to the origin: an exact difference first, and nothing that is zero, which a processor without doubles pays for."""
+        if self.shift is None:
+            return []
+        found = []
+        for j, (whole, rest) in enumerate(zip(self.shift.whole, self.shift.rest, strict=True)):
+            text = f"s->held[{j}]"
+            if whole != 0:
+                text = f"{text} - {'s->origin' if whole == 1 else f'({Precision().literal(float(whole))} * s->origin)'}"
+            found.append(text if rest == 0 else f"({text}) - s->moved_u[{j}]")
+        return found
 
     def tracked(self) -> dict[str, Any] | None:
         """Return what a phase-locked loop consists of: the observer's linear part, and slopes of lifted functions by states and parameter."""

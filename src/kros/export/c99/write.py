@@ -204,7 +204,7 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     doubles = context["m"] + (1 + context["m"] + len(context["shift_others"]) if context["shift"] else 0)
     reals = context["n"] + context["order"] + context["history"] + len(context["parameters"]) + context["delay"] * context["m"]
     reals += context["n"] + context["order"] + 2 if context["tracked"] else 0
-    reals += context["q"] * context["monitor"]["bands"] * 3 if context["monitor"] else 0
+    reals += context["q"] * context["monitor"]["bands"] * 3 + 1 if context["monitor"] else 0
     words = context["m"] + sum(bool(context[name]) for name in ("delay", "monitor", "start")) + 1
     words += 1 if context["monitor"] and context["monitor"]["conditions"] else 0
     size = 8 * doubles + real * reals + 4 * words

@@ -47,7 +47,7 @@ def main() -> None:
             place = folder / f"{units}x{options.seconds:g}"
             simulate(place / "recordings", units, options.seconds)
             command = [sys.executable, __file__, "--one", str(units), "--folder", str(place), *(["--refine"] if options.refine else [])]
-            found[units] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+            found[units] = json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout)
             print(json.dumps({"units": units, **found[units]}), flush=True)
     print(table(found))
 
@@ -98,6 +98,7 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
         times[name] = time.process_time() - began
         times[f"{name} (wall)"] = time.perf_counter() - wall
         memory[name] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+        print(f"{units} units, {name}: {1000 * times[name] / units:.2f} ms each, {memory[name]:.2f} GB", file=sys.stderr, flush=True)
 
     settings = UncertaintySettings.of({"n_freqs": POINTS, "max_order": ORDER}, "fleet")
     with stage("open"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,11 @@ import pytest
 from kros.core.lti import StateSpace
 from kros.identify.refine.minimax import smallest_largest
 from kros.identify.refine.spread import peak_residual_db
-from kros.uncertainty import Form, many, quantify_systems, residual, sigma_max
+from kros.report.sections import outliers, units
+from kros.uncertainty import Form, many, quantify_systems, residual, score_outliers, sigma_max
 from kros.uncertainty.forms import completion
 from kros.uncertainty.nominal.choice import choose_nominals
+from kros.uncertainty.outliers import model as outlier_model
 from kros.uncertainty.weights.certificate import Method
 from kros.uncertainty.weights.cover import cover_ratio
 
@@ -126,3 +129,60 @@ def test_the_spread_of_models_is_that_of_all_pairs():
     assert found == pytest.approx(20 * np.log10(min(peaks)), abs=1e-9)
     alike = units[np.zeros(5, int)]
     assert peak_residual_db(alike.A, alike.B, np.ones(2), np.ones(1), 50) == -np.inf
+
+
+def test_a_unit_scored_against_many_scores_as_it_would_among_them(monkeypatch):
+    freqs = np.geomspace(0.1, 40, 25)
+    responses = fleet(seed=5).frequency_response(freqs)
+    model = score_outliers(responses, freqs)
+    rng = np.random.default_rng(0)
+    draws = 0.02 * np.abs(responses[0]) * (rng.normal(size=(30, *responses.shape[1:])) + 1j * rng.normal(size=(30, *responses.shape[1:])))
+    for factor, deviations in ((1.02, None), (1.6, None), (1.02, draws)):
+        found = model.score("new", factor * responses[7], deviations, without=("7",))
+        with monkeypatch.context() as patch:
+            patch.setattr(outlier_model, "MANY", 10**9)
+            expected = model.score("new", factor * responses[7], deviations, without=("7",))
+        assert (found.outlier, found.status) == (expected.outlier, expected.status)
+        # One unit more changes which 64 units are the nominals, and with them medians and the others' cover, by several tenths of a dB.
+        assert found.score_db == pytest.approx(expected.score_db, abs=0.7)
+        assert found.detectable_db == pytest.approx(expected.detectable_db, abs=0.7)
+
+
+def test_deviations_are_asked_for_unit_by_unit():
+    freqs = np.geomspace(0.1, 40, 12)
+    responses = fleet(20, seed=6).frequency_response(freqs)
+    rng = np.random.default_rng(0)
+    listed = [0.01 * (1 + 4 * (k == 3)) * rng.normal(size=(10, *responses.shape[1:])) + 0j for k in range(20)]
+    asked: list[int] = []
+
+    class Lazy(Sequence[Any]):
+        def __len__(self) -> int:
+            return 20
+
+        def __getitem__(self, k: Any) -> Any:
+            asked.append(k)
+            return listed[k]
+
+    found, expected = score_outliers(responses, freqs, deviations=Lazy()), score_outliers(responses, freqs, deviations=listed)
+    assert [vars(s) for s in found.scores] == [vars(s) for s in expected.scores]
+    assert asked[:20] == list(range(20))
+
+
+def test_a_report_of_many_units_says_how_they_are_spread_and_shows_the_extremes():
+    ids = [f"{k:04d}" for k in range(1000)]
+    errors = dict(zip(ids, np.random.default_rng(0).permutation(1000).astype(float), strict=True))
+    home = {"observer": "o", "channel": "velocity", "condition": "noload", "rms": 1.0}
+    score = {"condition": "noload", "score": 1.0, "outlier": False}
+    metrics = {"study": {"identify_on": "noload"}}
+    found = {u: units._Known({"unit": u}, [home | {"unit": u, "error_percent": e}], [score | {"unit": u}]) for u, e in errors.items()}
+    found["0007"].scores[0] = score | {"unit": "0007", "score": 30.0, "outlier": True}
+    columns = units._columns(metrics, found, ["velocity"])
+    assert list(columns) == ["error of velocity (%)", "outlier score, no load (dB)"]
+    shown = units._extremes(found, columns)
+    worst = sorted(ids, key=lambda u: -errors[u])[:20]
+    assert set(worst) | {"0007"} <= set(shown)
+    assert len(shown) <= 41
+    row = units._quantiles(columns, 1000).rows[0]
+    assert row == ["error of velocity (%)", "1000", "0", "50.0", "500", "949", "999", worst[0]]
+    assert outliers.some_of(ids).endswith("0099 and 900 more")
+    assert outliers.some_of(ids[:3]) == "0000, 0001, 0002"

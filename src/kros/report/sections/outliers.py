@@ -10,6 +10,7 @@ from ..figures.residuals import Names, entry_names, short
 from ..names import condition_label, number
 from ..run_folder import NotShownError, RunFolder
 
+_NAMED = 100
 _MEANING = (
     "Beside every score stands the smallest change that would have been flagged: what the unit would have to exceed the others by, and the smallest change of "
     "gain in one response that does so somewhere. A unit that is “ok” may have any defect that changes its responses by less."
@@ -74,7 +75,12 @@ def flagged_text(flagged: list[Mapping[str, Any]]) -> str:
     units: dict[str, list[str]] = {}
     for row in flagged:
         units.setdefault(row["unit"], []).append(condition_label(row["condition"]))
-    return ", ".join(f"{unit} ({', '.join(conditions)})" for unit, conditions in units.items())
+    return some_of([f"{unit} ({', '.join(conditions)})" for unit, conditions in units.items()])
+
+
+def some_of(names: Sequence[str]) -> str:
+    """Return names for a sentence, the first hundred of many."""
+    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
 
 
 def score_card(row: Mapping[str, Any], names: Names | None) -> str:

@@ -22,11 +22,13 @@ from ..names import axis_label, channel_units, condition_label, in_condition, mi
 from ..run_folder import Array, NotShownError, RunFolder
 from ..sparks import spark
 from ..theme import Tone
-from .outliers import score_card, score_names, undecided_text
+from .outliers import score_card, score_names, some_of, undecided_text
 
 log = logging.getLogger(__name__)
 Row = Mapping[str, Any]
-_MOST, _ROWS = 100, 400  # units that get a panel with pictures, and a row; more would make the page too large
+_MOST, _ROWS = 100, 400  # units that get a panel with pictures, and units that all get a row; more would make the page too large
+_FAR = 20  # largest of every column that get a row where not all do
+_SHARES = {"5 %": 0.05, "median": 0.5, "95 %": 0.95}
 
 
 @dataclass
@@ -46,11 +48,56 @@ def section(run: RunFolder, metrics: Row) -> Section | None:
     found, name = _known(run, metrics), metrics["study"].get("deployed")
     hidden = [c for c in dict.fromkeys(r["channel"] for known in found.values() for r in known.errors) if c not in run.measured_states]
     flagged = [unit for unit, known in found.items() if any(r["outlier"] for r in known.scores)]
+    named = some_of(flagged)
     text = f"A name leads to all that is known of the unit{f', with “{observer_label(name)}”' if name else ''}. "
-    text += f"Flagged as not belonging to the batch: {', '.join(flagged)}." if flagged else "No unit is flagged."
-    panels = _panels(run, metrics, dict(list(found.items())[:_MOST]))
-    table = _table(run, metrics, found, hidden, {p.key for p in panels})
-    return Section("units", "Units", [text, *undecided_text(metrics.get("outliers", []))], [table], panels=panels)
+    text += f"Flagged as not belonging to the batch: {named}." if flagged else "No unit is flagged."
+    shown, tables = found, list[Table]()
+    if len(found) > _ROWS:
+        columns = _columns(metrics, found, hidden)
+        shown, tables = _extremes(found, columns), [_quantiles(columns, len(found))]
+    panels = _panels(run, metrics, dict(list(shown.items())[:_MOST]))
+    cut = (
+        "Every unit"
+        if shown is found
+        else f"{len(shown)} of {len(found)} units, those flagged and the {_FAR} largest of every column; metrics.json has all"
+    )
+    tables.append(_table(run, metrics, shown, hidden, {p.key for p in panels}, cut))
+    return Section("units", "Units", [text, *undecided_text(metrics.get("outliers", []))], tables, panels=panels)
+
+
+def _columns(metrics: Row, found: Mapping[str, _Known], hidden: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return numbers of units by what they are and unit, where they are known."""
+    home = metrics["study"]["identify_on"]
+    columns: dict[str, dict[str, float]] = {f"error of {c.replace('_', ' ')} (%)": {} for c in hidden}
+    for unit, known in found.items():
+        for row in known.errors:
+            if row["channel"] in hidden and row["condition"] == home:
+                columns[f"error of {row['channel'].replace('_', ' ')} (%)"][unit] = (
+                    math.inf if row["error_percent"] is None else row["error_percent"]
+                )
+        for row in known.scores:
+            if row["score"] is not None:
+                columns.setdefault(f"outlier score, {condition_label(row['condition'])} (dB)", {})[unit] = row["score"]
+        if known.bound.get("residual") is not None:
+            columns.setdefault("residual", {})[unit] = known.bound["residual"]
+    return {title: values for title, values in columns.items() if values}
+
+
+def _extremes(found: Mapping[str, _Known], columns: Mapping[str, Mapping[str, float]]) -> dict[str, _Known]:
+    """Return the units that are flagged, and those that are the largest in some column."""
+    flagged = [unit for unit, known in found.items() if any(r["outlier"] for r in known.scores)]
+    largest = [unit for values in columns.values() for unit in sorted(values, key=lambda u: -values[u])[:_FAR]]
+    return {unit: found[unit] for unit in list(dict.fromkeys(flagged + largest))[:_ROWS]}
+
+
+def _quantiles(columns: Mapping[str, Mapping[str, float]], units: int) -> Table:
+    """Return how numbers of units are spread, with the unit that is at the upper end."""
+    rows: list[Cells] = []
+    for title, values in columns.items():
+        numbers, last = np.array(list(values.values())), max(values, key=lambda u: values[u])
+        inner = [number(float(np.quantile(numbers, share, method="nearest"))) for share in _SHARES.values()]
+        rows.append([title, str(len(numbers)), number(float(numbers.min())), *inner, number(float(numbers.max())), last])
+    return Table(["", "units", "smallest", *_SHARES, "largest", "which is"], rows, f"How {units} units are spread")
 
 
 def _known(run: RunFolder, metrics: Row) -> dict[str, _Known]:
@@ -70,12 +117,11 @@ def _known(run: RunFolder, metrics: Row) -> dict[str, _Known]:
     return dict(sorted(found.items(), key=lambda item: (not any(r["outlier"] for r in item[1].scores), item[0])))
 
 
-def _table(run: RunFolder, metrics: Row, found: Mapping[str, _Known], hidden: Sequence[str], panels: set[str]) -> Table:
+def _table(run: RunFolder, metrics: Row, found: Mapping[str, _Known], hidden: Sequence[str], panels: set[str], cut: str) -> Table:
     home, units = metrics["study"]["identify_on"], channel_units(metrics)
     conditions = list(dict.fromkeys(r["condition"] for r in metrics.get("outliers", [])))
-    cut = "Every unit" if len(found) <= _ROWS else f"{_ROWS} of {len(found)} units, those flagged first; metrics.json has all"
     rows: list[Cells] = []
-    for unit, known in list(found.items())[:_ROWS]:
+    for unit, known in found.items():
         status = "flagged" if any(r["outlier"] for r in known.scores) else known.own.get("status", "ok")
         row: list[Cell | str] = [Cell(unit, href=_key(unit) if _key(unit) in panels else ""), Cell(status, strong=status != "ok")]
         errors = {r["channel"]: r for r in known.errors if r["condition"] == home}

@@ -20,6 +20,8 @@ from ..small_matrices import entries_first, sigma_max_first, squared
 Array = npt.NDArray[Any]
 
 MOST_NOMINALS = 64
+MOST_PAIRS = MOST_NOMINALS * 4096  # beyond, there are fewer nominals, but
+FEW_NOMINALS = 16  # at least
 _SMOOTHING_DECADES = 1.0 / 3.0
 _SINKHORN = 50
 _SMALLEST = 1e-12  # relative to the largest typical entry of row and column
@@ -58,6 +60,33 @@ def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
     level = _smooth(20 * np.log10(np.maximum(np.concatenate(sigma, axis=2), _LEAST)), freqs_hz)
     level[own] = np.nan
     return Distances(nominals, level, _median(level, own), np.concatenate(left), np.concatenate(right))
+
+
+def joined(form: Form, known: Distances, rows: Array, nominals: Array, response: Array, freqs_hz: Array) -> Distances:
+    """Return the distances of some units of a population and one more, in the scales of the population, which one unit of many does not move.
+
+    Parameters
+    ----------
+    form : Form
+    known : Distances
+        Of the population.
+    rows : ndarray of int, shape (unit,)
+        Units of the population, in increasing order.
+    nominals : ndarray, shape (nominal, frequency, p, m), complex
+        Responses of the population's nominals.
+    response : ndarray, shape (frequency, p, m), complex
+        Of the one more, which comes last.
+    freqs_hz : ndarray, shape (frequency,), Hz
+    """
+    there = np.flatnonzero(np.isin(known.nominals, rows))
+    own = scaled_levels(form, nominals[there], response, known, freqs_hz)
+    levels = np.concatenate([known.levels[rows], np.median(own, axis=0)[None]])
+    few = np.unique(
+        np.linspace(0, len(there) - 1, FEW_NOMINALS).round().astype(int)
+    )  # what is said of every nominal by itself is said of these
+    some = there[few]
+    by_nominal = np.concatenate([known.by_nominal[np.ix_(some, rows)], own[few, None]], axis=1)
+    return Distances(np.searchsorted(rows, known.nominals[some]), by_nominal, levels, known.left, known.right)
 
 
 def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances, freqs_hz: Array) -> Array:
@@ -103,13 +132,14 @@ def balance(responses: Array) -> tuple[Array, Array]:
 
 
 def _nominals(G: Array) -> Array:
-    """All units, or 64 spread evenly over their distances from the entrywise median; their order does not matter."""
+    """All units, or 64 (of thousands fewer) spread evenly over their distances from the entrywise median; their order does not matter."""
     if len(G) <= MOST_NOMINALS:
         return np.arange(len(G))
     middle = np.median(G.real, axis=0) + 1j * np.median(G.imag, axis=0)
     size = np.maximum(np.abs(middle), np.finfo(float).tiny)
     order = np.argsort((np.abs(G - middle) / size).mean(axis=(1, 2, 3)), kind="stable")
-    return np.sort(order[np.linspace(0, len(G) - 1, MOST_NOMINALS).round().astype(int)])
+    most = int(np.clip(MOST_PAIRS // len(G), FEW_NOMINALS, MOST_NOMINALS))
+    return np.sort(order[np.linspace(0, len(G) - 1, most).round().astype(int)])
 
 
 def _same(G: Array, nominals: Array) -> npt.NDArray[np.bool_]:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.loading import check_shapes, loader
 from ..forms import Form, as_form, check_responses
 from ..validation import check_scale
-from .distances import balance, distances
+from .distances import Distances, balance, distances, joined
 from .groups import separate
 from .noise import AS_GOOD, Others, noisier_than, spread
 from .score import OutlierScore
@@ -43,6 +44,7 @@ Array = npt.NDArray[Any]
 
 FALSE_ALARM_RATE = 3e-3
 _FREQUENCIES = 120
+MANY = 200  # inliers from which on a unit that is scored does not change how they are scaled
 _FEWEST = 2  # others that a unit can be compared with
 _NOISY = 2.0  # ratio of variances beyond which a unit takes no part in the cover of the others
 
@@ -137,7 +139,8 @@ class OutlierModel:
             )
         _require_finite(G[None], (unit,), self.freqs_hz)
         everyone = np.concatenate([self.responses[rows], (G / self.output_scale[:, None] * self.input_scale)[None]])
-        found = distances(self.form, everyone, self.freqs_hz)
+        many = len(self.unit_ids) > MANY
+        found = self._with(rows, everyone[-1]) if many else distances(self.form, everyone, self.freqs_hz)
         last = np.arange(len(everyone)) == len(everyone) - 1
         margin = float(margins_of(found.levels, self.false_alarm_rate)[1][-1])
         summary = Nominals.of(found, ~last, self.false_alarm_rate)
@@ -147,8 +150,18 @@ class OutlierModel:
         if deviations is None:
             return score
         draws = _deviations(unit, deviations, G.shape) / self.output_scale[:, None] * self.input_scale
-        others = Others.of(self.form, self.responses[rows], self.noise[rows], self.freqs_hz, self.false_alarm_rate)
+        within = replace(self._known, levels=self._known.levels[rows]) if many else None
+        others = Others.of(self.form, self.responses[rows], self.noise[rows], self.freqs_hz, self.false_alarm_rate, within)
         return with_noise(score, everyone[-1], others, draws)
+
+    @cached_property
+    def _known(self) -> Distances:
+        """Distances of the inliers, of which many are not compared anew with every unit that is scored."""
+        return distances(self.form, self.responses, self.freqs_hz)
+
+    def _with(self, rows: Array, response: Array) -> Distances:
+        known = self._known
+        return joined(self.form, known, rows, self.responses[known.nominals], response, self.freqs_hz)
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``outlier_model.json``."""

@@ -49,9 +49,9 @@ class Others:
     found: Distances  # of these units among themselves
 
     @classmethod
-    def of(cls, form: Form, responses: Array, noise: Array, freqs_hz: Array, rate: float) -> Others:
-        """Measure the distances of the units among themselves."""
-        return cls(form, responses, noise, freqs_hz, rate, distances(form, responses, freqs_hz))
+    def of(cls, form: Form, responses: Array, noise: Array, freqs_hz: Array, rate: float, found: Distances | None = None) -> Others:
+        """Measure the distances of the units among themselves, where they are not known."""
+        return cls(form, responses, noise, freqs_hz, rate, distances(form, responses, freqs_hz) if found is None else found)
 
     def bounds(self, response: Array, deviations: Array) -> tuple[float, float] | None:
         """Return the bound of a unit that is known as well as these, and of one with such estimation errors.

@@ -33,6 +33,7 @@ _DRAWS = 400_000
 _NUMBERS = 4_000_000
 _SHARE_OF_GROUPS = 0.25
 SHAPE = 0.1  # xi
+_HALVINGS = 55
 _ASYMPTOTIC = 60  # from here on the correction of the factor is proportional to 1 / n
 
 
@@ -56,8 +57,6 @@ def prediction_factor(count: int, rate: float) -> float:
     if count > _ASYMPTOTIC:
         limit = _limit(rate)
         return limit + (prediction_factor(_ASYMPTOTIC, rate) - limit) * _ASYMPTOTIC / count
-    from scipy.optimize import brentq
-
     location, scale = gumbel(standard_draws(np.random.default_rng(0), (_NUMBERS // 40 // count, count)))
 
     def too_many(c: float) -> float:
@@ -66,7 +65,11 @@ def prediction_factor(count: int, rate: float) -> float:
     top = 2 * max(abs(_limit(rate)), 1.0)
     while too_many(top) > 0:
         top *= 2
-    return float(brentq(too_many, -top, top))
+    low, high = -top, top
+    for _ in range(_HALVINGS):  # a root finder of SciPy would be done in ten steps, after half a second of loading
+        middle = (low + high) / 2
+        low, high = (middle, high) if too_many(middle) > 0 else (low, middle)
+    return (low + high) / 2
 
 
 def _limit(rate: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from kros.core.lti import StateSpace
+from kros.identify import smallest_stabilising_alpha
 from kros.identify.refine.minimax import smallest_largest
 from kros.identify.refine.spread import peak_residual_db
 from kros.report.sections import outliers, units
@@ -186,3 +188,10 @@ def test_a_report_of_many_units_says_how_they_are_spread_and_shows_the_extremes(
     assert row == ["error of velocity (%)", "1000", "0", "50.0", "500", "949", "999", worst[0]]
     assert outliers.some_of(ids).endswith("0099 and 900 more")
     assert outliers.some_of(ids[:3]) == "0000, 0001, 0002"
+
+
+def test_regularisations_tried_a_few_at_a_time_are_those_tried_together(monkeypatch):
+    R = np.triu(np.random.default_rng(0).normal(size=(12, 5, 5)))
+    expected = smallest_stabilising_alpha([(R, 2)])
+    monkeypatch.setattr(sys.modules["kros.identify.edmd"], "_MODELS", 30)
+    assert smallest_stabilising_alpha([(R, 2)]) == expected > 0

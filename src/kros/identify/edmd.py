@@ -29,6 +29,7 @@ Array = npt.NDArray[np.float64]
 _PER_DECADE = 10
 _DECADES_BELOW = 14
 _BISECTIONS = 30
+_MODELS = 20_000  # in memory at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,8 +145,9 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
     """
 
     def radius(alphas: Array) -> Array:
-        radii = [edmd(R[None], n, alphas[:, None]).spectral_radius().max(axis=-1) for R, n in factors]
-        return np.max(radii, axis=0)
+        at_once = max(1, _MODELS // max(len(R) for R, _ in factors))
+        parts = [alphas[start : start + at_once] for start in range(0, len(alphas), at_once)]
+        return np.concatenate([_radius(factors, part) for part in parts])
 
     top = 2 + np.ceil(
         np.log10(max(float(np.linalg.norm(R[..., : -n or None, : -n or None], axis=(-2, -1)).max()) ** 2 for R, n in factors))
@@ -164,6 +166,12 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
         middle = (low + high) / 2
         low, high = (low, middle) if radius(np.array([10**middle]))[0] < 1 - margin else (middle, high)
     return float(10**high)
+
+
+def _radius(factors: list[tuple[Array, int]], alphas: Array) -> Array:
+    """Return the largest spectral radius of all models at every regularisation."""
+    radii = [edmd(R[None], n, alphas[:, None]).spectral_radius().max(axis=-1) for R, n in factors]
+    return np.asarray(np.max(radii, axis=0))
 
 
 def _stable_without(factors: list[tuple[Array, int]], margin: float) -> bool:

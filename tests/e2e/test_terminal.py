@@ -74,8 +74,9 @@ def test_warnings_are_said_once_in_one_line(capsys):
 
 @pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
 def test_ctrl_c_says_how_to_go_on(tmp_path):
+    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # who started the tests may have had it ignored
     wait = "import kros.study.commands.demo as d, time; d.run_demo = lambda *a, **k: (print('runs', flush=True), time.sleep(60))"
-    code = f"{wait}; from kros.cli import app; app()"
+    code = f"{heard}; {wait}; from kros.cli import app; app()"
     command = [sys.executable, "-c", code, "demo", "--out", str(tmp_path / "demo")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

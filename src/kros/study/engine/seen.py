@@ -87,18 +87,21 @@ class Seen:
             yield from found
             return
         log.info("%s: %d of %d are new or changed", title, len(new), len(tasks))
-        with self._kept(title) as keep:
-            left = {mark: known[mark] for mark, result in zip(marks, found, strict=True) if mark is not None and result is not None}
+        left, fresh = dict(known), set[str]()
+        with self._kept(title, fresh) as keep:
             try:
                 for mark, result in zip(marks, found, strict=True):
                     value = next(computed) if result is None else result
                     if mark is not None:
-                        keep(mark, left.pop(mark, "") or json.dumps(_packed(value), separators=(",", ":")))
+                        text = left.pop(mark, "") if result is not None else ""
+                        keep(mark, text or json.dumps(_packed(value), separators=(",", ":")))
+                        fresh |= set() if text else {mark}
                     yield value
                 next(computed, None)  # its progress is told to the end
-            finally:  # where it ends early, what is known stays known
-                for mark, text in left.items():
-                    keep(mark, text)
+            except BaseException:  # where it ends early, all that is known stays known
+                for mark in left.keys() - fresh:
+                    keep(mark, left[mark])
+                raise
 
     def _path(self, title: str) -> Path:
         return self.folder / f"{quote(title, safe=' ()')}.gz"
@@ -128,13 +131,14 @@ class Seen:
         return value if usable is None or usable(task, value) else None
 
     @contextmanager
-    def _kept(self, title: str) -> Iterator[Callable[[str, str], None]]:
-        """Give what writes one result; the file is in its place once all are there."""
+    def _kept(self, title: str, fresh: set[str]) -> Iterator[Callable[[str, str], None]]:
+        """Give what writes one result; the file is in its place once all are there, and where it ends early if there are fresh ones."""
         if self.changed is None:
             yield lambda mark, text: None
             return
         path = self._path(title)
         temporary = path.with_name(f".{path.name}")
+        above = [folder for folder in (path.parent, path.parent.parent) if not folder.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             # Without a name and a time, the bytes depend on the content alone.
@@ -143,7 +147,12 @@ class Seen:
                 yield lambda mark, text: _write(file, mark, text)
         except BaseException:
             with suppress(OSError):
-                self._place(temporary, path)
+                if fresh:
+                    self._place(temporary, path)
+                else:
+                    temporary.unlink(missing_ok=True)
+                    for folder in above:
+                        folder.rmdir()
             raise
         self._place(temporary, path)
 

@@ -126,7 +126,8 @@ class Moments:
         for fold in folds:
             held = [i for i, (unit, _) in enumerate(self.groups) if unit in fold]
             for state in range(len(self.estimated)):
-                weights = np.stack([self._weights(state, fold, choice) for choice in tried])
+                means = {condition: self._means(state, fold, condition) for condition in trained}
+                weights = np.stack([self._solved(*means[choice.condition], choice) for choice in tried])
                 missed = self.power[held, state] - 2 * weights @ self.cross[held, state].T
                 missed += np.einsum("tf,ufg,tg->tu", weights, self.gram[held, state], weights, optimize=True)
                 errors[state][:, held] = np.sqrt(np.maximum(missed, np.finfo(float).tiny))
@@ -152,21 +153,25 @@ class Moments:
             raise DataError(f"Learned estimator: no unit is left to train on without {', '.join(sorted(without))}; record more units.")
         taps, h = self.features.taps, len(self.estimated)
         chosen = choices or (Choice(taps, RIDGE),) * h
-        weights = np.stack([self._weights(state, without, choice) for state, choice in enumerate(chosen)], axis=1)
+        weights = np.stack([self._solved(*self._means(s, without, choice.condition), choice) for s, choice in enumerate(chosen)], axis=1)
         response = weights[1:].reshape(-1, taps, h).copy()
         response[:, :-1] -= weights[1:].reshape(-1, taps, h)[:, 1:]
         return Learned(self.features, self.estimated, weights[0], response)
 
-    def _weights(self, state: int, without: Collection[str], choice: Choice) -> Array:
-        """Solve the normal equations, shape (1 + f,); weights of samples that do not count are zero, that of the constant is not penalised.
+    def _means(self, state: int, without: Collection[str], condition: str | None) -> tuple[Array, Array]:
+        """Return the mean moments of all other units in one condition or all, shapes (1 + f, 1 + f) and (1 + f,).
 
         Where the other units were not recorded in the condition that was chosen, all conditions are trained on.
         """
         others = [i for i, (unit, _) in enumerate(self.groups) if unit not in without]
-        rows = [i for i in others if choice.condition in (None, self.groups[i][1])] or others
-        lags = np.arange(self.gram.shape[-1] - 1) % self.features.taps
+        rows = [i for i in others if condition in (None, self.groups[i][1])] or others
+        return self.gram[rows, state].mean(axis=0), self.cross[rows, state].mean(axis=0)
+
+    def _solved(self, gram: Array, cross: Array, choice: Choice) -> Array:
+        """Solve the normal equations, shape (1 + f,); weights of samples that do not count are zero, that of the constant is not penalised."""
+        lags = np.arange(len(cross) - 1) % self.features.taps
         used = np.concatenate([[0], 1 + np.flatnonzero(lags < choice.taps)])
-        gram, cross = self.gram[rows, state].mean(axis=0)[np.ix_(used, used)], self.cross[rows, state].mean(axis=0)[used]
+        gram, cross = gram[np.ix_(used, used)], cross[used]
         size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
         penalty = np.diag([0.0] + [choice.ridge] * (len(size) - 1))
         weights = np.zeros(1 + len(lags))
@@ -195,12 +200,12 @@ def episode_moments(z: Array, truth: Array, taps: int) -> tuple[Array, Array, Ar
     (n_samples, c), h, behind = z.shape, truth.shape[1], taps - 1
     step = np.zeros((c, behind + n_samples))
     step[:, behind + 1 :] = (z[:-1] - z[1:]).T
-    lagged = [step[:, behind - j : behind - j + n_samples].T for j in range(1, taps)]
     latest = np.concatenate([z[:1], z[:-1]])
-    signals = np.concatenate([np.ones((n_samples, 1)), latest, truth, *lagged[:1]], axis=1).T.copy()
+    newest = step[:, behind - 1 : behind - 1 + n_samples] if behind else step[:0]
+    signals = np.concatenate([np.ones((1, n_samples)), latest.T, truth.T, newest])
     known, state, own = slice(1 + c), slice(1 + c, 1 + c + h), slice(1 + c + h, None)
     level = signals[known] @ signals[: 1 + c + h].T
-    product = np.stack([signals @ d for d in lagged]) if lagged else np.zeros((0, len(signals), c))
+    product = products_with_lags(signals, step, behind)
 
     ends = step[:, n_samples - 1 : n_samples + behind - 1].T[::-1]  # what leaves the sum with every further lag
     between = np.zeros((behind, behind, c, c))
@@ -219,3 +224,23 @@ def episode_moments(z: Array, truth: Array, taps: int) -> tuple[Array, Array, Ar
     gram = np.block([[np.full((1, 1), n_samples), sums.reshape(1, -1)], [sums.reshape(-1, 1), blocks.reshape(c * taps, -1)]])
     cross = np.concatenate([level[:1, state], rows.reshape(-1, h)])
     return gram / n_samples, cross / n_samples, np.mean(truth**2, axis=0)
+
+
+def products_with_lags(signals: Array, step: Array, behind: int) -> Array:
+    """Return ``sum_k signals[:, k] step[:, behind - j + k]`` for lags j = 1, ..., behind, shape (behind, s, c): by transforms of short pieces.
+
+    Parameters
+    ----------
+    signals : ndarray, shape (s, n_samples)
+    step : ndarray, shape (c, behind + n_samples)
+    """
+    if not behind:
+        return np.zeros((0, len(signals), len(step)))
+    size = 1 << (8 * behind).bit_length()
+    piece = size - behind
+    count = -(-signals.shape[1] // piece)
+    first = np.pad(signals, ((0, 0), (0, count * piece - signals.shape[1]))).reshape(len(signals), count, piece)
+    padded = np.pad(step, ((0, 0), (0, count * piece + behind - step.shape[1])))
+    second = np.lib.stride_tricks.sliding_window_view(padded, size, axis=1)[:, ::piece]
+    common = np.einsum("spf,cpf->scf", np.fft.rfft(first, size).conj(), np.fft.rfft(second), optimize=True)
+    return np.asarray(np.moveaxis(np.fft.irfft(common, size)[..., :behind], -1, 0)[::-1])

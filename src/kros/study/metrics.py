@@ -58,7 +58,7 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
     if Stage.IDENTIFY in done:
         study["alpha"] = context.identified.models(context.identified.edmd_kinds[0]).alpha
     if Stage.SYNTHESIZE in done:
-        study["deployed"] = _observers_record(context)["deployed"]
+        study["deployed"] = context.observers_record["deployed"]
     return study
 
 
@@ -146,16 +146,12 @@ def diagnostic_entry(store: Store, name: str) -> dict[str, Any]:
     return entry
 
 
-def _observers_record(context: Context) -> dict[str, Any]:
-    return load_artifact(context.store.path("observers"), "observers")[0]
-
-
 def _observers(context: Context) -> dict[str, Any]:
     entries: dict[str, Any] = {}
-    record = _observers_record(context)
-    for name in record["facts"]:
-        entry = dict(record["facts"][name])
-        if context.store.holds("synthesis", name):
+    written = context.store.files()
+    for name, facts in context.observers_record["facts"].items():
+        entry = dict(facts)
+        if f"synthesis/{name}/synthesis.json" in written:
             synthesis = Synthesis.load(context.store.path("synthesis", name))
             entry |= {"status": synthesis.status, "solve_s": synthesis.solve_s}
             entry |= {key: getattr(synthesis, key) for key in ("h2_norm", "hinf_norm")}
@@ -166,20 +162,16 @@ def _observers(context: Context) -> dict[str, Any]:
 
 
 def _observers_and_baselines(context: Context) -> dict[str, Any]:
-    return {**_observers(context), **_evaluation_record(context)["baselines"]}
+    return {**_observers(context), **context.evaluation["baselines"]}
 
 
 def _evaluation(context: Context) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = _evaluation_record(context)["rows"]
+    rows: list[dict[str, Any]] = context.evaluation["rows"]
     return rows
 
 
 def _intervals(context: Context) -> list[dict[str, Any]]:
     return interval_rows(_evaluation(context))
-
-
-def _evaluation_record(context: Context) -> dict[str, Any]:
-    return load_artifact(context.store.path("evaluation"), "evaluation")[0]
 
 
 def _disturbed(context: Context) -> dict[str, Any]:
@@ -192,7 +184,7 @@ def _disturbed(context: Context) -> dict[str, Any]:
 
 def _recorded(context: Context) -> dict[str, Any]:
     """Errors of recorded states against what they really were; only where the recordings say so."""
-    found = _evaluation_record(context)
+    found = context.evaluation
     return {"recorded": found["recorded"]} if "recorded" in found else {}
 
 
@@ -204,7 +196,7 @@ def _outliers(context: Context) -> list[dict[str, Any]]:
 
 def _free_run(context: Context) -> dict[str, Any]:
     models = _models(context)
-    free = _evaluation_record(context)["free_run"]
+    free = context.evaluation["free_run"]
     return {name: entry | {"freerun_error_percent": free[name]} for name, entry in models.items()}
 
 

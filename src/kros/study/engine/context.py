@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
+from ...core.artifacts import load_artifact
 from ...core.work import Work
 from ...data.population import Population
 from ...data.survey import RecordingFacts
@@ -55,3 +57,13 @@ class Context:
     def uncertain(self) -> UncertainModels:
         """What the quantify stage left."""
         return UncertainModels.load_sets(self.store.folder, self.identified)
+
+    @cached_property
+    def observers_record(self) -> dict[str, Any]:
+        """What the synthesize stage left beside its observers: names, facts, and which is deployed."""
+        return load_artifact(self.store.path("observers"), "observers")[0]
+
+    @cached_property
+    def evaluation(self) -> dict[str, Any]:
+        """What the evaluate stage left: errors of observers and baselines."""
+        return load_artifact(self.store.path("evaluation"), "evaluation")[0]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact, save_artifact
+from ...core.artifacts import save_artifact
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
 from ...design.estimators import Baseline
@@ -98,7 +98,7 @@ def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, di
     if not (config.robustness or config.monte_carlo):
         return None
     everything = config.robustness == "all"
-    record = load_artifact(context.store.path("observers"), "observers")[0]
+    record = context.observers_record
     kind = split_name(str(record["deployed"]))[0]
     names = tuple(name for name in record["names"] if everything or split_name(name)[0] == kind)
     models = context.identified.models()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact, save_artifact
+from ...core.artifacts import save_artifact
 from ...core.errors import KrosError
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
@@ -326,7 +326,7 @@ def free_run_percent(
 
 def load_observers(context: Context) -> dict[str, Observer]:
     """Load all observers that the synthesis stage left, in its order."""
-    names = load_artifact(context.store.path("observers"), "observers")[0]["names"]
+    names = context.observers_record["names"]
     return {name: Observer.load(context.store.path("observers", f"{name}.json")) for name in names}
 
 

@@ -143,7 +143,7 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
     facts, population = whole.facts, whole.population.select(held)
     units, keys = held_parameters(context, population, facts), tuple(k for k in facts.test if k.unit in held)
     results = outcomes(context, estimation(context, population, keys, units))
-    record = load_artifact(context.store.path("observers"), "observers")[0]
+    record = context.observers_record
     band, rows = band_hz(whole), []
     for name, outcome in results.items():
         if isinstance(outcome, Outcome):
@@ -167,9 +167,9 @@ def held_parameters(context: Context, population: Population, facts: RecordingFa
 def next_unit(context: Context) -> dict[str, Any]:
     """Run the deployed observer on the units in reserve; return their errors, and what these say about the next unit in every condition."""
     config, facts = context.config.evaluate, context.facts
-    deployed = load_artifact(context.store.path("observers"), "observers")[0]["deployed"]
+    deployed = context.observers_record["deployed"]
     rows, failed = reserve_rows(context, deployed)
-    evaluated: Rows = load_artifact(context.store.path("evaluation"), "evaluation")[0]["rows"]
+    evaluated: Rows = context.evaluation["rows"]
     known = [r for r in evaluated if r["observer"] == deployed and r["unit"] in facts.pooled]
     hidden = [c for c in context.population.states if c not in context.population.measured] or list(context.population.states)
     content: dict[str, Any] = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": config.confidence, "observer": deployed}

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact
 from ...core.lti import StateSpace
 from ...design.methods.disturbance_model import DisturbanceModel
 from ...design.synthesize import measurement_noise
@@ -26,7 +25,7 @@ _SHARES = (0.05, 0.5, 0.95)
 
 def member_work(context: Context, kind: str, members: int) -> Callable[[], Members]:
     """Return the work of running the certified observers of one kind of model on random members of its set; it finds nothing where nothing is certified."""
-    facts = load_artifact(context.store.path("observers"), "observers")[0]["facts"]
+    facts = context.observers_record["facts"]
     bounds = {
         name: float(own["worst_case_h2"])
         for name, own in facts.items()

@@ -10,9 +10,8 @@ asked whether they are covered, in blocks, so that memory does not grow with the
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -61,10 +60,10 @@ def bound_many(asked: Quantification, base: StateSpace, units: StateSpace, freqs
     """
     many = _Many(asked, base, units, freqs_hz)
     rows = many.deciding()
-    for _ in range(_ROUNDS):
+    for last in (False,) * (_ROUNDS - 1) + (True,):
         found = many.fitted(rows)
         rest = {} if found.remainder is None else {Part.REMAINDER: found.remainder}
-        proofs = many.proofs({Part.RESIDUAL: found.weight, **rest})
+        proofs = many.proofs({Part.RESIDUAL: found.weight, **rest}, rows, certain=last)
         beyond = np.setdiff1d(np.concatenate([proof.beyond for proof in proofs.values()]), rows)
         if not beyond.size:
             break
@@ -129,38 +128,41 @@ class _Many:
     def _grid(self) -> Array:
         return checking_grid(self.freqs_hz, self.base.dt, self.asked.density, filled=True)
 
-    def proofs(self, weights: Mapping[Part, Weight]) -> dict[Part, _Proof]:
-        """Compare weights with all units, as those of few units are."""
+    def proofs(self, weights: Mapping[Part, Weight], rows: Array, certain: bool) -> dict[Part, _Proof]:
+        """Compare weights with all units, as those of few units are.
+
+        Unless it has to be `certain`, nothing more is proven from where units beyond the weights that are not among `rows` were found on the grid.
+        """
         found: dict[Part, list[_Proof]] = {part: [] for part in weights}
+        proving = True
         for block in self.blocks():
             own = self.units[block]
-            respond = lru_cache(maxsize=1)(
-                lambda key, own=own: self._responses(np.frombuffer(key), own)
-            )  # of the grid, which is asked for often
             also = peaks_hz(ResidualSystems(self.asked.form, self.base, own), self._grid, self.base.dt)
             claimed = Checks(self.asked.density, also).claimed(self.freqs_hz, self.base.dt)
-            for part, weight in weights.items():
-                systems = ResidualSystems(self.asked.form, self.base, own, part=part)
-                found[part].append(self._proof(partial(self._ratio, part, weight, respond), claimed, weight, systems, block.start))
+            parts = completion(self.asked.form, self.base.frequency_response(claimed), own.frequency_response(claimed))
+            for (part, weight), E in zip(weights.items(), parts, strict=False):
+                known = _ratio(weight, E, claimed)
+                proving &= certain or not np.setdiff1d(_beyond(known) + block.start, rows).size
+                if proving:
+                    found[part].append(self._proof(part, weight, own, claimed, known, block.start))
+                else:
+                    found[part].append(_Proof(float(known.max()), float(known.max()), Method.GRID, _beyond(known) + block.start))
         return {part: _Proof.together(of_blocks) for part, of_blocks in found.items()}
 
-    def _responses(self, freqs_hz: Array, units: StateSpace) -> tuple[Array, Array]:
-        G, Gp = self.base.frequency_response(freqs_hz), units.frequency_response(freqs_hz)
-        return G, Gp
+    def _proof(self, part: Part, weight: Weight, units: StateSpace, claimed: Array, known: Array, start: int) -> _Proof:
+        """Certify a weight against some units, from their ratios at claimed frequencies, shape (unit, frequency)."""
 
-    def _ratio(self, part: Part, weight: Weight, respond: Callable[[bytes], tuple[Array, Array]], freqs_hz: Array) -> Array:
-        G, Gp = respond(freqs_hz.tobytes())
-        E, used = self._of(part, G, Gp), weight.magnitudes(freqs_hz)
-        return cover_ratio(E, used.left, used.right)
+        def ratio(freqs_hz: Array) -> Array:
+            if freqs_hz is claimed:
+                return known
+            return _ratio(weight, self._of(part, self.base.frequency_response(freqs_hz), units.frequency_response(freqs_hz)), freqs_hz)
 
-    def _proof(self, ratio: Callable[[Array], Array], claimed: Array, weight: Weight, systems: ResidualSystems, start: int) -> _Proof:
-        known = ratio(claimed)
-        found = certify(lambda f: known if f is claimed else ratio(f), claimed, weight.left, weight.right, systems)
+        found = certify(ratio, claimed, weight.left, weight.right, ResidualSystems(self.asked.form, self.base, units, part=part))
         bound = found.peak * (1 + found.margin) if found.method is Method.LEVEL_SETS else found.peak
-        at = np.zeros(0, int)
+        beyond = _beyond(known)
         if bound > 1:
-            at = np.append(known.argmax(axis=0)[known.max(axis=0) > 1], ratio(np.array([found.freq_hz])).argmax())
-        return _Proof(bound, float(known.max()), found.method, np.unique(at) + start)
+            beyond = np.append(beyond, ratio(np.array([found.freq_hz])).argmax())
+        return _Proof(bound, float(known.max()), found.method, np.unique(beyond) + start)
 
     def finished(self, found: Bounded, proofs: Mapping[Part, _Proof]) -> Bounded:
         """Lift weights over what is beyond them, and say what holds for all units."""
@@ -196,6 +198,17 @@ class _Many:
             ratios.append(misfit(self.asked.form, G, Gp, E))
             bound = np.maximum(bound, sigma_max(E).max(axis=0))
         return np.concatenate(ratios), bound
+
+
+def _ratio(weight: Weight, E: Array, freqs_hz: Array) -> Array:
+    """Return the ratios of residuals and a weight, shape (unit, frequency)."""
+    used = weight.magnitudes(freqs_hz)
+    return cover_ratio(E, used.left, used.right)
+
+
+def _beyond(ratio: Array) -> Array:
+    """Return the units with the largest ratio at some frequency, where that is above one."""
+    return np.unique(ratio.argmax(axis=0)[ratio.max(axis=0) > 1])
 
 
 def _lifted(weight: Weight, proof: _Proof) -> Weight:

@@ -233,6 +233,8 @@ def products_with_lags(signals: Array, step: Array, behind: int) -> Array:
     ----------
     signals : ndarray, shape (s, n_samples)
     step : ndarray, shape (c, behind + n_samples)
+    behind : int
+        Lags.
     """
     if not behind:
         return np.zeros((0, len(signals), len(step)))

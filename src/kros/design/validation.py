@@ -177,6 +177,7 @@ class ValidationSet:
         groups = [(key.unit, key.condition) for key in self.batch.keys]  # an episode in which a machine hardly moves has no size of its own
         of = {group: size[[i for i, own in enumerate(groups) if own == group]].max(axis=0) for group in set(groups)}
         size = np.array([of[group] for group in groups])
+        x = np.ascontiguousarray(x.swapaxes(1, 2)).swapaxes(1, 2)  # in memory as estimates are
         with np.errstate(divide="ignore", invalid="ignore"):
             found = [(100 * error_rms(e[..., : x.shape[-1]], x, lengths) / size).mean(axis=0) for e in estimates]
         return np.where(np.isfinite(found), found, np.inf)

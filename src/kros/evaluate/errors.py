@@ -96,9 +96,11 @@ def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> 
     >>> error_rms(recorded + 0.1, recorded, np.array([3])).round(9).tolist()
     [[0.1]]
     """
-    inside = np.arange(len(truth))[:, None, None] < lengths[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.sqrt(np.sum((estimate - truth) ** 2, axis=0, where=inside) / lengths[:, None])
+        error = estimate - truth
+        if np.any(lengths != len(truth)):
+            error[np.arange(len(truth))[:, None] >= lengths] = 0.0
+        return np.sqrt(np.einsum("kbn,kbn->bn", error, error) / lengths[:, None])
 
 
 def error_percent(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:

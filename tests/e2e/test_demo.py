@@ -198,7 +198,8 @@ def test_the_deployed_observer_is_exported(kros, demo, tmp_path, command):
     assert not (tmp_path / "other.fmu").exists()
 
 
-def test_new_units_are_scored(kros, demo, tmp_path):
+def test_new_units_are_scored(kros, demo, recorded, tmp_path):
+    """One of them has the name of a unit of the study. It makes no difference whether the study's own recordings are still there."""
     fresh = tmp_path / "new"
     assert kros("simulate", fresh, "--units", 2, "--episodes", 4, "--seconds", 12, "--seed", 77, "--outlier").exit_code == 0
     result = kros("check", demo, fresh, "--json", "--workers", 1)
@@ -206,6 +207,12 @@ def test_new_units_are_scored(kros, demo, tmp_path):
     assert {(r["unit"], r["condition"]) for r in scores} == {(u, c) for u in ("000000", "001001", "001002") for c in ("noload", "load")}
     assert all(np.isfinite(r["score"]) for r in scores)
     assert result.exit_code == (3 if any(r["outlier"] for r in scores) else 0)
+    assert {r[name]["units"] for r in scores for name in ("static_gains", "residual_power")} == {4, 5}
+    recorded.rename(tmp_path / "elsewhere")
+    try:
+        assert kros("check", demo, fresh, "--json", "--workers", 1).stdout == result.stdout
+    finally:
+        (tmp_path / "elsewhere").rename(recorded)
 
 
 def test_what_the_refinement_found_out_is_kept(demo):

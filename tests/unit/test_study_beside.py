@@ -7,10 +7,11 @@ import pytest
 from scipy.signal import lfilter
 
 from kros.data import Channel, Population, Role, from_arrays
+from kros.design.unit_quantities import GAINS, POWERS, UnitQuantities
 from kros.lifting import Lifting
 from kros.observer import Monitor, Observer
 from kros.observer.monitor import octaves
-from kros.study.commands.beside import GAINS, POWERS, Looked, beside_lines, with_beside
+from kros.study.commands.beside import beside_lines, with_beside
 from kros.uncertainty.outliers.quantities import score_quantities
 
 CHANNELS = (
@@ -39,8 +40,8 @@ def recorded(units: dict[str, tuple[float, ...]], seed: int, channels: tuple[Cha
 
 
 @pytest.fixture(scope="module")
-def study() -> tuple[Looked, Population]:
-    """Fourteen units whose gain falls by a percent a kelvin."""
+def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Observer, UnitQuantities]:
+    """Fourteen units whose gain falls by a percent a kelvin, as a run keeps them."""
     rng = np.random.default_rng(1)
     temperatures = rng.uniform(20, 40, 14)
     gains = (1 + 0.01 * rng.normal(size=14)) * (1 - 0.01 * (temperatures - 30))
@@ -48,18 +49,20 @@ def study() -> tuple[Looked, Population]:
     plain = Observer.open_loop("model", Lifting(("valve", "pressure")), A, B, (0,), ("command",), 0.01)
     monitor = Monitor(octaves(), 1e-2, 10, np.ones(1), np.ones((1, 6)), np.array([[3, 3, 3, 3, 2, 2]]), 0.02)
     observer = replace(plain, monitor=monitor)
-    return Looked.of(observer, population, {(u, c): keys for u, c, keys in population.groups()}), population
+    folder = tmp_path_factory.mktemp("quantities")
+    UnitQuantities.of(observer, population, {(u, c): keys for u, c, keys in population.groups()}, {}).save(folder)
+    return observer, UnitQuantities.load(folder)
 
 
 def looked_at(study, units: dict[str, tuple[float, ...]], channels: tuple[Channel, ...] = CHANNELS) -> dict[str, dict]:
     """Return by unit what a row of `kros check` holds."""
-    looked, population = study
-    both = (population, recorded(units, 3, channels))
-    theirs, mine = (looked.quantities(p, {(u, c): keys for u, c, keys in p.groups()}, {}, "default") for p in both)
+    (observer, theirs), population = study, recorded(units, 3, channels)
+    mine = theirs.ruler.measure(observer, population, {(u, c): keys for u, c, keys in population.groups()}, {})["default"]
     row = {"outlier": False, "status": "ok", "score": 0.0}
     ids = mine[GAINS].unit_ids
     found = {
-        unit: {name: score_quantities(theirs[name], table.of([k]), 0.003) for name, table in mine.items()} for k, unit in enumerate(ids)
+        unit: {name: score_quantities(theirs.among("default", name), table.of([k]), 0.003) for name, table in mine.items()}
+        for k, unit in enumerate(ids)
     }
     return {unit: with_beside(row, {name: score.content() for name, score in own.items()}) for unit, own in found.items()}
 
@@ -97,3 +100,11 @@ def test_hidden_channels_leave_what_was_recorded(study) -> None:
     assert row["leak"][GAINS]["quantity"] == "valve / command"
     assert row["leak"]["outlier_by"] == []
     assert POWERS in row["rough"]["outlier_by"]
+
+
+def test_in_a_condition_of_its_own_a_unit_is_held_against_nobody(study) -> None:
+    observer, theirs = study
+    population = recorded({"leak": (0.85, 30.0)}, 3)
+    for name, own in theirs.ruler.measure(observer, population, {("leak", "default"): population.episodes}, {})["default"].items():
+        score = score_quantities(theirs.among("cold", name), own, 0.003)
+        assert (score.status.value, score.units, score.reason) == ("cannot tell", 0, "too few units to tell: 0 of 8")

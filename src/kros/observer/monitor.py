@@ -157,6 +157,9 @@ class Monitor:
             own = scaled[taken, machine].T
             bands = np.stack([b * _apart(all_pole(own, a1, a2)) for b, a1, a2 in self.filters], axis=1)
             squares = np.moveaxis(self._remembered(bands**2), -1, 0)
+            if len(taken) == len(judged) - taken[0]:
+                found[taken[0] :, machine] = squares
+                continue
             latest = np.searchsorted(taken, np.arange(len(judged)), side="right")
             found[:, machine] = np.concatenate([np.zeros((1, *squares.shape[1:])), squares])[latest]
         return found
@@ -250,14 +253,19 @@ def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving:
     moving : ndarray of bool, shape (n_samples, batch)
         Samples that the observer takes: not those that wait for late measurements.
     """
-    wait = np.zeros(status.shape[1], dtype=int)
-    judged = np.empty(status.shape, dtype=bool)
-    for k in range(len(status)):
-        wait[starts[k]] = settle
-        bad = status[k] != 0
-        judged[k] = moving[k] & ~bad & (wait == 0)
-        after = np.where(bad, np.minimum(wait + RECOVERY, settle), np.maximum(wait - 1, 0))
-        wait = np.where(moving[k], after, wait)
+    judged, bad = np.zeros(status.shape, dtype=bool), status != 0
+    events = bad | starts | ~moving
+    for machine, own in enumerate(judged.T):
+        wait = after = 0  # samples that are not judged yet; the sample behind the latest event
+        for k in [*np.flatnonzero(events[:, machine]).tolist(), len(own)]:
+            own[after + wait : k] = True
+            wait, after = max(wait - (k - after), 0), k + 1
+            if k == len(own):
+                break
+            wait = settle if starts[k, machine] else wait
+            if moving[k, machine]:
+                own[k] = wait == 0 and not bad[k, machine]
+                wait = min(wait + RECOVERY, settle) if bad[k, machine] else max(wait - 1, 0)
     return judged
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError, IdentificationError
-from ...data import EpisodeBatch, Population
+from ...data import Population
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
-from ...evaluate.sensor import as_arriving
+from ...evaluate.arriving import Arriving, arriving
 from ...observer import Observer, run_observer, track_parameter
 from ...observer.samples import SampleStatus
 from ...observer.screen import sample_status
@@ -24,19 +24,6 @@ from .recordings import UnitValues, check_channels, hidden_states, identify_on, 
 
 Array = npt.NDArray[np.float64]
 _BATCH, _PHASES, _SEEN_S = 64, 24, 20.0
-
-
-@dataclass(frozen=True)
-class Arriving:
-    """Some episodes as they arrive: measurements y, shape (n_samples, batch, q), and inputs u, shape (n_samples, batch, m)."""
-
-    batch: EpisodeBatch
-    y: Array
-    u: Array
-
-    def parameters(self, observer: Observer, rows: list[int]) -> dict[str, Array]:
-        """Return the lifting parameters of some episodes."""
-        return {name: np.asarray(values, dtype=float)[rows] for name, values in observer.own(self.batch.parameters).items()}
 
 
 @dataclass(frozen=True)
@@ -131,20 +118,6 @@ class FieldRecordings:
             for bit in SampleStatus:
                 if number := int(np.count_nonzero(status[:length, i] & bit)):
                     own[str(bit.name)] = own.get(str(bit.name), 0) + number
-
-
-def arriving(
-    observer: Observer,
-    population: Population,
-    keys: tuple[EpisodeKey, ...],
-    values: dict[str, dict[str, float]],
-    samples: int | None = None,
-) -> Arriving:
-    """Read episodes, perhaps cut to some samples, with lifting parameters by unit."""
-    batch = EpisodeBatch.read(population, keys, samples, values)
-    measured = [population.states.index(observer.lifting.states[i]) for i in observer.measured]
-    y = as_arriving(batch, observer.sensor, population.states).measurements(measured)
-    return Arriving(batch, y, batch.inputs[..., [population.inputs.index(name) for name in observer.inputs]])
 
 
 def _settled(

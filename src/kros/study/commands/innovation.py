@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...evaluate.arriving import Arriving
 from ...observer import Observer
 from ...observer.monitor import Monitor
 from ...observer.simulate import run_innovations
 from ...uncertainty.outliers.score import Status
-from .field import Arriving, FieldRecordings
+from .field import FieldRecordings
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]

@@ -135,7 +135,8 @@ def score_quantities(population: Quantities, unit: Quantities, rate: float, with
     """
     here = population.of([k for k, name in enumerate(population.unit_ids) if name not in without])
     names, reason = _shared(here, unit)
-    at = [k for k in range(len(here.names)) if np.isfinite(unit.values[0, k]) and np.isfinite(here.values[:, k]).mean() >= KNOWN]
+    often = np.count_nonzero(np.isfinite(here.values), axis=0) >= KNOWN * len(here.unit_ids)
+    at = np.flatnonzero(np.isfinite(unit.values[0]) & often).tolist()
     known = np.isfinite(np.column_stack([here.values[:, at], *(here.covariates[c] for c in names)])).all(axis=1)
     here, few = here.of(known), FEWEST + len(names)
     if not at or len(here.unit_ids) < few:

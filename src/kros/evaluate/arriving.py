@@ -1,0 +1,43 @@
+"""Recordings as they arrive at an observer, with the lifting parameters of every unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..data import EpisodeBatch, Population
+from ..data.population import EpisodeKey
+from ..observer import Observer
+from .sensor import as_arriving
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Arriving:
+    """Some episodes as they arrive: measurements y, shape (n_samples, batch, q), and inputs u, shape (n_samples, batch, m)."""
+
+    batch: EpisodeBatch
+    y: Array
+    u: Array
+
+    def parameters(self, observer: Observer, rows: list[int]) -> dict[str, Array]:
+        """Return the lifting parameters of some episodes."""
+        return {name: np.asarray(values, dtype=float)[rows] for name, values in observer.own(self.batch.parameters).items()}
+
+
+def arriving(
+    observer: Observer,
+    population: Population,
+    keys: Sequence[EpisodeKey],
+    values: Mapping[str, Mapping[str, float]],
+    samples: int | None = None,
+) -> Arriving:
+    """Read episodes, perhaps cut to some samples, with lifting parameters by unit."""
+    batch = EpisodeBatch.read(population, keys, samples, values)
+    measured = [population.states.index(observer.lifting.states[i]) for i in observer.measured]
+    y = as_arriving(batch, observer.sensor, population.states).measurements(measured)
+    return Arriving(batch, y, batch.inputs[..., [population.inputs.index(name) for name in observer.inputs]])

@@ -23,7 +23,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 # A demo that shows that an installation works, in seconds of processor time.
 SHORT := --set identify.refine=false --set synthesis.input_weight=3.0 --set evaluate.robustness=false --set evaluate.monte_carlo=0
 
-TEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadgroup --benchmark-skip
+TEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --benchmark-skip
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' Makefile

@@ -18,12 +18,36 @@ settings.register_profile("kros", derandomize=True, deadline=None, suppress_heal
 settings.load_profile("kros")
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
+# Files that need the demo's study, which is made once for all of them, and what takes longest and begins first, that processes end together.
+DEMO = {f"tests/e2e/test_{name}.py" for name in ("demo", "edge", "faults", "field", "motor_drives", "robustness")}
+LONGEST = ["tests/e2e/test_short_way.py", "demo", "tests/e2e/test_examples.py", "tests/e2e/test_demo_command.py"]
+
+
+def group_of(nodeid: str) -> str:
+    """Return what tests belong to that run in one process, one after the other: their file, or the demo."""
+    path = nodeid.partition("::")[0]
+    return "demo" if path in DEMO else path
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep the tests of a file in one process, and all files that need the demo's study in one, so that it is made once."""
-    needing = {item.path for item in items if "demo" in getattr(item, "fixturenames", ())}
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group("demo" if item.path in needing else str(item.path)))
+    """Put the longest first; refuse a file that would make the demo's study once more."""
+    groups = {item.nodeid: group_of(item.nodeid) for item in items}
+    if unknown := {item.path.name for item in items if "demo" in getattr(item, "fixturenames", ()) and groups[item.nodeid] != "demo"}:
+        raise pytest.UsageError(f"tests/conftest.py, DEMO: should name {', '.join(sorted(unknown))}, which needs the demo's study.")
+    items.sort(key=lambda item: LONGEST.index(groups[item.nodeid]) if groups[item.nodeid] in LONGEST else len(LONGEST))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Hand tests to processes by `group_of`, in their order: what pytest-xdist does by marks does nothing with pytest 9.2."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Groups(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return group_of(nodeid)
+
+    config.option.loadscopereorder = False
+    return Groups(config, log)
 
 
 @pytest.fixture(scope="session")

@@ -17,6 +17,7 @@ from kros.observer.certificate.report import relift_report
 from kros.observer.certificate.signals import signal_bound
 from kros.observer.start import Start
 from kros.synthesis import Injection
+from kros.synthesis.worst_case.arcs import Enclosure
 from kros.uncertainty.coprime.bands import band_edges
 
 DT, N = 0.01, 600
@@ -31,6 +32,25 @@ def resonant(rng: np.random.Generator, n: int = 5, p: int = 2, m: int = 3, radiu
         rng.standard_normal((p, m)),
         DT,
     )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_responses_on_arcs_are_as_close_to_their_segments_as_is_said(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    system = resonant(rng)
+    theta = np.concatenate([np.linspace(0.05, 3.1, 40), np.abs(np.angle(np.linalg.eigvals(system.A)))])
+    half = 10.0 ** rng.uniform(-4, -2, len(theta))
+    ends, distance = Enclosure(system).segments(theta, half)
+    closest = 0.0
+    for at, h, (first, last), allowed in zip(theta, half, ends, distance, strict=True):
+        along = np.linspace(-1, 1, 21)
+        T = system.frequency_response((at + h * along) / (2 * np.pi * DT))
+        # Of points at the same height of the arc, which is where the distance is said.
+        share = (1 + np.sin(h * along) / np.sin(h))[:, None, None] / 2
+        far = np.abs(T - (1 - share) * first - share * last)
+        assert (far <= allowed).all()
+        closest = max(closest, float((far / allowed).max()))
+    assert closest > 0.5
 
 
 @pytest.mark.parametrize("seed", range(3))

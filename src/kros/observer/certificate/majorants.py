@@ -4,14 +4,15 @@ For a row t(z) of a stable system, and bands of the unit circle, a matrix is loo
 
 .. math:: M_b \succeq t(z)^H t(z) \quad\text{for all } z \text{ in band } b, \qquad \mathrm{tr}(M_b W_b) \text{ small},
 
-W_b the energies that it is for. Bands are covered by arcs. In the middle of arc s the response is ``t_s``, and no entry is further from it on the arc than
-``delta_i`` (`Enclosure.entries`). The least matrix above all ``t_s^H t_s`` has the dual ``max tr(sum_s mu_s t_s^H t_s)^{1/2}`` over weights mu that sum to one,
-which a multiplicative iteration solves; it is enlarged until it covers. For the rest, with any sizes s_i > 0,
+W_b the energies that it is for. Bands are covered by arcs, along which the response stays close to the straight segment between two ends ``t_s``: no entry is
+further from it than ``delta_i`` (`Enclosure.segments`). The least matrix above all ``t_s^H t_s``, and so above the squares on the segments, has the dual
+``max tr(sum_s mu_s t_s^H t_s)^{1/2}`` over weights mu that sum to one, which a multiplicative iteration solves; it is enlarged until it covers. For the rest,
+with any sizes s_i > 0,
 
 .. math:: d^H d \preceq \Big(\sum_i \delta_i s_i\Big) \mathrm{diag}(\delta_i / s_i) \quad (|d_i| \le \delta_i), \qquad
           (t + d)^H (t + d) \preceq (1 + \epsilon)\, t^H t + (1 + 1/\epsilon)\, d^H d .
 
-Arcs are halved until the rest is a hundredth of the whole. Nothing is decided at points: what lies between them is in delta.
+Arcs are cut until the rest is a small share of the whole. Nothing is decided at points: what lies between them is in delta.
 """
 
 from __future__ import annotations
@@ -26,18 +27,21 @@ from ...core.lti import StateSpace
 from ...synthesis.worst_case.arcs import Enclosure
 
 Array = npt.NDArray[Any]
-_CLOSE = 0.01  # of a row's size in its band, or of its mean size over all of them
+_CLOSE = 0.004  # distance from segments, of a row's size in its band, or of its mean size over all of them
 _ARCS = 20000
 _ROUNDS = 30
-_FIRST = 4  # arcs of a band in the beginning
-_SHAPED = 48  # responses of a band that the shape of a matrix is made for
-_ITERATIONS = 40
+_PARTS = 8  # most that an arc is cut into at once
+_SPARE = 1.1
+_SHAPED = 16  # responses of a band that the shape of a matrix is made for
+_ITERATIONS = 16
+_POWER = 4  # of the heights
+_ENOUGH = 1.01  # a trace over the least one
 _RIDGE = 1e-10
 _TINY = np.finfo(float).tiny
 _SAFE = 1 + 1e-9  # for rounding of small matrices
 
 
-def majorants(system: StateSpace, edges: Array, weight: Array, close: float = _CLOSE) -> Array:
+def majorants(system: StateSpace, edges: Array, weight: Array) -> Array:
     """Return matrices above the responses of every row of a system in every band, shape (p, b, m, m).
 
     Parameters
@@ -48,8 +52,6 @@ def majorants(system: StateSpace, edges: Array, weight: Array, close: float = _C
         From zero to pi.
     weight : ndarray, shape (b, m, m)
         Energies that the matrices are for; they hold for all.
-    close : float
-        How far the response may be from those in the middle of arcs, relative to its size.
     """
     size = np.sqrt(np.maximum(np.einsum("bii->i", weight).real, 0.0))
     size = np.where(size > 1e-100, size, 1.0)  # a channel without energy
@@ -60,11 +62,12 @@ def majorants(system: StateSpace, edges: Array, weight: Array, close: float = _C
     root = (vectors * np.sqrt(values)[:, None, :]) @ adjoint(vectors)
     back = (vectors / np.sqrt(values)[:, None, :]) @ adjoint(vectors)
     sizes = np.sqrt(np.einsum("bii->bi", W).real)
-    band, T, reach = _arcs(scaled, edges, root, sizes, close)
+    band, T, reach = _arcs(scaled, edges, root, sizes)
 
-    n_bands, (p, m) = len(edges) - 1, T.shape[1:]
-    t = T @ root[band]
+    n_bands, (p, m) = len(edges) - 1, T.shape[2:]
     far = np.stack([reach[band == b].max(axis=0) for b in range(n_bands)])
+    band = np.repeat(band, 2)
+    t = T.reshape(-1, p, m) @ root[band]
     shape = _least_above(np.stack([_some(t[band == b]) for b in range(n_bands)]))
     inverse = np.linalg.inv(shape)
     height = np.einsum("kpi,kpij,kpj->kp", t, inverse[band], t.conj(), optimize=True).real
@@ -85,29 +88,31 @@ def energy(matrices: Array, energies: Array) -> Array:
     return np.asarray(np.einsum("pbij,...bji->...p", matrices, energies, optimize=True).real)
 
 
-def _arcs(system: StateSpace, edges: Array, root: Array, sizes: Array, close: float) -> tuple[Array, Array, Array]:
-    """Return the band of every arc, the responses in the middle, (k, p, m), and the distances of entries on the arc, (k, p, m)."""
+def _arcs(system: StateSpace, edges: Array, root: Array, sizes: Array) -> tuple[Array, Array, Array]:
+    """Return the band of every arc, in order, the ends of its segment, (k, 2, p, m), and the distances of entries from it, (k, p, m)."""
     enclosed, n_bands = Enclosure(system), len(edges) - 1
-    cuts = edges[:-1, None] + np.diff(edges)[:, None] * np.linspace(0, 1, _FIRST + 1)
-    theta, half = ((cuts[:, 1:] + cuts[:, :-1]) / 2).ravel(), (np.diff(cuts) / 2 * _SAFE).ravel()
-    band = np.repeat(np.arange(n_bands), _FIRST)
-    done: list[tuple[Array, Array, Array]] = []
+    theta, half, band = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2 * _SAFE, np.arange(n_bands)
+    done: list[tuple[Array, Array, Array, Array]] = []
     peak, tried = np.zeros((n_bands, system.n_outputs)), len(theta)
     for remaining in reversed(range(_ROUNDS)):
-        T, reach = enclosed.entries(theta, half)
-        np.maximum.at(peak, band, np.sum(np.abs(T @ root[band]) ** 2, axis=-1))
-        allowed = close * np.sqrt(np.maximum(peak, peak.mean(axis=0)))
-        loose = (np.einsum("kpi,ki->kp", reach, sizes[band]) > allowed[band]).any(axis=1)
-        tried += 2 * int(loose.sum())
-        if not remaining or tried > _ARCS:
-            loose[:] = ~np.isfinite(reach).all(axis=(1, 2)) & bool(remaining)
-        done.append((band[~loose], T[~loose], reach[~loose]))
-        if not loose.any():
+        T, reach = enclosed.segments(theta, half)
+        np.maximum.at(peak, band, np.sum(np.abs(T @ root[band][:, None]) ** 2, axis=-1).max(axis=1))
+        allowed = _CLOSE * np.sqrt(np.maximum(peak, peak.mean(axis=0)))
+        over = (np.einsum("kpi,ki->kp", reach, sizes[band]) / np.maximum(allowed[band], _TINY)).max(axis=1)
+        parts = np.where(over > 1, np.ceil(np.clip(_SPARE * np.sqrt(over), 2, _PARTS)), 0).astype(int)
+        if not remaining or tried + parts.sum() > _ARCS:
+            parts[np.isfinite(over) | (not remaining)] = 0
+        kept = parts == 0
+        done.append((theta[kept], band[kept], T[kept], reach[kept]))
+        if kept.all():
             break
-        quarter = half[loose] / 2
-        theta, half = np.concatenate([theta[loose] - quarter, theta[loose] + quarter]), np.concatenate([quarter, quarter])
-        band = np.concatenate([band[loose], band[loose]])
-    return tuple(np.concatenate(parts) for parts in zip(*done, strict=True))  # type: ignore[return-value]
+        tried += parts.sum()
+        place = np.concatenate([2 * np.arange(k) + 1 - k for k in parts])
+        half, band = np.repeat(half / np.maximum(parts, 1), parts), np.repeat(band, parts)
+        theta = np.repeat(theta, parts) + place * half
+    theta, band, T, reach = (np.concatenate(each) for each in zip(*done, strict=True))
+    order = np.argsort(theta)
+    return band[order], T[order], reach[order]
 
 
 def _some(rows: Array) -> Array:
@@ -117,14 +122,24 @@ def _some(rows: Array) -> Array:
 
 def _least_above(rows: Array) -> Array:
     """Return the shape of the matrix of least trace above the squares of rows, (b, s, p, m); shape (b, p, m, m), to be scaled."""
-    rows = np.ascontiguousarray(np.swapaxes(rows, 1, 2))  # (b, p, s, m)
-    columns, count, m = adjoint(rows), *rows.shape[2:]
-    mu = np.full(rows.shape[:3], 1 / count)
-    ridge = (_RIDGE * np.sum(np.abs(rows) ** 2, axis=(2, 3)) + _TINY)[..., None, None] * np.eye(m)
+    n_bands, _, p, m = rows.shape
+    rows = np.ascontiguousarray(np.swapaxes(rows, 1, 2)).reshape(n_bands * p, -1, m)
+    mu = np.full(rows.shape[:2], 1 / rows.shape[1])
+    ridge = (_RIDGE * np.sum(rows.real**2 + rows.imag**2, axis=(1, 2)) + _TINY)[:, None, None] * np.eye(m)
+    found, least, left = np.zeros((len(rows), m, m), complex), np.full(len(rows), np.inf), np.arange(len(rows))
     for _ in range(_ITERATIONS):
-        values, vectors = np.linalg.eigh((columns * mu[..., None, :]) @ rows + ridge)
+        values, vectors = np.linalg.eigh((adjoint(rows) * mu[:, None, :]) @ rows + ridge)
         along = rows @ vectors
         height = ((along.real**2 + along.imag**2) @ (1 / np.sqrt(values))[..., None])[..., 0]
-        mu = mu * height
-        mu = mu / np.maximum(mu.sum(axis=-1, keepdims=True), _TINY)
-    return np.asarray((vectors * np.sqrt(values)[..., None, :]) @ adjoint(vectors))
+        excess = height.max(axis=-1) / np.maximum(np.sum(mu * height, axis=-1), _TINY)  # of the trace over that of the dual
+        better = excess < least[left]
+        least[left] = np.minimum(least[left], excess)
+        vectors, values = vectors[better], values[better]
+        found[left[better]] = (vectors * np.sqrt(values)[:, None, :]) @ adjoint(vectors)
+        on = excess > _ENOUGH
+        if not on.any():
+            break
+        left, rows, ridge, height = left[on], rows[on], ridge[on], height[on]
+        mu = mu[on] * (height / height.max(axis=-1, keepdims=True)) ** _POWER
+        mu = mu / mu.sum(axis=-1, keepdims=True)
+    return found.reshape(n_bands, p, m, m)

@@ -33,7 +33,6 @@ from .search import quick_gain
 Array = npt.NDArray[np.float64]
 _BANDS, _BELOW = 96, 10  # bands, the lowest of which ends at a tenth of an episode's lowest frequency
 _RIDGE = 1e-6
-_ROUGH = 0.1
 _SPARE = 1e-6
 _OTHERS = (
     0.0,
@@ -215,14 +214,12 @@ def signal_bound(
     if not frozen.is_stable():
         return replace(found, reason="its error does not settle where slopes and limits rest")
     energies = _energies(signal, batch, known).of_units(batch.units)
-    first = energies.cover()
     plant = StateSpace(
         frozen.A, frozen.B, np.vstack([system.C[:n], frozen.C]), np.vstack([np.zeros((n, frozen.n_inputs)), frozen.D]), system.dt
     )
-    rough = majorants(plant, energies.edges, first.energy, _ROUGH)
-    # The cover is made once more for the states' errors: a matrix that no unit exceeds, where it matters.
-    size = energy(rough[:n], energies.energy).max(axis=0)
-    matter = np.einsum("p,pbij->bij", 1 / np.maximum(size, np.finfo(float).tiny), rough[:n])
+    # The cover is made for the errors and for what slopes act on: a matrix that no unit exceeds, where it matters.
+    rough = majorants(plant, energies.edges, energies.energy.mean(axis=0))
+    matter = np.einsum("p,pbij->bij", 1 / np.maximum(energy(rough, energies.energy).max(axis=0), np.finfo(float).tiny), rough)
     matter = matter + _RIDGE * np.einsum("bii->b", matter).real[:, None, None] * np.eye(matter.shape[-1])
     final = cover(energies.energy, matter)
     M = majorants(plant, energies.edges, final)

@@ -5,6 +5,10 @@ Around the middle ``z_0`` of an arc, with ``R_0 = (z_0 I - A)^{-1}`` and ``h >= 
 .. math:: \|c_i^T (R - R_0) B\| \le h \|c_i^T R_0^2 B\| + h^2 \frac{\|c_i^T R_0^2\| \|R_0 B\|}{1 - h \|R_0\|},
           \qquad h \|R_0\| < 1.
 
+One term more is a straight line in z, from which the arc itself departs by ``h^2 / 2`` at most: what is left is of second order,
+
+.. math:: \|c_i^T (R - R_0 + (z - z_0) R_0^2) b_j\| \le h^2 |c_i^T R_0^3 b_j| + h^3 \frac{\|c_i^T R_0^2\| \|R_0^2 b_j\|}{1 - h \|R_0\|} .
+
 It holds in all coordinates of the state; those in which white noise gives every state the same size and no correlation keep ``R_0`` small.
 Arcs on which the enclosure is not good enough are halved: no frequency is left out, and no decision is made at a point.
 
@@ -49,32 +53,44 @@ class Enclosure:
 
     def __call__(self, theta: Array, half: Array) -> tuple[Array, Array]:
         """Return the response in the middle, (k, p, m), and the distance of every row from it on the arc, (k, p); infinite where the series ends."""
-        return self._enclosed(theta, half, lambda rows: np.linalg.norm(rows, axis=-1))
-
-    def entries(self, theta: Array, half: Array) -> tuple[Array, Array]:
-        """Return the response in the middle and the distance of every entry from it on the arc, both (k, p, m)."""
-        return self._enclosed(theta, half, np.abs)
-
-    def _enclosed(self, theta: Array, half: Array, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
-        n = self.system.n_states
-        R = np.linalg.inv(np.expm1(1j * theta)[:, None, None] * np.eye(n) - self._A)
+        R = self._resolvent(theta)
         CR, RB = self._C @ R, R @ self._B
         response = CR @ self._B + self.system.D
-        size = measure(response)
-        if not n:
+        size = _size(response, -1)
+        if not self.system.n_states:
             return response, _ROUNDING * size
-        shape = (-1, *[1] * (size.ndim - 1))
         moduli = np.abs(R)
         size_R = np.sqrt(moduli.sum(axis=-1).max(axis=-1) * moduli.sum(axis=-2).max(axis=-1))
-        twice, reach = np.linalg.norm(CR @ R, axis=-1), half * size_R
-        # Over the rows' entries: either their norm, or those of single columns.
-        reached = np.linalg.norm(RB, axis=(-2, -1))[:, None] if size.ndim == 2 else np.linalg.norm(RB, axis=-2)[:, None]
-        left, first = (v.reshape(*v.shape, *[1] * (size.ndim - 2)) for v in (twice, np.linalg.norm(CR, axis=-1)))
-        tail = left * reached / np.where(reach < 1, 1 - reach, 1.0).reshape(shape)
-        lost = n * _RESOLVENT * first * reached
-        h = half.reshape(shape)
-        distance = h * measure(CR @ RB) + h**2 * tail + lost + _ROUNDING * size
-        return response, np.where((reach < 1).reshape(shape), distance, np.inf)
+        reach, reached = (half * size_R)[:, None], _size(RB, (-2, -1))[:, None]
+        tail = _size(CR @ R, -1) * reached / np.where(reach < 1, 1 - reach, 1.0)
+        lost = self.system.n_states * _RESOLVENT * _size(CR, -1) * reached
+        h = half[:, None]
+        distance = h * _size(CR @ RB, -1) + h**2 * tail + lost + _ROUNDING * size
+        return response, np.where(reach < 1, distance, np.inf)
+
+    def segments(self, theta: Array, half: Array) -> tuple[Array, Array]:
+        """Return two ends, (k, 2, p, m), and how far every entry is on the arc from the segment between them, (k, p, m); infinite where the series ends."""
+        R = self._resolvent(theta)
+        CR, RB = self._C @ R, R @ self._B
+        middle, slope = CR @ self._B + self.system.D, -CR @ RB
+        z = np.exp(1j * theta)[:, None]
+        ends = middle[:, None] + (z * np.expm1(1j * half[:, None] * [-1, 1]))[..., None, None] * slope[:, None]
+        h, reach = half[:, None, None], (half * _size(R, (-2, -1)))[:, None, None]
+        CR2, R2B = CR @ R, R @ RB
+        bend = np.abs(CR2 @ RB)
+        tail = _size(CR2, -1)[..., None] * _size(R2B, -2)[:, None] / np.where(reach < 1, 1 - reach, 1.0)
+        lost = self.system.n_states * _RESOLVENT * (_size(CR, -1) + half[:, None] * _size(CR2, -1))[..., None] * _size(RB, -2)[:, None]
+        moved = np.abs(slope)
+        distance = h**2 * (moved / 2 + bend + h * tail) + lost + _ROUNDING * (np.abs(middle) + h * moved)
+        return ends, np.where(reach < 1, distance, np.inf)
+
+    def _resolvent(self, theta: Array) -> Array:
+        return np.linalg.inv(np.expm1(1j * theta)[:, None, None] * np.eye(self.system.n_states) - self._A)
+
+
+def _size(values: Array, axis: int | tuple[int, int]) -> Array:
+    """Root of the sum of squares."""
+    return np.asarray(np.sqrt(np.sum(values.real**2 + values.imag**2, axis=axis)))
 
 
 def _even_coordinates(system: StateSpace) -> Array:

@@ -14,7 +14,7 @@ What rounding may miss is added.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,7 +27,9 @@ from ...core.linalg import adjoint
 Array = npt.NDArray[Any]
 BANDS = 96
 _ROUNDING = 1e-13  # of a channel's energy: correlations by FFT and their sums with weights below 2 / lag
-_ITERATIONS = 60
+_AT_ONCE, _BLOCK = 2_000_000, 2048  # lags of signals in memory at a time, and those whose weights are
+_ITERATIONS, _TURNS = 60, 10  # at most; after so many it is looked which bands can be left
+_ENOUGH = 1.002  # of what is covered
 _REGULAR = 1e-14  # of the largest eigenvalue: what is smaller is rounding
 _RIDGE = 1e-6  # of the largest energy, in every direction: where all lie in fewer of them, the iteration needs its square above rounding
 
@@ -81,8 +83,10 @@ class BandEnergies:
         if not np.isfinite(signal).all():
             raise DimensionError("Band energies: the signal contains NaN or infinity; look at the recordings and the model.")
         alone = np.where((np.arange(len(signal))[:, None] < lengths)[..., None], signal, 0.0)
-        found = [_energies(alone[:, i], edges) for i in range(len(lengths))]  # one at a time: lags of all would not fit in memory
-        return cls(edges, np.array(found) / np.asarray(lengths if samples is None else samples, dtype=float)[:, None, None, None])
+        return cls(
+            edges,
+            np.array([*_energies(alone, edges)]) / np.asarray(lengths if samples is None else samples, dtype=float)[:, None, None, None],
+        )
 
     def of_units(self, units: Sequence[str]) -> BandEnergies:
         """Return the mean over the episodes of every unit, units in order of appearance; `units` names that of every episode."""
@@ -153,11 +157,7 @@ def cover(energies: Array, weight: Array | None = None) -> Array:
     E = half @ (energies / outer) @ half
     size = np.maximum(np.einsum("kbii->kb", E).real.max(axis=0), np.finfo(float).tiny)[:, None, None]
     E = E / size + _RIDGE * np.eye(n)
-    F = np.broadcast_to(np.eye(n) / np.sqrt(len(E)), E.shape).astype(complex)  # Y_k = F_k F_k^H
-    for _ in range(_ITERATIONS):
-        F = E @ F
-        F = _power((F @ adjoint(F)).sum(axis=0), -0.5) @ F
-    M = (E @ F @ adjoint(F)).sum(axis=0)
+    M = _least(np.ascontiguousarray(np.swapaxes(E, 0, 1)))
     M = (M + adjoint(M)) / 2
     total = E.sum(axis=0)  # covers in any case
     M = np.where((np.einsum("bii->b", total - M).real >= 0)[:, None, None], M, total)
@@ -167,6 +167,25 @@ def cover(energies: Array, weight: Array | None = None) -> Array:
     smaller = (np.einsum("bii->b", grown - added).real < 0) & (np.linalg.eigvalsh(M)[..., 0] > 0)
     found = back @ (np.where(smaller[:, None, None], grown, added) * size) @ back
     return np.asarray((found + adjoint(found)) / 2 * outer)
+
+
+def _least(E: Array) -> Array:
+    """Return the iteration's ``sum_k E_k Y_k`` in every band, for matrices (b, k, n, n); a band is left when hardly anything exceeds it any more."""
+    count, many, n = E.shape[:3]
+    found, left = np.empty((count, n, n), complex), np.arange(count)
+    G = np.broadcast_to(np.eye(n) / np.sqrt(many), E.shape).astype(complex)  # Y_k = G_k^H G_k
+    for turn in range(1, _ITERATIONS + 1):
+        rows = (G @ E).reshape(len(E), many * n, n)
+        G = (rows @ _power(adjoint(rows) @ rows, -0.5)).reshape(E.shape)
+        if turn % _TURNS and turn < _ITERATIONS:
+            continue
+        found[left] = now = (E @ (adjoint(G) @ G)).sum(axis=1)
+        root = _power(now, -0.5)[:, None]
+        on = np.linalg.eigvalsh(root @ E @ root)[..., -1].max(axis=1) > _ENOUGH
+        if not on.any():
+            break
+        left, E, G = left[on], E[on], G[on]
+    return found
 
 
 def _touching(M: Array, E: Array) -> Array:
@@ -182,20 +201,45 @@ def _power(matrices: Array, exponent: float) -> Array:
     return np.asarray((vectors * (values**exponent)[..., None, :]) @ adjoint(vectors))
 
 
-def _energies(signal: Array, edges: Array) -> Array:
-    """Integrals of ``R R^H / pi`` over bands, for one signal (n_samples, n); shape (b, n, n)."""
-    n_samples, n = signal.shape
-    size = np.sqrt(np.sum(signal**2, axis=0))
-    size[size == 0] = 1.0
+def _energies(signals: Array, edges: Array) -> Iterator[Array]:
+    """Yield integrals of ``R R^H / pi`` over bands, shape (b, n, n), for every signal of (n_samples, batch, n)."""
+    n_samples, batch, n = signals.shape
+    many = max(1, _AT_ONCE // (n_samples * n * n))
+    for start in range(0, batch, many):
+        some = signals[:, start : start + many]
+        size = np.sqrt(np.sum(some**2, axis=0))
+        size[size == 0] = 1.0
+        for total, outer in zip(_integrals(_lags(some / size), edges), size[:, :, None] * size[:, None, :], strict=True):
+            energy = np.diff(total, axis=0) / np.pi
+            values, vectors = np.linalg.eigh(energy)
+            positive = (vectors * np.maximum(values, 0.0)[:, None, :]) @ adjoint(vectors)
+            yield (positive + _ROUNDING * np.eye(n)) * outer
+
+
+def _lags(signals: Array) -> Array:
+    """Return ``sum_k r_{k+l} r_k^T`` for signals (n_samples, batch, n), shape (batch, n_samples, n, n)."""
+    n_samples, batch, n = signals.shape
     points = 1 << (2 * n_samples - 1).bit_length()
-    R = np.fft.rfft(signal / size, points, axis=0)
-    lags = np.fft.irfft(R[:, :, None] * R[:, None, :].conj(), points, axis=0)[:n_samples].reshape(n_samples, n * n)  # sum_k r_{k+l} r_k^T
-    lag = np.arange(1, n_samples)
-    total = np.empty((len(edges), n, n), complex)  # integral from zero to the edge
-    for i, edge in enumerate(edges):
-        half = (((1 - np.exp(-1j * edge * lag)) / (1j * lag)) @ lags[1:]).reshape(n, n)
-        total[i] = edge * lags[0].reshape(n, n) + half + half.conj().T
-    energy = np.diff(total, axis=0) / np.pi
-    values, vectors = np.linalg.eigh(energy)
-    positive = (vectors * np.maximum(values, 0.0)[:, None, :]) @ adjoint(vectors)
-    return np.asarray((positive + _ROUNDING * np.eye(n)) * np.outer(size, size))
+    found = np.empty((batch, n_samples, n, n))
+    for i in range(batch):
+        R = np.fft.rfft(signals[:, i], points, axis=0)
+        for j in range(n):
+            for k in range(j + 1):
+                both = np.fft.irfft(R[:, j] * R[:, k].conj(), points)
+                found[i, :, j, k], found[i, :, k, j] = both[:n_samples], both[-np.arange(n_samples)]
+    return found
+
+
+def _integrals(lags: Array, edges: Array) -> Array:
+    """Return the integrals from zero to every edge, shape (batch, edges, n, n); their weights are the same for all signals."""
+    batch, n_samples, n, _ = lags.shape
+    lags = lags.reshape(batch, n_samples, n * n)
+    even, odd = np.zeros((2, batch, len(edges), n * n))
+    for start in range(1, n_samples, _BLOCK):
+        lag = np.arange(start, min(start + _BLOCK, n_samples))
+        angle = edges[:, None] * lag
+        even += (np.sin(angle) / lag) @ lags[:, start : start + _BLOCK]
+        odd += (2 * np.sin(angle / 2) ** 2 / lag) @ lags[:, start : start + _BLOCK]
+    even, odd = (v.reshape(batch, len(edges), n, n) for v in (even, odd))
+    whole = edges[:, None, None] * lags[:, :1].reshape(batch, 1, n, n)
+    return whole + even + np.swapaxes(even, -1, -2) - 1j * (odd - np.swapaxes(odd, -1, -2))

@@ -131,14 +131,16 @@ def _newton(fixed: Array, slopes: Array, cost: Array, x: Array) -> Array:
     """Minimise ``cost x - sum_f log det (fixed_f + sum_i x_i slopes_fi)`` from a point inside."""
 
     def value(x: Array) -> float:
-        sign, log = np.linalg.slogdet(F := fixed + np.tensordot(x, slopes, (0, 1)))
-        inside = bool(np.all(sign.real > 0)) and np.linalg.eigvalsh(F)[:, 0].min() > 0
-        return float(cost @ x - log.sum()) if inside else np.inf
+        try:
+            R = np.linalg.cholesky(fixed + np.tensordot(x, slopes, (0, 1)))
+        except np.linalg.LinAlgError:
+            return np.inf
+        return float(cost @ x - 2 * np.log(np.einsum("fii->fi", R).real).sum())
 
     current = value(x)
     for _ in range(_NEWTON):
         F = fixed + np.tensordot(x, slopes, (0, 1))
-        parts = np.linalg.solve(F[:, None], slopes + 0j)
+        parts = np.linalg.inv(F)[:, None] @ slopes
         gradient = cost - np.trace(parts, axis1=2, axis2=3).real.sum(axis=0)
         hessian = np.einsum("fiab,fjba->ij", parts, parts, optimize=True).real
         step = -np.linalg.lstsq(hessian, gradient, rcond=None)[0]

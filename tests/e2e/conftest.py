@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
+
+from kros.report.figures import Drawn, draw
+from kros.report.run_folder import RunFolder
 
 
 @pytest.fixture(scope="session")
@@ -46,6 +49,21 @@ def demo(kros, recorded, tmp_path_factory) -> Path:
 def metrics(demo) -> dict[str, Any]:
     """The demo's machine-readable result."""
     return json.loads((demo / "metrics.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def few_figures() -> Iterator[None]:
+    """Reports have two figures, drawn in this process, where tests are about something else: drawing takes longest."""
+    some = ("errors", "forms")
+
+    def drawn(name: str, run: RunFolder) -> Drawn:
+        return draw(name, run) if name in some else Drawn(name, name, reason="not asked for")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("kros.report.html.draw", drawn)
+        patch.setattr("kros.report.files.draw_all", lambda run: (draw(name, run) for name in some))
+        patch.setattr("kros.cli._count", lambda workers: workers or 1)
+        yield
 
 
 @pytest.fixture

@@ -19,12 +19,13 @@ def run_example(name, recordings, out, *options):
 
 
 def test_double_pendulum(recordings, tmp_path):
-    # EDMD models, a fixed weight of the inputs, a quick predictor, no trials: the rest is most of the time, and tests of other studies do it
+    # EDMD models, one method, no trials: the rest is most of the time, and tests of other studies do it
     quick = [
         "identify.refine=false",
-        "synthesis.input_weight=3.0",
+        'synthesis.methods=["residual_h2"]',
         "uncertainty.n_freqs=100",
-        "predictor.effort=quick",
+        "uncertainty.max_order=1",
+        "uncertainty.structure=scalar",
         "evaluate.robustness=false",
         "evaluate.monte_carlo=0",
     ]

@@ -19,6 +19,7 @@ from kros.core.locks import NAME as LOCK
 from kros.core.locks import locked
 from kros.study import Stage, load_config, run_study
 
+pytestmark = pytest.mark.usefixtures("few_figures")
 FAST = (
     'name = "fast"\n[data]\nsource = "{source}"\nreader = "parquet"\n'
     "[identify]\nrefine = false\n"
@@ -47,7 +48,7 @@ def fast(pendulums, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def finished(fast) -> Path:
+def finished(fast, few_figures) -> Path:
     """A finished run, which no test changes."""
     run_study(load_config(fast, ["evaluate.folds=2"]), fast.parent / "finished")
     return fast.parent / "finished"

@@ -20,7 +20,7 @@ settings.load_profile("kros")
 
 # Files that need the demo's study, which is made once for all of them, and what takes longest and begins first, that processes end together.
 DEMO = {f"tests/e2e/test_{name}.py" for name in ("demo", "edge", "faults", "field", "motor_drives", "robustness")}
-LONGEST = ["tests/e2e/test_short_way.py", "demo", "tests/e2e/test_examples.py", "tests/e2e/test_demo_command.py"]
+LONGEST = ["demo", *(f"tests/e2e/test_{name}.py" for name in ("examples", "short_way", "units_of_measure", "run_folder", "demo_command"))]
 
 
 def group_of(nodeid: str) -> str:

@@ -23,6 +23,7 @@ def test_double_pendulum(recordings, tmp_path):
     quick = [
         "identify.refine=false",
         'synthesis.methods=["residual_h2"]',
+        'observer.baselines=["open_loop", "learned"]',
         "uncertainty.n_freqs=100",
         "uncertainty.max_order=1",
         "uncertainty.structure=scalar",

@@ -11,7 +11,9 @@ from kros.design.unit_quantities import GAINS, POWERS, UnitQuantities
 from kros.lifting import Lifting
 from kros.observer import Monitor, Observer
 from kros.observer.monitor import octaves
-from kros.study.commands.beside import beside_lines, with_beside
+from kros.study import validate_config
+from kros.study.commands.beside import beside_lines, scores_beside, with_beside
+from kros.study.engine.store import Store
 from kros.uncertainty.outliers.quantities import score_quantities
 
 CHANNELS = (
@@ -108,3 +110,9 @@ def test_in_a_condition_of_its_own_a_unit_is_held_against_nobody(study) -> None:
     for name, own in theirs.ruler.measure(observer, population, {("leak", "default"): population.episodes}, {})["default"].items():
         score = score_quantities(theirs.among("cold", name), own, 0.003)
         assert (score.status.value, score.units, score.reason) == ("cannot tell", 0, "too few units to tell: 0 of 8")
+
+
+def test_a_run_without_quantities_of_its_own_says_so(study, tmp_path, caplog) -> None:
+    config = validate_config({"data": {"source": "recordings"}}, tmp_path)
+    assert scores_beside(config, Store(tmp_path), study[0], recorded({"leak": (0.85, 30.0)}, 3), {}, {}) == {}
+    assert "run the study again" in caplog.text

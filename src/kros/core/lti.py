@@ -17,13 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import DimensionError
+from .linalg import adjoint
 
 Array = npt.NDArray[Any]
-_INDEPENDENT, _CHECKED, _AGREED = (
-    1e13,
-    33,
-    1e-6,
-)  # modes: condition of their vectors, at how many frequencies they are checked, and how closely
 
 
 def real_array(name: str, values: Any) -> Array:
@@ -187,9 +183,9 @@ class StateSpace:
 
 
 def dense_response(system: StateSpace, freqs_hz: npt.ArrayLike) -> Array:
-    """Return the response of one system at many frequencies: by its modes where these reproduce it at some of them, one by one elsewhere.
+    """Return the response of one system at very many frequencies, several times sooner: by one Schur decomposition in balanced coordinates.
 
-    Modes agree to a millionth of every entry's largest value there.
+    It is that of `StateSpace.frequency_response` up to rounding; what has to be the same for a system alone and in a batch does not come from here.
 
     Examples
     --------
@@ -199,19 +195,20 @@ def dense_response(system: StateSpace, freqs_hz: npt.ArrayLike) -> Array:
     >>> bool(np.allclose(dense_response(lag, freqs_hz), lag.frequency_response(freqs_hz)))
     True
     """
-    freqs = np.asarray(freqs_hz, dtype=float)
-    if not (system.n_states and system.dt > 0 and system.is_stable()):
-        return system.frequency_response(freqs)
-    values, vectors = np.linalg.eig(system.A - np.eye(system.n_states))
-    if not np.linalg.cond(vectors) < _INDEPENDENT:
-        return system.frequency_response(freqs)
-    parts = (system.C @ vectors).T[:, :, None] * np.linalg.solve(vectors, system.B + 0j)[:, None, :]
-    modes = 1 / (np.expm1(2j * np.pi * freqs * system.dt)[:, None] - values)
-    found = (modes @ parts.reshape(len(values), -1)).reshape(len(freqs), *system.D.shape) + system.D
-    some = np.linspace(0, len(freqs) - 1, min(len(freqs), _CHECKED)).round().astype(int)
-    asked = system.frequency_response(freqs[some])
-    agree = np.abs(found[some] - asked) <= _AGREED * np.abs(asked).max(axis=0)
-    return found if agree.all() else system.frequency_response(freqs)
+    from scipy.linalg import matrix_balance, schur
+
+    n, m = system.n_states, system.n_inputs
+    if not n:
+        return system.frequency_response(freqs_hz)
+    s = 2j * np.pi * np.asarray(freqs_hz, dtype=float)
+    zeta = np.expm1(s * system.dt) if system.dt > 0 else s
+    balanced, (size, _) = matrix_balance(system.A - np.eye(n) if system.dt > 0 else system.A, permute=False, separate=True)
+    T, Z = schur(balanced, output="complex")
+    B, C = adjoint(Z) @ (system.B / size[:, None]), (system.C * size) @ Z
+    states = np.empty((n, m, len(zeta)), dtype=complex)
+    for i in reversed(range(n)):
+        states[i] = (B[i][:, None] + np.tensordot(T[i, i + 1 :], states[i + 1 :], 1)) / (zeta - T[i, i])
+    return np.asarray(np.moveaxis(np.tensordot(C, states, 1), -1, 0) + system.D)
 
 
 def gain(matrix: npt.ArrayLike, dt: float) -> StateSpace:

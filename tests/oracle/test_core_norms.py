@@ -5,7 +5,6 @@ import pytest
 import scipy.linalg as sl
 
 from kros.core import StateSpace, gain, h2_norm, hinf_norm
-from kros.core.lti import dense_response
 
 
 def oscillator(zeta, omega):
@@ -98,13 +97,3 @@ def test_static_gain():
     assert hinf_norm(gain(matrix, 1.0)) == pytest.approx(5)
     assert h2_norm(gain(matrix, 1.0)) == pytest.approx(5)
     assert h2_norm(gain(np.zeros((2, 1)), 0.0)) == 0
-
-
-@pytest.mark.parametrize("coupled", [0.0, 1e-9, 0.3])
-def test_dense_responses_are_those_of_single_frequencies_also_where_modes_are_not_independent(coupled: float) -> None:
-    rng, n = np.random.default_rng(4), 6
-    A = np.diag(np.full(n - 1, 0.7), 1) + coupled * rng.standard_normal((n, n)) / 4  # a chain of delays, nilpotent where nothing is coupled
-    system = StateSpace(A, rng.standard_normal((n, 2)), rng.standard_normal((3, n)), rng.standard_normal((3, 2)), 0.01)
-    freqs_hz = np.linspace(0, 50, 501)
-    asked = system.frequency_response(freqs_hz)
-    assert (np.abs(dense_response(system, freqs_hz) - asked) <= 1e-6 * np.abs(asked).max(axis=0)).all()

@@ -71,7 +71,7 @@ def test_spectral_radius_is_told_from_one(value, text):
 
 @pytest.mark.parametrize("dt", [0.0, 1e-3])
 @pytest.mark.parametrize("delays", [0, 6])
-def test_a_sweep_over_many_frequencies_is_the_response_at_each(dt, delays):
+def test_dense_responses_are_those_of_single_frequencies(dt, delays):
     rng = np.random.default_rng(delays)
     n = 5
     A = rng.standard_normal((n, n))

@@ -209,7 +209,8 @@ def episode_moments(z: Array, truth: Array, taps: int) -> tuple[Array, Array, Ar
 
     ends = step[:, n_samples - 1 : n_samples + behind - 1].T[::-1]  # what leaves the sum with every further lag
     between = np.zeros((behind, behind, c, c))
-    between[:1] = product[None, :, own]
+    if behind:
+        between[0] = product[:, own]
     for i in range(1, behind):
         between[i, i:] = between[i - 1, i - 1 : -1] - ends[i - 1, None, :, None] * ends[i - 1 : -1, None, :]
     later, earlier = np.tril_indices(behind, -1)
@@ -229,6 +230,8 @@ def episode_moments(z: Array, truth: Array, taps: int) -> tuple[Array, Array, Ar
 def products_with_lags(signals: Array, step: Array, behind: int) -> Array:
     """Return ``sum_k signals[:, k] step[:, behind - j + k]`` for lags j = 1, ..., behind, shape (behind, s, c): by transforms of short pieces.
 
+    Lags at which a channel has not moved yet are exactly zero, so that rounding gives them no weight.
+
     Parameters
     ----------
     signals : ndarray, shape (s, n_samples)
@@ -245,4 +248,6 @@ def products_with_lags(signals: Array, step: Array, behind: int) -> Array:
     padded = np.pad(step, ((0, 0), (0, count * piece + behind - step.shape[1])))
     second = np.lib.stride_tricks.sliding_window_view(padded, size, axis=1)[:, ::piece]
     common = np.einsum("spf,cpf->scf", np.fft.rfft(first, size).conj(), np.fft.rfft(second), optimize=True)
-    return np.asarray(np.moveaxis(np.fft.irfft(common, size)[..., :behind], -1, 0)[::-1])
+    found = np.moveaxis(np.fft.irfft(common, size)[..., :behind], -1, 0)[::-1]
+    moved = (step != 0).argmax(axis=1) + np.arange(1, behind + 1)[:, None] < step.shape[1]
+    return np.where(moved[:, None], found, 0.0)

@@ -18,7 +18,9 @@ from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
 from kros.loops import compiler, filtered, find_compiler, library, recursion
+from kros.observer import Monitor
 from kros.observer.baselines.extended_kalman import ExtendedKalman
+from kros.observer.monitor import octaves
 from kros.observer.simulate import run_innovations, run_observer, run_observers
 from kros.observer.tuning.blocks import blocks_of, moved
 
@@ -77,6 +79,16 @@ def test_observers_side_by_side_run_alike(both):
     y, u, phase = machines_of()
     observers = [drive(order=order, **LIMITS) for order in (0, 2, 5)]
     assert_same(*both(lambda: run_observers(observers, y, u, {"phase": phase})))
+
+
+@needs_compiler
+def test_monitors_remember_alike(both):
+    rng = np.random.default_rng(3)
+    noise, judged = rng.normal(size=(500, 3, 2)) * [1.0, 300.0], rng.random((500, 3)) < [0.9, 1.0, 0.0]
+    noise[rng.random(noise.shape) < 0.02] = np.nan
+    filters = octaves(9)  # more than are side by side at once
+    monitor = Monitor(filters, 0.01, 0, np.array([1.0, 0.1]), np.ones((2, 9)), np.pad([[8], [8]], ((0, 0), (0, 8))), 0.02, first=0.1)
+    assert_same(*both(lambda: [monitor.mean_squares(noise, judged)]))
 
 
 def model_of(lifting, units, rng):

@@ -12,6 +12,7 @@ from ..core.errors import DataError
 from .population import EpisodeKey, Population
 
 Array = npt.NDArray[np.float64]
+_AT_ONCE = 512  # samples of all episodes that are put side by side at once: they stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +156,9 @@ def hold_missing(y: Array) -> Array:
 def _side_by_side(episodes: Sequence[Array], lengths: npt.NDArray[np.int64]) -> Array:
     """Return episodes as one array, shape (n_samples, batch, n_columns), shorter ones held at their last sample."""
     values = np.empty((lengths.max(), len(episodes), episodes[0].shape[1]))
-    for i, episode in enumerate(episodes):
-        values[: len(episode), i] = episode
-        values[len(episode) :, i] = episode[-1]
+    for start in range(0, len(values), _AT_ONCE):
+        for i, episode in enumerate(episodes):
+            part = episode[start : start + _AT_ONCE]
+            values[start : start + len(part), i] = part
+            values[start + len(part) : start + _AT_ONCE, i] = episode[-1]
     return values

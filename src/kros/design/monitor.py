@@ -10,16 +10,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..data import EpisodeBatch
+from ..core.work import Work
 from ..data.population import EpisodeKey
-from ..evaluate.sensor import as_shown
 from ..observer import Observer
 from ..observer.monitor import WEIGHT, Monitor, octaves, poisson_interval
 from ..observer.simulate import run_innovations
@@ -28,7 +27,7 @@ from .validation import TrainingSet, spread
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-UNITS, EPISODES, TOGETHER = 60, 12, 60  # most units, most episodes of each in every condition, and episodes in memory
+UNITS, EPISODES = 60, 12  # most units, and most episodes of each in every condition
 MEMORY, BEGINNING = 8000, 500  # samples that mean squares remember, and that they count as quiet in the beginning
 FORGOTTEN = 1e-3  # of a start, when innovations are judged
 SETTLE = (100, 1000)
@@ -37,7 +36,7 @@ MOTIONS = 6  # from which on motions add nothing to a bound
 MOVING = 0.1  # of the RMS step of a measurement: less is rest
 
 
-def fit_monitor(observer: Observer, training: TrainingSet, rate: float) -> Monitor | None:
+def fit_monitor(observer: Observer, training: TrainingSet, rate: float, work: Work | None = None) -> Monitor | None:
     """Return the monitor of an observer; None with fewer than three units.
 
     Parameters
@@ -47,34 +46,33 @@ def fit_monitor(observer: Observer, training: TrainingSet, rate: float) -> Monit
         In the observer's units of measure.
     rate : float
         Probability that one more good unit exceeds the bound.
+    work : Work, optional
+        Where the observer runs.
 
     Returns
     -------
     Monitor or None
     """
-    own: dict[tuple[str, str], list[tuple[Array, npt.NDArray[np.bool_], Array]]] = {}
-    settle = settling(observer)
-    for batch in _batches(training):
-        y = batch.measurements(observer.measured)
-        nu, judged = run_innovations(observer, y, batch.inputs, observer.own(batch.parameters), settle)
-        for i, (key, n) in enumerate(zip(batch.keys, batch.lengths, strict=True)):
-            if judged[:n, i].any():
-                own.setdefault((key.unit, key.condition), []).append((nu[:n, i], judged[:n, i], y[:n, i]))
+    tasks = list(_tasks(observer, training, settling(observer)))
+    met = (work or Work()).map("monitor", _met, tasks)
+    own = {task.group: found for task, found in zip(tasks, met, strict=True) if found}
     episodes, units = [e for found in own.values() for e in found], list(dict.fromkeys(unit for unit, _ in own))
     if len(units) < LEAST_SCORES:
         log.info("%s has no monitor: its bound needs training episodes of %d units, found %d.", observer.name, LEAST_SCORES, len(units))
         return None
-    size = np.sqrt(np.mean([np.mean(np.minimum(nu[judged] ** 2, 1e300), axis=0) for nu, judged, _ in episodes], axis=0))
+    size = np.sqrt(np.mean([e.mean_square() for e in episodes], axis=0))
     if not np.isfinite(size).all() or np.any(size <= 0):
         return None
     filters = octaves()
     even = np.ones((len(size), len(filters)))
-    free = Monitor(filters, 1 / MEMORY, settle, size, even, weighted(even), rate, units=len(units), first=1 / BEGINNING)
-    squares = {group: free.in_turn([(nu, judged) for nu, judged, _ in found]) for group, found in own.items()}
-    largest = {group: 10 * np.log10(np.maximum(np.max([p.max(axis=0) for p in found], axis=0), 1e-30)) for group, found in squares.items()}
+    free = Monitor(filters, 1 / MEMORY, settling(observer), size, even, weighted(even), rate, units=len(units), first=1 / BEGINNING)
+
+    def squares(group: tuple[str, str]) -> list[Array]:  # found anew wherever they are needed: all of them fill a memory
+        return free.in_turn([(e.innovation, e.judged) for e in own[group]])
+
+    largest = {group: 10 * np.log10(np.maximum(np.max([p.max(axis=0) for p in squares(group)], axis=0), 1e-30)) for group in own}
     weights = weighted(steady(largest))
-    courses = {group: [_decibels(p, weights) for p in found] for group, found in squares.items()}
-    peaks = {group: [float(level.max()) for level in found] for group, found in courses.items()}
+    peaks = {group: [float(_decibels(p, weights).max()) for p in squares(group)] for group in own}
     conditions = list(dict.fromkeys(condition for _, condition in own))
     of = {c: [peaks[u, c] for u in units if (u, c) in peaks] for c in conditions}
     loudest = [max((peaks[u, c] for c in conditions if (u, c) in peaks), key=max) for u in units]
@@ -82,10 +80,67 @@ def fit_monitor(observer: Observer, training: TrainingSet, rate: float) -> Monit
     bounds = {c: bound_of_peaks(p, rate) - bound for c, p in of.items() if len(conditions) > 1 and len(p) >= LEAST_SCORES}
     shape = np.mean(list(largest.values()), axis=0)
     limits = 10 ** ((shape - (shape * weights).sum() / WEIGHT + bound) / 10)
-    step = np.sqrt(np.nanmean([np.nanmean(np.diff(y, axis=0) ** 2, axis=0) for _, _, y in episodes], axis=0))
-    moving = sum(int(np.count_nonzero(j[1:] & (np.abs(np.diff(y, axis=0)) > MOVING * step).any(axis=-1))) for _, j, y in episodes)
-    alarms = sum(int(np.count_nonzero(np.diff((level > bound).astype(int)) == 1)) for found in courses.values() for level in found)
+    step = np.sqrt(np.nanmean([e.step_square() for e in episodes], axis=0))
+    moving = sum(e.moving(MOVING * step) for e in episodes)
+    alarms = sum(_alarms(_decibels(p, weights) > bound) for group in own if max(peaks[group]) > bound for p in squares(group))
     return replace(free, limits=limits, weights=weights, bounds=bounds, hours=moving * observer.sample_period_s / 3600, alarms=alarms)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """Episodes of a unit in a condition, as an observer meets them."""
+
+    group: tuple[str, str]
+    observer: Observer
+    training: TrainingSet
+    settle: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Met:
+    """What an observer met in an episode: innovations and measurements, shape (n_samples, q), and which samples are judged."""
+
+    innovation: Array
+    judged: npt.NDArray[np.bool_]
+    y: Array
+
+    def mean_square(self) -> Array:
+        """Mean square of the innovations that are judged, shape (q,)."""
+        return np.asarray(np.mean(np.minimum(self.innovation[self.judged] ** 2, 1e300), axis=0))
+
+    def step_square(self) -> Array:
+        """Mean square of the steps of measurements, shape (q,)."""
+        return np.asarray(np.nanmean(np.diff(self.y, axis=0) ** 2, axis=0))
+
+    def moving(self, least: Array) -> int:
+        """How many samples are judged in which some measurement makes a step of at least a size, shape (q,)."""
+        return int(np.count_nonzero(self.judged[1:] & (np.abs(np.diff(self.y, axis=0)) > least).any(axis=-1)))
+
+
+def _tasks(observer: Observer, training: TrainingSet, settle: int) -> Iterator[_Task]:
+    """Take some episodes of some units."""
+    groups: dict[tuple[str, str], list[EpisodeKey]] = {}
+    for key in training.keys:
+        groups.setdefault((key.unit, key.condition), []).append(key)
+    units = set(spread(list(dict.fromkeys(unit for unit, _ in groups)), UNITS))
+    for (unit, condition), keys in groups.items():
+        if unit in units:
+            population, chosen = training.population.select([unit], [condition]), tuple(spread(keys, EPISODES))
+            own = replace(training, population=population, keys=chosen, parameters={unit: training.parameters.get(unit, {})})
+            yield _Task((unit, condition), observer, own, settle)
+
+
+def _met(task: _Task) -> list[_Met]:
+    """Run the observer on episodes as the sensor shows them, and return those in which something is judged."""
+    observer, batch = task.observer, task.training.read_whole().batch
+    y = batch.measurements(observer.measured)
+    nu, judged = run_innovations(observer, y, batch.inputs, observer.own(batch.parameters), task.settle)
+    every = [_Met(nu[:n, i].copy(), judged[:n, i].copy(), y[:n, i].copy()) for i, n in enumerate(batch.lengths)]
+    return [met for met in every if met.judged.any()]
+
+
+def _alarms(above: npt.NDArray[np.bool_]) -> int:
+    return int(np.count_nonzero(above[1:] & ~above[:-1]))
 
 
 def bound_of_peaks(peaks: Sequence[Sequence[float]], rate: float) -> float:
@@ -172,15 +227,3 @@ def settling(observer: Observer) -> int:
     radius = float(np.abs(np.linalg.eigvals(step)).max(initial=0.0))
     samples = SETTLE[1] if radius >= 1 else np.log(FORGOTTEN) / np.log(max(radius, 1e-9))
     return int(np.clip(np.ceil(samples), *SETTLE)) + observer.runtime.delay
-
-
-def _batches(training: TrainingSet) -> Iterator[EpisodeBatch]:
-    """Read some episodes of some units, as the sensor shows them."""
-    groups: dict[tuple[str, str], list[EpisodeKey]] = {}
-    for key in training.keys:
-        groups.setdefault((key.unit, key.condition), []).append(key)
-    units = set(spread(list(dict.fromkeys(unit for unit, _ in groups)), UNITS))
-    keys = [key for (unit, _), own in groups.items() if unit in units for key in spread(own, EPISODES)]
-    for start in range(0, len(keys), TOGETHER):
-        batch = EpisodeBatch.read(training.population, keys[start : start + TOGETHER], None, training.parameters)
-        yield as_shown(batch, training.sensor, training.population.states)

@@ -236,15 +236,15 @@ def synthesize_all(
     facts = {found.name: dict(designs[found.name].facts) if found.name in designs else dict(found.facts) for found in results}
     eligible = robust_of(running, facts) if robust else running
     deployed = choose_deployed(observer.deployed, list(designs), eligible)
-    designs[deployed] = watched(designs[deployed], uncertain.models, sensor, observer.false_alarm_rate)
+    designs[deployed] = watched(designs[deployed], uncertain.models, sensor, observer.false_alarm_rate, work)
     facts[deployed] = dict(designs[deployed].facts)
     return Designs(designs, deployed, facts, tuple(running))
 
 
-def watched(design: Design, identified: IdentifiedModels, sensor: Sensors | None, rate: float) -> Design:
+def watched(design: Design, identified: IdentifiedModels, sensor: Sensors | None, rate: float, work: Work | None = None) -> Design:
     """Return a design whose observer has a monitor, where there are enough units."""
     training = TrainingSet.whole(identified, identified.models(split_name(design.name)[0]), sensor)
-    monitor = fit_monitor(design.observer, training, rate)
+    monitor = fit_monitor(design.observer, training, rate, work)
     if monitor is None:
         return design
     return replace(design, observer=replace(design.observer, monitor=monitor), facts={**design.facts, "monitor": monitor_facts(monitor)})

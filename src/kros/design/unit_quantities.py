@@ -187,11 +187,11 @@ def _powers(observer: Observer, found: Arriving) -> Array:
     if monitor is None:
         return np.zeros((2, 0))
     nu, judged = run_innovations(observer, found.y, found.u, found.parameters(observer, list(range(len(found.batch.keys)))), monitor.settle)
-    own = []
-    for e, n in enumerate(found.batch.lengths):
-        if judged[:n, e].any():
-            squares = monitor.mean_squares(nu[:n, [e]], judged[:n, [e]])[judged[:n, e], 0]
-            own.append(10 * np.log10(np.maximum(squares.mean(axis=0).ravel(), 1e-30)))
+    judged &= np.arange(len(judged))[:, None] < found.batch.lengths
+    squares, own = monitor.mean_squares(nu, judged), []
+    for e in np.flatnonzero(judged.any(axis=0)):
+        mean = squares[judged[:, e], e].mean(axis=0)
+        own.append(10 * np.log10(np.maximum(mean.ravel(), 1e-30)))
     unknown = np.zeros(monitor.limits.size)
     if not own:
         return np.stack([unknown + np.nan, unknown])

@@ -126,6 +126,19 @@ typedef struct {
     double *before;           /* one sample before them; none */
 } filter_job;
 
+/* Monitors of machines that start together: mean squares of the bands of innovations; see kros.observer.monitor. */
+typedef struct {
+    whole machines;
+    whole samples;
+    whole q;
+    whole bands;
+    const double *nu;         /* (samples, machines, q), divided by their size */
+    const uint8_t *judged;    /* (samples, machines): the others hold what was */
+    const double *filters;    /* (bands, 3) */
+    const double *gains;      /* (2): share that the first sample replaces, and the last one */
+    double *squares;          /* (machines, q, bands, samples) */
+} monitor_job;
+
 enum { ADD, MULTIPLY, DIVIDE, POWER, SIN, COS, TAN, EXP, LOG, SQRT, TANH, ABS, SIGN, ATAN };
 
 #define LANES(X) ((double *)(X))
@@ -618,5 +631,40 @@ int kros_filter(const filter_job *s)
         }
     }
     free(in), free(out), free(earlier);
+    return failed;
+}
+
+int kros_monitor(const monitor_job *s)
+{
+    const whole samples = s->samples, signals = s->machines * s->q;
+    vec *out = vectors(TILE);
+    for (whole i = 0; i < signals && out; i++)
+        for (whole first = 0; first < s->bands; first += WIDE) { /* bands side by side */
+            const whole lanes = s->bands - first < WIDE ? s->bands - first : WIDE;
+            vec b = {0}, a1 = {0}, a2 = {0}, one = {0}, two = {0}, p = {0};
+            for (whole l = 0; l < lanes; l++) {
+                const double *filter = s->filters + 3 * (first + l);
+                b[l] = filter[0], a1[l] = filter[1], a2[l] = filter[2];
+            }
+            const uint8_t *judged = s->judged + i / s->q;
+            const double *nu = s->nu + i;
+            double gain = s->gains[0];
+            for (whole k = 0; k < samples; k += TILE) {
+                const whole length = samples - k < TILE ? samples - k : TILE;
+                for (whole j = 0; j < length; j++) {
+                    if (judged[(k + j) * s->machines]) {
+                        const vec v = b * nu[(k + j) * signals], band = v + one;
+                        one = two - a1 * band, two = -v - a2 * band;
+                        p += gain * (band * band - p);
+                        gain /= 1.0 + gain;
+                        gain = gain > s->gains[1] ? gain : s->gains[1];
+                    }
+                    out[j * MOST] = p;
+                }
+                for (whole l = 0; l < lanes; l++) store(s->squares + (i * s->bands + first + l) * samples + k, LANES(out) + l, length);
+            }
+        }
+    const int failed = !out;
+    free(out);
     return failed;
 }

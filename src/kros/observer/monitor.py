@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError
-from ..loops import all_pole
+from ..loops import all_pole, library
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -146,10 +146,18 @@ class Monitor:
         Returns
         -------
         ndarray, shape (n_samples, batch, q, bands)
+            Perhaps a view with the samples innermost in memory.
         """
-        found = np.zeros((*innovation.shape, len(self.filters)))
         scaled = innovation / self.size
         scaled = np.clip(np.where(np.isnan(scaled), LARGEST, scaled), -LARGEST, LARGEST)
+        if (loops := library()) is not None:
+            samples, machines, q = innovation.shape
+            course = np.empty((machines, q, len(self.filters), samples))
+            job = {"machines": machines, "samples": samples, "q": q, "bands": len(self.filters), "nu": scaled, "judged": judged}
+            job |= {"filters": self.filters, "gains": (max(self.first, self.forget), self.forget), "squares": course}
+            loops.call("kros_monitor", ("monitor_job", job))
+            return np.moveaxis(course, -1, 0)
+        found = np.zeros((*innovation.shape, len(self.filters)))
         for machine in range(innovation.shape[1]):
             taken = np.flatnonzero(judged[:, machine])
             if not len(taken):

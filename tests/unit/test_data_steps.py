@@ -7,6 +7,7 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError
 from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, from_frame, prepare, steps
+from kros.data.recording import Recording, estimate_period
 from kros.data.steps.filtered import lowpass, resample_even
 
 KEY = EpisodeKey("a", "default", "0")
@@ -252,3 +253,10 @@ def test_direction_turns_signs_and_sides_where_the_machine_runs_backwards() -> N
     np.testing.assert_array_equal(prepare(backwards, [steps.ByDirection("v", ("force",), each="episode")]).read(KEY)[:, 1], -values[:, 1])
     with pytest.raises(ConfigError, match=r"swap needs pairs of channels with one role and unit, found \['a', 'v'\]"):
         prepare(raw, [steps.ByDirection("v", swap=(("a", "v"),))])
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-12, 1e-5, 0.3])
+def test_the_period_is_the_median_step_in_six_digits(jitter):
+    steps = 1e-3 * (1 + jitter * np.random.default_rng(0).uniform(-1, 1, 501))
+    recording = Recording(KEY, np.zeros((502, 1)), np.concatenate([[5.0], 5.0 + np.cumsum(steps)]))
+    assert estimate_period(recording) == float(f"{np.median(np.diff(recording.time_s)):.6g}")

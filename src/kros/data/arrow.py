@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ def from_numpy(values: npt.NDArray[Any]) -> Any:
     return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(np.ascontiguousarray(values))])
 
 
+@lru_cache(maxsize=8)  # episodes of one length, one behind the other
 def repeated(text: str, count: int) -> Any:
     """Return a dictionary-encoded Arrow array that holds one text `count` times."""
     import pyarrow as pa

@@ -52,7 +52,9 @@ def print_of(values: npt.NDArray[np.float64], channels: Sequence[Channel]) -> Pr
         Stretches in which a state stands still are left out: a machine at rest looks like any other one.
     """
     values = np.ascontiguousarray(values) + 0.0  # one zero
-    digest = sha256(repr(values.shape).encode() + values.tobytes()).digest()
+    found = sha256(repr(values.shape).encode())
+    found.update(values.data)
+    digest = found.digest()
     states = [i for i, c in enumerate(channels) if c.role is Role.STATE]
     if len(values) <= STRETCH:
         return Print(digest, np.zeros(0, np.uint64))
@@ -125,5 +127,7 @@ def _stretches(values: npt.NDArray[np.float64]) -> npt.NDArray[np.uint64]:
 
 
 def _mixed(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    x = (x ^ (x >> np.uint64(30))) * _MIX
-    return x ^ (x >> np.uint64(27))
+    x = x ^ (x >> np.uint64(30))
+    x *= _MIX
+    x ^= x >> np.uint64(27)
+    return x

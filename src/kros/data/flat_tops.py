@@ -97,7 +97,8 @@ class Ends:
 
 def ends_of(unit: str, episode: str, signal: Array, inputs: Array) -> Ends:
     """Return the flat tops of a signal, shape (n_samples,), with inputs of shape (n_samples, m), at both ends."""
-    return Ends(flat_tops(unit, episode, -signal, inputs), flat_tops(unit, episode, signal, inputs))
+    signal, width = np.ascontiguousarray(signal), _width(signal)
+    return Ends(flat_tops(unit, episode, -signal, inputs, width), flat_tops(unit, episode, signal, inputs, width))
 
 
 def found_limit(found: Sequence[Ends], ranges: Array) -> FoundLimit | None:
@@ -140,19 +141,19 @@ def _mirrored(other: _Level | None, found: Sequence[FlatTops]) -> _Level | None:
     return _Level(other.value, (), 0) if abs(furthest.top - other.value) <= furthest.width else None
 
 
-def flat_tops(unit: str, episode: str, signal: Array, inputs: Array) -> FlatTops:
-    """Return the flat tops of a signal at its upper end; without any it says how far the signal goes."""
-    width = _width(signal)
+def flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: float) -> FlatTops:
+    """Return the flat tops of a signal at its upper end, with noise of a width; without any it says how far the signal goes."""
     top = float(np.partition(signal, -SHORTEST)[-SHORTEST]) if len(signal) > 2 * SHORTEST else float(signal.max())
     near = signal >= top - width
     for _ in range(2):
         top = float(signal[near].mean())
         near = signal >= top - width
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], near, [False]]).astype(np.int8)))
+    there = np.concatenate([[False], near, [False]])
+    edges = np.flatnonzero(there[1:] != there[:-1])
     starts, stops = edges[::2], edges[1::2]
     long = stops - starts >= SHORTEST
     starts, stops = starts[long], stops[long]
-    if len(starts) and len(np.unique(signal)) < _LEVELS:
+    if len(starts) and len(np.unique(signal[::_LEVELS])) < _LEVELS and len(np.unique(signal)) < _LEVELS:
         starts, stops = starts[:0], stops[:0]
     lengths = stops - starts
     means = [_means(c, starts, stops) for c in (signal, *inputs.T)]
@@ -206,17 +207,21 @@ def limit_of(found: Sequence[FlatTops], ranges: Array) -> _Level | None:
 
 def _width(signal: Array) -> float:
     """Width of the noise: five standard deviations by second differences, at least one step of quantisation."""
-    second = np.abs(np.diff(signal, 2))
-    steps = np.abs(np.diff(signal))
+    steps = np.diff(signal)
+    second = np.abs(np.diff(steps))
     floor = 1e-9 * float(np.abs(signal).max())
-    steps = steps[steps > floor]
+    np.abs(steps, out=steps)
+    smallest = float(np.where(steps > floor, steps, np.inf).min(initial=np.inf))
     noise = 1.4826 * float(np.median(second)) / np.sqrt(6) if len(second) else 0.0
-    return max(_NOISE * noise, 1.01 * float(steps.min()) if len(steps) else floor)
+    return max(_NOISE * noise, 1.01 * smallest if np.isfinite(smallest) else floor)
 
 
 def _means(signal: Array, starts: npt.NDArray[np.int64], stops: npt.NDArray[np.int64]) -> Array:
-    total = np.concatenate([[0.0], np.cumsum(signal)])
-    return np.asarray((total[stops] - total[starts]) / np.maximum(stops - starts, 1))
+    """Return the means of a signal over runs that are in order and apart."""
+    if not len(starts):
+        return np.zeros(0)
+    bounds = np.stack([starts, stops], axis=1).ravel()[:-1]
+    return np.asarray(np.add.reduceat(signal[: stops[-1]], bounds)[::2] / (stops - starts))
 
 
 def _sides(signal: Array, starts: npt.NDArray[np.int64], stops: npt.NDArray[np.int64], far: float) -> npt.NDArray[np.bool_]:

@@ -89,12 +89,18 @@ def estimate_period(recording: Recording) -> float:
         raise DataError(
             f"{title(recording.key)}: the sampling period needs at least two samples with time, found {found}; leave the episode out."
         )
-    period = float(np.median(np.diff(time)))
+    steps = np.diff(time)
+    shortest, longest = _six_digits(steps.min()), _six_digits(steps.max())
+    period = shortest if shortest == longest else _six_digits(np.median(steps))  # rounding keeps order
     if not period > 0:
         raise DataError(
             f"{title(recording.key)}: the median time step is {period:g} s; name the column that holds time, in seconds and increasing."
         )
-    return float(f"{period:.6g}")
+    return period
+
+
+def _six_digits(number: float) -> float:
+    return float(f"{number:.6g}")
 
 
 def check_increasing(recording: Recording) -> None:

@@ -6,7 +6,7 @@ Population --survey--> Population that can be used, RecordingFacts
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
@@ -151,6 +151,7 @@ def survey(
     work: Work | None = None,
     reserve: Sequence[str] = (),
     earlier: Path | None = None,
+    wrote: Callable[[Path, str], None] | None = None,
 ) -> tuple[Population, RecordingFacts]:
     """Read all recordings once, without those that `work` knows from earlier.
 
@@ -170,6 +171,8 @@ def survey(
         Units that are read, checked and written, and of which the facts say nothing else.
     earlier : Path, optional
         What an earlier survey wrote as its `folder`: files of recordings that have not changed are taken from there.
+    wrote : callable, optional
+        Told every file of recordings that was written, and the SHA-256 of its content.
 
     Returns
     -------
@@ -191,6 +194,10 @@ def survey(
         return folder is None or _taken(known, earlier, folder)
 
     found = list((work or Work()).recall("read", _read_group, tasks, marks, _KINDS, usable))
+    if wrote is not None and folder is not None:
+        for group in found:
+            if group.record is not None and group.written is not None:
+                wrote(folder / group.record.file, group.written)
     kept = _kept(population, found, folder)
     left, aside = set(kept.episodes), set(reserve)
     taking_part = [u for u in kept.unit_ids if u not in aside]
@@ -248,11 +255,16 @@ def _read_group(task: _Group) -> _Found:
     )
     ends: dict[str, list[Ends]] = {name: [] for name in hidden}
     reach = np.array([[np.inf], [-np.inf]]) * np.ones(len(population.inputs))
+    shown: list[npt.NDArray[np.float64]] = []
 
     def look(key: EpisodeKey, values: npt.NDArray[np.float64]) -> None:
+        if not shown:
+            shown.append(values)
+        columns = np.ascontiguousarray(values.T)
         for name in hidden:
-            ends[name].append(ends_of(key.unit, f"{key.condition}/{key.episode}", values[:, population.states.index(name)], values[:, own]))
-        reach[:] = np.minimum(reach[0], values[:, own].min(axis=0)), np.maximum(reach[1], values[:, own].max(axis=0))
+            signal = columns[population.states.index(name)]
+            ends[name].append(ends_of(key.unit, f"{key.condition}/{key.episode}", signal, columns[own].T))
+        reach[:] = np.minimum(reach[0], columns[own].min(axis=1)), np.maximum(reach[1], columns[own].max(axis=1))
 
     if task.folder is None:
         prints = scan_prints(population.select([task.unit], [task.condition]), on_nan=task.on_nan, look=look)
@@ -262,7 +274,7 @@ def _read_group(task: _Group) -> _Found:
     episodes = tuple(key for key, _ in prints)
     if not episodes:
         raise DataError(f"Unit {task.unit} ({task.condition}): every episode was dropped; fix the source or leave the unit out.")
-    first = population.read(episodes[0])
+    first = shown[0][:, : len(population.channels)]
     names = population.states + population.inputs
     steps = {m: resolution(first[:, names.index(m)]) for m in population.measured}
     alerts = period_alerts(first, population.channels, population.sample_period_s)

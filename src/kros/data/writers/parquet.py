@@ -218,5 +218,5 @@ def _table(key: EpisodeKey, values: npt.NDArray[np.float64], schema: Any) -> Any
     import pyarrow as pa
 
     keys = [repeated(text, len(values)) for text in (key.unit, key.condition, key.episode)]
-    columns = [from_numpy(np.ascontiguousarray(column)) for column in values.T]
+    columns = [from_numpy(column) for column in np.ascontiguousarray(values.T)]
     return pa.Table.from_arrays([*keys, from_numpy(np.arange(len(values), dtype=np.int64)), *columns], schema=schema)

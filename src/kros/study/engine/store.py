@@ -48,6 +48,7 @@ class Store:
     folder: Path
     place: Path | None = None
     _runs: list[str] = field(default_factory=list, compare=False, repr=False)
+    _told: dict[Path, tuple[str, str]] = field(default_factory=dict, compare=False, repr=False)
 
     def path(self, *parts: str) -> Path:
         """Return where something that earlier stages wrote is read from."""
@@ -56,6 +57,10 @@ class Store:
     def draft(self, *parts: str) -> Path:
         """Return where the running stage writes something; it will be found at `path` once the stage is done."""
         return (self.place or self.folder).joinpath(*parts)
+
+    def told(self, path: Path, digest: str) -> None:
+        """Take the digest of a drafted file from who wrote it; it is believed while the file's size and time stay."""
+        self._told[path] = records.stamp(path), digest
 
     def nested(self, stage: str, name: str) -> Store:
         """Return the run folder of a study that the running stage makes inside this one; it keeps its own records, and is not drafted."""
@@ -73,7 +78,7 @@ class Store:
         """Give a store whose drafts are elsewhere until `commit`; what is not committed goes."""
         self.tidy()
         try:
-            yield replace(self, place=self.path(PARTIAL, "draft"), _runs=[])
+            yield replace(self, place=self.path(PARTIAL, "draft"), _runs=[], _told={})
         finally:
             self.tidy()
 
@@ -134,7 +139,7 @@ class Store:
         written = sorted(f.relative_to(draft).as_posix() for f in draft.rglob("*") if records.is_file(f))
         for name in written:
             self._require_free(name)
-        digests = {name: records.digest(draft / name) for name in written}
+        digests = {name: self._digest(draft / name) for name in written}
         stamps = {name: records.stamp(draft / name) for name in written if records.is_large(draft / name)}
         for run in self._runs:
             known = Store(self.path(run)).everything()
@@ -144,6 +149,10 @@ class Store:
             target = self.path(name)
             target.parent.mkdir(parents=True, exist_ok=True)
             (draft / name).replace(target)
+
+    def _digest(self, path: Path) -> str:
+        stamp, digest = self._told.get(path, ("", ""))
+        return digest if stamp == records.stamp(path) else records.digest(path)
 
     def _require_free(self, name: str) -> None:
         target = records.place(self.folder, name)

@@ -79,7 +79,9 @@ def run(context: Context) -> None:
     folder = None if in_place else context.store.draft("recordings")
     population, data = open_source(config, context.given), config.data
     reserve, earlier = draw(config, population), context.store.path("recordings")
-    _, facts = survey(population, config.split.test, data.identify_on, data.on_nan, folder, context.work, reserve, earlier)
+    _, facts = survey(
+        population, config.split.test, data.identify_on, data.on_nan, folder, context.work, reserve, earlier, context.store.told
+    )
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them first with on_nan = 'drop_episode'.")
     content = {"recordings": config.data.source if in_place else "recordings", **facts.content()}

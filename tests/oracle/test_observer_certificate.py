@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -17,7 +18,7 @@ from kros.lifting import Lifting
 from kros.observer import Observer, run_observer
 from kros.observer.certificate.certificate import ReliftCertificate, relift_certificate
 from kros.observer.certificate.error import ErrorSystem, ReliftScales, error_system
-from kros.observer.certificate.multipliers import best_multipliers
+from kros.observer.certificate.multipliers import _Barrier, best_multipliers
 from kros.observer.certificate.proof import _positive, margin, proven
 from kros.observer.certificate.report import relift_report
 from kros.observer.certificate.sdp import sdp_proposal
@@ -353,3 +354,33 @@ def test_multipliers_are_nearly_the_best_of_a_direct_search(seed: int, size: flo
     assert (found is None) == (best == 1e30)
     if found is not None:
         assert squared(np.log(found)) <= 1.02**2 * best  # two percent in gain: the centring steps are damped and few
+
+
+@pytest.mark.parametrize(("n_w", "room"), [(5, np.inf), (0, 8.0)])
+def test_the_barrier_of_multipliers_is_that_of_the_matrices_it_stands_for(n_w: int, room: float) -> None:
+    """Log determinants of ``diag(c t, g I) - H' diag(t, I) H`` as they are written, their slopes and curvatures by traces."""
+    rng, width, c = np.random.default_rng(0), 3, 0.7
+    H = 0.15 * (rng.standard_normal((6, width + 2, width + n_w)) + 1j * rng.standard_normal((6, width + 2, width + n_w)))
+    H[:, width:, :width] *= 0.5
+    P = np.conj(np.swapaxes(H[:, width:], 1, 2)) @ H[:, width:]
+    sizes, vectors = np.linalg.eigh(P[:, width:, width:])
+    barrier = replace(_Barrier.of(H, width, sizes, vectors), looser=c, room=room)
+    x = np.concatenate([[1.0, 1.4, 0.8], [3.0] * bool(n_w)])
+    here = barrier.at(x)
+    assert here is not None
+    rows = np.einsum("fja,fjb->jfab", H[:, :width].conj(), H[:, :width])
+    slopes = c * np.array([np.diag(unit) for unit in np.eye(width, width + n_w)])[:, None] - rows
+    if n_w:
+        slopes = np.concatenate([slopes, np.broadcast_to(np.diag(np.arange(width + n_w) >= width), (1, *P.shape))])
+    F = np.tensordot(x, slopes, 1) - P
+    assert np.linalg.eigvalsh(F).min() > 0
+    parts, left = np.linalg.solve(F, slopes), room - x[:width].sum()
+    extra = width / left * (np.arange(len(x)) < width)
+    logs = np.linalg.slogdet(F)[1].sum() + (width * np.log(left) if np.isfinite(room) else 0.0)
+    gradient, hessian = here.derivatives()
+    assert here.value == pytest.approx(-logs, rel=1e-12)
+    np.testing.assert_allclose(gradient, extra - np.trace(parts, axis1=2, axis2=3).sum(axis=1).real, rtol=1e-10)
+    np.testing.assert_allclose(hessian, np.outer(extra, extra) / width + np.einsum("ifab,jfba->ij", parts, parts).real, rtol=1e-10)
+    for size in np.linspace(0.0, 4.0, 40):  # inside where the matrices are positive definite, and nowhere else
+        F = np.tensordot(size * x, slopes, 1) - P
+        assert (barrier.at(size * x) is not None) == (np.linalg.eigvalsh(F).min() > 0 and size * x[:width].sum() < room)

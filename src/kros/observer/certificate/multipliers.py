@@ -3,7 +3,8 @@ r"""Best multipliers over a grid of frequencies: a convex problem in as many num
     minimise g   subject to   F_f(t, g) = diag(t, g I) - sum_j t_j h_fj h_fj' - H_z' H_z > 0   at every frequency f,
 
 with ``h_fj`` the row of H that leads to the slope's input q_j. The set of multipliers that prove stability at all is found first, as the
-one for which ``lambda diag(t) > sum_j t_j h_fj h_fj'`` with a lambda below one. Newton's method on batches of small Hermitian matrices.
+one for which ``lambda diag(t) > sum_j t_j h_fj h_fj'`` with a lambda below one. Newton's method on batches of small Hermitian matrices: whatever the number
+of disturbances, of two rows for every slope.
 
 References
 ----------
@@ -12,6 +13,7 @@ S. Boyd and L. El Ghaoui, "Method of centers for minimizing generalized eigenval
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -50,28 +52,24 @@ def _best(H: Array, width: int) -> Array | None:
     """Return them for all frequencies that are given."""
     through = np.sqrt(np.max(np.sum(np.abs(H[:, width:, :width]) ** 2, axis=1), axis=0))
     by_slopes = through @ np.sqrt(np.max(np.sum(np.abs(H[:, :width, width:]) ** 2, axis=2), axis=0))
-    size = max(np.linalg.norm(H[:, width:, width:], 2, axis=(1, 2)).max(), by_slopes) or 1.0
+    direct = np.linalg.eigh(_adjoint(H[:, width:, width:]) @ H[:, width:, width:])
+    size = max(np.sqrt(direct.eigenvalues.max(initial=0.0)), by_slopes) or 1.0
     through = np.maximum(through, 1e-12 * size)
     H = H / np.concatenate([through, np.full(H.shape[2] - width, size)])
     H[:, :width] *= through[:, None]  # now t is measured in units of through^2
     start = _stabilising(H[:, :width, :width])
     if start is None:
         return None
-    rows = np.einsum("fja,fjb->fjab", H[:, :width].conj(), H[:, :width])
-    fixed = np.conj(np.swapaxes(H[:, width:], 1, 2)) @ H[:, width:]
-    n = H.shape[2]
-    units = np.zeros((width + 1, n, n))
-    units[range(width), range(width), range(width)] = 1.0
-    units[width, range(width, n), range(width, n)] = 1.0
-    slopes = np.concatenate([units[:width] - rows, np.broadcast_to(units[width:], (len(H), 1, n, n))], axis=1)
+    barrier = _Barrier.of(H, width, direct.eigenvalues / size**2, direct.eigenvectors)
     x = np.append(start, 1.0)
-    while not _inside(-fixed[:, :width, :width], slopes[:, :width, :width, :width], x[:width]):
+    while barrier.of_slopes().at(x[:width]) is None:
         x[:width] *= 2.0
-    while not _inside(-fixed, slopes, x):
+    while barrier.at(x) is None:
         x[width] *= 2.0
-    weight = len(H) * n / x[width]
-    while weight * x[width] * _ACCURACY < len(H) * n:
-        x = _newton(-fixed, slopes, np.append(np.zeros(width), weight), x)
+    count = len(H) * H.shape[2]
+    weight = count / x[width]
+    while weight * x[width] * _ACCURACY < count:
+        x = _newton(barrier, np.append(np.zeros(width), weight), x)
         weight *= 8.0
     return np.asarray(x[:width] * through**2)
 
@@ -79,24 +77,20 @@ def _best(H: Array, width: int) -> Array | None:
 def _stabilising(G: Array) -> Array | None:
     """Return multipliers with ``diag(t) > G_f' diag(t) G_f`` at every frequency, well inside; None where there are none."""
     width = G.shape[1]
-    rows = np.einsum("fja,fjb->fjab", G.conj(), G)
-    units = np.zeros((width, width, width))
-    units[range(width), range(width), range(width)] = 1.0
     t = min((np.ones(width), _balanced(np.abs(G).max(axis=0))), key=lambda t: _needed(G, t).max())
     needed = _needed(G, t)
     level, binding = needed.max(), np.zeros(len(G), bool)
     least, best = level, t
+    whole = _Barrier.of(G, width, np.zeros((len(G), 0)), np.zeros((len(G), 0, 0)))
     for centred in range(_CENTRES):
         if level < _WELL_INSIDE and centred:
             break
         looser = max(level * 1.05 + 1e-12, _WELL_INSIDE)
         # Frequencies far below the level bind nothing, and as many of them would keep the centre where it is.
         binding, known = binding | (needed > _BINDING * level), binding
-        # One number of the t is free: their sum stays below the number of slopes.
-        rest = np.zeros((binding.sum() + 1, width, width), complex)
-        slopes = np.concatenate([looser * units - rows[binding], -np.broadcast_to(np.eye(width), (1, width, width, width))], axis=0)
-        rest[-1] = 2 * width * np.eye(width)
-        t = _newton(rest, slopes, np.zeros(width), t * width / t.sum())
+        # One number of the t is free: their sum stays below twice the number of slopes.
+        barrier = replace(whole, fixed=whole.fixed[binding], looser=looser, room=2.0 * width)
+        t = _newton(barrier, np.zeros(width), t * width / t.sum())
         needed, before = _needed(G, t), level
         level = needed.max()
         if level < least:
@@ -123,34 +117,120 @@ def _needed(G: Array, t: Array) -> Array:
     return np.asarray(np.linalg.norm(root[:, None] * G / root, 2, axis=(1, 2)) ** 2)
 
 
-def _inside(fixed: Array, slopes: Array, x: Array) -> bool:
-    return bool(np.linalg.eigvalsh(fixed + np.tensordot(x, slopes, (0, 1)))[:, 0].min() > 0)
+def _adjoint(matrices: Array) -> Array:
+    return np.conj(np.swapaxes(matrices, 1, 2))
 
 
-def _newton(fixed: Array, slopes: Array, cost: Array, x: Array) -> Array:
-    """Minimise ``cost x - sum_f log det (fixed_f + sum_i x_i slopes_fi)`` from a point inside."""
+@dataclass(frozen=True, eq=False)
+class _Barrier:
+    r"""``-sum_f log det F_f(t, g)``, with ``F = diag(looser t, g I) - R diag(t) R' - P`` of the columns r_j = h_j' of R and ``P = H_z' H_z``.
 
-    def value(x: Array) -> float:
+    F is the Schur complement of ``diag(1/t)`` in a matrix whose block for the disturbances is diagonal, ``g I - sizes``, in the eigenvectors of P_ww:
+
+        [ looser diag(t) - P_pp   R_p         -P_pw       ]
+        [ R_p'                    diag(1/t)   R_w'        ]
+        [ -P_wp                   R_w         g I - sizes ]
+
+    Without that block M is left, two rows for every slope: ``log det F = log det (g I - sizes) + log det M + sum log t``, and ``M^-1`` says all of
+    F^-1 along ``e_j`` and ``r_j``, where t changes F.
+    """
+
+    fixed: Array  # [[-P_pp, R_p], [R_p', 0]], (f, 2 n_p, 2 n_p)
+    sizes: Array  # (f, n_w)
+    sides: Array  # [-P_wp, R_w], (f, n_w, 2 n_p)
+    looser: float = 1.0
+    room: float = np.inf  # the sum of t stays below, too
+
+    @classmethod
+    def of(cls, H: Array, width: int, sizes: Array, vectors: Array) -> _Barrier:
+        """Of responses, with eigenvalues and eigenvectors of P_ww."""
+        R, through = _adjoint(H[:, :width]), H[:, width:, :width]
+        sides = np.concatenate([-_adjoint(H[:, width:, width:]) @ through, R[:, width:]], axis=2)
+        own, fixed = R[:, :width], -_adjoint(through) @ through
+        fixed = np.concatenate([np.concatenate([fixed, own], axis=2), np.concatenate([_adjoint(own), np.zeros_like(own)], axis=2)], axis=1)
+        return cls(fixed, sizes, _adjoint(vectors) @ sides)
+
+    def of_slopes(self) -> _Barrier:
+        """Return that of t alone, for any g."""
+        return replace(self, sizes=self.sizes[:, :0], sides=self.sides[:, :0])
+
+    def at(self, x: Array) -> _Point | None:
+        """Return what is known of a point (t, g), or t where there are no disturbances; None outside."""
+        width = self.fixed.shape[1] // 2
+        t, apart, room = x[:width], x[width:] - self.sizes, self.room - x[:width].sum()
+        if min(t.min(), apart.min(initial=np.inf), room) <= 0:
+            return None
+        unit = np.concatenate([t**-0.5, t**0.5])
+        sides = self.sides * unit
+        M = self.fixed * (unit[:, None] * unit) + np.diag(np.repeat([self.looser, 1.0], width))
+        if apart.size:
+            M -= _adjoint(sides) @ (sides / apart[:, :, None])
         try:
-            R = np.linalg.cholesky(fixed + np.tensordot(x, slopes, (0, 1)))
+            root = np.linalg.cholesky(M)
         except np.linalg.LinAlgError:
-            return np.inf
-        return float(cost @ x - 2 * np.log(np.einsum("fii->fi", R).real).sum())
+            return None
+        logs = 2 * np.log(np.einsum("fii->fi", root).real).sum() + len(M) * np.log(t).sum() + np.log(apart).sum()
+        return _Point(t, apart, room, self.looser, sides, M, -float(logs + (width * np.log(room) if np.isfinite(room) else 0.0)))
 
-    current = value(x)
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A point inside, with what is known of it; M and the sides have t as their unit."""
+
+    t: Array
+    apart: Array  # g - sizes
+    room: float  # for the sum of t
+    looser: float
+    sides: Array
+    M: Array
+    value: float
+
+    def derivatives(self) -> tuple[Array, Array]:
+        """Gradient and Hessian of the barrier."""
+        sides, width = self.sides, len(self.t)
+        inverse = np.linalg.inv(self.M)
+        weight = np.concatenate([self.looser / self.t, 1 / self.t])
+        G = inverse - np.diag(np.repeat([0.0, 1.0], width))  # V' F^-1 V, scaled, of V = [e_1 ... r_1 ...]
+        gradient = -_signed(weight * np.einsum("fii->i", G).real)
+        hessian = _signed(_signed(weight[:, None] * weight * (G.real**2 + G.imag**2).sum(axis=0)).T)
+        if np.isfinite(self.room):
+            gradient, hessian = gradient + width / self.room, hessian + width / self.room**2
+        if not self.apart.size:
+            return gradient, hessian
+        once = sides / self.apart[:, :, None]
+        second, third = _adjoint(once) @ once, _adjoint(once) @ (once / self.apart[:, :, None])
+        part = inverse @ second
+        first = -(1 / self.apart).sum() - np.einsum("fii->", part).real
+        last = (self.apart**-2.0).sum() + 2 * np.einsum("fij,fji->", inverse, third).real + np.einsum("fij,fji->", part, part).real
+        mixed = _signed(weight * np.einsum("fij,fji->i", part, inverse).real)
+        return np.append(gradient, first), np.vstack([np.column_stack([hessian, mixed]), np.append(mixed, last)])
+
+
+def _signed(rows: Array) -> Array:
+    """Return the first half of the rows less the second: a slope brings ``e_j e_j'`` and takes ``r_j r_j'``."""
+    half = len(rows) // 2
+    return rows[:half] - rows[half:]
+
+
+def _newton(barrier: _Barrier, cost: Array, x: Array) -> Array:
+    """Minimise ``cost x`` plus the barrier from a point inside."""
+    here = barrier.at(x)
     for _ in range(_NEWTON):
-        F = fixed + np.tensordot(x, slopes, (0, 1))
-        parts = np.linalg.inv(F)[:, None] @ slopes
-        gradient = cost - np.trace(parts, axis1=2, axis2=3).real.sum(axis=0)
-        hessian = np.einsum("fiab,fjba->ij", parts, parts, optimize=True).real
+        if here is None:
+            break
+        gradient, hessian = here.derivatives()
+        gradient = gradient + cost
         step = -np.linalg.lstsq(hessian, gradient, rcond=None)[0]
         decrease = -float(gradient @ step)
         if decrease < 1e-4:
             break
-        length = 1.0
-        while (trial := value(x + length * step)) > current - 0.1 * length * decrease and length > 1e-8:
+        length, current = 1.0, here.value + cost @ x
+        while length > 1e-8:
+            trial = barrier.at(x + length * step)
+            if trial is not None and trial.value + cost @ (x + length * step) <= current - 0.1 * length * decrease:
+                break
             length /= 2
         if length <= 1e-8:
             break
-        x, current = x + length * step, trial
+        x, here = x + length * step, trial
     return x

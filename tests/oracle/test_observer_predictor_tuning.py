@@ -6,8 +6,9 @@ from batches import batch_of
 
 from kros.lifting import Lifting
 from kros.observer import Observer, PastMoments, identify_predictor, run_observer
+from kros.observer.predictor.sensitivities import Sensitivities
 from kros.observer.predictor.tuning import _slowing, _Tuning, tune_predictor
-from kros.observer.tuning.blocks import blocks_of, joined
+from kros.observer.tuning.blocks import blocks_of, estimates_along, joined, states_along
 from kros.synthesis import Injection, kalman
 from kros.synthesis.residual_shaped.shaping_filter import Basis
 
@@ -34,8 +35,12 @@ def recursion(model, z, start):
 def test_blocks_estimate_what_the_model_does(order):
     model, z = random_model(order), np.random.default_rng(1).normal(size=(3, 2, 60))
     blocks = blocks_of(*model)
-    found = sum(np.tensordot(b.H, b.run(z, z[..., 0])[0], 1) for b in blocks)
-    np.testing.assert_allclose(found, recursion(model, z, z[..., 0])[0], rtol=1e-7, atol=1e-9)
+    expected = recursion(model, z, z[..., 0])[0]
+    h, held = states_along(blocks, z, z[..., 0])
+    np.testing.assert_allclose(estimates_along(blocks, z, z[..., 0]), expected, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(np.tensordot(joined(blocks)[2], h, 1), expected, rtol=1e-7, atol=1e-9)
+    np.testing.assert_array_equal(h[..., 0], held)
+    np.testing.assert_array_equal(states_along(blocks, z, z[..., 0], 7)[0], h[..., ::7])
     for power in range(4):
         F, G, H = joined(blocks)
         expected = model[2] @ np.linalg.matrix_power(model[0], power) @ model[1]
@@ -62,6 +67,58 @@ def test_responses_are_the_derivatives():
         W[i, j] += step
         change = (recursion((W[:, :4], W[:, 4:], H), z, z[..., 0])[0] - before) / step
         np.testing.assert_allclose(found[i, j], change, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("order", [1, 4, 5])
+def test_few_signals_make_up_all_responses(order):
+    rng = np.random.default_rng(5)
+    z, rest, blocks = rng.normal(size=(3, 2, 60)), np.vstack([np.zeros((2, 2)), rng.normal(size=(1, 2))]), blocks_of(*random_model(order))
+    h, held = states_along(blocks, z, rest)
+    expected = np.concatenate([b.responses(np.concatenate([h, z]), np.concatenate([held, rest]), 7) for b in blocks])
+    sensitive = Sensitivities(blocks, [2])
+    signals = sensitive.signals(z, rest, 7)
+    assert len(signals) == 2 * order * 3 + 1
+    np.testing.assert_allclose(np.tensordot(sensitive.states, signals, 1), h[..., ::7], rtol=1e-9, atol=1e-9)
+    found = np.einsum("oisk,kbt->isobt", sensitive.responses, signals)
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+
+
+def test_responses_of_slow_poles_keep_their_digits():
+    slow = np.array([[0.9995, 2e-4, 0.0], [-2e-4, 0.9995, 0.0], [0.0, 0.0, 0.9999]])
+    z, blocks = np.cumsum(np.random.default_rng(6).normal(size=(1, 1, 2000)), axis=-1), blocks_of(slow, np.ones((3, 1)), np.ones((1, 3)))
+    F, G, H = (m.astype(np.longdouble) for m in joined(blocks))
+    h, S, expected = np.zeros(3, np.longdouble), np.zeros((3, 3, 4), np.longdouble), []
+    for value in z[0, 0]:
+        expected.append((H[0] @ S.reshape(3, -1)).reshape(3, 4))
+        S = (F @ S.reshape(3, -1)).reshape(3, 3, 4)
+        S[range(3), range(3)] += np.append(h, value)
+        h = F @ h + G[:, 0] * value
+    sensitive = Sensitivities(blocks, [])
+    found = np.tensordot(sensitive.responses[0], sensitive.signals(z, np.zeros((1, 1)), 1)[:, 0], 1)
+    np.testing.assert_allclose(found, np.moveaxis(np.array(expected, float), 0, -1), rtol=0, atol=1e-10 * float(np.abs(expected).max()))
+
+
+@pytest.mark.parametrize("lifted", [False, True])
+def test_curvature_is_that_of_the_responses(lifted):
+    rng = np.random.default_rng(7)
+    x, u = np.cumsum(rng.normal(size=(400, 6, 3)), axis=0), rng.normal(size=(400, 6, 1))
+    batch = batch_of(x, u, DT, units=list("aabbcc"))
+    past = PastMoments.of(Lifting(("p", "v", "i"), ("sin(p)",) if lifted else ()), (0,), batch, Basis(4))
+    problem = _Tuning(past, batch, 1.0, 0.2, {"": 1.0})
+    blocks = blocks_of(*past.model(3))
+    into, _ = problem._whitening(problem.at(blocks), None)
+    weight = rng.uniform(0.5, 2.0, size=(len(problem.group), 2))
+    expected = 0.0
+    for part, each in problem.curved:
+        h, rest = problem.states(blocks, part, None)
+        signals, resting = np.concatenate([h, problem.z[:, part]]), np.concatenate([rest, problem.rest[:, part]])
+        inner = np.einsum("isobt,sw->iwobt", np.concatenate([b.responses(signals, resting, 3) for b in blocks]), into)
+        direct = np.einsum("op,jbt->ojpbt", np.eye(2), h[..., ::3])
+        root = np.sqrt(weight[part].T * each / direct.shape[-1])[..., None]
+        X = np.concatenate([(own * root).reshape(-1, direct[0, 0].size) for own in (inner, direct)])
+        expected = expected + X @ X.T
+    found = problem._curvature(blocks, weight, into, 3)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
 
 
 def test_tuning_reaches_the_kalman_predictor_from_a_poor_model():
@@ -142,13 +199,3 @@ def test_the_gradient_of_all_samples_is_that_of_differences():
             np.add.at(square, tuning.group, np.mean(error**2, axis=-1).T * tuning.each[:, None])
             errors.append(np.sum(tuning.share * np.log(square)) / 2)
         assert found[k] == pytest.approx(-(errors[1] - errors[0]) / (2 * step), rel=1e-4, abs=1e-6 * np.abs(found).max())
-
-
-def test_runs_that_are_kept_and_those_that_are_run_again_give_one_model(monkeypatch):
-    x, u = ripple(np.array([1.0, 2.0, 0.5, 1.0]), n_samples=400)
-    batch = batch_of(x + np.array([0.3, 0.0]), u, DT, units=list("aabb"))
-    past = PastMoments.of(Lifting(("p", "v"), ("sin(5*p)",)), (0,), batch, Basis(5))
-    kept = tune_predictor(past.model(4), past, batch, deviation=0.4, iterations=2)
-    monkeypatch.setattr("kros.observer.predictor.tuning._KEPT", 0)
-    again = tune_predictor(past.model(4), past, batch, deviation=0.4, iterations=2)
-    assert np.allclose(kept[1], again[1], rtol=1e-9)

@@ -7,8 +7,22 @@ all liftings, models and observers, compiled once on a machine. Where there is n
 from __future__ import annotations
 
 from .compiler import COMPILERS, find_compiler
-from .filtering import all_pole, filtered, recursion
+from .filtering import all_pole, blocks_along, filtered, lattice, lattice_along, recursion
 from .library import Library, formulas, library
 from .tape import Tape, tape_of
 
-__all__ = ["COMPILERS", "Library", "Tape", "all_pole", "filtered", "find_compiler", "formulas", "library", "recursion", "tape_of"]
+__all__ = [
+    "COMPILERS",
+    "Library",
+    "Tape",
+    "all_pole",
+    "blocks_along",
+    "filtered",
+    "find_compiler",
+    "formulas",
+    "lattice",
+    "lattice_along",
+    "library",
+    "recursion",
+    "tape_of",
+]

@@ -79,3 +79,86 @@ def recursion(F: Array, driven: Array, first: Array) -> Array:
     for k in range(n_samples - 1):
         h[k + 1] = h[k] @ own + driven[k]
     return h
+
+
+def blocks_along(F: Array, G: Array, H: Array, z: Array, rest: Array, held: Array, every: int = 1, *, states: bool = True) -> Array:
+    """Return the states of a model in blocks of two, ``h[k + 1] = F h[k] + G z[k]``, or its estimates ``H h[k]``.
+
+    Parameters
+    ----------
+    F : ndarray, shape (blocks, 2, 2)
+    G : ndarray, shape (blocks, 2, channels)
+    H : ndarray, shape (outputs, blocks, 2)
+    z : ndarray, shape (channels, batch, n_samples)
+    rest : ndarray, shape (channels, batch)
+        What z was before, for ever: the model is stable.
+    held : ndarray, shape (blocks, 2, batch)
+        What the states were before.
+    every : int
+        States at every so many samples.
+    states : bool
+        False: the estimates.
+
+    Returns
+    -------
+    ndarray, shape (blocks * 2, batch, n_samples / every) or (outputs, batch, n_samples)
+    """
+    (blocks, _, channels), (batch, samples) = G.shape, z.shape[1:]
+    if (loops := library()) is not None:
+        found = np.empty((2 * blocks, batch, -(-samples // every)) if states else (len(H), batch, samples))
+        job = {"blocks": blocks, "channels": channels, "outputs": len(H), "samples": samples, "batch": batch, "every": every}
+        job |= {"F": F, "G": G, "H": H, "z": z, "rest": rest, "held": held, "h" if states else "sum": found}
+        loops.call("kros_blocks", ("blocks_job", job))
+        return found
+    h = np.zeros((samples, blocks, 2, batch))
+    driven = np.einsum("bdc,cek->kbde", G, z - rest[..., None])
+    for k in range(samples - 1):
+        h[k + 1] = F @ h[k] + driven[k]
+    h += held
+    return h.reshape(samples, -1, batch)[::every].transpose(1, 2, 0) if states else np.einsum("obd,kbde->oek", H, h)
+
+
+def lattice_along(reflections: Array, x: Array, every: int = 1) -> Array:
+    """Return the states of normalised lattice sections in a row along signals, from rest: those of an orthonormal basis.
+
+    Parameters
+    ----------
+    reflections : ndarray, shape (sections, 2)
+        k1 and k2 of the all-pass ``(k2 + k1 (1 + k2) q + q^2) / (1 + k1 (1 + k2) q + k2 q^2)``, q the delay; not a number in place of k2: of
+        ``(k1 + q) / (1 + k1 q)``.
+    x : ndarray, shape (signals, n_samples)
+    every : int
+
+    Returns
+    -------
+    ndarray, shape (states, signals, n_samples / every)
+        Before every so many samples.
+
+    References
+    ----------
+    A. H. Gray and J. D. Markel, "A normalized digital filter structure", IEEE Trans. Acoust., Speech, Signal Process. 23 (1975) 268-277.
+    """
+    single = np.isnan(reflections[:, 1])
+    if (loops := library()) is not None:
+        held = np.empty((int(np.sum(2 - single)), len(x), -(-x.shape[1] // every)))
+        job = {"sections": len(reflections), "states": len(held), "signals": len(x), "samples": x.shape[1], "every": every}
+        loops.call("kros_chain", ("chain_job", job | {"reflections": reflections, "x": x, "held": held}))
+        return held
+    A, B = lattice(reflections)
+    return recursion(A, x.T[..., None] * B, np.zeros((len(x), len(A))))[::every].transpose(2, 1, 0)
+
+
+def lattice(reflections: Array) -> tuple[Array, Array]:
+    """Return A and B of `lattice_along`'s states ``s+ = A s + B x``: the rows of [A, B] are orthonormal."""
+    A, B, C, D = np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0
+    for k1, k2 in reflections:
+        c1 = np.sqrt(1 - k1**2)
+        if np.isnan(k2):
+            a, b, c, d = np.array([[-k1]]), np.array([c1]), np.array([c1]), k1
+        else:
+            c2 = np.sqrt(1 - k2**2)
+            a, b = np.array([[-k1, -c1 * k2], [c1, -k1 * k2]]), np.array([c1 * c2, k1 * c2])
+            c, d = np.array([0.0, c2]), k2
+        A = np.block([[A, np.zeros((len(A), len(a)))], [np.outer(b, C), a]])
+        B, C, D = np.concatenate([B, b * D]), np.concatenate([d * C, c]), d * D
+    return A, B

@@ -139,6 +139,36 @@ typedef struct {
     double *squares;          /* (machines, q, bands, samples) */
 } monitor_job;
 
+/* Models of blocks of two states, h+ = F h + G z, from what z was before, for ever: see kros.loops.filtering.blocks_along. */
+typedef struct {
+    whole blocks;
+    whole channels;
+    whole outputs;
+    whole samples;
+    whole batch;
+    whole every;
+    const double *F;          /* (blocks, 2, 2) */
+    const double *G;          /* (blocks, 2, channels) */
+    const double *H;          /* (outputs, blocks, 2) */
+    const double *z;          /* (channels, batch, samples) */
+    const double *rest;       /* (channels, batch): z before */
+    const double *held;       /* (blocks, 2, batch): h before */
+    double *h;                /* (blocks, 2, batch, samples / every); none */
+    double *sum;              /* (outputs, batch, samples): H h; none */
+} blocks_job;
+
+/* All-pass sections of one or two states in a row, every one a normalised lattice, at rest before. */
+typedef struct {
+    whole sections;
+    whole states;
+    whole signals;
+    whole samples;
+    whole every;
+    const double *reflections; /* (sections, 2); the second one is not a number where a section has one state */
+    const double *x;          /* (signals, samples) */
+    double *held;             /* (states, signals, samples / every): before every sample */
+} chain_job;
+
 enum { ADD, MULTIPLY, DIVIDE, POWER, SIN, COS, TAN, EXP, LOG, SQRT, TANH, ABS, SIGN, ATAN };
 
 #define LANES(X) ((double *)(X))
@@ -666,5 +696,105 @@ int kros_monitor(const monitor_job *s)
         }
     const int failed = !out;
     free(out);
+    return failed;
+}
+
+int kros_blocks(const blocks_job *s)
+{
+    const whole samples = s->samples, kept = (samples + s->every - 1) / s->every, batch = s->batch, channels = s->channels, outputs = s->outputs;
+    vec *z = vectors(channels * TILE), *sum = vectors(outputs * TILE), *out = vectors(2 * TILE), *state = vectors(2 * s->blocks);
+    vec *rest = vectors(channels), *held = vectors(2 * s->blocks);
+    const int failed = !z || !sum || !out || !state || !rest || !held;
+    for (whole first = 0; first < batch && !failed; first += WIDE * MOST) {
+        const whole lanes = batch - first < WIDE * MOST ? batch - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
+        for (whole c = 0; c < channels; c++) gather(rest + c * MOST, s->rest + c * batch + first, 1, lanes);
+        for (whole i = 0; i < 2 * s->blocks; i++) gather(held + i * MOST, s->held + i * batch + first, 1, lanes);
+        memset(state, 0, (size_t)(2 * s->blocks * MOST) * sizeof(vec)); /* differences from what was at rest, which may be far larger */
+        for (whole k = 0, done = 0; k < samples; k += TILE) {
+            const whole length = samples - k < TILE ? samples - k : TILE;
+            whole count = 0;
+            for (whole c = 0; c < channels; c++) {
+                vec *into = z + c * TILE * MOST;
+                for (whole b = 0; b < lanes; b++) load(LANES(into) + b, s->z + (c * batch + first + b) * samples + k, length);
+                for (whole i = 0; i < length; i++)
+                    for (whole v = 0; v < w; v++) into[i * MOST + v] -= rest[c * MOST + v];
+            }
+            memset(sum, 0, (size_t)(outputs * TILE * MOST) * sizeof(vec));
+            for (whole block = 0; block < s->blocks; block++) {
+                const double *F = s->F + 4 * block, *G = s->G + 2 * channels * block;
+                vec *h = state + 2 * block * MOST;
+                const vec *before = held + 2 * block * MOST;
+                count = 0;
+                for (whole i = 0; i < length; i++) {
+                    const int wanted = s->h && (k + i) % s->every == 0;
+                    for (whole v = 0; v < w; v++) {
+                        const vec a = h[v], b = h[MOST + v];
+                        vec next = F[0] * a + F[1] * b, other = F[2] * a + F[3] * b;
+                        for (whole c = 0; c < channels; c++) {
+                            const vec x = z[(c * TILE + i) * MOST + v];
+                            next += G[c] * x, other += G[channels + c] * x;
+                        }
+                        if (s->sum) {
+                            const vec one = a + before[v], two = b + before[MOST + v];
+                            for (whole o = 0; o < outputs; o++) {
+                                const double *H = s->H + 2 * (o * s->blocks + block);
+                                sum[(o * TILE + i) * MOST + v] += H[0] * one + H[1] * two;
+                            }
+                        }
+                        if (wanted) out[count * MOST + v] = a + before[v], out[(TILE + count) * MOST + v] = b + before[MOST + v];
+                        h[v] = next, h[MOST + v] = other;
+                    }
+                    count += wanted;
+                }
+                for (whole j = 0; j < 2 && s->h; j++)
+                    for (whole b = 0; b < lanes; b++)
+                        store(s->h + ((2 * block + j) * batch + first + b) * kept + done, LANES(out + j * TILE * MOST) + b, count);
+            }
+            for (whole o = 0; o < outputs && s->sum; o++)
+                for (whole b = 0; b < lanes; b++) store(s->sum + (o * batch + first + b) * samples + k, LANES(sum + o * TILE * MOST) + b, length);
+            done += count;
+        }
+    }
+    free(z), free(sum), free(out), free(state), free(rest), free(held);
+    return failed;
+}
+
+int kros_chain(const chain_job *s)
+{
+    const whole samples = s->samples, kept = (samples + s->every - 1) / s->every;
+    vec *x = vectors(TILE), *out = vectors(2 * TILE), *state = vectors(2 * s->sections);
+    const int failed = !x || !out || !state;
+    for (whole first = 0; first < s->signals && !failed; first += WIDE * MOST) {
+        const whole lanes = s->signals - first < WIDE * MOST ? s->signals - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
+        memset(state, 0, (size_t)(2 * s->sections * MOST) * sizeof(vec));
+        for (whole k = 0, done = 0; k < samples; k += TILE) {
+            const whole length = samples - k < TILE ? samples - k : TILE;
+            whole count = 0, row = 0;
+            for (whole b = 0; b < lanes; b++) load(LANES(x) + b, s->x + (first + b) * samples + k, length);
+            for (whole section = 0; section < s->sections; section++) {
+                const double k1 = s->reflections[2 * section], k2 = s->reflections[2 * section + 1], c1 = sqrt(1.0 - k1 * k1), c2 = sqrt(1.0 - k2 * k2);
+                const int single = isnan(k2);
+                vec *h = state + 2 * section * MOST;
+                count = 0;
+                for (whole i = 0; i < length; i++) {
+                    const int wanted = (k + i) % s->every == 0;
+                    for (whole v = 0; v < w; v++) {
+                        const vec in = x[i * MOST + v], a = h[v], b = h[MOST + v];
+                        if (wanted) out[count * MOST + v] = a, out[(TILE + count) * MOST + v] = b;
+                        if (single) h[v] = c1 * in - k1 * a, x[i * MOST + v] = k1 * in + c1 * a;
+                        else {
+                            const vec inner = c2 * in - k2 * b;
+                            h[v] = c1 * inner - k1 * a, h[MOST + v] = k1 * inner + c1 * a, x[i * MOST + v] = k2 * in + c2 * b;
+                        }
+                    }
+                    count += wanted;
+                }
+                for (whole j = 0; j < 2 - single; j++, row++)
+                    for (whole b = 0; b < lanes; b++) store(s->held + (row * s->signals + first + b) * kept + done, LANES(out + j * TILE * MOST) + b, count);
+            }
+            done += count;
+        }
+    }
+    free(x), free(out), free(state);
     return failed;
 }

@@ -88,6 +88,6 @@ class FreeStart:
         felt = np.einsum("hkn,hbk->nb", self.seen, weighted, optimize=True)
         return np.asarray(weighted - np.einsum("nhk,nb->hbk", inverse, felt, optimize=True))
 
-    def moved(self, starts: Array) -> Array:
-        """Return what starts d, shape (n, batch), add to the states, shape (n, batch, n_samples)."""
-        return np.asarray(np.einsum("knm,mb->nbk", self.powers, starts, optimize=True))
+    def moved(self, starts: Array, every: int = 1) -> Array:
+        """Return what starts d, shape (n, batch), add to the states, shape (n, batch, n_samples / every)."""
+        return np.asarray(np.einsum("knm,mb->nbk", self.powers[::every], starts, optimize=True))

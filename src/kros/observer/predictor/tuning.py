@@ -25,18 +25,18 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...data import EpisodeBatch
-from ..tuning.blocks import Array, Block, Model, blocks_of, joined
+from ..tuning.blocks import Array, Block, Model, blocks_of, estimates_along, joined, states_along
 from ..tuning.gauss_newton import SETTLED, Damping, mean_log, scaled, search, whitening
 from .free_start import FreeStart, in_motion
 from .moments import PastMoments, Weights, hidden_of
+from .sensitivities import Sensitivities
 
 _DAMPING = Damping(1e-7, 1e-3, 1e4, 4.0)
-_THIN, _SIDE_BY_SIDE = 8, 4  # episodes: keeps derivatives in some ten megabytes
+_THIN, _SIDE_BY_SIDE = 8, 8  # episodes: keeps derivatives in some ten megabytes
 _ROWS = 20  # samples for every coefficient that curvature is taken from: all samples make the gradient, so that it decides how fast, not where to
 _TINY = np.finfo(float).tiny
 _ALIKE = 1e-13  # share of a direction below which rounding decides
 _SIZED = 16  # episodes that say how large errors are
-_KEPT = 1e7  # states along recordings that are kept with a model, 80 MB; of more, models are run again where they are needed
 _BOUND, _AT_BOUND = 1e4, 1 - 1e-6  # a pole at its bound stays there instead of ending the search
 
 
@@ -91,22 +91,18 @@ def tune_predictor(
         raise DataError("Tuning a predictor: the model is not stable; start from one that is.")
     blocks = blocks_of(*model)
     some = list(range(0, len(problem.group), -(-len(problem.group) // _SIZED)))
-    problem.weights = FreeStart.by_size(problem.missed(blocks, some, None)[2])
+    problem.weights = FreeStart.by_size(problem.missed(blocks, some, None))
     found, criterion = search(problem.at(blocks), problem.steps, _DAMPING, iterations, least_gain, patience=2)
     return joined(found.blocks), criterion
 
 
-Runs = tuple[Array, Array, Array]
-
-
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A model in blocks, its mean square errors, shape (group, h), and its runs along all recordings, where they are few."""
+    """A model in blocks, and its mean square errors, shape (group, h)."""
 
     blocks: list[Block]
     errors: Array
     criterion: float
-    runs: Runs | None = None
 
 
 class _Tuning:
@@ -156,14 +152,10 @@ class _Tuning:
         """Run a model."""
         found = np.zeros(self.share.shape)
         with np.errstate(over="ignore", invalid="ignore"):
-            free, runs = self._free(blocks), list[Runs]()
-            kept = sum(len(b.F) for b in blocks) * self.z[0].size < _KEPT
+            free = self._free(blocks)
             for part in self._parts():
-                run = self.missed(blocks, part, free)
-                np.add.at(found, self.group[part], np.mean(run[2] ** 2, axis=-1).T * self.each[part, None])
-                runs += [run] if kept else []
-            whole = tuple(np.concatenate(parts, axis=1) for parts in zip(*runs, strict=True)) if kept else None
-            return _Point(blocks, found, mean_log(self.share.ravel(), found.ravel()), whole)  # type: ignore[arg-type]
+                np.add.at(found, self.group[part], np.mean(self.missed(blocks, part, free) ** 2, axis=-1).T * self.each[part, None])
+            return _Point(blocks, found, mean_log(self.share.ravel(), found.ravel()))
 
     def steps(self, point: _Point) -> Callable[[float], _Point]:
         """Gauss-Newton steps, bounded where they slow down the slowest pole.
@@ -171,34 +163,26 @@ class _Tuning:
         Coefficients are those of all states and channels, white along the recordings, in the rows of white states: directions that change no
         estimate, and those between nearly alike channels, cost nothing.
         """
-        from scipy.linalg import block_diag
-
         blocks, model = point.blocks, joined(point.blocks)
         n, outputs = len(model[0]), len(self.truth)
         free = self._free(blocks)
         into, out = self._whitening(point, free)
-        width = into.shape[1]
+        width, back = into.shape[1], np.linalg.pinv(out)
         weight = (self.share / np.maximum(point.errors, _TINY))[self.group]
         parameters = n * (width + outputs)
         every = max(1, int(self.truth[0, 0].size * sum(len(part) for part, _ in self.curved) * outputs / (_ROWS * parameters)))
-        H = np.zeros((parameters, parameters))
-        for part, each in self.curved:
-            h, rest, _ = self._run(point, part, free)
-            signals = np.tensordot(into.T, np.concatenate([h, self.z[:, part]]), 1)
-            rest = np.tensordot(into.T, np.concatenate([rest, self.rest[:, part]]), 1)
-            inner = np.concatenate([b.responses(signals, rest, every) for b in blocks])
-            if free is not None:
-                inner = free.without(inner, every)
-            direct = np.zeros((outputs, *h[..., ::every].shape[:1], outputs, *h[..., ::every].shape[1:]))
-            direct[range(outputs), :, range(outputs)] = h[..., ::every]
-            root = np.sqrt(weight[part].T * each / h[0, 0, ::every].size)[..., None]
-            X = np.concatenate([(part_of * root).reshape(-1, root[..., 0].size * inner.shape[-1]) for part_of in (inner, direct)])
-            H += X @ X.T
-        g = self._gradient(point, free, weight * self.each[:, None], into)
-        turn = block_diag(np.kron(np.linalg.pinv(out).T, np.eye(width)), np.kron(np.eye(outputs), out))
-        H, g, size = scaled(turn.T @ H @ turn, turn.T @ g)
+
+        def turned(rows: Array) -> Array:
+            """Coefficients, rows, in directions that are those of white states."""
+            inner, direct = np.split(rows.reshape(len(rows), -1), [n * width])
+            inner = np.tensordot(back, inner.reshape(n, width, -1), 1).reshape(-1, inner.shape[1])
+            direct = np.einsum("nk,onr->okr", out, direct.reshape(outputs, n, -1)).reshape(-1, direct.shape[1])
+            return np.concatenate([inner, direct])
+
+        H = self._curvature(blocks, weight, into, every) if free is None else self._curvature_of_free(blocks, free, weight, into, every)
+        H, g, size = scaled(turned(turned(H).T), turned(self._gradient(point, free, weight * self.each[:, None], into))[:, 0])
         slows = np.hstack([_slowing(model[0]), np.zeros((n, len(self.z)))]) @ into
-        outward = turn.T @ np.concatenate([slows.ravel(), np.zeros(outputs * n)]) / size
+        outward = turned(np.concatenate([slows.ravel(), np.zeros(outputs * n)]))[:, 0] / size
         outward /= np.linalg.norm(outward)
         radius = max(float(np.abs(np.linalg.eigvals(b.F)).max()) for b in blocks)
         bounded = np.outer(outward, outward) * _BOUND if radius > self.slowest * _AT_BOUND else np.zeros_like(H)
@@ -208,12 +192,43 @@ class _Tuning:
             step = np.linalg.solve(damped, g)
             if outward @ step > 0:
                 step = np.linalg.solve(damped + bounded, g)
-            inner, direct = np.split(turn @ (step / size), [n * width])
-            moved = inner.reshape(n, width) @ into.T
-            changed = model[0] + moved[:, :n], model[1] + moved[:, n:], model[2] + direct.reshape(outputs, n)
+            inner, direct = np.split(step / size, [len(back) * width])
+            moved = back.T @ inner.reshape(-1, width) @ into.T
+            changed = model[0] + moved[:, :n], model[1] + moved[:, n:], model[2] + direct.reshape(outputs, -1) @ out.T
             return self.at([b.within(self.slowest) for b in blocks_of(*changed)])
 
         return trial
+
+    def _curvature(self, blocks: Sequence[Block], weight: Array, into: Array, every: int) -> Array:
+        """Weighted products of what all coefficients do to the estimates, shape (parameters, parameters)."""
+        sensitive = Sensitivities(blocks, np.flatnonzero(self.rest.any(axis=1)).tolist())
+        part, each = (np.concatenate(of) for of in zip(*self.curved, strict=True))
+        signals = sensitive.signals(self.z[:, part], self.rest[:, part], every)
+        inner = np.einsum("oisk,sw->oiwk", sensitive.responses, into, optimize=True)
+        direct = np.zeros((len(inner), len(inner), *sensitive.states.shape))
+        direct[range(len(inner)), range(len(inner))] = sensitive.states
+        found = 0.0
+        for own, others, root in zip(inner, direct, np.sqrt(weight[part].T * each / signals.shape[-1]), strict=True):
+            R = np.linalg.qr((signals * root[:, None]).reshape(len(signals), -1).T, mode="r")
+            rows = R @ np.concatenate([one.reshape(-1, len(signals)) for one in (own, others)]).T
+            found = found + rows.T @ rows
+        return np.asarray(found)
+
+    def _curvature_of_free(self, blocks: Sequence[Block], free: FreeStart, weight: Array, into: Array, every: int) -> Array:
+        """The same where every recording has a start of its own, which moves the states that coefficients multiply."""
+        outputs, n = len(self.truth), len(into) - len(self.z)
+        H = np.zeros((n * (into.shape[1] + outputs),) * 2)
+        for part, each in self.curved:
+            h, rest = self.states(blocks, part, free)
+            signals = np.tensordot(into.T, np.concatenate([h, self.z[:, part]]), 1)
+            rest = np.tensordot(into.T, np.concatenate([rest, self.rest[:, part]]), 1)
+            inner = free.without(np.concatenate([b.responses(signals, rest, every) for b in blocks]), every)
+            direct = np.zeros((outputs, *h[..., ::every].shape[:1], outputs, *h[..., ::every].shape[1:]))
+            direct[range(outputs), :, range(outputs)] = h[..., ::every]
+            root = np.sqrt(weight[part].T * each / h[0, 0, ::every].size)[..., None]
+            X = np.concatenate([(part_of * root).reshape(-1, root[..., 0].size * inner.shape[-1]) for part_of in (inner, direct)])
+            H += X @ X.T
+        return H
 
     def _gradient(self, point: _Point, free: FreeStart | None, weight: Array, into: Array) -> Array:
         """How fast the weighted squares fall with all coefficients, of all recordings and samples.
@@ -222,22 +237,21 @@ class _Tuning:
         """
         blocks = point.blocks
         inner, direct = np.zeros((sum(len(b.F) for b in blocks), len(into))), np.zeros((len(self.truth), sum(len(b.F) for b in blocks)))
+        F, _, H = joined(blocks)
+        backwards = [Block(b.F.T, b.H.T, b.H) for b in blocks]
         for part in self._parts():
-            h, rest, missed = self._run(point, part, free)
-            missed = missed * (weight[part].T / missed.shape[-1])[..., None]
+            h, rest = self.states(blocks, part, free)
+            missed = self.truth[:, part] - np.tensordot(H, h, 1)
+            missed *= (weight[part].T / missed.shape[-1])[..., None]
             if free is not None:
                 missed = free.back(missed)
             signals, resting = np.concatenate([h, self.z[:, part]]), np.concatenate([rest, self.rest[:, part]])
             direct += np.tensordot(missed, h, ((1, 2), (1, 2)))
             back = missed[..., ::-1]
-            gathered, before = [], []
-            for b in blocks:
-                later = Block(b.F.T, b.H.T, b.H).run(back, np.zeros(back.shape[:2]))[0]
-                gathered.append(later[..., ::-1])
-                last = np.tensordot(b.F.T, later[..., -1], 1) + np.tensordot(b.H.T, back[..., -1], 1)
-                before.append(np.linalg.solve(np.eye(len(b.F)) - b.F.T, last.reshape(len(b.F), -1)).reshape(last.shape))
-            inner += np.tensordot(np.concatenate(gathered), signals, ((1, 2), (1, 2)))
-            inner += np.tensordot(np.concatenate(before), resting, (1, 1))
+            later = states_along(backwards, back, np.zeros(back.shape[:2]))[0]
+            last = F.T @ later[..., -1] + H.T @ back[..., -1]
+            inner += np.tensordot(later[..., ::-1], signals, ((1, 2), (1, 2)))
+            inner += np.linalg.solve(np.eye(len(F)) - F.T, last) @ resting.T
         return np.concatenate([(inner @ into).ravel(), direct.ravel()])
 
     def _whitening(self, point: _Point, free: FreeStart | None) -> tuple[Array, Array]:
@@ -245,26 +259,23 @@ class _Tuning:
         n = sum(len(b.F) for b in point.blocks)
         moments = np.zeros((n + len(self.z),) * 2)
         for part in self._parts():
-            flat = np.concatenate([self._run(point, part, free)[0][..., ::_THIN], self.z[:, part, ::_THIN]]).reshape(len(moments), -1)
+            h = self.states(point.blocks, part, free, _THIN)[0]
+            flat = np.concatenate([h, self.z[:, part, ::_THIN]]).reshape(len(moments), -1)
             moments += flat @ flat.T
         moments *= _THIN / self.z[0].size
         return whitening(moments, _ALIKE), whitening(moments[:n, :n], _ALIKE)
 
-    def _run(self, point: _Point, part: slice | list[int], free: FreeStart | None) -> Runs:
-        """Return `missed` of a point on some episodes, run again where it was not kept."""
-        if point.runs is None:
-            return self.missed(point.blocks, part, free)
-        h, rest, missed = point.runs
-        return h[:, part], rest[:, part], missed[:, part]
+    def missed(self, blocks: Sequence[Block], part: slice | list[int], free: FreeStart | None) -> Array:
+        """Return what the estimates miss on some episodes, shape (h, batch, n_samples)."""
+        missed = self.truth[:, part] - estimates_along(blocks, self.z[:, part], self.rest[:, part])
+        return missed if free is None else free.without(missed)
 
-    def missed(self, blocks: Sequence[Block], part: slice | list[int], free: FreeStart | None) -> Runs:
-        """Return states of all blocks on some episodes, their rest, and what the estimates miss."""
-        runs = [b.run(self.z[:, part], self.rest[:, part]) for b in blocks]
-        h, rest = np.concatenate([r[0] for r in runs]), np.concatenate([r[1] for r in runs])
-        H = np.hstack([b.H for b in blocks])
+    def states(self, blocks: Sequence[Block], part: slice | list[int], free: FreeStart | None, every: int = 1) -> tuple[Array, Array]:
+        """Return states of all blocks on some episodes, shape (n, batch, n_samples / every), and their rest, shape (n, batch)."""
+        h, rest = states_along(blocks, self.z[:, part], self.rest[:, part], every)
         if free is not None:
-            h += free.moved(free.fitted(self.truth[:, part] - np.tensordot(H, h, 1)))
-        return h, rest, self.truth[:, part] - np.tensordot(H, h, 1)
+            h += free.moved(free.fitted(self.truth[:, part] - estimates_along(blocks, self.z[:, part], self.rest[:, part])), every)
+        return h, rest
 
     def _free(self, blocks: Sequence[Block]) -> FreeStart | None:
         """What starts of their own do, where recordings begin in motion."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...loops import filtered
+from ...loops import blocks_along, filtered
 
 Array = npt.NDArray[np.float64]
 Model = tuple[Array, Array, Array]
@@ -38,7 +38,8 @@ class Block:
         return (-float(F[0, 0]), 0.0) if len(F) == 1 else (-float(np.trace(F)), float(np.linalg.det(F)))
 
     @property
-    def _behind(self) -> Array:
+    def behind(self) -> Array:
+        """``tr F I - F``, what multiplies the filtered signal of one sample before; zero for one state."""
         return np.trace(self.F) * np.eye(2) - self.F if len(self.F) == 2 else np.zeros((1, 1))
 
     def within(self, radius: float) -> Block:
@@ -46,23 +47,54 @@ class Block:
         largest = np.abs(np.linalg.eigvals(self.F)).max()
         return self if largest <= radius else Block(self.F * (radius / largest), self.G, self.H)
 
-    def run(self, z: Array, rest: Array) -> tuple[Array, Array]:
-        """Return the states h along channels z (channels, batch, n_samples) that were `rest` (channels, batch) before, and at rest."""
-        behind = self._behind
-        driven, rest = np.tensordot(self.G, z, 1), self.G @ rest
-        h, before = filtered(driven, rest, *self._poles)
-        h -= np.tensordot(behind, before, 1)
-        held_rest = rest / (1 + sum(self._poles))
-        return h, held_rest - behind @ held_rest
-
     def responses(self, signals: Array, rest: Array, every: int) -> Array:
         """Return what signals added to each of its states do to the estimates, shape (d, signals, h, batch, n_samples / every)."""
         now, before = filtered(signals, rest, *self._poles, every)
-        behind, (outputs, n) = self.H @ self._behind, self.H.shape
+        behind, (outputs, n) = self.H @ self.behind, self.H.shape
         found = np.empty((n, len(now), outputs, *now.shape[1:]))
         for i, o in np.ndindex(n, outputs):
             found[i, :, o] = self.H[o, i] * now - behind[o, i] * before
         return found
+
+
+def states_along(blocks: Sequence[Block], z: Array, rest: Array, every: int = 1) -> tuple[Array, Array]:
+    """Return the states of a model along channels, at every so many samples, and at rest.
+
+    Parameters
+    ----------
+    blocks : sequence of Block
+    z : ndarray, shape (channels, batch, n_samples)
+    rest : ndarray, shape (channels, batch)
+        What z was before.
+    every : int
+
+    Returns
+    -------
+    h : ndarray, shape (n, batch, n_samples / every)
+    held : ndarray, shape (n, batch)
+    """
+    F, G, H = _in_pairs(blocks)
+    held, n = _held(F, G, rest), sum(len(b.F) for b in blocks)
+    return blocks_along(F, G, H, z, rest, held, every)[:n], held.reshape(-1, rest.shape[1])[:n]
+
+
+def estimates_along(blocks: Sequence[Block], z: Array, rest: Array) -> Array:
+    """Return the estimates of a model along channels, shape (h, batch, n_samples); `z` and `rest` as in `states_along`."""
+    F, G, H = _in_pairs(blocks)
+    return blocks_along(F, G, H, z, rest, _held(F, G, rest), states=False)
+
+
+def _in_pairs(blocks: Sequence[Block]) -> Model:
+    """Blocks side by side, shapes (b, 2, 2), (b, 2, channels), (h, b, 2); one of one state has a second one that nothing moves."""
+    F, G, H = np.zeros((len(blocks), 2, 2)), np.zeros((len(blocks), 2, blocks[0].G.shape[1])), np.zeros((len(blocks[0].H), len(blocks), 2))
+    for i, b in enumerate(blocks):
+        own = slice(len(b.F))
+        F[i, own, own], G[i, own], H[:, i, own] = b.F, b.G, b.H
+    return F, G, H
+
+
+def _held(F: Array, G: Array, rest: Array) -> Array:
+    return np.asarray(np.linalg.solve(np.eye(2) - F, G @ rest))
 
 
 def moved(blocks: Sequence[Block], signals: Array, every: int, first: int) -> Array:
@@ -75,7 +107,7 @@ def moved(blocks: Sequence[Block], signals: Array, every: int, first: int) -> Ar
     for i, block in enumerate(blocks):
         for j, one in enumerate(filtered(signals, rest, *block._poles, every)):
             held[:, 2 * i + j] = one[..., first:]
-    share = np.stack([part for b in blocks for part in (b.H @ b.G, -b.H @ b._behind @ b.G)], axis=-1)  # (h, channels, 2 * blocks)
+    share = np.stack([part for b in blocks for part in (b.H @ b.G, -b.H @ b.behind @ b.G)], axis=-1)  # (h, channels, 2 * blocks)
     return np.asarray(share.swapaxes(0, 1)[:, None] @ held.reshape(*held.shape[:2], -1))
 
 

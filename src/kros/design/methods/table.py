@@ -40,7 +40,7 @@ METHODS = (
     Method("kalman_white", 0.0, 8),
     Method("kalman_tuned", 1.0, 6),
     Method("luenberger", 0.5, 7),
-    Method("mixed", 0.9, 3, not_refined=_LIFTED),
+    Method("mixed", 3.0, 3, not_refined=_LIFTED),
     Method("paper", 1.5, 10, not_refined=_LIFTED),
     Method("worst_case_h2", 4.0, 1),
     Method("worst_case_hinf", 8.0, 2),

@@ -18,9 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...data import EpisodeBatch
-from ...loops import recursion
 from ...synthesis.residual_shaped.shaping_filter import Basis
-from ..tuning.blocks import Array, Model
+from ..tuning.blocks import Array, Model, blocks_of, estimates_along
 from .free_start import FreeStart, in_motion
 from .moments import PastMoments, hidden_of, limited
 
@@ -181,11 +180,14 @@ def _orders(
         held, total, count = batch.take(runs), np.zeros((len(internal), len(rows), len(hidden))), np.zeros(len(rows))
         for _, name, start, end in own:
             count[rows.index(name)] += end - start
-        balanced = past.balanced(units, share, deviation, weights)
+        balanced, truth = past.balanced(units, share, deviation, weights), held.states[..., hidden]
+        z = np.ascontiguousarray(past.channels(held).transpose(2, 1, 0))
+        lifted, at_rest = slice(len(z) - len(past.lifting.functions), None), np.zeros(z.shape[:2])
+        at_rest[lifted] = z[lifted, :, 0]
         for n, memories in enumerate(internal):
-            error = estimates(balanced.model(len(hidden) + memories), past, held) - held.states[..., hidden]
+            error = missed_by(balanced.model(len(hidden) + memories), z, at_rest, truth)
             for i, name, start, end in own:
-                total[n, rows.index(name)] += np.sum(error[start:end, runs.index(i)] ** 2, axis=0)
+                total[n, rows.index(name)] += np.sum(error[:, runs.index(i), start:end] ** 2, axis=-1)
         found = total / np.where(count > 0, count, np.nan)[:, None]
         return np.moveaxis(found, 0, -1)[which]
 
@@ -217,16 +219,18 @@ def _first_good(scores: Array) -> int:
     return int(good[0] if len(good) else scores.mean(axis=1).argmin())
 
 
-def estimates(model: Model, past: PastMoments, batch: EpisodeBatch) -> Array:
-    """Run a model along recordings, from rest or from the best start where these begin in motion, shape (n_samples, batch, h)."""
-    F, G, H = model
-    z = past.channels(batch)
-    held = np.zeros(z.shape[1:])
-    lifted = slice(z.shape[-1] - len(past.lifting.functions), None)
-    held[:, lifted] = z[0][:, lifted]
-    h = recursion(F, z @ G.T, np.asarray(np.linalg.solve(np.eye(len(F)) - F, G @ held.T).T))
-    truth, found = batch.states[..., hidden_of(past.lifting, past.measured)], h @ H.T
+def missed_by(model: Model, z: Array, rest: Array, truth: Array) -> Array:
+    """Return what a model's estimates miss, shape (h, batch, n_samples), from rest or from the best start where recordings begin in motion.
+
+    Parameters
+    ----------
+    model : F, G, H
+    z : ndarray, shape (channels, batch, n_samples)
+    rest : ndarray, shape (channels, batch)
+        What z was before.
+    truth : ndarray, shape (n_samples, batch, h)
+    """
+    missed = truth.transpose(2, 1, 0) - estimates_along(blocks_of(*model), z, rest)
     if in_motion(truth):
-        missed = (truth - found).transpose(2, 1, 0)
-        found = truth - FreeStart.of(F, H, len(h), FreeStart.by_size(missed)).without(missed).transpose(2, 1, 0)
-    return np.asarray(found)
+        return FreeStart.of(model[0], model[2], len(truth), FreeStart.by_size(missed)).without(missed)
+    return np.asarray(missed)

@@ -261,7 +261,9 @@ class PastMoments:
         channels, power = self.n_channels, np.sum(share * self.power[rows], axis=0)
 
         def pooled(own: Array) -> Array:
-            P = np.asarray(np.tensordot(own, self.gram[rows], 1))
+            every = np.zeros(len(self.gram))  # rows that take no part count nothing: no copy of the others
+            every[rows] = own
+            P = np.asarray(np.tensordot(every, self.gram, 1))
             for channel in range(channels - len(self.lifting.functions), channels):
                 of_one = np.arange(channel, self.basis.delays * channels, channels)
                 P[np.ix_(of_one, of_one)] *= 1 + deviation**2

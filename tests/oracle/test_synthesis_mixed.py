@@ -176,9 +176,10 @@ def test_units_of_all_signals_do_not_matter():
 
 def test_feedthrough_is_absorbed():
     plant = two_channel(np.random.default_rng(3), n=2)
-    found = mixed(replace(plant, D22=[[0.3]]), gamma=0.12)
-    assert found.h2_norm == pytest.approx(mixed(plant, gamma=0.12).h2_norm, rel=1e-3)
-    assert found.hinf_norm < 0.12
+    gamma = 0.2  # closer to the least that is in reach, rounding decides where the local improvement ends
+    found = mixed(replace(plant, D22=[[0.3]]), gamma=gamma)
+    assert found.h2_norm == pytest.approx(mixed(plant, gamma=gamma).h2_norm, rel=1e-6)
+    assert found.hinf_norm < gamma
 
 
 @pytest.mark.parametrize(("seed", "order", "injection"), [(3, 5, Injection.INPUT), (3, 3, Injection.INPUT), (5, 1, Injection.STATE)])

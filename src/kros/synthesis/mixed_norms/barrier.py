@@ -161,6 +161,7 @@ def _follow(
     def value(point: Array) -> float:
         return float(c @ point + point @ quadratic @ point / 2)
 
+    scaled = _Scaled.of(blocks, len(x))
     mu, lower, ending = max(abs(value(x)), 1e-3) / size * 10, -np.inf, Ending.STALLED
     while steps < _STEPS:
         steps += 1
@@ -168,7 +169,7 @@ def _follow(
             ending = Ending.TIME
             break
         try:
-            gradient, hessian, roots = _derivatives(blocks, x, box)
+            gradient, hessian, roots = _derivatives(blocks, scaled, x, box)
             gradient, hessian = (c + quadratic @ x) / mu + gradient, quadratic / mu + hessian
             direction = -_solve(hessian, gradient)
         except np.linalg.LinAlgError:
@@ -195,20 +196,39 @@ def _follow(
     return Outcome(x, value(x), lower, ending, steps)
 
 
-def _derivatives(blocks: Sequence[Block], x: Array, box: Array) -> tuple[Array, Array, list[Array]]:
+@dataclass(frozen=True, eq=False)
+class _Scaled:
+    """Coefficients of all matrices with the variables last, (d, d n) each, and memory for what every step makes of them: new memory costs more."""
+
+    bases: list[Array]
+    left: list[Array]  # of their shapes: R M_i
+    lower: Array  # (entries, n): lower triangles of R M_i R', those of one matrix after the other
+
+    @classmethod
+    def of(cls, blocks: Sequence[Block], n: int) -> _Scaled:
+        """Of blocks with n variables."""
+        bases = [np.ascontiguousarray(np.moveaxis(m, 0, 2)).reshape(len(m[0]), -1) for b in blocks for m in np.swapaxes(b.basis, 0, 1)]
+        return cls(bases, [np.empty_like(m) for m in bases], np.empty((sum(len(m) * (len(m) + 1) // 2 for m in bases), n)))
+
+    def along(self, roots: Sequence[Array]) -> tuple[Array, Array]:
+        """Return ``sum_k tr D_ki`` and ``sum_k tr D_ki D_kj`` of ``D_ki = R_k M_ki R_k'``, for lower triangular roots R in the order of the matrices."""
+        end, trace = 0, np.zeros(self.lower.shape[1])
+        for root, basis, memory in zip(roots, self.bases, self.left, strict=True):
+            left = np.matmul(root, basis, out=memory).reshape(*root.shape, -1)
+            for row in range(len(root)):
+                start, end = end, end + row + 1
+                np.matmul(root[: row + 1, : row + 1], left[row, : row + 1], out=self.lower[start:end])
+                trace += self.lower[end - 1]
+                self.lower[end - 1] *= np.sqrt(0.5)  # counts once, all others twice
+        return trace, 2 * (self.lower.T @ self.lower)
+
+
+def _derivatives(blocks: Sequence[Block], scaled: _Scaled, x: Array, box: Array) -> tuple[Array, Array, list[Array]]:
     """Gradient and Hessian of the barrier, and the inverse Cholesky factors of all blocks."""
-    n = len(x)
-    gradient = 1 / (box - x) - 1 / (box + x)
-    hessian = np.diag(1 / (box - x) ** 2 + 1 / (box + x) ** 2)
-    roots = []
-    for block in blocks:
-        root = np.linalg.inv(np.linalg.cholesky(block.at(x)))
-        scaled = root @ block.basis @ root.swapaxes(-1, -2)
-        gradient -= np.trace(scaled, axis1=-2, axis2=-1).sum(axis=-1)
-        flat = scaled.reshape(n, -1)
-        hessian += flat @ flat.T
-        roots.append(root)
-    return gradient, hessian, roots
+    roots = [np.linalg.inv(np.linalg.cholesky(block.at(x))) for block in blocks]
+    trace, products = scaled.along([root for block in roots for root in block])
+    gradient = 1 / (box - x) - 1 / (box + x) - trace
+    return gradient, np.diag(1 / (box - x) ** 2 + 1 / (box + x) ** 2) + products, roots
 
 
 def _solve(hessian: Array, gradient: Array) -> Array:

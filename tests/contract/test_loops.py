@@ -13,6 +13,7 @@ from families import FAMILIES, INPUT_FUNCTIONS, INPUTS, STATES
 from machines import LIMITS, MACHINES, drive, samples
 
 from kros.core.errors import ConfigError
+from kros.evaluate.errors import summarise_all
 from kros.identify.free_run import free_run
 from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
@@ -21,7 +22,7 @@ from kros.loops import blocks_along, compiler, filtered, find_compiler, lattice,
 from kros.observer import Monitor
 from kros.observer.baselines.extended_kalman import ExtendedKalman
 from kros.observer.monitor import octaves
-from kros.observer.simulate import run_innovations, run_observer, run_observers
+from kros.observer.simulate import run_innovations, run_observer, run_observers, run_some_at_a_time
 from kros.observer.tuning.blocks import blocks_of, moved
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
@@ -89,6 +90,30 @@ def test_monitors_remember_alike(both):
     filters = octaves(9)  # more than are side by side at once
     monitor = Monitor(filters, 0.01, 0, np.array([1.0, 0.1]), np.ones((2, 9)), np.pad([[8], [8]], ((0, 0), (0, 8))), 0.02, first=0.1)
     assert_same(*both(lambda: [monitor.mean_squares(noise, judged)]))
+
+
+@needs_compiler
+def test_errors_and_spectra_are_alike(both):
+    """Episodes that end within a segment and between two, with memories behind the states and an estimate that is lost."""
+    rng, lengths = np.random.default_rng(4), np.array([1500, 40, 511, 512, 767, 768, 1023, 1024, 1279, 1280, 1499])
+    estimates = rng.normal(size=(1500, 3, 5, len(lengths))).transpose(1, 0, 3, 2)
+    estimates[1, 700, 3, 1], estimates[2, 1100, 9, 0] = np.inf, np.nan
+    truth = 2 * rng.normal(size=(1500, len(lengths), 2))
+    truth[:, 7, 1] = 0.0
+
+    def run():
+        found = summarise_all(estimates, truth, lengths, 0.01)
+        return [getattr(own, name) for own in found for name in ("rms", "percent", "start_percent", "rest_percent", "spectra", "freqs_hz")]
+
+    assert_same(*both(run))
+
+
+def test_observers_some_at_a_time_find_what_all_of_them_do():
+    y, u, phase = machines_of(200)
+    observers = [drive(order=order, **LIMITS) for order in (0, 2, 5)]
+    together = run_observers(observers, y, u, {"phase": phase})
+    for count in (1, 2):
+        np.testing.assert_array_equal(np.concatenate(list(run_some_at_a_time(observers, y, u, {"phase": phase}, count))), together)
 
 
 def model_of(lifting, units, rng):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+
+from ..loops import library
 
 Array = npt.NDArray[np.float64]
 START = 50  # samples in which an observer finds out what it does not know at first
@@ -37,6 +40,12 @@ class ErrorSummary:
     spectra: Array
     freqs_hz: Array
 
+    @classmethod
+    def joined(cls, parts: Sequence[ErrorSummary]) -> ErrorSummary:
+        """Return the summary of one batch after the other."""
+        names = ("rms", "percent", "start_percent", "rest_percent", "spectra")
+        return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
     def band_power(self, band_hz: tuple[float, float]) -> Array:
         """Return the error's power inside a band, shape (batch, n)."""
         inside = (self.freqs_hz >= band_hz[0]) & (self.freqs_hz <= band_hz[1])
@@ -58,22 +67,59 @@ def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt:
     ErrorSummary
         Not-a-number or infinite where the estimate diverged.
     """
+    return summarise_all(estimate[None], truth, lengths, dt)[0]
+
+
+def summarise_all(estimates: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> list[ErrorSummary]:
+    """Summarise the errors of estimates, shape (estimate, n_samples, batch, n or more), of which the first n states have a truth; others as in `summarise`.
+
+    It is fastest where the samples are outermost in memory and the batch innermost, as `run_observers` returns them.
+    """
+    loops, n = library(), truth.shape[2]
     with np.errstate(over="ignore", invalid="ignore"):
-        error = _signals(estimate, truth)
-        whole = bool(np.all(lengths == error.shape[-1]))
-        rms = np.sqrt(np.einsum("bns,bns->bn", error, error) / lengths[:, None]) if whole else error_rms(estimate, truth, lengths)
-        spectra = np.empty((len(lengths), _SEGMENT // 2 + 1, error.shape[1]))
-        for length in np.unique(lengths):
-            episodes = np.flatnonzero(lengths == length)
-            for rows in np.split(episodes, range(_TOGETHER, len(episodes), _TOGETHER)):
-                freqs, density = error_spectrum(error[rows, :, :length], dt, axis=-1)
-                spectra[rows] = np.swapaxes(density, 1, 2)
-        begun = np.minimum(START, lengths)
-        first = error_rms(estimate[:START], truth[:START], begun)
-        left = np.maximum(rms**2 * lengths[:, None] - first**2 * begun[:, None], 0.0)
-        rest = np.sqrt(left / np.maximum(lengths - START, 1)[:, None])
-    percent, start, behind = (_of_range(values, truth, lengths) for values in (rms, first, rest))
-    return ErrorSummary(rms, percent, start, behind, spectra, freqs)
+        if loops is None:
+            return [_summary(estimate[..., :n], truth, lengths, dt) for estimate in estimates]
+        x = estimates.transpose(1, 0, 3, 2)
+        (samples, count, states, batch), turn = x.shape, 2 * np.pi * np.arange(_SEGMENT) / _SEGMENT
+        largest, squares, powers = np.empty((n, batch)), np.empty((count, n, 2, batch)), np.empty((count, n, _SEGMENT // 2 + 1, batch))
+        job = {"samples": samples, "estimates": count, "states": states, "n": n, "batch": batch, "begun": START, "lengths": lengths}
+        job |= {
+            "x": x,
+            "truth": truth.swapaxes(1, 2),
+            "window": _window(_SEGMENT),
+            "turns": np.stack([np.cos(turn), np.sin(turn)], axis=-1),
+        }
+        loops.call("kros_errors", ("error_job", job | {"largest": largest, "squares": squares, "powers": powers}))
+        spectra = np.moveaxis(_density(np.moveaxis(powers, 2, -1), _window(_SEGMENT), _SEGMENT, dt), (2, 1), (1, 3))
+        for row in np.flatnonzero(lengths < _SEGMENT):
+            own = slice(None, lengths[row])
+            spectra[:, row] = error_spectrum(estimates[:, own, row, :n] - truth[own, row], dt, axis=1)[1]
+    sums = np.moveaxis(squares, 1, -1)  # (estimate, 2, batch, n)
+    return [_of_squares(*own, largest.T, lengths, dt) for own in zip(sums, spectra, strict=True)]
+
+
+def _summary(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> ErrorSummary:
+    """`summarise` where nothing is compiled."""
+    error = _signals(estimate, truth)
+    for own, length in zip(error, lengths, strict=True):
+        own[:, length:] = 0.0
+    spectra = np.empty((len(lengths), _SEGMENT // 2 + 1, error.shape[1]))
+    for length in np.unique(lengths):
+        episodes = np.flatnonzero(lengths == length)
+        for rows in np.split(episodes, range(_TOGETHER, len(episodes), _TOGETHER)):
+            spectra[rows] = np.swapaxes(error_spectrum(error[rows, :, :length], dt, axis=-1)[1], 1, 2)
+    squares = np.stack([np.einsum("bns,bns->bn", part, part) for part in (error[..., :START], error)])
+    return _of_squares(squares, spectra, _largest(truth, lengths), lengths, dt)
+
+
+def _of_squares(squares: Array, spectra: Array, largest: Array, lengths: npt.NDArray[np.int64], dt: float) -> ErrorSummary:
+    """The summary of sums of squares of the start and the whole, shape (2, batch, n), and largest values, shape (batch, n)."""
+    first, whole = squares
+    rest = np.maximum(whole - first, 0.0)
+    counts = (lengths, np.minimum(START, lengths), np.maximum(lengths - START, 1))
+    rms, start, behind = (np.sqrt(sums / count[:, None]) for sums, count in zip((whole, first, rest), counts, strict=True))
+    percent, of_start, of_rest = (_percent(values, largest) for values in (rms, start, behind))
+    return ErrorSummary(rms, percent, of_start, of_rest, spectra, np.asarray(np.fft.rfftfreq(_SEGMENT, dt), dtype=float))
 
 
 def _signals(estimate: Array, truth: Array) -> Array:
@@ -114,16 +160,18 @@ def error_percent(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64])
     >>> error_percent(recorded + 0.1, recorded, np.array([3])).round(9).tolist()
     [[2.5]]
     """
-    return _of_range(error_rms(estimate, truth, lengths), truth, lengths)
+    return _percent(error_rms(estimate, truth, lengths), _largest(truth, lengths))
 
 
-def _of_range(rms: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
+def _largest(truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
+    """Largest absolute values of episodes, shape (batch, n)."""
     if np.all(lengths == len(truth)):
-        size = np.maximum(truth.max(axis=0), -truth.min(axis=0))
-    else:
-        inside = np.arange(len(truth))[:, None, None] < lengths[:, None]
-        size = np.max(np.abs(truth), axis=0, where=inside, initial=0.0)
-    return np.divide(100 * rms, size, out=np.full_like(rms, np.nan), where=size > 0)
+        return np.maximum(truth.max(axis=0), -truth.min(axis=0))
+    return np.asarray(np.max(np.abs(truth), axis=0, where=np.arange(len(truth))[:, None, None] < lengths[:, None], initial=0.0))
+
+
+def _percent(rms: Array, largest: Array) -> Array:
+    return np.divide(100 * rms, largest, out=np.full_like(rms, np.nan), where=largest > 0)
 
 
 def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int = 0) -> tuple[Array, Array]:
@@ -155,9 +203,20 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int =
     """
     signal = np.moveaxis(np.asarray(error, dtype=float), axis, -1)
     size = min(segment, signal.shape[-1])
-    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size)
+    window = _window(size)
     pieces = np.lib.stride_tricks.sliding_window_view(signal, size, axis=-1)[..., :: size - size // 2, :]
     spectra = np.fft.rfft((pieces - pieces.mean(axis=-1, keepdims=True)) * window, segment)
-    density = np.mean(spectra.real**2 + spectra.imag**2, axis=-2) * (dt / max(np.sum(window**2), np.finfo(float).tiny))
-    density[..., 1 : (segment + 1) // 2] *= 2  # all but zero and, of an even number, Nyquist
+    density = _density(np.mean(spectra.real**2 + spectra.imag**2, axis=-2), window, segment, dt)
     return np.asarray(np.fft.rfftfreq(segment, dt), dtype=float), np.moveaxis(density, -1, axis)
+
+
+def _window(size: int) -> Array:
+    """Hann's, of so many samples."""
+    return np.asarray(0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size))
+
+
+def _density(powers: Array, window: Array, segment: int, dt: float) -> Array:
+    """The one-sided power spectral density of mean squares of transforms, frequencies last."""
+    density = powers * (dt / max(np.sum(window**2), np.finfo(float).tiny))
+    density[..., 1 : (segment + 1) // 2] *= 2  # all but zero and, of an even number, Nyquist
+    return np.asarray(density)

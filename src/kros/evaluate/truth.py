@@ -6,6 +6,7 @@ agree with the recording then trails as well, and its error against the recordin
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +44,13 @@ class TrueErrors:
     rms: Array
     error_percent: Array
     lag_s: Array
+
+    @classmethod
+    def joined(cls, parts: Sequence[TrueErrors]) -> TrueErrors:
+        """Return the errors of one batch after the other."""
+        return cls(
+            parts[0].states, *(np.concatenate([getattr(part, name) for part in parts]) for name in ("rms", "error_percent", "lag_s"))
+        )
 
 
 def true_errors(signals: Array, truths: Array, states: tuple[int, ...], lengths: npt.NDArray[np.int64], dt: float) -> TrueErrors:

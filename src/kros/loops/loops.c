@@ -169,6 +169,24 @@ typedef struct {
     double *held;             /* (states, signals, samples / every): before every sample */
 } chain_job;
 
+/* Errors of estimates and their spectra by Welch's method: see kros.evaluate.errors. */
+typedef struct {
+    whole samples;
+    whole estimates;
+    whole states;      /* of estimates: those with a truth, and memories behind them */
+    whole n;
+    whole batch;
+    whole begun;       /* samples that are the start */
+    const double *x;          /* (samples, estimates, states, batch) */
+    const double *truth;      /* (samples, n, batch) */
+    const whole *lengths;     /* (batch): samples that count */
+    const double *window;     /* (SEGMENT) */
+    const double *turns;      /* (SEGMENT, 2): cosines and sines of fractions of a turn */
+    double *largest;          /* (n, batch): absolute values of truths */
+    double *squares;          /* (estimates, n, 2, batch): sums of those of the start, and of all samples */
+    double *powers;           /* (estimates, n, SEGMENT / 2 + 1, batch): means over segments; zero where an episode is shorter than a segment */
+} error_job;
+
 enum { ADD, MULTIPLY, DIVIDE, POWER, SIN, COS, TAN, EXP, LOG, SQRT, TANH, ABS, SIGN, ATAN };
 
 #define LANES(X) ((double *)(X))
@@ -796,5 +814,108 @@ int kros_chain(const chain_job *s)
         }
     }
     free(x), free(out), free(state);
+    return failed;
+}
+
+#define SEGMENT 512
+#define HALF (SEGMENT / 2)
+#define AHEAD 32 /* samples that are on their way from memory */
+
+/* Add the squares of the discrete Fourier transforms of re + i im to `powers`: Stockham's algorithm, four steps by four and one by two. z and other have
+   room for SEGMENT pairs. */
+static void transform(vec *z, vec *other, const double *turns, vec *powers)
+{
+    whole stride = 1;
+    for (whole m = SEGMENT / 4; m > 0; m /= 4, stride *= 4) {
+        for (whole p = 0; p < m; p++) {
+            const double *w1 = turns + 2 * p * stride, *w2 = turns + 4 * p * stride, *w3 = turns + 6 * p * stride;
+            for (whole q = 0; q < stride; q++) {
+                const vec *a = z + 2 * (q + stride * p), *b = a + 2 * stride * m, *c = b + 2 * stride * m, *d = c + 2 * stride * m;
+                const vec sum_r = a[0] + c[0], sum_i = a[1] + c[1], less_r = a[0] - c[0], less_i = a[1] - c[1];
+                const vec and_r = b[0] + d[0], and_i = b[1] + d[1], turn_r = d[1] - b[1], turn_i = b[0] - d[0]; /* i (b - d) */
+                const vec one_r = less_r - turn_r, one_i = less_i - turn_i, three_r = less_r + turn_r, three_i = less_i + turn_i;
+                const vec two_r = sum_r - and_r, two_i = sum_i - and_i;
+                vec *to = other + 2 * (q + stride * 4 * p);
+                to[0] = sum_r + and_r, to[1] = sum_i + and_i;
+                to += 2 * stride, to[0] = w1[0] * one_r + w1[1] * one_i, to[1] = w1[0] * one_i - w1[1] * one_r;
+                to += 2 * stride, to[0] = w2[0] * two_r + w2[1] * two_i, to[1] = w2[0] * two_i - w2[1] * two_r;
+                to += 2 * stride, to[0] = w3[0] * three_r + w3[1] * three_i, to[1] = w3[0] * three_i - w3[1] * three_r;
+            }
+        }
+        vec *swap = z;
+        z = other, other = swap;
+    }
+    for (whole q = 0; q < HALF; q++) {
+        const vec *a = z + 2 * q, *b = a + 2 * HALF, sum_r = a[0] + b[0], sum_i = a[1] + b[1], less_r = a[0] - b[0], less_i = a[1] - b[1];
+        powers[q] += sum_r * sum_r + sum_i * sum_i, powers[q + HALF] += less_r * less_r + less_i * less_i;
+    }
+}
+
+/* Errors of some machines from a sample on, zero beyond the end of an episode; returns their sum, adds their squares, and finds the largest truth. */
+static vec errors(const error_job *s, whole e, whole j, whole first, whole lanes, whole begin, whole count, whole shortest, mask lengths, vec *to, vec *squares, vec *largest)
+{
+    const double *x = s->x + ((begin * s->estimates + e) * s->states + j) * s->batch + first, *truth = s->truth + (begin * s->n + j) * s->batch + first;
+    vec sum = {0};
+    for (whole k = begin; k < begin + count; k++, x += s->estimates * s->states * s->batch, truth += s->n * s->batch, to++) {
+        vec a = {0}, b = {0};
+        __builtin_prefetch(x + AHEAD * s->estimates * s->states * s->batch), __builtin_prefetch(truth + AHEAD * s->n * s->batch);
+        if (k < s->samples && lanes == WIDE) memcpy(&a, x, sizeof a), memcpy(&b, truth, sizeof b);
+        else if (k < s->samples) memcpy(&a, x, (size_t)lanes * sizeof(double)), memcpy(&b, truth, (size_t)lanes * sizeof(double));
+        a -= b;
+        if (k >= shortest) a = either((mask){0} + k < lengths, a, (vec){0}), b = either((mask){0} + k < lengths, b, (vec){0});
+        b = either(b < 0.0, -b, b);
+        *largest = either(b > *largest, b, *largest);
+        sum += a, *squares += a * a, *to = a;
+    }
+    return sum;
+}
+
+int kros_errors(const error_job *s)
+{
+    vec *z = room(2 * SEGMENT * (whole)sizeof(vec)), *other = room(2 * SEGMENT * (whole)sizeof(vec)), *error = room(3 * HALF * (whole)sizeof(vec));
+    vec *powers = room(SEGMENT * (whole)sizeof(vec));
+    const int failed = !z || !other || !error || !powers;
+    for (whole first = 0; first < s->batch && !failed; first += WIDE) {
+        const whole lanes = s->batch - first < WIDE ? s->batch - first : WIDE;
+        mask lengths = {0}, segments = {0};
+        whole shortest = s->samples, most = 0, fewest = s->samples;
+        for (whole b = 0; b < lanes; b++) {
+            lengths[b] = s->lengths[first + b];
+            segments[b] = lengths[b] < SEGMENT ? 0 : (lengths[b] - SEGMENT) / HALF + 1;
+            shortest = lengths[b] < shortest ? lengths[b] : shortest;
+            most = segments[b] > most ? segments[b] : most, fewest = segments[b] < fewest ? segments[b] : fewest;
+        }
+        for (whole each = 0; each < s->estimates * s->n; each++) {
+            const whole e = each / s->n, j = each % s->n;
+            vec squares = {0}, begun = {0}, largest = {0}, sums[3];
+            memset(powers, 0, SEGMENT * sizeof(vec));
+            sums[0] = errors(s, e, j, first, lanes, 0, HALF, shortest, lengths, error, &squares, &largest);
+            for (whole k = 0; k < s->begun; k++) begun += error[k] * error[k];
+            for (whole at = 0, segment = 0; at < s->samples; at += SEGMENT, segment += 2) { /* two segments are one complex signal */
+                for (whole half = 1; half < 3; half++)
+                    sums[half] = errors(s, e, j, first, lanes, at + half * HALF, HALF, shortest, lengths, error + half * HALF, &squares, &largest);
+                if (segment < most) {
+                    const vec one = (sums[0] + sums[1]) / SEGMENT, two = (sums[1] + sums[2]) / SEGMENT;
+                    for (whole k = 0; k < SEGMENT; k++) z[2 * k] = (error[k] - one) * s->window[k], z[2 * k + 1] = (error[HALF + k] - two) * s->window[k];
+                    if (segment + 1 >= fewest)
+                        for (whole k = 0; k < SEGMENT; k++) {
+                            z[2 * k] = either(segments > segment, z[2 * k], (vec){0});
+                            z[2 * k + 1] = either(segments > segment + 1, z[2 * k + 1], (vec){0});
+                        }
+                    transform(z, other, s->turns, powers);
+                }
+                memcpy(error, error + SEGMENT, HALF * sizeof(vec));
+                sums[0] = sums[2];
+            }
+            scatter(s->largest + j * s->batch + first, &largest, 1, lanes);
+            scatter(s->squares + (2 * each) * s->batch + first, &begun, 1, lanes);
+            scatter(s->squares + (2 * each + 1) * s->batch + first, &squares, 1, lanes);
+            for (whole k = 0; k <= HALF; k++) {
+                const vec both = (powers[k] + powers[(SEGMENT - k) % SEGMENT]) / 2;
+                for (whole b = 0; b < lanes; b++) s->powers[(each * (HALF + 1) + k) * s->batch + first + b] = segments[b] ? both[b] / segments[b] : 0.0;
+            }
+        }
+    }
+    free(z), free(other), free(error), free(powers);
     return failed;
 }

@@ -154,6 +154,12 @@ class Runtime:
             return x
         return np.asarray(np.clip(x, self.lower, self.upper))
 
+    def clip_estimates(self, x: Array) -> None:
+        """Bring estimates, shape (..., n), within their limits where they are."""
+        for i in self.limited_states(x.shape[-1]):
+            low, high = (none if side is None else side[i] for side, none in ((self.lower, -np.inf), (self.upper, np.inf)))
+            np.clip(x[..., i], low, high, out=x[..., i])
+
     def within(self, states: Array) -> Array:
         """Return recorded states, shape (..., n_recorded), within the limits that they have."""
         low, high = (side if side is None else side[: states.shape[-1]] for side in (self.lower, self.upper))

@@ -62,7 +62,8 @@ class Bounds:
 
     def pass_all(self, values: Array) -> bool:
         """Whether all samples, shape (..., channels), are good as they are."""
-        return bool(np.all((values >= np.maximum(self.lower, self.least)) & (values <= np.minimum(self.upper, self.most))))
+        channels = ((values[..., i], *sides) for i, sides in enumerate(self.good))
+        return all(bool(least <= own.min(initial=least) and own.max(initial=most) <= most) for own, least, most in channels)
 
     @cached_property
     def good(self) -> list[tuple[float, float]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 
 import numpy as np
@@ -83,7 +83,7 @@ def run_observer(
     >>> run_observer(observer, y, np.zeros((4, 1, 1))).ravel().tolist()
     [4.0, 2.0, 4.0, 2.0]
     """
-    return _run([observer], y, u, parameters, EstimateKind(estimate))[0]
+    return _run([observer], screened(observer, y, u), parameters, EstimateKind(estimate))[0]
 
 
 def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
@@ -113,6 +113,14 @@ def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, paramet
     >>> run_observers(observers, np.array([4.0, 8.0, 0.0]).reshape(3, 1, 1), np.zeros((3, 1, 1))).reshape(2, 3).tolist()
     [[4.0, 2.0, 1.0], [4.0, 2.0, 4.0]]
     """
+    (found,) = run_some_at_a_time(observers, y, u, parameters, len(observers))
+    return found
+
+
+def run_some_at_a_time(
+    observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None, count: int
+) -> Iterator[Array]:
+    """Yield what `run_observers` returns, so many observers at a time: estimates of all of them may fill a memory."""
     first = observers[0]
     if any((o.lifting, o.measured, o.inputs) != (first.lifting, first.measured, first.inputs) for o in observers[1:]):
         raise DimensionError(
@@ -127,9 +135,14 @@ def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, paramet
         for o in observers
     )
     alone |= bool(late and first.lifting.history)
-    if alone and len(observers) > 1:
-        return np.stack([_run([o], y, u, parameters, EstimateKind.PREDICT)[0] for o in observers])
-    return _run(observers, y, u, parameters, EstimateKind.PREDICT)
+    samples = None if alone else screened(first, y, u)
+    for start in range(0, len(observers), count):
+        some = observers[start : start + count]
+        if samples is None:
+            each = [_run([o], screened(o, y, u), parameters, EstimateKind.PREDICT)[0] for o in some]
+            yield np.stack(each) if len(each) > 1 else each[0][None]
+        else:
+            yield _run(some, samples, parameters, EstimateKind.PREDICT)
 
 
 def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None, *, cut: bool = False) -> tuple[Array, Array]:
@@ -155,15 +168,14 @@ def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters |
     return first, added
 
 
-def _run(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Parameters | None, wanted: EstimateKind) -> Array:
+def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None, wanted: EstimateKind) -> Array:
     """Run observers on screened samples, shape (observer, n_samples, batch, n).
 
     With a delay d, states are those of the time of measurement: at k, ``min(k - start, d)`` samples ago. While the first d samples go by, what arrives was
     measured before the start and says nothing but where to start. In the end all of them are predicted to k.
     """
-    observer = observers[0]
-    samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
-    (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
+    observer, d = observers[0], observers[0].runtime.delay
+    (n_samples, batch), values = samples.starts.shape, observer.values(parameters, samples.starts.shape[1:])
     steps, pending = Steps(observers, batch, values), _pending(samples.starts, d) if d else None
     moving = None if pending is None else (pending == d) & ~samples.starts
     estimates = np.empty((n_samples, len(observers), observer.lifting.n_states, batch))
@@ -179,7 +191,7 @@ def _run(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Para
             for own, of_one in zip(observers, found, strict=True):
                 _predict(own, of_one, *before, samples, values)
         if observer.runtime.binding:
-            found[...] = observer.runtime.clip_estimate(found)
+            observer.runtime.clip_estimates(found)
     return found
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -20,13 +20,14 @@ from ...design.mean_profile import make_mean_profile
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
 from ...evaluate import TrueErrors, true_errors
-from ...evaluate.errors import ErrorSummary, summarise
+from ...evaluate.errors import ErrorSummary, summarise_all
 from ...evaluate.sensor import as_shown
 from ...identify import ModelSet, free_run
 from ...identify.presets import gearbox_band_hz
-from ...observer import Observer, run_observers
+from ...observer import Observer
 from ...observer.limits import limits_of, sides
 from ...observer.sensor import Sensors
+from ...observer.simulate import run_some_at_a_time
 from ..engine.context import Context
 from .disturbed import Trial, make_trial, run_disturbed
 from .load import run_load
@@ -35,7 +36,8 @@ from .together import alike
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 UnitParameters = dict[str, dict[str, float]]
-_SAMPLES_AT_ONCE = 20_000_000  # of all estimates that are in memory, 160 MB
+_EPISODES = 32  # side by side
+_NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that size is used again, and more has to be made first
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,15 +72,14 @@ def evaluate_observers(
     shown: tuple[int, ...],
     sensor: Sensors,
 ) -> list[Outcome]:
-    """Run observers that `alike` puts together on test episodes as the sensor shows them, as many at a time as fit into memory."""
-    batch, first = as_shown(EpisodeBatch.read(population, keys, parameters=units, truths=True), sensor, population.states), observers[0]
-    y, parameters = batch.measurements(first.measured), batch.parameters if first.lifting.parameters else None
-    together = max(1, _SAMPLES_AT_ONCE // batch.states.size)
-    found = []
-    for start in range(0, len(observers), together):
-        estimates = run_observers(observers[start : start + together], y, batch.inputs, parameters)
-        found += [_outcome(e[..., : len(population.states)], batch, population, shown) for e in estimates]
-    return found
+    """Run observers that `alike` puts together on test episodes as the sensor shows them."""
+    first = observers[0]
+
+    def run(batch: EpisodeBatch) -> Iterator[Array]:
+        y, parameters = batch.measurements(first.measured), batch.parameters if first.lifting.parameters else None
+        return run_some_at_a_time(observers, y, batch.inputs, parameters, max(1, _NUMBERS // batch.states.size))
+
+    return _outcomes(run, population, keys, units, shown, sensor)
 
 
 def evaluate_baseline(
@@ -99,8 +100,7 @@ def evaluate_baseline(
         baseline = replace(make(), limits=limits)
     except KrosError as error:
         return str(error)
-    batch = as_shown(EpisodeBatch.read(population, keys, parameters=units, truths=True), sensor, population.states)
-    outcome = _outcome(baseline.run(batch, batch.parameters), batch, population, shown)
+    (outcome,) = _outcomes(lambda batch: [baseline.run(batch, batch.parameters)[None]], population, keys, units, shown, sensor)
     disturbed = None if trial is None else trial.errors_of_baseline(baseline)
     return replace(outcome, facts=baseline.facts, estimated=baseline.estimated, disturbed=disturbed)
 
@@ -109,23 +109,57 @@ def evaluate_model(
     models: ModelSet, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
 ) -> Outcome:
     """Run every unit's own model freely from the true first state, with delays from the first recorded ones."""
-    batch = EpisodeBatch.read(population, keys, parameters=units)
-    rows = [models.index(k.unit) for k in keys]
-    parameters = batch.parameters if models.lifting.parameters else {}
-    states = free_run(
-        models.A[rows],
-        models.B[rows],
-        models.lifting,
-        parameters,
-        batch.first_states(models.lifting.history),
-        np.swapaxes(batch.inputs, 0, 1),
-    )
-    return _outcome(np.swapaxes(states, 0, 1), batch, population, shown)
+
+    def run(batch: EpisodeBatch) -> list[Array]:
+        rows = [models.index(k.unit) for k in batch.keys]
+        parameters = batch.parameters if models.lifting.parameters else {}
+        first, inputs = batch.first_states(models.lifting.history), np.swapaxes(batch.inputs, 0, 1)
+        states = free_run(models.A[rows], models.B[rows], models.lifting, parameters, first, inputs)
+        return [np.swapaxes(states, 0, 1)[None]]
+
+    (outcome,) = _outcomes(run, population, keys, units, shown, {}, truths=False)
+    return outcome
 
 
-def _outcome(estimate: Array, batch: EpisodeBatch, population: Population, shown: tuple[int, ...]) -> Outcome:
-    dt, pieces = population.sample_period_s, [estimate[: batch.lengths[i], i] for i in shown]
-    return Outcome(summarise(estimate, batch.states, batch.lengths, dt), pieces, true=_true(estimate, batch, population))
+def _outcomes(
+    run: Callable[[EpisodeBatch], Iterable[Array]],
+    population: Population,
+    keys: tuple[EpisodeKey, ...],
+    units: UnitParameters,
+    shown: tuple[int, ...],
+    sensor: Sensors,
+    truths: bool = True,
+) -> list[Outcome]:
+    """Return the outcomes of estimates, shape (estimate, n_samples, batch, n or more), a few at a time, some episodes after others.
+
+    That many episodes are side by side in the compiled loops at once, and their estimates are put where those of others were.
+    """
+    found = []
+    for start in range(0, len(keys), _EPISODES):
+        batch = EpisodeBatch.read(population, keys[start : start + _EPISODES], parameters=units, truths=truths)
+        batch = as_shown(batch, sensor, population.states)
+        batch = replace(batch, states=np.ascontiguousarray(batch.states.swapaxes(1, 2)).swapaxes(1, 2))  # in memory as estimates are
+        own = [i - start for i in shown if 0 <= i - start < len(batch.keys)]
+        found.append([outcome for estimates in run(batch) for outcome in _of_block(estimates, batch, population, own)])
+    blocks = [[i for i in shown if i // _EPISODES == block] for block in range(len(found))]
+    return [_joined(of_blocks, [i for block in blocks for i in block], shown) for of_blocks in zip(*found, strict=True)]
+
+
+def _of_block(estimates: Array, batch: EpisodeBatch, population: Population, shown: Sequence[int]) -> list[Outcome]:
+    n, lengths = len(population.states), batch.lengths
+    summaries = summarise_all(estimates, batch.states, lengths, population.sample_period_s)
+    return [
+        Outcome(summary, [estimate[: lengths[i], i, :n].copy() for i in shown], true=_true(estimate[..., :n], batch, population))
+        for summary, estimate in zip(summaries, estimates, strict=True)
+    ]
+
+
+def _joined(parts: Sequence[Outcome], found: Sequence[int], shown: tuple[int, ...]) -> Outcome:
+    """Put outcomes of episodes one after the other; the pieces of `found` episodes, in the order of those that are `shown`."""
+    pieces = dict(zip(found, (piece for part in parts for piece in part.shown), strict=True))
+    true = [part.true for part in parts if part.true is not None]
+    summary = ErrorSummary.joined([part.summary for part in parts])
+    return Outcome(summary, [pieces[i] for i in shown], true=TrueErrors.joined(true) if true else None)
 
 
 def _true(signals: Array, batch: EpisodeBatch, population: Population) -> TrueErrors | None:

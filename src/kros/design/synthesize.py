@@ -24,6 +24,7 @@ from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..identify.kinds import kind_of
+from ..lifting import Lifting
 from ..observer import Observer, ReliftCertificate, Sensor, in_sizes
 from ..observer.limits import Limit, Limits, limits_of
 from ..observer.sensor import Sensors, require_measured
@@ -323,13 +324,17 @@ def certified(
     from .uncertain_set import certificate
 
     pairs = [(task, found) for task, found in zip(tasks, results, strict=True) if found.observer is not None]
-    on_the_set = work.run("certify", [partial(certificate, task, found, certified_problem(task, pairs)) for task, found in pairs])
-    kinds = [[pair for pair in pairs if pair[0].models.name == kind] for kind in dict.fromkeys(task.models.name for task in tasks)]
-    as_they_run = [partial(certify_running, kind[0][0], [found for _, found in kind]) for kind in kinds if kind]
-    running = [one for of_kind in work.run("certify as it runs", as_they_run) for one in of_kind]
-    by_name = {one.name: one for one in running}
+    on_the_set = [partial(certificate, task, found, certified_problem(task, pairs)) for task, found in pairs]
+    side_by_side: dict[tuple[str, Lifting], list[tuple[DesignTask, DesignResult]]] = {}
+    for task, found in pairs:
+        assert found.observer is not None
+        side_by_side.setdefault((task.models.name, found.observer.lifting), []).append((task, found))
+    as_they_run = [partial(certify_running, own[0][0], [found for _, found in own]) for own in side_by_side.values()]
+    found_of: list[Any] = work.run("certify", [*as_they_run, *on_the_set])  # the first ones take longest
+    by_name = {one.name: one for of_lifting in found_of[: len(as_they_run)] for one in of_lifting}
+    running = [by_name[found.name] for _, found in pairs]
     designs = {}
-    for (task, found), holds in zip(pairs, on_the_set, strict=True):
+    for (task, found), holds in zip(pairs, found_of[len(as_they_run) :], strict=True):
         assert found.observer is not None
         assert found.synthesis is not None
         one, facts = by_name[found.name], {**found.facts, **holds, **by_name[found.name].facts()}

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from batches import batch_of
+from scipy.signal import butter, lfilter
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
@@ -101,6 +102,16 @@ def test_filtered_difference_of_a_ramp_and_a_sine():
     changed = FilteredDifference(3, ((0, 1),), 40.0, DT).run(later, np.zeros((4000, 2, 0)))
     np.testing.assert_array_equal(changed[:2001, :, 1], found[:2001, :, 1])  # row k reads measurements up to k - 1
     assert changed[2001, 0, 1] != found[2001, 0, 1]
+
+
+@pytest.mark.parametrize("cutoff_hz", [1.0, 80.0, 440.0])
+def test_filtered_difference_is_that_of_a_butterworth_filter(cutoff_hz):
+    y = np.cumsum(np.random.default_rng(5).normal(size=(900, 2, 1)), axis=0)
+    found = FilteredDifference(2, ((0, 1),), cutoff_hz, 1e-3).run(y, y[..., :0])[..., 1]
+    rate = np.zeros((900, 2))
+    rate[2:] = np.diff(y[:-1, :, 0], axis=0) / 1e-3
+    wanted = lfilter(*butter(2, cutoff_hz, fs=1e3), rate, axis=0)
+    np.testing.assert_allclose(found, wanted, atol=1e-10 * np.abs(wanted).max())
 
 
 def test_rates_follow_from_units_of_measure():
@@ -204,6 +215,19 @@ def test_a_unit_that_is_left_out_leaves_no_trace():
     assert np.abs(moments.estimator().run(y, u, phases) - others.estimator().run(y, u, phases))[..., 1].max() > 0.1
     with pytest.raises(DataError, match="no unit is left"):
         moments.estimator(["a", "b", "c"])
+
+
+def test_means_of_many_units_are_those_of_the_definition():
+    """More units than there are blocks, and one that was not recorded in both conditions."""
+    rng = np.random.default_rng(8)
+    groups = [(f"unit {i}", condition) for i in range(29) for condition in ("load", "noload") if (i, condition) != (5, "load")]
+    gram, cross, power = rng.normal(size=(len(groups), 2, 4, 4)), rng.normal(size=(len(groups), 2, 4)), np.ones((len(groups), 2))
+    moments = Moments(Features(Lifting(("x",)), (0,), np.zeros((1, 3)), 3), (1, 2), tuple(groups), gram, cross, power)
+    for without in ([], ["unit 5"], ["unit 13", "unit 0"], moments.units[1::4]):
+        for condition in (None, "load", "noload", "another"):
+            among = [i for i, (unit, own) in enumerate(groups) if unit not in without and condition in (None, own, "another")]
+            for found, wanted in zip(moments._means(1, without, condition), (gram, cross), strict=True):
+                np.testing.assert_allclose(found, wanted[among, 1].mean(axis=0), atol=1e-14)
 
 
 def test_learned_estimator_refuses_what_it_cannot_use():

@@ -42,16 +42,18 @@ def make_mean_profile(training: TrainingSet, measured: tuple[int, ...], populati
     named: list[EpisodeKey] = []
     for key in keys:
         u = population.read_parts(key)[1]
-        if not motions or min(difference(u, motion, sizes_of([*motions, u])) for motion in motions) > SAME:
+        sizes = sizes_of([*motions, u])
+        if not motions or min(difference(u, motion, sizes) for motion in motions) > SAME:
             motions.append(u)
             named.append(key)
+    sizes = sizes_of(motions)
     sums: list[dict[str, Array]] = [{} for _ in motions]
     counts: list[dict[str, int]] = [{} for _ in motions]
     closest = np.full(len(motions), np.inf)
     total, read, groups = 0, 0, len({(key.unit, key.condition) for key in training.keys})
     for part in training.one_by_one():
         (unit,), states, u = part.batch.units, part.batch.states[:, 0, estimated], part.batch.inputs[:, 0]
-        apart = np.array([difference(motion, u, sizes_of(motions)) for motion in motions])
+        apart = np.array([difference(motion, u, sizes) for motion in motions])
         closest = np.minimum(closest, apart)
         if apart.min() <= SAME:
             at = int(apart.argmin())

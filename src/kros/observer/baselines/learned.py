@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -57,11 +58,16 @@ class Features:
         static[alone, 0] = mean[alone]
         return cls(lifting, tuple(measured), static, taps)
 
-    @property
+    @cached_property
     def visible(self) -> tuple[int, ...]:
         """Lifted functions that read measured states and parameters alone."""
         seen = {self.lifting.states[i] for i in self.measured} | set(self.lifting.parameters)
         return tuple(i for i, formula in enumerate(self.lifting.formulas) if set(formula.used) <= seen)
+
+    @cached_property
+    def _bare(self) -> Lifting:
+        """The lifting with these functions alone."""
+        return replace(self.lifting, functions=tuple(self.lifting.functions[i] for i in self.visible), input_functions=())
 
     def channels(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Return z, shape (n_samples, batch, channels), of y (n_samples, batch, q) and u (n_samples, batch, m); parameters of shape (batch,)."""
@@ -71,7 +77,7 @@ class Features:
             )
         parts = [y - self.static[:, 0] - u @ self.static[:, 1:].T, u]
         if self.visible:
-            bare = replace(self.lifting, functions=tuple(self.lifting.functions[i] for i in self.visible), input_functions=())
+            bare = self._bare
             x = np.zeros((*y.shape[:-1], bare.n_states))
             x[..., list(self.measured)] = y
             slopes = bare.slopes(x, parameters)[..., list(self.measured)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -19,10 +20,12 @@ from ...data.batch import hold_missing
 from .learned import Features, Learned
 
 Array = npt.NDArray[np.float64]
+Whole = npt.NDArray[np.intp]
 RIDGE = 1e-5
 _TAPS = (5, 10, 20, 40, 80)
 _RIDGES = (1e-10, 1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 _FOLDS = 4
+_BLOCKS = 3 * _FOLDS
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,7 @@ class Moments:
         if not estimated:
             raise DataError("Learned estimator: every state is measured, there is nothing to estimate.")
         floor = np.finfo(float).tiny + (np.zeros(n) if least is None else least)[estimated]
-        found: dict[tuple[str, str], list[Array]] = {}
+        found: dict[tuple[str, str], tuple[Array, Array, Array]] = {}
         counts: dict[tuple[str, str], int] = {}
         for batch in batches:
             z = features.channels(hold_missing(batch.measurements(features.measured)), batch.inputs, batch.parameters)
@@ -101,11 +104,16 @@ class Moments:
                 truth = batch.states[:length, i][:, estimated]
                 size = np.maximum(np.abs(truth).max(axis=0), floor)
                 gram, cross, power = episode_moments(z[:length, i], truth / size, features.taps)
-                new = [gram / size[:, None, None] ** 2, cross.T / size[:, None], power]
-                group = (key.unit, key.condition)
-                found[group] = [a + b for a, b in zip(found[group], new, strict=True)] if group in found else new
+                group, h = (key.unit, key.condition), len(estimated)
+                if group not in found:
+                    found[group] = np.zeros((h, *gram.shape)), np.zeros((h, len(gram))), np.zeros(h)
+                for into, new in zip(found[group], (gram / size[:, None, None] ** 2, cross.T / size[:, None], power), strict=True):
+                    into += new
                 counts[group] = counts.get(group, 0) + 1
-        gram, cross, power = (np.stack([found[group][part] / counts[group] for group in found]) for part in range(3))
+        for group, own in found.items():
+            for part in own:
+                part /= counts[group]
+        gram, cross, power = (np.stack([own[part] for own in found.values()]) for part in range(3))
         return cls(features, tuple(estimated), tuple(found), gram, cross, power)
 
     @property
@@ -123,17 +131,24 @@ class Moments:
         trained = (None, *conditions) if len(conditions) > 1 else (None,)
         tried = [Choice(*settings) for settings in product(taps, _RIDGES, trained)]
         errors = np.zeros((len(self.estimated), len(tried), len(self.groups)))
-        for fold in folds:
+        for fold, state in product(folds, range(len(self.estimated))):
             held = [i for i, (unit, _) in enumerate(self.groups) if unit in fold]
-            for state in range(len(self.estimated)):
-                means = {condition: self._means(state, fold, condition) for condition in trained}
-                weights = np.stack([self._solved(*means[choice.condition], choice) for choice in tried])
-                missed = self.power[held, state] - 2 * weights @ self.cross[held, state].T
-                missed += np.einsum("tf,ufg,tg->tu", weights, self.gram[held, state], weights, optimize=True)
-                errors[state][:, held] = np.sqrt(np.maximum(missed, np.finfo(float).tiny))
+            means = {condition: self._means(state, fold, condition) for condition in trained}
+            for count in taps:
+                used, own = self._used(count), [i for i, choice in enumerate(tried) if choice.taps == count]
+                found = {c: solved(gram[np.ix_(used, used)], cross[used], _RIDGES) for c, (gram, cross) in means.items()}
+                weights = np.stack([found[tried[i].condition][_RIDGES.index(tried[i].ridge)] for i in own])
+                errors[state][np.ix_(own, held)] = np.stack([self._error(group, state, used, weights) for group in held], axis=1)
         members = [[i for i, group in enumerate(self.groups) if group[1] == condition] for condition in conditions]
         scores = sum(np.log(errors[..., rows].mean(axis=-1)) for rows in members)
         return tuple(tried[i] for i in np.argmin(scores, axis=-1))
+
+    def _error(self, group: int, state: int, used: Whole, weights: Array) -> Array:
+        """RMS errors of weights, shape (choice, used), in the episodes of a group."""
+        gram, cross = self.gram[group, state], self.cross[group, state, used]
+        gram = gram if len(used) == len(gram) else gram[np.ix_(used, used)]
+        missed = self.power[group, state] - 2 * weights @ cross + np.einsum("tf,tf->t", weights @ gram, weights)
+        return np.asarray(np.sqrt(np.maximum(missed, np.finfo(float).tiny)))
 
     def estimator(self, without: Collection[str] = (), choices: Sequence[Choice] | None = None) -> Learned:
         """Train on all units but some; names of units that took no part are ignored.
@@ -153,30 +168,67 @@ class Moments:
             raise DataError(f"Learned estimator: no unit is left to train on without {', '.join(sorted(without))}; record more units.")
         taps, h = self.features.taps, len(self.estimated)
         chosen = choices or (Choice(taps, RIDGE),) * h
-        weights = np.stack([self._solved(*self._means(s, without, choice.condition), choice) for s, choice in enumerate(chosen)], axis=1)
+        weights = np.zeros((self.gram.shape[-1], h))
+        for state, choice in enumerate(chosen):
+            used, (gram, cross) = self._used(choice.taps), self._means(state, without, choice.condition)
+            (weights[used, state],) = solved(gram[np.ix_(used, used)], cross[used], [choice.ridge])
         response = weights[1:].reshape(-1, taps, h).copy()
         response[:, :-1] -= weights[1:].reshape(-1, taps, h)[:, 1:]
         return Learned(self.features, self.estimated, weights[0], response)
 
+    def _used(self, taps: int) -> Whole:
+        """Regressors of so many samples of the past: the constant and those lags of every channel."""
+        return np.concatenate([[0], 1 + np.flatnonzero(np.arange(self.gram.shape[-1] - 1) % self.features.taps < taps)])
+
+    @cached_property
+    def _blocks(self) -> list[tuple[list[int], Array, Array]]:
+        """Groups of some units in one condition, all of one fold, and the sums of their moments."""
+        rows: dict[tuple[int, str], list[int]] = {}
+        number = {unit: i for i, unit in enumerate(self.units)}
+        for i, (unit, condition) in enumerate(self.groups):
+            rows.setdefault((number[unit] % _BLOCKS, condition), []).append(i)
+        return [(own, _sum(self.gram, own), _sum(self.cross, own)) for own in rows.values()]
+
     def _means(self, state: int, without: Collection[str], condition: str | None) -> tuple[Array, Array]:
         """Return the mean moments of all other units in one condition or all, shapes (1 + f, 1 + f) and (1 + f,).
 
-        Where the other units were not recorded in the condition that was chosen, all conditions are trained on.
+        Where the other units were not recorded in the condition that was chosen, all conditions are trained on. Sums of blocks in which none is left out
+        are there already; nothing is taken off again, so that a unit that is left out leaves no trace.
         """
         others = [i for i, (unit, _) in enumerate(self.groups) if unit not in without]
         rows = [i for i in others if condition in (None, self.groups[i][1])] or others
-        return self.gram[rows, state].mean(axis=0), self.cross[rows, state].mean(axis=0)
+        wanted, gram, cross = set(rows), np.zeros(self.gram.shape[2:]), np.zeros(self.cross.shape[2:])
+        for own, gram_of_block, cross_of_block in self._blocks:
+            if wanted.issuperset(own):
+                gram += gram_of_block[state]
+                cross += cross_of_block[state]
+                continue
+            for i in (i for i in own if i in wanted):
+                gram += self.gram[i, state]
+                cross += self.cross[i, state]
+        return gram / len(rows), cross / len(rows)
 
-    def _solved(self, gram: Array, cross: Array, choice: Choice) -> Array:
-        """Solve the normal equations, shape (1 + f,); weights of samples that do not count are zero, that of the constant is not penalised."""
-        lags = np.arange(len(cross) - 1) % self.features.taps
-        used = np.concatenate([[0], 1 + np.flatnonzero(lags < choice.taps)])
-        gram, cross = gram[np.ix_(used, used)], cross[used]
-        size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
-        penalty = np.diag([0.0] + [choice.ridge] * (len(size) - 1))
-        weights = np.zeros(1 + len(lags))
-        weights[used] = np.linalg.solve(gram / np.outer(size, size) + penalty, cross / size) / size
-        return weights
+
+def _sum(moments: Array, groups: Sequence[int]) -> Array:
+    total = np.zeros(moments.shape[1:])
+    for i in groups:
+        total += moments[i]
+    return total
+
+
+def solved(gram: Array, cross: Array, ridges: Sequence[float]) -> Array:
+    """Solve the normal equations for some penalties, shape (ridge, 1 + f); that of the constant is not penalised."""
+    from scipy.linalg.lapack import dposv
+
+    size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    scaled, sought, found = gram / np.outer(size, size), cross / size, []
+    penalised = np.arange(1, len(size))
+    for ridge in ridges:
+        matrix = scaled.copy()
+        matrix[penalised, penalised] += ridge
+        _, weights, failed = dposv(matrix.T, sought, overwrite_a=False)
+        found.append((np.linalg.solve(matrix, sought) if failed else weights) / size)
+    return np.array(found)
 
 
 def episode_moments(z: Array, truth: Array, taps: int) -> tuple[Array, Array, Array]:
@@ -247,7 +299,7 @@ def products_with_lags(signals: Array, step: Array, behind: int) -> Array:
     first = np.pad(signals, ((0, 0), (0, count * piece - signals.shape[1]))).reshape(len(signals), count, piece)
     padded = np.pad(step, ((0, 0), (0, count * piece + behind - step.shape[1])))
     second = np.lib.stride_tricks.sliding_window_view(padded, size, axis=1)[:, ::piece]
-    common = np.einsum("spf,cpf->scf", np.fft.rfft(first, size).conj(), np.fft.rfft(second), optimize=True)
+    common = np.einsum("spf,cpf->scf", np.fft.rfft(first, size), np.fft.rfft(second).conj(), optimize=True).conj()
     found = np.moveaxis(np.fft.irfft(common, size)[..., :behind], -1, 0)[::-1]
     moved = (step != 0).argmax(axis=1) + np.arange(1, behind + 1)[:, None] < step.shape[1]
     return np.where(moved[:, None], found, 0.0)

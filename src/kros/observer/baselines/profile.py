@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,11 @@ class MeanProfile:
     inputs: Sequence[Array]
     states: Sequence[Array]
 
+    @cached_property
+    def sizes(self) -> Array:
+        """Largest absolute values of the inputs, see `sizes_of`."""
+        return sizes_of(self.inputs)
+
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Estimate a batch from its first sample on, each member by the motion whose inputs are nearest to its own; shape (n_samples, batch, n).
 
@@ -39,16 +45,16 @@ class MeanProfile:
         """
         del parameters
         estimate = np.full((*y.shape[:2], self.n_states), np.nan)
-        sizes = sizes_of(self.inputs)
         for i in range(y.shape[1]):
-            distance = [difference(u[:, i], motion, sizes) for motion in self.inputs]
+            distance = [difference(u[:, i], motion, self.sizes) for motion in self.inputs]
             estimate[:, i, list(self.estimated)] = held(self.states[int(np.argmin(distance))], len(y))
         return estimate
 
 
 def held(signal: Array, n_samples: int) -> Array:
     """Return a signal, shape (n, ...), of so many samples: cut, or held at its last one."""
-    return np.asarray(signal[np.minimum(np.arange(n_samples), len(signal) - 1)])
+    longer = len(signal) >= n_samples
+    return signal[:n_samples] if longer else np.asarray(signal[np.minimum(np.arange(n_samples), len(signal) - 1)])
 
 
 def sizes_of(inputs: Sequence[Array]) -> Array:

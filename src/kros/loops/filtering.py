@@ -44,37 +44,40 @@ def all_pole(x: Array, a1: float, a2: float = 0.0) -> Array:
     return filtered(ahead, np.zeros(x.shape[:-1]), a1, a2)[0][..., 1:]
 
 
-def recursion(F: Array, driven: Array, first: Array) -> Array:
-    """Return ``h[k + 1] = F h[k] + driven[k]``.
+def recursion(F: Array, driven: Array, first: Array, G: Array | None = None) -> Array:
+    """Return ``h[k + 1] = F h[k] + G driven[k]``.
 
     Parameters
     ----------
     F : ndarray, shape (n, n)
-    driven : ndarray, shape (n_samples, batch, n)
+    driven : ndarray, shape (n_samples, batch, m)
         The last sample drives nothing.
     first : ndarray, shape (batch, n)
+    G : ndarray, shape (n, m), optional
+        The identity by default.
 
     Returns
     -------
     ndarray, shape (n_samples, batch, n)
     """
-    n_samples, batch, n = driven.shape
+    (n_samples, batch, m), n = driven.shape, len(F)
     if not n:
-        return np.zeros(driven.shape)
+        return np.zeros((n_samples, batch, 0))
     if (loops := library()) is not None:
-        states, column = np.empty((n_samples, n, batch)), np.zeros((2 * n, batch))
+        states, column = np.empty((n_samples, n, batch)), np.zeros((n + m, batch))
         column[:n] = first.T
         job = {
             "observers": 1,
             "samples": n_samples,
             "batch": batch,
-            "map": np.hstack([F, np.eye(n)]),
+            "map": np.hstack([F, np.eye(n) if G is None else G]),
             "u": driven.swapaxes(1, 2),
             "column": column,
         }
-        loops.call("kros_relift", linear_formulas(n, n), ("relift_job", job | {"states": states}))
+        loops.call("kros_relift", linear_formulas(n, m), ("relift_job", job | {"states": states}))
         return states.swapaxes(1, 2)
-    h, own = np.empty(driven.shape), np.ascontiguousarray(F.T)
+    h, own = np.empty((n_samples, batch, n)), np.ascontiguousarray(F.T)
+    driven = driven if G is None else driven @ G.T
     h[0] = first
     for k in range(n_samples - 1):
         h[k + 1] = h[k] @ own + driven[k]
@@ -145,7 +148,7 @@ def lattice_along(reflections: Array, x: Array, every: int = 1) -> Array:
         loops.call("kros_chain", ("chain_job", job | {"reflections": reflections, "x": x, "held": held}))
         return held
     A, B = lattice(reflections)
-    return recursion(A, x.T[..., None] * B, np.zeros((len(x), len(A))))[::every].transpose(2, 1, 0)
+    return recursion(A, x.T[..., None], np.zeros((len(x), len(A))), B[:, None])[::every].transpose(2, 1, 0)
 
 
 def lattice(reflections: Array) -> tuple[Array, Array]:

@@ -140,7 +140,7 @@ def embedded_with(
 
 def _measured_rows(F: Array, G: Array, z: Array, y: Array, truth: Array, ridges: Sequence[float]) -> list[Array]:
     """Fit the change of the measured states on h and z, shape (q, order + channels), by every ridge; the first states of h are the hidden ones."""
-    h = recursion(F, z @ G.T, np.zeros((z.shape[1], len(F))))
+    h = recursion(F, z, np.zeros((z.shape[1], len(F))), G)
     if in_motion(truth):
         missed = (truth - h[..., : truth.shape[-1]]).transpose(2, 1, 0)
         free = FreeStart.of(F, np.eye(truth.shape[-1], len(F)), len(h), FreeStart.by_size(missed))

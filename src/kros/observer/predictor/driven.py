@@ -88,17 +88,19 @@ def with_internal(
             f"Internal states of observer {observer.name}: they are driven by the {recorded} states {', '.join(observer.recorded)}, found {states.shape[-1]}."
         )
     values = {**observer.parameters, **(parameters or {})} if observer.lifting.parameters else None
-    rows, into = observer.A[recorded:n].T, observer.B[recorded:n].T
+    rows, into = observer.A[recorded:n], observer.B[recorded:n]
     driven = np.zeros((*states.shape[:2], n))
     driven[..., :recorded] = states
     first = observer.initial(states[0][:, list(observer.measured)], values) if start is None else start
     driven[0, :, recorded:] = first[:, recorded:]
-    constant = observer.lifting.lift(driven, values)
-    constant[..., recorded:n] = 0.0
-    drive = constant @ rows + inputs @ into
+    outside = [*range(recorded), *range(n, observer.lifting.n_lifted)]
+    signals, gains = [observer.lifting.lift(driven, values)[..., outside], inputs], [rows[:, outside], into]
     if added is not None:
-        drive[: len(added)] += added[: len(drive), :, recorded:]
-    driven[..., recorded:] = recursion(rows[recorded:n].T, drive, driven[0, :, recorded:])
+        apart = np.zeros((*states.shape[:2], n - recorded))
+        apart[: len(added)] = added[: len(apart), :, recorded:]
+        signals, gains = [*signals, apart], [*gains, np.eye(n - recorded)]
+    drive = np.concatenate(signals, axis=-1)
+    driven[..., recorded:] = recursion(rows[:, recorded:n], drive, driven[0, :, recorded:], np.hstack(gains))
     return driven
 
 

@@ -253,7 +253,7 @@ class PastMoments:
 
     def errors(self, W: Array) -> Array:
         """Return the mean square errors of a regression, shape (row, h)."""
-        found = self.power - 2 * np.einsum("hn,rnh->rh", W, self.cross) + np.einsum("hn,rnm,hm->rh", W, self.gram, W, optimize=True)
+        found = self.power - 2 * np.einsum("hn,rnh->rh", W, self.cross) + np.sum((W @ self.gram) * W, axis=-1)
         return np.maximum(found, _NEGLIGIBLE * self.power)
 
     def _solved(self, rows: list[int], share: Array, deviation: float) -> tuple[Array, Array, Array]:

@@ -264,7 +264,7 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
     return ratio
 
 
-def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike) -> tuple[Array, Array]:
+def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike, E: Array | None = None) -> tuple[Array, Array]:
     """Return residuals and the additive remainder that completes them: `Gp = rebuild(form, G, E) + R` for every unit and frequency.
 
     Parameters
@@ -272,6 +272,8 @@ def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLik
     form : Form or str
     nominal, responses : array_like, shape (..., p, m), complex
         Leading axes broadcast.
+    E : ndarray, shape (..., p', m'), optional
+        Residuals, when already computed.
 
     Returns
     -------
@@ -290,7 +292,7 @@ def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLik
     ([1.2, 0.1], [0.0, 0.1])
     """
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
-    E = residual(form, G, Gp)
+    E = residual(form, G, Gp) if E is None else E
     if form.inverse:
         regular = condition_number(inverted_matrix(form, G, E)) <= MAX_CONDITION
         E = np.where(regular[..., None, None], E, 0.0)

@@ -125,7 +125,7 @@ class Quantification:
         self, residuals: _Residuals, freqs_hz: Array, dt: float, systems: ResidualSystems | None, also_hz: Array | None, sampled: bool
     ) -> Bounded:
         G, Gp = residuals.responses(freqs_hz)
-        E = residual(self.form, G, Gp)
+        E = residuals.of_form(freqs_hz)
         options: dict[str, Any] = {"max_order": self.max_order, "density": self.density, "also_hz": also_hz, "sampled": sampled}
 
         def fit(structure: Structure) -> tuple[Weight, Cover]:
@@ -197,23 +197,28 @@ class _Residuals:
     units: Responder
 
     @cached_property
-    def _known(self) -> dict[bytes, tuple[Array, Array]]:
+    def _known(self) -> dict[tuple[str, bytes], Any]:
         return {}
+
+    def _once(self, name: str, freqs_hz: Array, found: Callable[[], Any]) -> Any:
+        """Return what is known at some frequencies; fits, checks and proofs ask for the same ones."""
+        key = name, freqs_hz.tobytes()
+        if key not in self._known:
+            self._known[key] = found()
+        return self._known[key]
 
     def responses(self, freqs_hz: Array) -> tuple[Array, Array]:
         """Responses of the nominal and the units."""
-        key = freqs_hz.tobytes()
-        if key not in self._known:
-            self._known[key] = self.nominal(freqs_hz), self.units(freqs_hz)
-        return self._known[key]
+        found: tuple[Array, Array] = self._once("responses", freqs_hz, lambda: (self.nominal(freqs_hz), self.units(freqs_hz)))
+        return found
 
     def of_form(self, freqs_hz: Array) -> Array:
         """Residuals of the form."""
-        return residual(self.form, *self.responses(freqs_hz))
+        return np.asarray(self._once("residuals", freqs_hz, lambda: residual(self.form, *self.responses(freqs_hz))))
 
     def left_over(self, freqs_hz: Array) -> Array:
         """What the form does not rebuild; the whole difference from the nominal where the misfit is not known."""
-        return completion(self.form, *self.responses(freqs_hz))[1]
+        return np.asarray(self._once("left over", freqs_hz, lambda: completion(self.form, *self.responses(freqs_hz), self.of_form(freqs_hz))[1]))
 
 
 def _leaves_out(form: Form, ratio: Array) -> bool:

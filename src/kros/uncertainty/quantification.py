@@ -37,6 +37,7 @@ _EXACT = 1e-9  # relative misfit up to which a form is said to rebuild every uni
 _WORTH_SAYING = 0.01  # a misfit that makes another form worth a thought
 _REMAINDER_TOLERANCE = 1.5  # the remainder is small: its weight may be looser by this factor
 _LARGEST_PRODUCT = 0.7  # of |W_R W_L|: an amplification by 3.3
+_PIECE = 10_000  # units times frequencies in one piece of a computation
 _LOOSEST = 3.0  # overbound in tolerances at which a diagonal weight is loose
 
 
@@ -214,11 +215,27 @@ class _Residuals:
 
     def of_form(self, freqs_hz: Array) -> Array:
         """Residuals of the form."""
-        return np.asarray(self._once("residuals", freqs_hz, lambda: residual(self.form, *self.responses(freqs_hz))))
+
+        def found() -> Array:
+            G, Gp = self.responses(freqs_hz)
+            return _by_pieces(lambda units: residual(self.form, G, units), Gp)
+
+        return np.asarray(self._once("residuals", freqs_hz, found))
 
     def left_over(self, freqs_hz: Array) -> Array:
         """What the form does not rebuild; the whole difference from the nominal where the misfit is not known."""
-        return np.asarray(self._once("left over", freqs_hz, lambda: completion(self.form, *self.responses(freqs_hz), self.of_form(freqs_hz))[1]))
+
+        def found() -> Array:
+            (G, Gp), E = self.responses(freqs_hz), self.of_form(freqs_hz)
+            return _by_pieces(lambda units, E: completion(self.form, G, units, E)[1], Gp, E)
+
+        return np.asarray(self._once("left over", freqs_hz, found))
+
+
+def _by_pieces(function: Callable[..., Array], *units: Array) -> Array:
+    """Return what a function of the units makes, a few units at a time: what it needs in between stays in the cache."""
+    some = max(1, _PIECE // max(1, units[0].shape[1]))
+    return np.concatenate([function(*(part[k : k + some] for part in units)) for k in range(0, len(units[0]), some)])
 
 
 def _leaves_out(form: Form, ratio: Array) -> bool:

@@ -66,7 +66,7 @@ class JointFit:
         state, damping = _State.of(self, start), _DAMPING[1]
         for temperature in temperatures:
             for _ in range(steps):
-                if state.fitted().excess_db <= enough_db:
+                if state.excess_db <= enough_db:
                     return state.fitted()
                 before = state.value(temperature)
                 state, damping = state.step(temperature, damping)
@@ -167,9 +167,15 @@ class _State:
         both, count = np.tile(np.eye(p), 2), self.product.shape[1]
         return *found, _Terms(self.product.ravel(), np.tile(np.arange(count), p), np.repeat(both, count, axis=0), price)
 
+    @cached_property
+    def _values(self) -> dict[float, float]:
+        return {}
+
     def value(self, temperature: float) -> float:
         """What is minimised, nepers."""
-        return sum(t.smoothed(temperature) for t in self.terms)
+        if temperature not in self._values:
+            self._values[temperature] = sum(t.smoothed(temperature) for t in self.terms)
+        return self._values[temperature]
 
     def weights(self, temperature: float) -> Array:
         """How much every log magnitude moves what is minimised, shape (entry, frequency)."""
@@ -196,10 +202,13 @@ class _State:
             damping *= 4
         return self, damping
 
+    @cached_property
+    def excess_db(self) -> float:
+        """Largest excess cost once raised to be sound."""
+        return (float(self.excess[np.isfinite(self.excess)].max()) + float(self.sigma.max())) * NEPER_DB
+
     def fitted(self) -> Fitted:
-        lift = float(self.sigma.max())
-        excess = float(self.excess[np.isfinite(self.excess)].max()) + lift
-        return Fitted(self.sections.lifted(slice(0, self.data.n_left), lift), excess * NEPER_DB)
+        return Fitted(self.sections.lifted(slice(0, self.data.n_left), float(self.sigma.max())), self.excess_db)
 
 
 def _singular(matrices: Array) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -118,7 +119,7 @@ def _fit_checked(
             break
         checked, of_fit = checked.joined(found), joined(of_fit, found.freqs_hz)[0]
         lowest = max(max(unscaled.left_orders) - 1, 0)  # further points do not make a lower order better
-    best = optimal_cover(residuals(freqs_hz), structure)
+    best = fitter.cover(fitter.sampled(freqs_hz), structure)
     weight = _lifted(unscaled, checked.some(np.isin(checked.freqs_hz, claimed)), proof)
     return weight.measured(freqs_hz, best, fitter.tolerance_db), best
 
@@ -193,6 +194,17 @@ class _Fitter:
         """Return the residuals at some frequencies."""
         return _Sampled(freqs_hz, self.residuals(freqs_hz))
 
+    @cached_property
+    def _covers(self) -> dict[tuple[Structure, bytes], Cover]:
+        return {}
+
+    def cover(self, points: _Sampled, structure: Structure = Structure.DIAGONAL) -> Cover:
+        """Return the optimal cover; the one that a weight is fitted to is most often the one that it is measured against."""
+        key = structure, points.freqs_hz.tobytes()
+        if key not in self._covers:
+            self._covers[key] = optimal_cover(points.E, structure)
+        return self._covers[key]
+
     def inside(self, freqs_hz: Array) -> Array:
         """Whether frequencies are within the band that was asked for."""
         return (freqs_hz >= self.band_hz[0]) & (freqs_hz <= self.band_hz[1])
@@ -216,7 +228,7 @@ class _Fitter:
 
     def diagonal(self, grid: _Sampled, checked: _Sampled) -> Weight:
         """Joint fit, and again with the frequencies and units at which it is exceeded or costs more than it should."""
-        best = optimal_cover(grid.E)
+        best = self.cover(grid)
         size, beyond = optimal_cover(grid.E, Structure.SCALAR).left[:, 0], np.flatnonzero(~self.inside(checked.freqs_hz))
         cost = np.where(best.left.min(axis=1) > 0, np.sqrt(np.maximum(10 ** (best.cost_db() / 10), 0.0)), 0.0)
         chosen = np.union1d(_marked(grid.freqs_hz, size, _POINTS // 2), _marked(grid.freqs_hz, cost, _POINTS // 2))

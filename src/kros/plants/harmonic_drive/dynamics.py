@@ -10,6 +10,7 @@ evaluated at the predicted middle of the substep.
 Symbols
 -------
 q, w : motor angle and velocity / gear ratio;   s : gear twist;   w_l : flange velocity;   i, u : current and its command
+p, v : position and velocity that the drive measures
 z : [s, w, w_l, i, u, f_m, f_l], shape (7, n);   M : map from z to the next [s, w, w_l, i] and the step of q, shape (5, 7, n)
 """
 
@@ -28,6 +29,10 @@ Array = npt.NDArray[Any]
 SUBSTEPS = 2
 SUBSTEP_S = SAMPLE_PERIOD_S / SUBSTEPS
 TWIST, W, WL, CURRENT, COMMAND, FM, FL = range(7)
+MEASURED = 2  # rows of p and v, in front of q and z
+RECORDED = MEASURED + 1 + COMMAND  # rows from p to i
+_HALF_STEP, _RATIO = np.array(0.5 * SUBSTEP_S), np.array(float(GEAR_RATIO))  # NumPy turns floats into these, at every call
+_SMOOTHING = np.array([[1.0], [SMOOTHING_VELOCITY**2]])  # of what fades with the velocity, and of its sign
 
 
 def transition(p: DriveParameters, loaded: Array) -> Array:
@@ -67,74 +72,87 @@ class Physics:
         self.moment = loaded * p.load_moment
         self.M = np.ascontiguousarray(np.moveaxis(transition(p, loaded), 0, -1))
         self.ripple = np.ascontiguousarray((p.ripple * np.exp(1j * p.phase_rad)).T)
-        self.z = np.zeros((7, n))
-        self.q = q0.astype(float).copy()
+        self.rows = np.zeros((MEASURED + 1 + 7, n))  # side by side, so that recording a sample is one copy
+        self.p_v, self.q, self.z = self.rows[:MEASURED], self.rows[MEASURED], self.rows[MEASURED + 1 :]
+        self.q[:] = q0
         for _ in range(20):
             self.z[TWIST] = self.moment * np.sin(self.q - self.z[TWIST]) / p.stiffness
         self.z[CURRENT] = self.z[COMMAND] = p.stiffness * self.z[TWIST] / p.torque_constant + p.gearbox_current(self.q)
-        self._inverse_stribeck = 1.0 / p.stribeck_velocity
+        self._highest, self._lower = self.ripple[-1], tuple(self.ripple[-2::-1])
+        self._minus_constant, self._minus_moment = -p.torque_constant, -self.moment
+        self._scales = np.stack([1.0 / p.stribeck_velocity, np.ones(n)])
         self._new = np.empty((5, n))
-        self._a, self._b, self._c = np.empty(n), np.empty(n), np.empty(n)
+        self._a, self._b, self._squares = np.empty(n), np.empty(n), np.empty((2, n))
         self._angle, self._power = np.empty(n, complex), np.empty(n, complex)
 
     def advance(self) -> None:
         """Move on by one sampling period with the command in `z[COMMAND]` held."""
-        z, a = self.z, self._a
+        q, z, a = self.q, self.z, self._a
+        w, moved, new, step = z[W], z[:4], self._new[:4], self._new[4]
         for _ in range(SUBSTEPS):
-            np.multiply(z[W], 0.5 * SUBSTEP_S, out=a)
-            np.add(self.q, a, out=a)  # q in the middle of the substep
+            np.multiply(w, _HALF_STEP, a)
+            np.add(q, a, a)  # q in the middle of the substep
             self._motor_torque(a)
             self._gravity(a)
             np.einsum("ijn,jn->in", self.M, z, out=self._new)
-            z[:4] = self._new[:4]
-            np.add(self.q, self._new[4], out=self.q)
+            moved[:] = new
+            np.add(q, step, q)
 
     def _motor_torque(self, q: Array) -> None:
         """z[FM] = -K_t i_d(q) - F(w)."""
         f = self.z[FM]
-        np.multiply(self._disturbance(q), self.p.torque_constant, out=f)
-        np.add(f, self._friction(), out=f)
-        np.negative(f, out=f)
+        np.multiply(self._disturbance(q), self._minus_constant, f)
+        np.subtract(f, self._friction(), f)
 
     def _disturbance(self, q: Array) -> Array:
         """(34): i_d is the imaginary part of sum_h a_h exp(j phi_h) exp(j h r q), by Horner's rule."""
-        e, acc = self._angle, self._power
-        np.multiply(q, GEAR_RATIO, out=self._b)
-        np.cos(self._b, out=e.real)
-        np.sin(self._b, out=e.imag)
-        np.copyto(acc, self.ripple[-1])
-        for coefficient in self.ripple[-2::-1]:
-            np.multiply(acc, e, out=acc)
-            np.add(acc, coefficient, out=acc)
-        np.multiply(acc, e, out=acc)
+        e, acc, add, multiply = self._angle, self._power, np.add, np.multiply
+        multiply(q, _RATIO, self._b)
+        np.cos(self._b, e.real)
+        np.sin(self._b, e.imag)
+        multiply(self._highest, e, acc)
+        for coefficient in self._lower:
+            add(acc, coefficient, acc)
+            multiply(acc, e, acc)
         return acc.imag
 
     def _friction(self) -> Array:
         """F(w), as `DriveParameters.dry_friction` but in place."""
-        w, fade, width = self.z[W], self._b, self._c
-        np.multiply(w, self._inverse_stribeck, out=fade)
-        np.multiply(fade, fade, out=fade)
-        np.add(fade, 1.0, out=fade)
-        np.divide(self.p.breakaway_torque, fade, out=fade)
-        np.add(fade, self.p.coulomb_torque, out=fade)
-        np.multiply(fade, w, out=fade)
-        np.multiply(w, w, out=width)
-        np.add(width, SMOOTHING_VELOCITY**2, out=width)
-        np.sqrt(width, out=width)
-        np.divide(fade, width, out=fade)
+        w, squares = self.z[W], self._squares
+        fade, width = squares
+        np.multiply(self._scales, w, squares)
+        np.multiply(squares, squares, squares)
+        np.add(squares, _SMOOTHING, squares)
+        np.divide(self.p.breakaway_torque, fade, fade)
+        np.add(fade, self.p.coulomb_torque, fade)
+        np.multiply(fade, w, fade)
+        np.sqrt(width, width)
+        np.divide(fade, width, fade)
         return fade
 
     def _gravity(self, q: Array) -> None:
         """z[FL] = -m g l sin(q - s)."""
         f = self.z[FL]
-        np.subtract(q, self.z[TWIST], out=f)
-        np.sin(f, out=f)
-        np.multiply(f, self.moment, out=f)
-        np.negative(f, out=f)
+        np.subtract(q, self.z[TWIST], f)
+        np.sin(f, f)
+        np.multiply(f, self._minus_moment, f)
 
-    def load_torque(self, inertia: Array, total_inertia: Array) -> Array:
-        """Torque that the load takes from the flange now, inertia and gravity, shape (n,), N m."""
-        p, z = self.p, self.z
-        gravity = self.moment * np.sin(self.q - z[TWIST])
-        acceleration = (p.stiffness * z[TWIST] + p.damping * (z[W] - z[WL]) - gravity) / total_inertia
-        return inertia * acceleration + gravity
+
+def load_torque(p: DriveParameters, recorded: Array) -> Array:
+    """Torque that loads take from the flange, inertia and gravity, N m.
+
+    Parameters
+    ----------
+    p : DriveParameters
+        One row per loaded trajectory.
+    recorded : ndarray, shape (RECORDED, n_samples, n)
+        Their rows from p to i.
+
+    Returns
+    -------
+    ndarray, shape (n_samples, n)
+    """
+    q, z = recorded[MEASURED], recorded[MEASURED + 1 :]
+    gravity = p.load_moment * np.sin(q - z[TWIST])
+    acceleration = (p.stiffness * z[TWIST] + p.damping * (z[W] - z[WL]) - gravity) / (p.flange_inertia + p.load_inertia)
+    return p.load_inertia * acceleration + gravity

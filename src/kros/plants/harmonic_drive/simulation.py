@@ -17,14 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from .control import COUNT_RAD, SAMPLE_PERIOD_S, VELOCITY_POLE, Gains
-from .dynamics import COMMAND, CURRENT, Physics, W
+from .dynamics import COMMAND, CURRENT, MEASURED, RECORDED, Physics, W, load_torque
 from .parameters import DriveParameters
 
 Array = npt.NDArray[Any]
 
-BLOCK_SAMPLES = 256
+BLOCK_SAMPLES = 32
 CHUNK_TRAJECTORIES = 800  # keeps the working set of a step in cache
-SIGNALS = 4  # position, velocity, current, true velocity; the load torque after them
+_SIGNALS = (0, 1, MEASURED + 1 + CURRENT)  # recorded rows of position, velocity and current
+_COUNTS, _COUNT, _POLE, _LEAST, _MOST = (np.array(c) for c in (1.0 / COUNT_RAD, COUNT_RAD, VELOCITY_POLE, -1.0, 1.0))
+_DIFFERENCE = np.array((1.0 - VELOCITY_POLE) / SAMPLE_PERIOD_S)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,7 @@ def simulate(p: DriveParameters, loaded: Array, reference: Array, targets: tuple
     n, n_samples = len(p), targets[0].shape[1]
     n_loaded = int(np.count_nonzero(loaded))
     rows = np.cumsum(loaded > 0) - 1
-    out = Signals(np.empty((n, SIGNALS - 1, n_samples)), np.empty((n, 1, n_samples)), np.empty((n_loaded, n_samples), np.float32))
+    out = Signals(np.empty((n, len(_SIGNALS), n_samples)), np.empty((n, 1, n_samples)), np.empty((n_loaded, n_samples), np.float32))
     for start in range(0, n, CHUNK_TRAJECTORIES):
         part = slice(start, start + CHUNK_TRAJECTORIES)
         _simulate_chunk(p.take(part), loaded[part], reference[part], targets, gains, out, part, rows[part])
@@ -77,63 +79,64 @@ def _simulate_chunk(
     n, n_samples = len(p), targets[0].shape[1]
     physics = Physics(p, loaded, targets[0][reference, 0])
     drive = _Controller(physics, gains)
-    total_inertia = p.flange_inertia + loaded * p.load_inertia
-    load_inertia = loaded * p.load_inertia
-    is_loaded = loaded > 0
-    any_loaded = bool(is_loaded.any())
-    block = np.empty((SIGNALS + 1, BLOCK_SAMPLES, n))
+    is_loaded = np.flatnonzero(loaded)
+    with_load = p.take(is_loaded)
+    recorded = np.empty((BLOCK_SAMPLES, RECORDED, n))
     for first in range(0, n_samples, BLOCK_SAMPLES):
         stop = min(first + BLOCK_SAMPLES, n_samples)
         rp, rv = (np.ascontiguousarray(t[:, first:stop].T)[:, reference] for t in targets)
         for k in range(stop - first):
             drive.sample(rp[k], rv[k])
-            block[0, k], block[1, k], block[2, k], block[3, k] = drive.p, drive.v, physics.z[CURRENT], physics.z[W]
-            if any_loaded:
-                block[SIGNALS, k] = physics.load_torque(load_inertia, total_inertia)
+            recorded[k] = physics.rows[:RECORDED]
             physics.advance()
-        length = stop - first
-        out.states[part, :, first:stop] = block[:3, :length].transpose(2, 0, 1)
-        out.velocity[part, 0, first:stop] = block[3, :length].T
-        if any_loaded:
-            out.load_torque[rows[is_loaded], first:stop] = (block[SIGNALS, :length] / p.torque_constant).T[is_loaded]
+        block = recorded[: stop - first]
+        for row, signal in enumerate(_SIGNALS):
+            out.states[part, row, first:stop] = block[:, signal].T
+        out.velocity[part, 0, first:stop] = block[:, MEASURED + 1 + W].T
+        if len(is_loaded):
+            torque = load_torque(with_load, block[..., is_loaded].swapaxes(0, 1))
+            out.load_torque[rows[is_loaded], first:stop] = (torque / with_load.torque_constant).T
 
 
 class _Controller:
-    """Encoder, velocity estimate and cascaded control of a batch; writes the command into the physics."""
+    """Encoder, velocity estimate and cascaded control of a batch; writes what it measures and the command into the physics."""
 
     def __init__(self, physics: Physics, gains: Gains) -> None:
         n = len(physics.q)
-        self.physics, self.gains = physics, gains
-        self.p = np.rint(physics.q / COUNT_RAD) * COUNT_RAD
-        self.v = np.zeros(n)
+        self.physics = physics
+        self.p, self.v = physics.p_v
+        self.p[:] = np.rint(physics.q / COUNT_RAD) * COUNT_RAD
         self._integral = physics.z[COMMAND].copy()
         self._error, self._raw = np.empty(n), np.empty(n)
+        self._position, self._velocity, self._antiwindup = np.array(gains.position), np.array(gains.velocity), np.array(gains.antiwindup)
+        self._integrated = np.array(gains.integral * SAMPLE_PERIOD_S)
 
     def sample(self, rp: Array, rv: Array) -> None:
         """Measure, and set the command for the coming sampling period."""
         self._measure()
-        g, error, raw, u = self.gains, self._error, self._raw, self.physics.z[COMMAND]
+        error, raw, u = self._error, self._raw, self.physics.z[COMMAND]
         np.subtract(rp, self.p, out=error)
-        np.multiply(error, g.position, out=error)
+        np.multiply(error, self._position, out=error)
         np.add(error, rv, out=error)
         np.subtract(error, self.v, out=error)  # Kp (rp - p) + rv - v
-        np.multiply(error, g.velocity, out=raw)
+        np.multiply(error, self._velocity, out=raw)
         np.add(raw, self._integral, out=raw)
-        np.clip(raw, -1.0, 1.0, out=u)
-        np.multiply(error, g.integral * SAMPLE_PERIOD_S, out=error)
+        np.maximum(raw, _LEAST, out=u)
+        np.minimum(u, _MOST, out=u)
+        np.multiply(error, self._integrated, out=error)
         np.add(self._integral, error, out=self._integral)
         np.subtract(u, raw, out=raw)
-        np.multiply(raw, g.antiwindup, out=raw)
+        np.multiply(raw, self._antiwindup, out=raw)
         np.add(self._integral, raw, out=self._integral)
 
     def _measure(self) -> None:
         """Quantise the position; v becomes a v + (1 - a) (p - last p) / T."""
         new, step = self._error, self._raw
-        np.multiply(self.physics.q, 1.0 / COUNT_RAD, out=new)
+        np.multiply(self.physics.q, _COUNTS, out=new)
         np.rint(new, out=new)
-        np.multiply(new, COUNT_RAD, out=new)
+        np.multiply(new, _COUNT, out=new)
         np.subtract(new, self.p, out=step)
-        np.multiply(step, (1.0 - VELOCITY_POLE) / SAMPLE_PERIOD_S, out=step)
-        np.multiply(self.v, VELOCITY_POLE, out=self.v)
+        np.multiply(step, _DIFFERENCE, out=step)
+        np.multiply(self.v, _POLE, out=self.v)
         np.add(self.v, step, out=self.v)
-        np.copyto(self.p, new)
+        self.p[:] = new

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from .core.errors import ConfigError
+from .core.memory import keep_freed_memory
 from .edge import NOT_MET, EdgeGroup, log_to_stderr
 
 app = typer.Typer(
@@ -57,8 +58,9 @@ def main(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error in place of a message.")] = False,
     version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version and nothing else.")] = False,
 ) -> None:
-    """Set up logging."""
+    """Set up logging and memory."""
     log_to_stderr(verbose)
+    keep_freed_memory()
 
 
 @app.command()

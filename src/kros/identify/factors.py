@@ -100,10 +100,10 @@ def reduce_episode(x: Array, u: Array, lifting: Lifting) -> Factor:
     x, u = x[lifting.history :], u[lifting.history :]
     g = lifting.separation.evaluate(window)
     v = lifting.input_separation.evaluate(window, u) if lifting.input_functions else u[:, :0]
-    now = np.concatenate([x, g, u, v], axis=1)
-    after = now[1:, : x.shape[1] + g.shape[1]]
-    data = np.concatenate([now[:-1], after], axis=1)
-    return Factor(triangular(data), np.abs(now).max(axis=0), np.asarray(len(data)), np.stack([u.min(axis=0), u.max(axis=0)]))
+    now = np.concatenate([x.T, g.T, u.T, v.T])  # a signal a row: extremes and reflections run along memory
+    data = np.concatenate([now[:, :-1], now[: x.shape[1] + g.shape[1], 1:]])
+    least, most, inputs = now.min(axis=1), now.max(axis=1), slice(x.shape[1] + g.shape[1], now.shape[0] - v.shape[1])
+    return Factor(triangular(data.T), np.maximum(most, -least), np.asarray(data.shape[1]), np.stack([least[inputs], most[inputs]]))
 
 
 def triangular(rows: Array) -> Array:

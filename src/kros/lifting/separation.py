@@ -62,7 +62,7 @@ class Separation:
 
     def evaluate(self, window: Array, u: Array | None = None) -> Array:
         """Return the parameter-free functions at windows (..., n_window), with the present inputs for input functions; shape (..., n_basis)."""
-        out = np.empty((*window.shape[:-1], len(self.basis)))
+        out = np.moveaxis(np.empty((len(self.basis), *window.shape[:-1])), 0, -1)  # a function's values side by side
         self._columns.fill(self.window.values(window, u), out)
         return out
 

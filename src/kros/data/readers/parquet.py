@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from ..tables import build
 
 INDEX = "population"  # kind of the artifact, hence population.json
 KEYS = ("unit", "condition", "episode")
+Version = tuple[int, int, int]
 _KEPT = Kept(limit=2**28)  # the demo's recordings fit, those of a factory do not have to
 
 
@@ -48,13 +50,14 @@ class ParquetRecordings(Recordings):
         file = path.stat()
         version = (file.st_ino, file.st_size, file.st_mtime_ns)  # a file written anew is read anew
         return Recording(
-            key, _KEPT.take((str(path), version, group, samples, key, self.columns), lambda: self._values(key, path, group, samples))
+            key,
+            _KEPT.take((str(path), version, group, samples, key, self.columns), lambda: self._values(key, path, version, group, samples)),
         )
 
-    def _values(self, key: EpisodeKey, path: Path, group: int, samples: int) -> npt.NDArray[np.float64]:
+    def _values(self, key: EpisodeKey, path: Path, version: Version, group: int, samples: int) -> npt.NDArray[np.float64]:
         """Return the samples of an episode from its file."""
         try:
-            table = _read_group(path, group, samples, [*KEYS, *self.columns])
+            table = _read_group(path, version, group, samples, [*KEYS, *self.columns])
             values = np.empty((table.num_rows, len(self.columns)))
             for column, channel in enumerate(self.columns):
                 fill(values[:, column], table.column(channel))
@@ -68,11 +71,20 @@ class ParquetRecordings(Recordings):
         return values
 
 
-def _read_group(path: Path, group: int, samples: int, columns: list[str]) -> Any:
+@lru_cache(maxsize=64)
+def _metadata(path: Path, version: Version) -> Any:
+    """Return what a file says of all its row groups, which are asked for one by one."""
+    from pyarrow import parquet
+
+    return parquet.read_metadata(path)
+
+
+def _read_group(path: Path, version: Version, group: int, samples: int, columns: list[str]) -> Any:
     """Read one row group after its length and the types of its columns, pages against their checksums."""
     from pyarrow import parquet
 
-    with parquet.ParquetFile(path, memory_map=True, page_checksum_verification=True) as file:
+    about = _metadata(path, version)
+    with parquet.ParquetFile(path, metadata=about, memory_map=True, pre_buffer=False, page_checksum_verification=True) as file:
         found = file.metadata.row_group(group).num_rows
         if found != samples:
             raise DataError(

@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
 from ...core.errors import ConfigError, KrosError
+from ...core.memory import keep_freed_memory
 from ...core.work import Executor, SerialExecutor
 from .cluster import open_dask
 from .threads import single_threaded
@@ -80,7 +81,7 @@ def _pool(workers: int) -> Iterator[Any]:
 
     context = multiprocessing.get_context("spawn")
     theirs, ours = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with, initargs=(theirs,))
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(theirs,))
     try:
         yield pool
         pool.shutdown()
@@ -90,10 +91,12 @@ def _pool(workers: int) -> Iterator[Any]:
         theirs.close()
 
 
-def _end_with(pipe: Any) -> None:
+def _begin(pipe: Any) -> None:
     """In a worker: end as soon as the other end of a pipe is closed; an interrupt from the keyboard is the parent's to handle."""
     import signal
     from threading import Thread
+
+    keep_freed_memory()
 
     def watch() -> None:
         with suppress(EOFError, OSError):

@@ -120,7 +120,8 @@ def _fit_checked(
         checked, of_fit = checked.joined(found), joined(of_fit, found.freqs_hz)[0]
         lowest = max(max(unscaled.left_orders) - 1, 0)  # further points do not make a lower order better
     best = fitter.cover(fitter.sampled(freqs_hz), structure)
-    weight = _lifted(unscaled, checked.some(np.isin(checked.freqs_hz, claimed)), proof)
+    inside = np.isin(checked.freqs_hz, claimed)
+    weight = _lifted(unscaled, checked if inside.all() else checked.some(inside), proof)
     return weight.measured(freqs_hz, best, fitter.tolerance_db), best
 
 
@@ -165,14 +166,28 @@ class _Sampled:
     freqs_hz: Array
     E: Array
 
+    @cached_property
+    def _ratios(self) -> list[tuple[Weight, Array]]:
+        return []
+
     def ratio(self, weight: Weight) -> Array:
-        """Largest ratio for every unit and frequency."""
-        used = weight.magnitudes(self.freqs_hz)
-        return cover_ratio(self.E, used.left, used.right)
+        """Largest ratio for every unit and frequency; that of the last weight is kept, for fits are checked where they are proven."""
+        if not self._ratios or self._ratios[0][0] is not weight:
+            used = weight.magnitudes(self.freqs_hz)
+            self._ratios[:] = [(weight, cover_ratio(self.E, used.left, used.right))]
+        return self._ratios[0][1]
 
     def some(self, index: Array) -> _Sampled:
         """Return those of some frequencies."""
         return _Sampled(self.freqs_hz[index], self.E[:, index])
+
+    def chosen(self, other: _Sampled, index: Array) -> _Sampled:
+        """Return some of these and of others, by their indices in both, one after the other; both may be large."""
+        count = len(self.freqs_hz)
+        own, theirs = np.flatnonzero(index < count), np.flatnonzero(index >= count)
+        order = np.argsort(np.concatenate([own, theirs]))
+        E = np.concatenate([self.E[:, index[own]], other.E[:, index[theirs] - count]], axis=1)
+        return _Sampled(np.concatenate([self.freqs_hz, other.freqs_hz])[index], E[:, order])
 
     def joined(self, other: _Sampled) -> _Sampled:
         """Return the same with further frequencies."""
@@ -190,9 +205,16 @@ class _Fitter:
     tolerance_db: float
     band_hz: tuple[float, float]
 
+    @cached_property
+    def _known(self) -> dict[bytes, _Sampled]:
+        return {}
+
     def sampled(self, freqs_hz: Array) -> _Sampled:
         """Return the residuals at some frequencies."""
-        return _Sampled(freqs_hz, self.residuals(freqs_hz))
+        key = freqs_hz.tobytes()
+        if key not in self._known:
+            self._known[key] = _Sampled(freqs_hz, self.residuals(freqs_hz))
+        return self._known[key]
 
     @cached_property
     def _covers(self) -> dict[tuple[Structure, bytes], Cover]:
@@ -241,15 +263,17 @@ class _Fitter:
         found = fit_sections(problem, self.max_order, self.tolerance_db)
         weight = self._weight(found.sections, grid.E.shape[2])
         for _ in range(_ROUNDS):
-            bends = np.arctan(np.sqrt(found.sections.bends())) / (np.pi * self.sample_period_s)
-            seen = checked.joined(self.sampled(bends))
-            ratio, used = seen.ratio(weight), weight.magnitudes(grid.freqs_hz)
+            bends = self.sampled(np.arctan(np.sqrt(found.sections.bends())) / (np.pi * self.sample_period_s))
+            seen = joined(checked.freqs_hz, bends.freqs_hz)[1]
+            ratio = np.concatenate([checked.ratio(weight), bends.ratio(weight)], axis=1)[:, seen]
+            used = weight.magnitudes(grid.freqs_hz)
             excess = (used.cost_db() - best.cost_db()) - found.excess_db
             if ratio.max() <= _LIFT and not (excess > _MISSED_DB).any():
                 break
             _LOG.debug("Weight: exceeded %.3f times, by %.2f dB in cost between the points of the fit", ratio.max(), excess.max())
             exceeded, costly = _peaks(ratio.max(axis=0)), _peaks(10 ** (np.nan_to_num(excess, nan=0.0, posinf=0.0) / 20))
-            problem = problem.joined(problem_at(seen.some(exceeded), ratio[:, exceeded])).joined(problem_at(grid.some(costly)))
+            worst = checked.chosen(bends, seen[exceeded])
+            problem = problem.joined(problem_at(worst, ratio[:, exceeded])).joined(problem_at(grid.some(costly)))
             found = refit(problem, found.sections)
             weight = self._weight(found.sections, grid.E.shape[2])
         return weight

@@ -24,6 +24,7 @@ from ..result import Injection, Status, Synthesis
 from .equations import discrete_gain, solve_riccati
 
 Array = npt.NDArray[Any]
+_CLOSE = 1e-6  # to the poles that are wanted
 
 
 def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLike, dt: float = 1.0) -> Synthesis:
@@ -101,6 +102,31 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     )
 
 
+def _only_gain(A: Array, C: Array, poles: Array) -> Array | None:
+    """Return the gain of one measurement, which is unique; None where rounding decides.
+
+    Left eigenvectors of A - L C are ``w' = (w' L) C (A - p I)^-1`` with ``w' L = 1``.
+    """
+    try:
+        W = np.vstack([np.linalg.solve((A - p * np.eye(len(A))).T, C[0]) for p in poles])
+        size = np.abs(W).max(axis=1)
+        L = np.linalg.solve(W / size[:, None], 1 / size).real[:, None]
+    except np.linalg.LinAlgError:
+        return None
+    reached = np.linalg.eigvals(A - L @ C)
+    close = np.isfinite(reached).all() and max(np.abs(reached - p).min() for p in poles) <= _CLOSE
+    return L if close else None
+
+
+def _one_of_many_gains(A: Array, C: Array, poles: Array) -> Array:
+    """Return the gain whose eigenvectors are conditioned well."""
+    from scipy.signal import place_poles  # a second to load
+
+    with warnings.catch_warnings():  # of eigenvectors that could be better conditioned still; the poles reached are checked
+        warnings.filterwarnings("ignore", message="Convergence was not reached", category=UserWarning)
+        return np.asarray(place_poles(A.T, C.T, poles).gain_matrix.T)
+
+
 def luenberger(A: npt.ArrayLike, C: npt.ArrayLike, poles: npt.ArrayLike, dt: float = 1.0) -> Synthesis:
     """Return the constant gain that places the poles of the error dynamics (17).
 
@@ -123,8 +149,6 @@ def luenberger(A: npt.ArrayLike, C: npt.ArrayLike, poles: npt.ArrayLike, dt: flo
     >>> luenberger([[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.0]], [0.5, 0.6]).controller.D.round(6).ravel().tolist()
     [0.9, 2.0]
     """
-    from scipy.signal import place_poles
-
     A, C = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (A, C))
     wanted = np.atleast_1d(np.asarray(poles))
     if wanted.shape != (A.shape[0],) or C.shape[1:] != A.shape[:1]:
@@ -135,9 +159,8 @@ def luenberger(A: npt.ArrayLike, C: npt.ArrayLike, poles: npt.ArrayLike, dt: flo
         )
     start = time.perf_counter()
     try:
-        with warnings.catch_warnings():  # of eigenvectors that could be better conditioned still; the poles reached are checked below
-            warnings.filterwarnings("ignore", message="Convergence was not reached", category=UserWarning)
-            L = place_poles(A.T, C.T, wanted).gain_matrix.T
+        L = _only_gain(A, C, wanted) if len(C) == 1 else None
+        L = _one_of_many_gains(A, C, wanted) if L is None else L
     except (ValueError, np.linalg.LinAlgError) as error:
         raise SynthesisError(
             f"Luenberger observer: the poles cannot be placed ({error}); use distinct poles in conjugate pairs, or measure more."

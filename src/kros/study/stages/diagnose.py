@@ -17,14 +17,23 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...core.errors import KrosError
-from ...identify import ModelSet
-from ...uncertainty import Form, UncertainModel, choose_nominals, magnitude_tightness, optimal_cover, residual, variation_and_noise
+from ...identify import ModelSamples, ModelSet
+from ...uncertainty import (
+    Form,
+    UncertainModel,
+    VariationAndNoise,
+    choose_nominals,
+    magnitude_tightness,
+    optimal_cover,
+    residual,
+    variation_and_noise,
+)
 from ...uncertainty.fits.magnitude import Tightness
 from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.settings import UncertaintySettings
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
 from ..engine.context import Context
-from .resampling import resampled_models
+from .resampling import resampling
 
 log = logging.getLogger(__name__)
 
@@ -39,18 +48,19 @@ class _Result(Protocol):
         """Write into a folder."""
 
 
-Task = tuple[Path, Callable[[], _Result]]
+Task = tuple[Path, Callable[[], _Result | None]]
 
 
 def diagnose(context: Context, found: UncertainModels) -> None:
     """Compute and save what there is to say; what cannot be said is logged, with its reason, and left out."""
     folder, config = context.store.draft("uncertainty"), context.config.uncertainty
-    tasks: list[Task] = []
-    for kind, uncertain in found.sets.items():
-        tasks += [(folder / kind / "noise", task) for task in _noise(context, kind, uncertain)]
-        tasks.append((folder / kind / "order", partial(order_curve, uncertain, config.max_order + _FURTHER_ORDERS)))
-    for kind in found.models.kinds[: len(found.models.edmd_kinds)]:  # the pair that figures compare
-        tasks.append((folder / kind / "units", partial(beside_weights, found.models.models(kind), found.sets[kind], config)))
+    models = found.models
+    noise = [(kind, task) for kind, uncertain in found.sets.items() for task in _noise(context, kind, uncertain)]
+    tasks: list[Task] = [(folder / kind / "noise", task) for kind, task in noise]  # those that read recordings begin
+    highest = config.max_order + _FURTHER_ORDERS
+    tasks += [(folder / kind / "order", partial(order_curve, uncertain, highest)) for kind, uncertain in found.sets.items()]
+    pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
+    tasks += [(folder / kind / "units", partial(beside_weights, models.models(kind), found.sets[kind], config)) for kind in pair]
     tasks += _others(context, found.scores)
     results = context.work.run("quantify (diagnose)", [partial(_attempt, place.parent.name, task) for place, task in tasks])
     for (place, _), result in zip(tasks, results, strict=True):
@@ -58,7 +68,7 @@ def diagnose(context: Context, found: UncertainModels) -> None:
             result.save(place)
 
 
-def _attempt(name: str, task: Callable[[], _Result]) -> _Result | None:
+def _attempt(name: str, task: Callable[[], _Result | None]) -> _Result | None:
     try:
         return task()
     except KrosError as error:
@@ -66,7 +76,7 @@ def _attempt(name: str, task: Callable[[], _Result]) -> _Result | None:
         return None
 
 
-def _noise(context: Context, name: str, uncertain: UncertainModel) -> list[Callable[[], _Result]]:
+def _noise(context: Context, name: str, uncertain: UncertainModel) -> list[Callable[[], _Result | None]]:
     """Compare variation and noise over at most 60 units, the nominal one among them."""
     if uncertain.nominal < 0:
         return []
@@ -75,21 +85,35 @@ def _noise(context: Context, name: str, uncertain: UncertainModel) -> list[Calla
     chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
     models = context.identified.models(name)
     try:
-        samples = resampled_models(context, name, chosen)
+        resample = resampling(context, name, chosen)
     except KrosError as error:
-        log.info("%s: variation and noise are not told apart: %s", name, error)
+        _not_told_apart(name, error)
         return []
     compare = partial(
         variation_and_noise,
-        samples,
-        models.frequencies(_NOISE_POINTS),
-        models.sample_period_s,
-        uncertain.form,
+        freqs_hz=models.frequencies(_NOISE_POINTS),
+        sample_period_s=models.sample_period_s,
+        form=uncertain.form,
         nominal=chosen.index(uncertain.nominal_id),
         output_scale=models.output_scale,
         input_scale=models.input_scale,
     )
-    return [compare]
+    return [partial(_compared, name, resample, compare)]
+
+
+def _compared(
+    name: str, resample: Callable[[], ModelSamples], compare: Callable[[ModelSamples], VariationAndNoise]
+) -> VariationAndNoise | None:
+    try:
+        samples = resample()
+    except KrosError as error:
+        _not_told_apart(name, error)
+        return None
+    return compare(samples)
+
+
+def _not_told_apart(name: str, error: KrosError) -> None:
+    log.info("%s: variation and noise are not told apart: %s", name, error)
 
 
 def order_curve(uncertain: UncertainModel, highest: int) -> Tightness:

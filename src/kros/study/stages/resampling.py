@@ -6,18 +6,24 @@ refined models and their information --> one step from them, for the episodes dr
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError
+from ...data.population import EpisodeKey, Population
 from ...data.scaled import scale_population
 from ...identify import Factor, KoopmanMatrices, ModelSamples, ModelSet, bootstrap_edmd, bootstrap_refined, episode_weights, lifted_factor
 from ...identify.identify import refine_options
 from ...identify.ranges import Ranges
 from ...identify.refine.episodes import episode_normals
+from ...identify.refine.model import RefinedModels
+from ...identify.refine.options import RefineOptions
+from ...lifting import Lifting
 from ..engine.context import Context
 
 Array = npt.NDArray[np.float64]
@@ -47,11 +53,20 @@ def resampled_models(context: Context, name: str, units: list[str]) -> ModelSamp
     IdentificationError
         When episodes that were drawn leave a model undetermined.
     """
+    return resampling(context, name, units)()
+
+
+def resampling(context: Context, name: str, units: list[str]) -> Callable[[], ModelSamples]:
+    """Return what `resampled_models` computes, with all it needs, for a process of its own."""
     models = context.identified.models(name)
     if models.alpha is None:
-        everyone = _refined_samples(context, models)
-        return _chosen(everyone, [models.index(u) for u in units])
+        return partial(_refined_samples, _refined_models(context, models), tuple(models.index(u) for u in units))
     factor, counts = episode_factor(context, models, units)
+    return partial(_edmd_samples, models, factor, counts, units)
+
+
+def _edmd_samples(models: ModelSet, factor: Factor, counts: list[int], units: list[str]) -> ModelSamples:
+    assert models.alpha is not None
     ranges = models.ranges if models.alpha_in_ranges else Ranges(np.ones_like(models.output_scale), np.ones_like(models.input_scale))
     weights = episode_weights(counts, DRAWS, _SEED)
     return _restored(bootstrap_edmd(ranges.triangles(factor.R), models.lifting.n_lifted, models.alpha, weights, units), ranges)
@@ -79,18 +94,46 @@ def _by_unit(values: npt.NDArray[Any], places: list[list[int]], most: int) -> np
     return found
 
 
-def _refined_samples(context: Context, models: ModelSet) -> ModelSamples:
-    """Samples of all units that were refined together, in channels divided by their ranges as they were."""
+@dataclass(frozen=True, eq=False)
+class _Refined:
+    """Models that were refined together and what they were refined on, in channels divided by their ranges as they were."""
+
+    models: RefinedModels
+    ranges: Ranges
+    population: Population
+    keys: dict[str, tuple[EpisodeKey, ...]]
+    lifting: Lifting
+    parameters: dict[str, Array]
+    factor: Factor
+    counts: list[int]
+    options: RefineOptions
+    pooled: npt.NDArray[np.bool_]
+
+
+def _refined_models(context: Context, models: ModelSet) -> _Refined:
     units, facts, ranges = list(models.unit_ids), context.facts, models.ranges
-    refined = context.identified.refined[models.name].in_channels(ranges)
     factor, counts = episode_factor(context, models, units)
-    population, lifting = scale_population(context.population, models.sizes), models.lifting.in_sizes(models.sizes)
-    keys = {u: facts.keys("train", u, facts.identify_on) for u in units}
-    pooled = np.array([u in facts.pooled for u in units])
-    options = refine_options(context.config.identify)
-    normal = episode_normals(refined, population, keys, lifting, models.parameters, ranges.factor(factor), options, pooled)
-    weights = episode_weights(counts, DRAWS, _SEED)
-    return _restored(bootstrap_refined(refined.units, refined.whitening, refined.information, normal, weights, units), ranges)
+    return _Refined(
+        context.identified.refined[models.name].in_channels(ranges),
+        ranges,
+        scale_population(context.population.select(units, [facts.identify_on]), models.sizes),
+        {u: tuple(facts.keys("train", u, facts.identify_on)) for u in units},
+        models.lifting.in_sizes(models.sizes),
+        dict(models.parameters),
+        ranges.factor(factor),
+        counts,
+        refine_options(context.config.identify),
+        np.array([u in facts.pooled for u in units]),
+    )
+
+
+def _refined_samples(of: _Refined, rows: Sequence[int]) -> ModelSamples:
+    """Samples of some of the units, in the recordings' units of measure."""
+    normal = episode_normals(of.models, of.population, of.keys, of.lifting, of.parameters, of.factor, of.options, of.pooled)
+    weights, units = episode_weights(of.counts, DRAWS, _SEED), of.models.units
+    return _chosen(
+        _restored(bootstrap_refined(units, of.models.whitening, of.models.information, normal, weights, list(of.keys)), of.ranges), rows
+    )
 
 
 def _restored(samples: ModelSamples, ranges: Ranges) -> ModelSamples:
@@ -98,6 +141,6 @@ def _restored(samples: ModelSamples, ranges: Ranges) -> ModelSamples:
     return replace(samples, estimate=ranges.restore(samples.estimate), samples=ranges.restore(samples.samples))
 
 
-def _chosen(samples: ModelSamples, rows: list[int]) -> ModelSamples:
-    estimate, drawn = (KoopmanMatrices(m.A[rows], m.B[rows]) for m in (samples.estimate, samples.samples))
+def _chosen(samples: ModelSamples, rows: Sequence[int]) -> ModelSamples:
+    estimate, drawn = (KoopmanMatrices(m.A[list(rows)], m.B[list(rows)]) for m in (samples.estimate, samples.samples))
     return replace(samples, unit_ids=tuple(samples.unit_ids[k] for k in rows), estimate=estimate, samples=drawn)

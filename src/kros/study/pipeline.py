@@ -10,7 +10,7 @@ from typing import Any
 
 from ..core.artifacts import read_json
 from ..core.errors import ConfigError
-from ..core.work import Progress, Silent, Work
+from ..core.work import Executor, Progress, Silent, Work
 from ..data import Population
 from ..data.readers.opening import detect_reader
 from ..design.task import is_robust
@@ -117,8 +117,8 @@ def run_study(
     )  # workers elsewhere have a current folder of their own
     require_own(out, config)
     require_usable(config, until, population)
-    with open_run(out, config) as store:
-        return run_in(store, config, until, workers, scheduler, progress, population)
+    with open_run(out, config) as store, open_executor(workers, scheduler) as executor:
+        return run_in(store, config, until, executor, progress, population)
 
 
 def run(
@@ -193,17 +193,15 @@ def run_in(
     store: Store,
     config: StudyConfig,
     until: Stage,
-    workers: int,
-    scheduler: str | None = None,
+    executor: Executor,
     progress: Progress | None = None,
     given: Population | None = None,
 ) -> RunResult:
     """Run a study in its run folder, which is open."""
     began = time.perf_counter()
-    with open_executor(workers, scheduler) as executor:
-        context = Context(config, store, Work(executor, progress or Silent(), store.seen(code_key())), given)
-        run_steps(context, STEPS, until)
-        metrics = kept_metrics(store, collect_metrics(context, until, time.perf_counter() - began))
+    context = Context(config, store, Work(executor, progress or Silent(), store.seen(code_key())), given)
+    run_steps(context, STEPS, until)
+    metrics = kept_metrics(store, collect_metrics(context, until, time.perf_counter() - began))
     return RunResult(store.folder, metrics, violations(config, metrics))
 
 

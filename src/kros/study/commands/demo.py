@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from ...core.work import Progress
 from ...data import write_parquet, write_raw
 from ...identify.presets import HARMONIC_DRIVE
 from ..config import Stage, validate_config
+from ..engine.executors import open_executor
 from ..engine.run_folder import open_run
 from ..engine.store import Store, code_key, hash_of
 from ..pipeline import RunResult, require_usable, run_in
@@ -75,18 +78,27 @@ def run_demo(
     out = Path(out).absolute()
     raw = {"name": "demo", "data": {"source": str(out / _RECORDINGS), "reader": "parquet"}, "predictor": {"effort": "quick"}}
     config = validate_config(raw, out, overrides=overrides)
-    with open_run(out, config) as store:
-        _simulate_in(store, units, episodes, seconds, seed, progress)
+    with open_run(out, config) as store, open_executor(workers) as executor:
+        _simulate_in(store, units, episodes, seconds, seed, progress, partial(executor.map, _load, range(workers)))
         require_usable(config, Stage.REPORT)
-        return run_in(store, config, Stage.REPORT, workers, progress=progress)
+        return run_in(store, config, Stage.REPORT, executor, progress)
 
 
-def _simulate_in(store: Store, units: int, episodes: int, seconds: float, seed: int, progress: Progress) -> None:
-    """Simulate into a run folder, where the same simulation is not there already."""
+def _load(_: int) -> None:
+    """In a worker: load what takes long to load and every study needs."""
+    for name in ("kros.study.pipeline", "pyarrow.parquet", "scipy.optimize", "sympy"):
+        import_module(name)
+
+
+def _simulate_in(
+    store: Store, units: int, episodes: int, seconds: float, seed: int, progress: Progress, meanwhile: Callable[[], object]
+) -> None:
+    """Simulate into a run folder, where the same simulation is not there already; workers get something to do meanwhile."""
     settings = ("harmonic-drive", units, episodes, seconds, seed, 1.0, "stiff", True, "parquet")
     key = hash_of([code_key(), settings])
     if store.is_current(_STAGE, key):
         return
+    meanwhile()
     progress.start(_STAGE, None)
     began = time.perf_counter()
     with store.drafting() as draft:

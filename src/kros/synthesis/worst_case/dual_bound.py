@@ -48,9 +48,7 @@ def dual_bound(a: Array, P: Array, Q: Array) -> Array:
     c = d * np.abs(rotated) ** 2
     g, multipliers = _without_centre(s, q)
     g = g + np.sqrt(c.sum(axis=(-2, -1)) / max(s.shape[-1], 1))[..., None]
-    for _ in range(_SWEEPS):
-        g = _best_rows(c, multipliers[..., None, :] - d)
-        multipliers = _best_rows(np.swapaxes(c, -1, -2), np.swapaxes(g[..., :, None] - d, -1, -2))
+    g, multipliers = _descended(c, d, g, multipliers)
     slack = g[..., :, None] + multipliers[..., None, :] - d
     rest = np.where(c > 0, c / np.maximum(slack, 1e-150), 0.0).sum(axis=(-2, -1))
     squared = np.sum(np.abs(a) ** 2, axis=(-2, -1)) + g.sum(axis=-1) + multipliers.sum(axis=-1) + rest
@@ -68,19 +66,30 @@ def _without_centre(s: Array, q: Array) -> tuple[Array, Array]:
     return g[..., :rows], np.maximum(s**2 * q**2 - g, 0.0)[..., :columns]
 
 
+def _descended(c: Array, d: Array, g: Array, multipliers: Array) -> tuple[Array, Array]:
+    """Return better multipliers of rows and columns, by turns; with frequencies last, where sums over few entries are those of long vectors."""
+    c, d = (np.ascontiguousarray(np.moveaxis(x, (-2, -1), (0, 1))) for x in (c, d))
+    c_columns, d_columns = (np.ascontiguousarray(np.swapaxes(x, 0, 1)) for x in (c, d))
+    rows, columns = np.moveaxis(g, -1, 0), np.moveaxis(multipliers, -1, 0)
+    for _ in range(_SWEEPS):
+        rows = _best_rows(c, columns - d)
+        columns = _best_rows(c_columns, rows - d_columns)
+    return np.moveaxis(rows, 0, -1), np.moveaxis(columns, 0, -1)
+
+
 def _best_rows(c: Array, shift: Array) -> Array:
-    """Minimise ``x + sum_j c_ij / (x + shift_ij)`` over ``x >= 0`` with ``x + shift_ij >= 0``, for every row i.
+    """Minimise ``x + sum_j c_ij / (x + shift_ij)`` over ``x >= 0`` with ``x + shift_ij >= 0``, for every row i; shapes (i, j, ...).
 
     Newton's method on ``h^(-1/2) = 1``, ``h = sum_j c_ij / (x + shift_ij)^2``: concave, nearly linear, and started where a single term would end,
     so that it climbs from the left and stays feasible.
     """
-    least = np.maximum(np.max(-shift, axis=-1), 0.0)
-    gap = least[..., None] + shift
-    x = np.maximum(np.max(np.sqrt(c) - gap, axis=-1), 0.0)
+    least = np.maximum(np.max(-shift, axis=1), 0.0)
+    gap = least[:, None] + shift
+    x = np.maximum(np.max(np.sqrt(c) - gap, axis=1), 0.0)
     for _ in range(_STEPS):
-        inverse = 1 / np.maximum(x[..., None] + gap, 1e-150)
+        inverse = 1 / np.maximum(x[:, None] + gap, 1e-150)
         terms = c * inverse * inverse
-        h = np.maximum(terms.sum(axis=-1), 1e-300)
-        slope = np.maximum((terms * inverse).sum(axis=-1), 1e-300)
+        h = np.maximum(terms.sum(axis=1), 1e-300)
+        slope = np.maximum((terms * inverse).sum(axis=1), 1e-300)
         x = np.maximum(x + (h * np.sqrt(h) - h) / slope, 0.0)
     return least + x

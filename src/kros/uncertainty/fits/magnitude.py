@@ -247,27 +247,32 @@ def alternation_db(ratio: npt.ArrayLike, count: int) -> float:
     float, dB
         Of magnitudes, when the ratio is one; the largest H / L for which the alternation exists, between zero and `max / min`.
     """
-    level = 20 * np.log10(np.asarray(ratio, float))
+    level = _turning(20 * np.log10(np.asarray(ratio, float)))
     low, high = 0.0, float(np.ptp(level))
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        if any(_swings(level, bottom, bottom + middle) >= count for bottom in _bottoms(level, middle)):
+        bottoms = np.linspace(level.min(), level.max() - middle, _BOTTOMS)
+        if (_swings(level, bottoms, bottoms + middle) >= count).any():
             low = middle
         else:
             high = middle
     return low
 
 
-def _bottoms(level: Array, width: float) -> Array:
-    """Lower levels that are tried for an alternation of some width."""
-    return np.linspace(level.min(), level.max() - width, _BOTTOMS)
+def _turning(level: Array) -> Array:
+    """Return the ends and the values at which a sequence turns: what is between them swings no further."""
+    steps = np.diff(level)
+    level, steps = level[np.append(True, steps != 0)], steps[steps != 0]
+    return level[np.concatenate([[True], steps[1:] * np.sign(steps[:-1]) < 0, [True]])] if len(steps) else level
 
 
-def _swings(level: Array, bottom: float, top: float) -> int:
-    """How often the level reaches below the bottom and above the top in turn."""
-    side = np.where(level >= top, 1, np.where(level <= bottom, -1, 0))
-    side = side[side != 0]
-    return int((side[1:] != side[:-1]).sum()) + 1 if side.size else 0
+def _swings(level: Array, bottoms: Array, tops: Array) -> Array:
+    """How often the level reaches below every bottom and above its top in turn."""
+    side = (level >= tops[:, None]).astype(np.int8) - (level <= bottoms[:, None])
+    row, column = side.nonzero()
+    side, turned = side[row, column], np.ones(len(row), bool)
+    turned[1:] = (side[1:] != side[:-1]) | (row[1:] != row[:-1])
+    return np.bincount(row[turned], minlength=len(bottoms))
 
 
 def invert(system: StateSpace) -> StateSpace:

@@ -23,7 +23,7 @@ from ...data.scaled import scale_population
 from ...lifting import Lifting
 from ..factors import Factor
 from ..ranges import Ranges
-from .marquardt import Solution, minimise
+from .marquardt import Evaluate, Solution, minimise
 from .metric import ResponsePrior
 from .model import RefinedModels, TradeOff
 from .options import GUARD, LEAST_GAIN, NEGLIGIBLE_RESIDUAL, SEED, TOLERANCE, RefineOptions
@@ -196,7 +196,7 @@ def _path(problem: Problem, common: Array, validation: ValidationSet, options: R
     rows: list[TradeOff] = []
     for strength in sorted(options.strengths, reverse=True):
         now = _strengthen(problem, strength)
-        V = minimise(now.evaluate, now.admissible, V, options.path_iterations, LEAST_GAIN).V
+        V = _fit(now, V, options.path_iterations).V
         path.append(V)
         rows += validation.trade_off([V], (strength,))
         log.debug("prior of strength %g: held-out score %.4g, peak residual %.1f dB", strength, rows[-1].score, rows[-1].peak_db)
@@ -206,15 +206,24 @@ def _path(problem: Problem, common: Array, validation: ValidationSet, options: R
     return path, rows
 
 
+def _fit(problem: Problem, V: Array, iterations: int) -> Solution:
+    """Fit every unit by itself; those that are done are not run on."""
+
+    def narrowed(rows: npt.NDArray[np.int64]) -> Evaluate:
+        return replace(restrict(problem, rows), pooled=False, counted=problem.residuals).evaluate
+
+    return minimise(problem.evaluate, problem.admissible, V, iterations, LEAST_GAIN, narrowed)
+
+
 def _settle(problem: Problem, V: Array, options: RefineOptions) -> Solution:
     """Fit all units to the end: those that have not converged go on by themselves."""
-    solution = minimise(problem.evaluate, problem.admissible, V, options.iterations, LEAST_GAIN)
+    solution = _fit(problem, V, options.iterations)
     for _ in range(_ROUNDS):
         rows = np.flatnonzero(~solution.converged)
         if not rows.size:
             break
         part = replace(restrict(problem, rows), pooled=False)
-        more = minimise(part.evaluate, part.admissible, solution.V[rows], options.iterations, LEAST_GAIN)
+        more = _fit(part, solution.V[rows], options.iterations)
         solution = solution.updated(rows, more)
     return solution
 
@@ -242,7 +251,7 @@ def _keep_bounded(
         log.warning("%s; fitted again with a prior of strength %g", "; ".join(found[i] for i in sorted(found)), strength)
         part = replace(restrict(_strengthen(problem, strength), rows), pooled=False)
         V = np.repeat(common[None], len(rows), axis=0)
-        solution = solution.updated(rows, minimise(part.evaluate, part.admissible, V, options.iterations, LEAST_GAIN))
+        solution = solution.updated(rows, _fit(part, V, options.iterations))
     raise IdentificationError(
         f"Refinement: {next(iter(found.values()))}, even with a prior of strength {strength:g}; use longer horizons, or functions that stay bounded."
     )

@@ -95,6 +95,8 @@ class Problem:
     guard : float, optional
         Width of the soft edge of stability; none by default.
     prior : ResponsePrior, optional
+    counted : float, optional
+        Residuals that a unit of a whole population contributes on average, of which these units are some.
     """
 
     lifting: Lifting
@@ -107,10 +109,13 @@ class Problem:
     pooled: bool = False
     guard: float | None = None
     prior: ResponsePrior | None = None
+    counted: float | None = None
 
     @property
     def residuals(self) -> float:
         """Residuals that one unit's free runs contribute, on average."""
+        if self.counted is not None:
+            return self.counted
         return self.lifting.n_states * float(self.segments.compared.sum()) / self.segments.n_units / self.stride
 
     @property

@@ -156,6 +156,27 @@ def test_only_the_samples_asked_for_are_judged() -> None:
         np.testing.assert_array_equal(top[row], np.abs(data[:, :2]).max(axis=0))
 
 
+def test_free_runs_in_blocks_are_those_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    population, keys, _, W = machines(3, 0.05, seed=4)
+    rng, units, flat = np.random.default_rng(0), list(keys), [key for episodes in keys.values() for key in episodes]
+    rows = [units.index(key.unit) for key in flat]
+    shift = np.eye(6)[[4, 4]]
+    M = np.stack([np.concatenate([W + 1e-3 * rng.normal(size=W.shape), np.broadcast_to(shift, (3, 2, 6))], axis=1) for _ in range(2)])
+    A, B = M[:, rows][..., :4], M[:, rows][..., 4:]
+    errors = free_run_errors(A, B, BILINEAR, {}, population, flat)
+    for model in range(2):
+        for row, key in enumerate(flat):
+            data = population.read(key)
+            run = free_run(A[model, row], B[model, row], BILINEAR, {}, data[None, :4, :2], data[None, :, 2:])[0]
+            np.testing.assert_allclose(errors[0][model, row], np.sqrt(np.mean((run - data[:, :2]) ** 2, axis=0)), rtol=1e-12)
+            np.testing.assert_array_equal(errors[2][model, row], np.abs(run).max(axis=0))
+    monkeypatch.setattr("kros.identify.refine.validation_set._AT_ONCE", 0)
+    monkeypatch.setattr("kros.identify.refine.validation_set._LEAST", 7)
+    monkeypatch.setattr("kros.identify.refine.validation_set._TOGETHER", 5)
+    for one, other in zip(errors, free_run_errors(A, B, BILINEAR, {}, population, flat), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
 def test_an_episode_that_is_too_short_is_named() -> None:
     population, keys, _, _ = machines(1, 0.0, seed=1)
     with pytest.raises(DataError, match=r"episode 0 of unit u0 .* has 600 samples, and delays of up to 599 need at least 601"):

@@ -10,7 +10,7 @@ from kros.data import Channel, EpisodeKey, Population, Role, Unit
 from kros.identify import Factor
 from kros.identify.refine import RefineOptions, refine_population
 from kros.identify.refine.barrier import stability_barrier
-from kros.identify.refine.marquardt import minimise
+from kros.identify.refine.marquardt import Evaluate, minimise
 from kros.identify.refine.segments import Segments, held_segments, read_segments
 from kros.lifting import Lifting
 
@@ -95,6 +95,30 @@ def test_search_stays_within_the_constraint_and_finds_both_minima() -> None:
     solution = minimise(evaluate, lambda V: V[:, 0, 0] <= 2.0, np.zeros((2, 1, 1)), 60, 1e-12)
     assert solution.V[0, 0, 0] == pytest.approx(1.0, abs=1e-6)
     assert 1.5 < solution.V[1, 0, 0] <= 2.0
+
+
+def test_problems_that_are_done_are_not_evaluated_any_more() -> None:
+    """min (v^power - 2)^2: the higher the power, the longer the search."""
+    powers, asked = np.array([1.0, 1.0, 1.0, 9.0, 21.0]), []
+
+    def narrowed(rows: np.ndarray) -> Evaluate:
+        def evaluate(V: np.ndarray) -> np.ndarray:
+            asked.append(len(rows))
+            v, power = V[:, 0, 0], powers[rows]
+            J = np.stack([power * v ** (power - 1), 2.0 - v**power], axis=1)
+            return J[:, :, None] * J[:, None, :]
+
+        return evaluate
+
+    everything = narrowed(np.arange(5))
+    whole = minimise(everything, lambda V: V[:, 0, 0] > 0, np.full((5, 1, 1), 2.0), 60, 1e-9)
+    assert set(asked) == {5}
+    asked.clear()
+    fewer = minimise(everything, lambda V: V[:, 0, 0] > 0, np.full((5, 1, 1), 2.0), 60, 1e-9, narrowed)
+    assert min(asked) < 5
+    np.testing.assert_array_equal(whole.V, fewer.V)
+    np.testing.assert_array_equal(whole.matrix, fewer.matrix)
+    np.testing.assert_allclose(whole.V[:, 0, 0] ** powers, 2.0, rtol=1e-6)
 
 
 def test_barrier_is_silent_inside() -> None:

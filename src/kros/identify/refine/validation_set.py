@@ -17,7 +17,8 @@ from .problem import Problem
 from .spread import peak_residual_db
 
 Array = npt.NDArray[np.float64]
-_AT_ONCE = 4_000_000  # numbers of recordings in memory
+_TOGETHER = 32  # episodes, as many as the compiled loop runs side by side
+_AT_ONCE, _LEAST = 1 << 17, 256  # numbers of recordings and samples in a block
 
 
 def free_run_errors(
@@ -36,30 +37,42 @@ def free_run_errors(
     """
     n, h, models = lifting.n_states, lifting.history, len(A)
     rms, reached, top = np.full((models, len(keys), n), np.inf), np.full((models, len(keys), n), np.inf), np.zeros((len(keys), n))
-    episodes = [population.read(key)[: None if validation_samples is None else h + validation_samples] for key in keys]
-    by_length: dict[int, list[int]] = {}
-    for row, episode in enumerate(episodes):
-        by_length.setdefault(len(episode), []).append(row)
-    for length, same in by_length.items():
-        step = max(1, _AT_ONCE // (length * models * episodes[same[0]].shape[1]))
-        for rows in (same[i : i + step] for i in range(0, len(same), step)):
-            data = np.stack([episodes[row] for row in rows])
-            x, u = data[..., :n], data[..., n:]
-            top[rows] = np.abs(x).max(axis=1)
+    for start in range(0, len(keys), _TOGETHER):
+        episodes = {row: population.read(key) for row, key in enumerate(keys[start : start + _TOGETHER], start)}
+        by_length: dict[int, list[int]] = {}
+        for row, episode in episodes.items():
+            length = len(episode) if validation_samples is None else min(len(episode), h + validation_samples)
+            by_length.setdefault(length, []).append(row)
+        for length, rows in by_length.items():
             own = {name: np.tile(values[rows], models) for name, values in parameters.items()}
-            run = free_run(
-                A[:, rows].reshape(-1, *A.shape[2:]),
-                B[:, rows].reshape(-1, *B.shape[2:]),
-                lifting,
-                own,
-                np.tile(x[:, : h + 1], (models, 1, 1)),
-                np.tile(u, (models, 1, 1)),
-            ).reshape(models, *x.shape)
-            with np.errstate(over="ignore", invalid="ignore"):
-                found, far = np.sqrt(np.mean((run - x) ** 2, axis=2)), np.abs(run).max(axis=2)
-            rms[:, rows] = np.where(np.isfinite(found), found, np.inf)
-            reached[:, rows] = np.where(np.isfinite(far), far, np.inf)
+            rms[:, rows], top[rows], reached[:, rows] = _errors(A[:, rows], B[:, rows], lifting, own, [episodes[row][:length] for row in rows])
     return rms, top, reached
+
+
+def _errors(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, Array], episodes: Sequence[Array]) -> tuple[Array, Array, Array]:
+    """Do the same for episodes of one length, in blocks of samples that stay in the cache: a run goes on from its last states."""
+    n, h, (models, units), length = lifting.n_states, lifting.history, A.shape[:2], len(episodes[0])
+    lifting.window.require(length)
+    squares, far, top = np.zeros((n, models, units)), np.zeros((n, models, units)), np.zeros((n, units))
+    all_A, all_B = A.reshape(-1, *A.shape[2:]), B.reshape(-1, *B.shape[2:])
+    first = np.tile(np.stack([e[: h + 1, :n] for e in episodes]), (models, 1, 1))
+    block = max(_LEAST, _AT_ONCE // (models * units * episodes[0].shape[1]))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(0, length - h, block):  # samples k .. stop, of which the last h + 1 are where the next block starts
+            stop = min(k + block, length - h) + h
+            ahead = min(stop + 1, length)
+            u = np.tile(np.stack([e[k:ahead, n:] for e in episodes], axis=-1), (1, 1, models))
+            run = free_run(all_A, all_B, lifting, parameters, first, u.transpose(2, 0, 1))
+            first = run[:, -(h + 1) :]
+            counted = slice(h if k else 0, stop - k)  # what came before was counted with the block before
+            x, states = np.stack([e[k:stop, :n][counted] for e in episodes], axis=-1), run.transpose(1, 2, 0)[counted]
+            error = states.reshape(len(states), n, models, units) - x[:, :, None]
+            squares += np.einsum("kimu,kimu->imu", error, error)
+            far = np.maximum(far, np.abs(states).max(axis=0).reshape(far.shape))
+            top = np.maximum(top, np.abs(x).max(axis=0))
+        rms = np.sqrt(squares / length)
+    rms, far = (np.where(np.isfinite(values), values, np.inf).transpose(1, 2, 0) for values in (rms, far))
+    return rms, top.T, far
 
 
 def find_unbounded(
@@ -78,19 +91,15 @@ def find_unbounded(
     """
     found: dict[int, str] = {}
     flat = [(row, key) for row, episodes in enumerate(keys.values()) for key in episodes]
-    width = max(1, _AT_ONCE // (len(population.channels) * 20_000))
-    for part in (flat[i : i + width] for i in range(0, len(flat), width)):
-        rows = [row for row, _ in part]
-        own = {name: values[rows] for name, values in parameters.items()}
-        _, _, reached = free_run_errors(
-            A[None, rows], B[None, rows], lifting, own, population, [key for _, key in part], validation_samples
+    rows = [row for row, _ in flat]
+    own = {name: values[rows] for name, values in parameters.items()}
+    _, _, reached = free_run_errors(A[None, rows], B[None, rows], lifting, own, population, [key for _, key in flat], validation_samples)
+    for which, state in np.argwhere(~(reached[0] <= limit)):
+        row, key = flat[which]
+        found.setdefault(
+            row,
+            f"the free run over {key} reaches {reached[0, which, state]:.3g} in {lifting.states[state]!r}, beyond {limit[state]:.3g}",
         )
-        for which, state in np.argwhere(~(reached[0] <= limit)):
-            row, key = part[which]
-            found.setdefault(
-                row,
-                f"the free run over {key} reaches {reached[0, which, state]:.3g} in {lifting.states[state]!r}, beyond {limit[state]:.3g}",
-            )
     return found
 
 

@@ -117,6 +117,21 @@ class Work:
         """Run independent pieces of work, in order."""
         return list(self.map(title, _call, work))
 
+    def begin(self, title: str, work: Iterable[Callable[[], T]]) -> Callable[[], list[T]]:
+        """Begin independent pieces of work, and return what waits for their results, in order: work that is asked for meanwhile runs beside them."""
+        pieces = list(work)
+        running = self.executor.map(_call, pieces)
+
+        def results() -> list[T]:
+            self.progress.start(title, len(pieces))
+            found = []
+            for result in running:
+                self.progress.advance()
+                found.append(result)
+            return found
+
+        return results
+
 
 def _call(work: Callable[[], T]) -> T:
     return work()

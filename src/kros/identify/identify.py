@@ -8,7 +8,7 @@ in the condition that feeds synthesis --refined on free-run error--> koopman, li
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -43,6 +43,7 @@ _DOUBLINGS = 12
 _POINTS = 60  # frequencies at which the models of units are compared
 Array = npt.NDArray[np.float64]
 Task = tuple[Population, tuple[EpisodeKey, ...], Lifting]
+Refining = Callable[[], tuple[list[ModelSet], dict[str, RefinedModels]]]
 
 
 def identify(
@@ -123,9 +124,12 @@ def identify(
             facts.identify_on,
         )
     sets, factors, refined = dict[str, ModelSet](), dict[str, EpisodeFactors](), dict[str, RefinedModels]()
+    first = sorted(base.conditions, key=lambda c: c != facts.identify_on)  # its models are refined while the others are identified
+    identified = {condition: identify_condition(base, condition, asked, work) for condition in first}
     for condition in base.conditions:
-        factors[condition], models, found_out = identify_condition(base, condition, asked, work)
-        sets |= {base.place(m.name, condition): m for m in models}
+        factors[condition], models, refining = identified[condition]
+        better, found_out = refining()
+        sets |= {base.place(m.name, condition): m for m in (*models, *better)}
         refined |= found_out
     refined_kinds = tuple(kind.name for kind in kinds_for(found, refined=True)) if asked.refine else ()
     return replace(base, kinds=refined_kinds + base.edmd_kinds, sets=sets, factors=factors, refined=refined)
@@ -133,22 +137,21 @@ def identify(
 
 def identify_condition(
     base: IdentifiedModels, condition: str, settings: IdentifySettings, work: Work
-) -> tuple[EpisodeFactors, list[ModelSet], dict[str, RefinedModels]]:
-    """Reduce the training episodes of one condition, and identify every kind of model from them."""
+) -> tuple[EpisodeFactors, list[ModelSet], Refining]:
+    """Reduce the training episodes of one condition, identify every kind of model from them, and begin to refine those that feed synthesis."""
     population, facts, own = base.population, base.facts, base.parameters
     units = [u for u in facts.groups if u in own and facts.keys("train", u, condition)]
     tasks = [(population.select([u], [condition]), facts.keys("train", u, condition), base.lifting) for u in units]
     episodes = list(work.recall(f"identify ({condition})", reduce_episodes, tasks, factor_marks(facts, tasks), (Factor,)))
     factor = Factor.stack([combine(f) for f in episodes])
     parameters = {name: np.array([own[u][name] for u in units]) for name in base.lifting.parameters}
-    models, refined = identify_models(base, condition, units, factor, parameters, settings), dict[str, RefinedModels]()
-    if settings.refine and condition == facts.identify_on:
-        better, refined = refine_models(base, units, factor, parameters, models, settings, work)
-        models += better
     longest_s = max(int(f.n_samples.max()) for f in episodes) * population.sample_period_s
+    models = [replace(m, longest_s=longest_s) for m in identify_models(base, condition, units, factor, parameters, settings)]
+    wanted = settings.refine and condition == facts.identify_on
+    refining = begin_refinement(base, units, factor, parameters, models, settings, work) if wanted else _not_refined
     rows = tuple((k.unit, k.episode) for u in units for k in facts.keys("train", u, condition))
     together = Factor(*(np.concatenate([getattr(f, name) for f in episodes]) for name in ("R", "peak", "n_samples")))
-    return EpisodeFactors(condition, rows, together), [replace(m, longest_s=longest_s) for m in models], refined
+    return EpisodeFactors(condition, rows, together), models, refining
 
 
 def factor_marks(facts: RecordingFacts, tasks: Iterable[Task]) -> list[str | None]:
@@ -245,7 +248,7 @@ def alpha_factor(shared: list[tuple[Array, int]], edge: float, settings: Identif
     return settings.alpha_factor
 
 
-def refine_models(
+def begin_refinement(
     base: IdentifiedModels,
     units: list[str],
     factor: Factor,
@@ -253,8 +256,8 @@ def refine_models(
     starts: list[ModelSet],
     settings: IdentifySettings,
     work: Work,
-) -> tuple[list[ModelSet], dict[str, RefinedModels]]:
-    """Refine every kind of model on free-run error, the population first, then each unit with a prior centred on it.
+) -> Refining:
+    """Begin to refine every kind of model on free-run error, the population first, then each unit with a prior centred on it.
 
     Beside the models come what the refinement found out: the pooled model, the trade-off, the information matrices.
     """
@@ -267,13 +270,21 @@ def refine_models(
         partial(refine_population, base.population, keys, start.lifting, start.parameters, lifted, pooled, refine_options(settings))
         for start, lifted in zip(starts, factors, strict=True)
     ]
-    refined = work.run("identify (refine)", tasks)
-    kinds = kinds_for(base.lifting, refined=True)
-    models = [
-        with_matrices(start, kind.name, found.units, lifted)
-        for kind, start, found, lifted in zip(kinds, starts, refined, factors, strict=True)
-    ]
-    return models, {m.name: found for m, found in zip(models, refined, strict=True)}
+    results = work.begin("identify (refine)", tasks)
+
+    def refining() -> tuple[list[ModelSet], dict[str, RefinedModels]]:
+        refined, kinds = results(), kinds_for(base.lifting, refined=True)
+        models = [
+            with_matrices(start, kind.name, found.units, lifted)
+            for kind, start, found, lifted in zip(kinds, starts, refined, factors, strict=True)
+        ]
+        return models, {m.name: found for m, found in zip(models, refined, strict=True)}
+
+    return refining
+
+
+def _not_refined() -> tuple[list[ModelSet], dict[str, RefinedModels]]:
+    return [], {}
 
 
 def refine_options(settings: IdentifySettings) -> RefineOptions:

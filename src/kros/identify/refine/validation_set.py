@@ -45,7 +45,9 @@ def free_run_errors(
             by_length.setdefault(length, []).append(row)
         for length, rows in by_length.items():
             own = {name: np.tile(values[rows], models) for name, values in parameters.items()}
-            rms[:, rows], top[rows], reached[:, rows] = _errors(A[:, rows], B[:, rows], lifting, own, [episodes[row][:length] for row in rows])
+            rms[:, rows], top[rows], reached[:, rows] = _errors(
+                A[:, rows], B[:, rows], lifting, own, [episodes[row][:length] for row in rows]
+            )
     return rms, top, reached
 
 

@@ -158,7 +158,7 @@ def quantify(models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: 
         return quantify_systems(models, *arguments, **settings)
     models = require_kind(models, IdentifiedModels, "Quantify", "identify the population first, kros.identify(population)")
     asked = UncertaintySettings.of(settings, "Quantify")
-    outliers, scores = score_population(models, asked)
+    outliers, scores = score_population(models, asked, work)
     dropped = {row["unit"] for row in scores if row["outlier"]} if asked.drop_outliers else set()
     first = models.models()
     modelled = set(first.unit_ids) - dropped

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ...identify.identified import IdentifiedModels
+from ...core.work import Work
+from ...identify import ModelSet
+from ...identify.identified import EpisodeFactors, IdentifiedModels
 from ..settings import UncertaintySettings
 from .model import OutlierModel, score_outliers, scored_frequencies
 from .recorded import Recorded
@@ -17,7 +20,9 @@ from .score import OutlierScore
 log = logging.getLogger(__name__)
 
 
-def score_population(models: IdentifiedModels, settings: UncertaintySettings) -> tuple[dict[str, OutlierModel], list[dict[str, Any]]]:
+def score_population(
+    models: IdentifiedModels, settings: UncertaintySettings, work: Work | None = None
+) -> tuple[dict[str, OutlierModel], list[dict[str, Any]]]:
     """Score every unit against the others in every condition, whatever group it is filed under.
 
     Returns
@@ -27,36 +32,41 @@ def score_population(models: IdentifiedModels, settings: UncertaintySettings) ->
     list of dict
         One row a score, see `score_row`.
     """
-    found: dict[str, OutlierModel] = {}
-    rows: list[dict[str, Any]] = []
-    for condition in models.population.conditions:
-        place = models.place(models.edmd_kinds[0], condition)
-        if place not in models.sets:
-            continue
-        own = models.sets[place]
+    places = {condition: models.place(models.edmd_kinds[0], condition) for condition in models.population.conditions}
+    known = {condition: models.sets[place] for condition, place in places.items() if place in models.sets}
+    for condition, own in known.items():
         if len(own.unit_ids) < 3:
             log.info("%s: outlier scores need at least three units, found %d", condition, len(own.unit_ids))
-            continue
-        freqs = scored_frequencies(own.frequencies(settings.n_freqs))
-        recorded = Recorded.of(models.factors[condition], own, freqs)
-        evidence = list(recorded.units.values())
-        outliers = score_outliers(
-            recorded.response(evidence),
-            freqs,
-            settings.outlier_form,
-            unit_ids=own.unit_ids,
-            output_scale=own.output_scale,
-            input_scale=own.input_scale,
-            false_alarm_rate=settings.false_alarm_rate,
-            deviations=recorded.all_deviations(),
-        )
-        qualified = tuple(recorded.qualified(*pair) for pair in zip(outliers.scores, evidence, strict=True))
-        found[place] = outliers = replace(outliers, scores=qualified)
-        for score, data in zip(outliers.scores, evidence, strict=True):
+    scored = {condition: own for condition, own in known.items() if len(own.unit_ids) >= 3}
+    tasks = [partial(score_condition, models.factors[condition], own, settings) for condition, own in scored.items()]
+    rows: list[dict[str, Any]] = []
+    found: dict[str, OutlierModel] = {}
+    for condition, (outliers, samples) in zip(scored, (work or Work()).run("score outliers", tasks), strict=True):
+        found[places[condition]] = outliers
+        for score, count in zip(outliers.scores, samples, strict=True):
             keys, used = (models.facts.keys(part, score.unit, condition) for part in ("test", "train"))
-            seconds = data.n_samples * own.sample_period_s * (1 + len(keys) / len(used))  # episodes that are held out, like the others
+            seconds = count * scored[condition].sample_period_s * (1 + len(keys) / len(used))  # episodes that are held out, like the others
             rows.append(score_row(score, condition, len(keys) + len(used), seconds))
     return found, rows
+
+
+def score_condition(factors: EpisodeFactors, models: ModelSet, settings: UncertaintySettings) -> tuple[OutlierModel, list[int]]:
+    """Score all units in one condition; with every unit's number of samples."""
+    freqs = scored_frequencies(models.frequencies(settings.n_freqs))
+    recorded = Recorded.of(factors, models, freqs)
+    evidence = list(recorded.units.values())
+    outliers = score_outliers(
+        recorded.response(evidence),
+        freqs,
+        settings.outlier_form,
+        unit_ids=models.unit_ids,
+        output_scale=models.output_scale,
+        input_scale=models.input_scale,
+        false_alarm_rate=settings.false_alarm_rate,
+        deviations=recorded.all_deviations(),
+    )
+    qualified = tuple(recorded.qualified(*pair) for pair in zip(outliers.scores, evidence, strict=True))
+    return replace(outliers, scores=qualified), [data.n_samples for data in evidence]
 
 
 def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:

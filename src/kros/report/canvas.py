@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from math import ceil, floor, log10
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 from urllib.parse import quote
 
 import numpy as np
@@ -36,7 +37,39 @@ def grid(rows: int, columns: int, row_height_in: float, **options: Any) -> tuple
     layout = ConstrainedLayoutEngine(w_pad=0.05, h_pad=0.05, wspace=0.02, hspace=0.02)
     figure = Figure(figsize=(WIDTH_IN, rows * row_height_in + 0.06), layout=layout)
     ratios = {key: options.pop(key) for key in ("width_ratios", "height_ratios") if key in options}
-    return figure, figure.subplots(rows, columns, squeeze=False, **ratios, **options)
+    panels = figure.subplots(rows, columns, squeeze=False, **ratios, **options)
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            _copy_ticks(axis)
+    return figure, panels
+
+
+def _copy_ticks(axis: Axis) -> None:
+    """Let an axis copy its first tick: each is five artists, and most of the time goes into looking up how they all look."""
+    vars(axis).update(_get_tick=partial(_another_tick, axis), _copy_tick_props=_leave)
+
+
+def _another_tick(axis: Any, major: bool) -> Any:
+    known = axis.majorTicks if major else axis.minorTicks
+    return _twin(known[0]) if known else type(axis)._get_tick(axis, major)
+
+
+def _leave(*_: Any) -> None:
+    """A copy has the properties of the first tick already."""
+
+
+def _twin(tick: Any) -> Any:
+    """A tick like another, to be put somewhere else."""
+    parts = {name: _shallow(getattr(tick, name)) for name in ("tick1line", "tick2line", "gridline", "label1", "label2")}
+    for name in ("label1", "label2"):
+        parts[name].set_fontproperties(parts[name].get_fontproperties())  # its own, which may become bold
+    return _shallow(tick, **parts)
+
+
+def _shallow(artist: Any, **changed: Any) -> Any:
+    found = object.__new__(type(artist))
+    vars(found).update(vars(artist), **changed)
+    return found
 
 
 def settle(figure: Figure) -> None:
@@ -44,8 +77,9 @@ def settle(figure: Figure) -> None:
     engine = figure.get_layout_engine()
     if engine is None:
         return
+    renderer = cast(Any, figure)._get_renderer()  # one for all, which knows the texts that it has measured
     for axes in figure.axes:
-        _measure_once(axes)
+        _measure_once(axes, renderer)
     engine.execute(figure)
     for axes in figure.axes:
         _draw_unmeasured(axes)
@@ -54,7 +88,7 @@ def settle(figure: Figure) -> None:
         del axes.get_tightbbox
 
 
-def _measure_once(axes: Axes) -> None:
+def _measure_once(axes: Axes, renderer: Any) -> None:
     """Let an axes tell its size with ticks and labels from one measurement: the layout asks twice, and most of its time goes there.
 
     Ticks stay those that were measured; others might have wider labels.
@@ -67,7 +101,7 @@ def _measure_once(axes: Axes) -> None:
     for axis in (axes.xaxis, axes.yaxis):
         if not axis.label.get_text():
             axis.set_label_coords(0, 0)
-    whole = axes.get_tightbbox(for_layout_only=True)
+    whole = axes.get_tightbbox(renderer, for_layout_only=True)
     around = np.zeros(4) if whole is None else np.subtract(whole.extents, axes.bbox.extents)
     for axis in (axes.xaxis, axes.yaxis):
         if isinstance(axis.get_major_locator(), AutoLocator):

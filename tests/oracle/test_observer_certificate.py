@@ -19,7 +19,7 @@ from kros.observer import Observer, run_observer
 from kros.observer.certificate.certificate import ReliftCertificate, relift_certificate
 from kros.observer.certificate.error import ErrorSystem, ReliftScales, error_system
 from kros.observer.certificate.multipliers import _Barrier, best_multipliers
-from kros.observer.certificate.proof import _positive, margin, proven
+from kros.observer.certificate.proof import _clearly_positive, _eliminated, _positive, margin, proven
 from kros.observer.certificate.report import relift_report
 from kros.observer.certificate.sdp import sdp_proposal
 from kros.observer.certificate.search import growing_sequence
@@ -277,6 +277,22 @@ def test_definiteness_of_large_integers_is_that_of_their_determinant(share: floa
     F = np.array([[sizes[0], off, 0], [off, sizes[1], 1], [0, 1, sizes[2]]], dtype=object)
     assert (sizes[0] * sizes[1] > off**2) == (positive or share == 1)  # the root is rounded down, by less than can be told
     assert _positive(F) == positive
+
+
+@pytest.mark.parametrize("least", [1e-2, 1e-9, 1e-12, 1e-14, 1e-17, 0.0, -1e-17, -1e-14, -1e-9])
+def test_what_is_clearly_positive_is_so_by_elimination(least: float) -> None:
+    """Matrices whose least eigenvalue is prescribed, but for the rounding of entries, in integers of 96 bits."""
+    clearly = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        Q = np.linalg.qr(rng.standard_normal((8, 8)))[0]
+        M = (Q * np.append(rng.uniform(0.1, 1.0, 7), 1e-18)) @ Q.T
+        F = np.array([[int(np.ldexp(M[i, j], 96)) for j in range(8)] for i in range(8)], dtype=object)
+        F = np.tril(F) + np.tril(F, -1).T + int(np.ldexp(least, 96)) * np.eye(8, dtype=int).astype(object)
+        clearly.append(_clearly_positive(F))
+        assert _eliminated(F) or not clearly[-1]
+    assert all(clearly) == any(clearly) == (least >= 1e-12)  # what rounding may decide is left to elimination
+    assert not _clearly_positive(np.array([[1, 1 << 2000], [1 << 2000, 1]], dtype=object))
 
 
 @pytest.mark.parametrize("seed", range(3))

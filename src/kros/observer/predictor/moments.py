@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ...core.errors import DataError, DimensionError
 from ...core.linalg import least_squares
@@ -260,20 +261,18 @@ class PastMoments:
         """Solve the normal equations of rows that count by shares, shape (row, h) of sum one for every hidden state."""
         channels, power = self.n_channels, np.sum(share * self.power[rows], axis=0)
 
-        def pooled(own: Array) -> Array:
-            every = np.zeros(len(self.gram))  # rows that take no part count nothing: no copy of the others
-            every[rows] = own
-            P = np.asarray(np.tensordot(every, self.gram, 1))
+        every = np.zeros((share.shape[1] + 1, len(self.gram)))  # rows that take no part count nothing: no copy of the others
+        every[0, rows], every[1:, rows] = share.mean(axis=1), share.T
+        alike = bool(np.allclose(every[1:], every[0]))
+        pooled = np.tensordot(every[:1] if alike else every, self.gram, 1)
+        for P in pooled:
             for channel in range(channels - len(self.lifting.functions), channels):
                 of_one = np.arange(channel, self.basis.delays * channels, channels)
                 P[np.ix_(of_one, of_one)] *= 1 + deviation**2
-            return P
-
-        P = pooled(share.mean(axis=1))
+        P = pooled[0]
         W, left, size = np.empty((share.shape[1], len(P))), np.empty(share.shape[1]), self._channel_sizes(P)
         for column, own in enumerate(share.T):
-            cross = np.tensordot(own, self.cross[rows][..., column], 1)
-            mine = P if np.allclose(own, share.mean(axis=1)) else pooled(own)
+            cross, mine = np.tensordot(own, self.cross[rows][..., column], 1), pooled[0 if alike else column + 1]
             W[column] = _ridge(mine / np.outer(size, size), (cross / size)[:, None], self.basis, channels)[0] / size
             missed = power[column] - 2 * W[column] @ cross + W[column] @ mine @ W[column]
             left[column] = np.sqrt(max(missed, _NEGLIGIBLE * power[column]))
@@ -396,11 +395,18 @@ def _channels(lifting: Lifting, measured: tuple[int, ...], static: Array, free: 
 
 def _basis_states(basis: Basis, z: Array, rows: npt.NDArray[np.intp], slow: int) -> Array:
     """States s of one episode at some samples: delays of all channels, then lags of the first few, shape (rows, N)."""
-    delayed = [z[np.maximum(rows - j, 0)] for j in range(1, basis.delays + 1)]
-    first = z[:1, :slow]  # what came before is taken to have been constant, as for delays
-    none, moved = np.zeros(slow), (z[:, :slow] - first).T
-    lags = [filtered(np.sqrt(1 - p**2) * moved, none, -p, 0.0)[0].T[rows] + np.sqrt(1 - p**2) / (1 - p) * first for p in basis.poles]
-    return np.concatenate([*delayed, *lags], axis=1)
+    count, channels = basis.delays, z.shape[1]
+    found = np.empty((len(rows), count * channels + len(basis.poles) * slow))
+    # What came before is taken to have been constant.
+    windows = sliding_window_view(np.concatenate([np.repeat(z[:1], count, axis=0), z]), (count, channels))[:, 0]
+    found[:, : count * channels] = windows[rows, ::-1].reshape(len(rows), -1)
+    first, none = z[:1, :slow], np.zeros(slow)
+    moved = (z[:, :slow] - first).T
+    for i, p in enumerate(basis.poles):
+        at = count * channels + i * slow
+        held = filtered(np.sqrt(1 - p**2) * moved, none, -p, 0.0)[0]
+        found[:, at : at + slow] = held.T[rows] + np.sqrt(1 - p**2) / (1 - p) * first
+    return found
 
 
 def _ridge(P: Array, cross: Array, basis: Basis, channels: int) -> Array:

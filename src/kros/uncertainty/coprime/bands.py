@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ Array = npt.NDArray[Any]
 BANDS = 96
 _ROUNDING = 1e-13  # of a channel's energy: correlations by FFT and their sums with weights below 2 / lag
 _AT_ONCE, _BLOCK = 2_000_000, 2048  # lags of signals in memory at a time, and those whose weights are
+_BLOCKS = 4  # of weights that are kept
 _ITERATIONS, _TURNS = 60, 10  # at most; after so many it is looked which bands can be left
 _ENOUGH = 1.002  # of what is covered
 _REGULAR = 1e-14  # of the largest eigenvalue: what is smaller is rounding
@@ -236,10 +238,17 @@ def _integrals(lags: Array, edges: Array) -> Array:
     lags = lags.reshape(batch, n_samples, n * n)
     even, odd = np.zeros((2, batch, len(edges), n * n))
     for start in range(1, n_samples, _BLOCK):
-        lag = np.arange(start, min(start + _BLOCK, n_samples))
-        angle = edges[:, None] * lag
-        even += (np.sin(angle) / lag) @ lags[:, start : start + _BLOCK]
-        odd += (2 * np.sin(angle / 2) ** 2 / lag) @ lags[:, start : start + _BLOCK]
+        by_even, by_odd = _weights(edges.tobytes(), start, min(start + _BLOCK, n_samples))
+        even += by_even @ lags[:, start : start + _BLOCK]
+        odd += by_odd @ lags[:, start : start + _BLOCK]
     even, odd = (v.reshape(batch, len(edges), n, n) for v in (even, odd))
     whole = edges[:, None, None] * lags[:, :1].reshape(batch, 1, n, n)
     return whole + even + np.swapaxes(even, -1, -2) - 1j * (odd - np.swapaxes(odd, -1, -2))
+
+
+@lru_cache(maxsize=_BLOCKS)
+def _weights(edges: bytes, start: int, stop: int) -> tuple[Array, Array]:
+    """Return the integrals of cosines and sines of some lags from zero to every edge; recordings of one length share them."""
+    lag = np.arange(start, stop)
+    angle = np.frombuffer(edges)[:, None] * lag
+    return np.sin(angle) / lag, 2 * np.sin(angle / 2) ** 2 / lag

@@ -27,7 +27,7 @@ from ..observer import (
     signal_bound,
     with_internal,
 )
-from ..observer.certificate.report import ReliftRow, relift_report
+from ..observer.certificate.report import ReliftRow, course, relift_report
 from ..observer.residual.one_step import one_step_residual
 from ..observer.units import factors
 from ..uncertainty.coprime.bands import BandEnergies
@@ -132,14 +132,17 @@ def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignT
     if batch.lost is not None:  # bounds are for measurements that arrive
         y = batch.measurements(first.measured, arrived=False)
         arrived = run_observers(observers, y, batch.inputs, first.own(batch.parameters))
-    rows = [relift_report(c, o, batch, x) if c.certified else [] for o, c, x in zip(observers, certificates, arrived, strict=True)]
     errors = [data.compare(estimates), *(other.percent_of_all(observers) for other in others)]
     hidden = np.exp(np.mean([np.log(hidden_mean(percent, first.measured)) for percent in errors], axis=0))
     dropout = dropout_error_percent(observers, data, task.models.sample_period_s)
     rates = [task.sensor.get(first.lifting.states[i], Sensor()).dropout for i in first.measured]
     lost = [dropout_bound(c, o, rates) if any(rates) else None for o, c in zip(observers, certificates, strict=True)]
     known: dict[bytes, BandEnergies] = {}
-    bounds = [signal_bound(c, o, batch, x, known) for o, c, x in zip(observers, certificates, arrived, strict=True)]
+    rows, bounds = [], []
+    for o, c, x in zip(observers, certificates, arrived, strict=True):
+        seen = course(o, batch, x)
+        rows.append(relift_report(c, o, batch, x, seen) if c.certified else [])
+        bounds.append(signal_bound(c, o, batch, x, known, seen))
     bounds = [b.in_sizes(factors(o, {})[0][: len(b.states)]) for o, b in zip(observers, bounds, strict=True)]
     certificates = [c.in_sizes(o, {}) for o, c in zip(observers, certificates, strict=True)]
     found = zip(observers, certificates, rows, hidden, dropout, bounds, lost, strict=True)

@@ -66,6 +66,7 @@ def relift_report(
     observer: ObserverData,
     batch: EpisodeBatch,
     estimates: Array | None = None,
+    seen: Course | None = None,
 ) -> list[ReliftRow]:
     """Compare bounds and errors, episode by episode; recorded states stand for the true ones, so their noise is part of the residual.
 
@@ -80,10 +81,12 @@ def relift_report(
     batch : EpisodeBatch
     estimates : ndarray, shape (n_samples, batch, n), optional
         What `run_observer` returned; it is run where they are missing.
+    seen : Course, optional
+        What `course` found for these, where it is known already.
     """
     if certificate.gain is None:
         raise DimensionError(f"Re-lift report of observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")
-    seen, lengths, scales = course(observer, batch, estimates), batch.lengths, certificate.scales
+    seen, lengths, scales = seen or course(observer, batch, estimates), batch.lengths, certificate.scales
     with np.errstate(divide="ignore", invalid="ignore"):
         w = np.concatenate([seen.omega / scales.residual, seen.noise / scales.noise], axis=-1)
     w[np.isnan(w)] = 0.0  # what has no size has no part in the certificate

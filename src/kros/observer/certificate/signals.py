@@ -147,6 +147,7 @@ def signal_bound(
     batch: EpisodeBatch,
     estimates: Array | None = None,
     known: dict[bytes, BandEnergies] | None = None,
+    seen: Course | None = None,
 ) -> SignalBound:
     """Bound the errors of an observer for signals like those of recorded episodes.
 
@@ -161,6 +162,8 @@ def signal_bound(
         Of `run_observer` for these measurements; it is run where they are missing.
     known : dict, optional
         Energies that were found already, for observers of one model: filled here.
+    seen : Course, optional
+        What `course` found for these, where it is known already.
 
     Returns
     -------
@@ -183,7 +186,7 @@ def signal_bound(
     >>> bool((bound.errors <= bound.bounds).all())
     True
     """
-    seen = course(observer, batch, estimates)
+    seen = seen or course(observer, batch, estimates)
     n, within, inside = len(observer.recorded), None, seen.taken(observer)
     if observer.runtime.clipped_states(observer.lifting.n_states):
         free = replace(observer, runtime=replace(observer.runtime, lower=None, upper=None))

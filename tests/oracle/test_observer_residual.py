@@ -6,7 +6,7 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from kros.core import StateSpace
 from kros.lifting import Lifting
-from kros.observer.residual.one_step import mean_error_dynamics, one_step_residual, residual_spectra
+from kros.observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_residual, residual_spectra
 from kros.synthesis import Injection, ResidualProblem, Status, kalman, residual_h2
 from kros.synthesis.residual_shaped.shaping_filter import Basis, shaping_filter
 
@@ -258,7 +258,7 @@ def test_mean_error_dynamics_by_differences():
     rng = np.random.default_rng(7)
     states, inputs, values = rng.standard_normal((50, 2, 2)), np.zeros((50, 2, 1)), {"phase": np.array([0.2, 1.0])}
     dynamics = rng.standard_normal((4, 4))
-    found = mean_error_dynamics(lifting, dynamics, states, inputs, values)
+    found = mean_error_dynamics(dynamics, mean_slopes(lifting, states, inputs, values))
     step = 1e-6
     for i in range(2):
         moved = states + step * np.eye(2)[i]

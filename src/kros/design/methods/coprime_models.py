@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
-from ...observer.residual.one_step import mean_error_dynamics
+from ...observer.residual.one_step import mean_error_dynamics, mean_slopes
 from ...synthesis import Injection, ObserverProblem, Synthesis, worst_case_h2, worst_case_hinf
 from ...uncertainty import Form
 from ...uncertainty.coprime.bands import BandEnergies, band_edges
@@ -59,7 +59,7 @@ def coprime_problem(task: DesignTask, data: ValidationSet, A: Array, B: Array) -
     rows = [models.index(unit) for unit in task.covered]
     own = models.A[rows, :n], models.B[rows, :n]
     differences = ModelDifferences.of(A[:n], B[:n], own, task.covered, driven(task, data), dt, max_order=task.max_order)
-    F = mean_error_dynamics(models.lifting, A, batch.states, batch.inputs, batch.parameters)
+    F = mean_error_dynamics(A, mean_slopes(models.lifting, batch.states, batch.inputs, batch.parameters))
     return differences, as_problem(differences, F, task.selector[:, :n], task.noise, task.settings.penalty)
 
 

@@ -12,7 +12,7 @@ from ...core.errors import SynthesisError
 from ...core.lti import gain
 from ...observer.baselines.kalman import kalman_candidates, luenberger_candidates, noise_covariances
 from ...observer.residual.models import Refitted, refitted_models
-from ...observer.residual.one_step import mean_error_dynamics, one_step_covariance
+from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_covariance
 from ...synthesis import Synthesis, kalman
 from ..task import DesignResult, DesignTask, without_correction
 from ..validation import ValidationSet, hidden_mean
@@ -43,9 +43,9 @@ def design_kalman_tuned(task: DesignTask) -> DesignResult:
     nominal = models.index(task.unit)
     refitted, residual = refitted_models(lifting, models.A[nominal], models.B[nominal], models.measured, batch)
     covariance = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
-    tried = []
+    tried, slopes = [], mean_slopes(lifting, batch.states, batch.inputs, batch.parameters)
     for model in refitted:
-        dynamics = mean_error_dynamics(lifting, model.A, batch.states, batch.inputs, batch.parameters)
+        dynamics = mean_error_dynamics(model.A, slopes)
         shapes = {RESIDUAL: covariance[np.ix_(model.columns, model.columns)]} | ({} if model.rows else {EQUAL: models.output_scale[:n]})
         for name, shape in shapes.items():
             for level, found in kalman_candidates(dynamics, task.selector[:, :n], shape, R, models.sample_period_s):

@@ -23,7 +23,7 @@ from ...core.norms import hinf_norm
 from ...observer import Observer, Runtime, relift_certificate, tune_observer
 from ...observer.certificate.signals import SignalBound, signal_bound
 from ...observer.residual.models import refitted_models
-from ...observer.residual.one_step import mean_error_dynamics, one_step_residual, residual_spectra
+from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_residual, residual_spectra
 from ...observer.residual.signal_bounds import signal_lower_bounds
 from ...synthesis import Injection, ObserverProblem, ResidualProblem, Status, Synthesis, hinf, residual_h2
 from ...synthesis.problem.plants import shaped_plant
@@ -95,8 +95,8 @@ def design_for_signals_in_hinf(task: DesignTask) -> DesignResult:
     """
     began, data = time.perf_counter(), task.training.read()
     best, facts = chosen(task, data)
-    models, n, observer, dt = task.models, task.models.lifting.n_states, best.observer, task.models.sample_period_s
-    F = mean_error_dynamics(models.lifting, observer.A, data.batch.states, data.batch.inputs, data.batch.parameters)
+    models, batch, n, observer, dt = task.models, data.batch, task.models.lifting.n_states, best.observer, task.models.sample_period_s
+    F = mean_error_dynamics(observer.A, mean_slopes(models.lifting, batch.states, batch.inputs, batch.parameters))
     W_L = shaping_filter(signals_of(certified_on(task), observer).spectrum(_POINTS), _SMALL, dt)
     hidden = [i for i in range(n) if i not in models.measured] or list(range(n))
     one, nothing = gain(np.eye(n), dt), gain(np.zeros((1, 0)), dt)
@@ -166,7 +166,7 @@ def chosen(task: DesignTask, data: ValidationSet) -> tuple[Candidate, dict[str, 
 def lower_bounds(task: DesignTask, data: ValidationSet, observer: Observer) -> Array:
     """Return the errors that no other correction of an observer's model is certified to stay below, over the ranges."""
     batch, models = data.batch, task.models
-    dynamics = mean_error_dynamics(models.lifting, observer.A, batch.states, batch.inputs, batch.parameters)
+    dynamics = mean_error_dynamics(observer.A, mean_slopes(models.lifting, batch.states, batch.inputs, batch.parameters))
     C = task.selector[:, : models.lifting.n_states]
     return signal_lower_bounds(dynamics, C, task.noise, signals_of(data, observer), models.sample_period_s)
 
@@ -223,7 +223,7 @@ def gains(task: DesignTask, data: ValidationSet, A: Array, B: Array) -> Synthesi
     models, n, batch = task.models, task.models.lifting.n_states, data.batch
     residual = one_step_residual(models.lifting, A, B, batch.states, batch.inputs, batch.parameters)
     spectra = residual_spectra(residual, batch.lengths - 1 - models.lifting.history, batch.units)
-    dynamics = mean_error_dynamics(models.lifting, A, batch.states, batch.inputs, batch.parameters)
+    dynamics = mean_error_dynamics(A, mean_slopes(models.lifting, batch.states, batch.inputs, batch.parameters))
     problem = ResidualProblem(dynamics, task.selector[:, :n], spectra, task.noise, np.ones(n), models.sample_period_s)
     return residual_h2(problem, n_lifted=models.lifting.n_lifted, max_order=MAX_ORDER)
 

@@ -25,7 +25,7 @@ from ...core.linalg import least_squares
 from ...data import EpisodeBatch
 from ...lifting import Lifting
 from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, promised_errors
-from .one_step import mean_error_dynamics, one_step_residual, residual_spectra
+from .one_step import mean_error_dynamics, mean_slopes, one_step_residual, residual_spectra
 
 Array = npt.NDArray[np.float64]
 _MOST_HIDDEN = 3  # beyond it, all hidden states or none are refitted
@@ -173,12 +173,11 @@ def residual_models(
     """
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(range(n))
-    x, u, values = batch.states, batch.inputs, batch.parameters
     refitted, residual = refitted_models(lifting, A, B, measured, batch)
     spectra = residual_spectra(residual, batch.lengths - 1 - lifting.history, batch.units)
-    models = []
+    models, slopes = [], mean_slopes(lifting, batch.states, batch.inputs, batch.parameters)
     for model in refitted:
-        dynamics = mean_error_dynamics(lifting, model.A, x, u, values)
+        dynamics = mean_error_dynamics(model.A, slopes)
         chosen = spectra[..., model.columns, :][..., model.columns]
         promised = promised_errors(ResidualProblem(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, batch.sample_period_s))
         models.append(ResidualModel(model.rows, model.A, model.B, dynamics, chosen, promised))

@@ -58,19 +58,23 @@ def one_step_residual(
     return np.swapaxes(x[:, h + 1 :] - predicted, 0, 1)
 
 
-def mean_error_dynamics(
-    lifting: Lifting, A: Array, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
-) -> Array:
-    """Return the dynamics of the deployed error with the lifted functions' slopes at their mean over recordings, shape (n, n).
+def mean_slopes(lifting: Lifting, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    """Return the lifted functions' slopes by the states at their mean over recordings, shape (p, n).
 
     Parameters as in `one_step_residual`; slopes by earlier values, and of input functions, count as residual.
     """
     n = lifting.n_states
     if not lifting.functions:
-        return A[:n, :n].copy()
+        return np.zeros((0, n))
     values = {name: np.asarray(value, dtype=float)[..., None] for name, value in (parameters or {}).items()}
     slopes = lifting.slopes(lifting.windows(np.swapaxes(states, 0, 1), np.swapaxes(inputs, 0, 1)), values)[..., :n]
-    return A[:n, :n] + A[:n, n:] @ slopes.mean(axis=(0, 1))
+    return np.asarray(slopes.mean(axis=(0, 1)))
+
+
+def mean_error_dynamics(A: Array, slopes: Array) -> Array:
+    """Return the dynamics of the deployed error, shape (n, n), of a model A, shape (n_lifted, n_lifted), with slopes of shape (p, n) (`mean_slopes`)."""
+    n = slopes.shape[1]
+    return np.asarray(A[:n, :n] + A[:n, n:] @ slopes)
 
 
 def one_step_covariance(residual: Array, lengths: npt.ArrayLike) -> Array:

@@ -27,7 +27,7 @@ from ...data import EpisodeBatch
 from ...loops import recursion
 from ...synthesis.result import Injection
 from ..data import ObserverData
-from ..residual.one_step import mean_error_dynamics
+from ..residual.one_step import mean_error_dynamics, mean_slopes
 from ..simulate import run_observer
 from .blocks import blocks_of, moved
 from .gauss_newton import SETTLED, Damping, mean_log, scaled, search, whitening
@@ -112,6 +112,7 @@ class _Tuning:
         self.batch, self.hidden, self.slowest = batch, hidden, np.inf
         self.values = {**observer.parameters, **observer.own(batch.parameters)}
         self.share = np.full(len(hidden), 1 / len(hidden))
+        self.slopes = mean_slopes(observer.lifting, batch.states, batch.inputs, self.values)
 
     def at(self, observer: ObserverData) -> _Point:
         """Run an observer, unless its error dynamics are too slow."""
@@ -166,6 +167,6 @@ class _Tuning:
     def _dynamics(self, observer: ObserverData) -> Array:
         """Mean error dynamics of observer and filter."""
         K, n = observer.controller, observer.lifting.n_states
-        A = mean_error_dynamics(observer.lifting, observer.A, self.batch.states, self.batch.inputs, self.values)
+        A = mean_error_dynamics(observer.A, self.slopes)
         C = np.eye(n)[list(observer.measured)]
         return np.block([[A - K.D[:n] @ C, K.C[:n]], [-K.B @ C, K.A]])

@@ -119,6 +119,26 @@ def test_smallest_alpha_is_the_edge_of_stability():
     assert pole(alpha) == pytest.approx(1, abs=1e-8)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_smallest_alpha_is_that_of_a_search_over_all_models_of_all_units(seed):
+    """One regularisation after the other, from above, and then halved, each by QR of the regularised data; units turn unstable at their own."""
+    rng = np.random.default_rng(seed)
+    factors = []
+    for n in (2, 3):
+        R = np.triu(rng.normal(size=(6, 2 * n + 1, 2 * n + 1)))
+        R[:, :n, n + 1 :] = R[:, :n, :n] @ (rng.uniform(0.9, 1.1, size=(6, 1, 1)) * np.linalg.qr(rng.normal(size=(6, n, n)))[0])
+        factors.append((R, n))
+
+    def stable(exponent):
+        return all(np.all(edmd(R, n, 10**exponent).spectral_radius() < 1 - 1e-3) for R, n in factors)
+
+    high = next(e for e in np.arange(4.0, -12.0, -0.1) if not stable(e)) + 0.1
+    low = high - 0.1
+    for _ in range(40):
+        low, high = (low, (low + high) / 2) if stable((low + high) / 2) else ((low + high) / 2, high)
+    assert smallest_stabilising_alpha(factors, 1e-3) == pytest.approx(10**high, rel=1e-6)
+
+
 def test_no_regularisation_where_none_is_needed():
     factor = lifted_R([simulate(9)], model=Lifting(("position", "velocity")))
     assert smallest_stabilising_alpha([(factor.R, 2)]) == 0.0

@@ -7,9 +7,9 @@ import pytest
 
 from kros.core import StateSpace
 from kros.core.errors import ConfigError, DimensionError
+from kros.core.small_matrices import condition_number, lower_factor
 from kros.uncertainty import Form, bounds, choose_nominal, choose_nominals
 from kros.uncertainty.nominal.choice import frequency_weights
-from kros.uncertainty.small_matrices import condition_number, lower_factor
 
 FORMS = list(Form)
 SHAPES = [(4, 2), (2, 4), (2, 2), (1, 1), (3, 3), (1, 3)]

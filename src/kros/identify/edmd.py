@@ -143,35 +143,72 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
     >>> round(alpha, 3)
     0.02
     """
-
-    def radius(alphas: Array) -> Array:
-        at_once = max(1, _MODELS // max(len(R) for R, _ in factors))
-        parts = [alphas[start : start + at_once] for start in range(0, len(alphas), at_once)]
-        return np.concatenate([_radius(factors, part) for part in parts])
-
+    ridges = [_Ridge.of(R, n) for R, n in factors]
     top = 2 + np.ceil(
         np.log10(max(float(np.linalg.norm(R[..., : -n or None, : -n or None], axis=(-2, -1)).max()) ** 2 for R, n in factors))
     )
     grid = 10.0 ** np.arange(top, top - 2 - _DECADES_BELOW, -1 / _PER_DECADE)
-    stable = radius(grid) < 1 - margin
-    if not stable[0]:
+    at_once = max(1, min(_PER_DECADE, _MODELS // max(len(R) for R, _ in factors)))
+    for start in range(0, len(grid), at_once):
+        unstable = [ridge.unstable(grid[start : start + at_once], margin) for ridge in ridges]
+        found = np.any([own.any(axis=1) for own in unstable], axis=0)
+        if found.any():
+            break
+    else:
+        return 0.0 if _stable_without(factors, margin) else float(grid[-1])
+    first = int(np.argmax(found))
+    if start + first == 0:
         raise IdentificationError(
             f"EDMD: models stay unstable up to alpha = {grid[0]:.1e} with a stability margin of {margin}; lower identify.margin."
         )
-    if stable.all():
-        return 0.0 if _stable_without(factors, margin) else float(grid[-1])
-    first_unstable = int(np.argmin(stable))
-    low, high = np.log10(grid[first_unstable]), np.log10(grid[first_unstable - 1])
+    low, high = np.log10(grid[start + first]), np.log10(grid[start + first - 1])
+    suspects = [ridge.take(own[first]) for ridge, own in zip(ridges, unstable, strict=True)]
     for _ in range(_BISECTIONS):
         middle = (low + high) / 2
-        low, high = (low, middle) if radius(np.array([10**middle]))[0] < 1 - margin else (middle, high)
+        if not _any_unstable(suspects, middle, margin):  # the others are asked where these say nothing
+            if not _any_unstable(ridges, middle, margin):
+                high = middle
+                continue
+            suspects = [ridge.take(ridge.unstable(np.array([10**middle]), margin)[0]) for ridge in ridges]
+        low = middle
     return float(10**high)
 
 
-def _radius(factors: list[tuple[Array, int]], alphas: Array) -> Array:
-    """Return the largest spectral radius of all models at every regularisation."""
-    radii = [edmd(R[None], n, alphas[:, None]).spectral_radius().max(axis=-1) for R, n in factors]
-    return np.asarray(np.max(radii, axis=0))
+@dataclass(frozen=True, eq=False)
+class _Ridge:
+    """Regularised models of units as functions of alpha: with ``R11 = P diag(s) Q^T`` it is ``A^T = Q1 diag(s / (s^2 + alpha)) P^T R12``.
+
+    Parameters
+    ----------
+    left : ndarray, shape (unit, n_lifted, p)
+        The rows Q1 of Q.
+    values : ndarray, shape (unit, p)
+    right : ndarray, shape (unit, p, n_lifted)
+    """
+
+    left: Array
+    values: Array
+    right: Array
+
+    @classmethod
+    def of(cls, R: Array, n_lifted: int) -> _Ridge:
+        p = R.shape[-1] - n_lifted
+        P, values, Q = np.linalg.svd(R[:, :p, :p])
+        return cls(np.ascontiguousarray(np.swapaxes(Q, 1, 2)[:, :n_lifted]), values, np.swapaxes(P, 1, 2) @ R[:, :p, p:])
+
+    def take(self, rows: npt.NDArray[np.bool_]) -> _Ridge:
+        """Return those of some units."""
+        return _Ridge(self.left[rows], self.values[rows], self.right[rows])
+
+    def unstable(self, alphas: Array, margin: float) -> npt.NDArray[np.bool_]:
+        """Tell which models are not stable, shape (alpha, unit)."""
+        shrunk = self.values / np.maximum(self.values**2 + alphas[:, None, None], np.finfo(float).tiny)
+        radius = np.abs(np.linalg.eigvals((self.left * shrunk[..., None, :]) @ self.right)).max(axis=-1, initial=0.0)
+        return np.asarray(~(radius < 1 - margin))
+
+
+def _any_unstable(ridges: list[_Ridge], exponent: float, margin: float) -> bool:
+    return any(bool(ridge.unstable(np.array([10**exponent]), margin).any()) for ridge in ridges)
 
 
 def _stable_without(factors: list[tuple[Array, int]], margin: float) -> bool:

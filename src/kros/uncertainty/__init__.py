@@ -12,6 +12,7 @@ Examples
 ('1', True)
 """
 
+from ..core.small_matrices import sigma_max
 from .fits.magnitude import FittedMagnitude, fit_magnitude, magnitude_tightness
 from .forms import Form, bounds, completion, existence, misfit, rebuild, residual
 from .model import ResponseUncertainty, UncertainModel
@@ -20,7 +21,6 @@ from .outliers.model import OutlierModel, score_outliers
 from .outliers.score import OutlierScore
 from .quantify import UncertainModels, quantify
 from .responses import quantify_responses
-from .small_matrices import sigma_max
 from .systems import quantify_systems
 from .variation import VariationAndNoise, variation_and_noise
 from .weights.cover import Cover, optimal_cover

@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
 from ..core.linalg import adjoint
-from .small_matrices import condition_number, entries_first, entries_last, multiply, pseudo_inverse_first, sigma_max
+from ..core.small_matrices import condition_number, entries_first, entries_last, multiply, pseudo_inverse_first, sigma_max
 
 Array = npt.NDArray[Any]
 E = TypeVar("E", bound=Enum)

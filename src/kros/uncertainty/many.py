@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.lti import StateSpace
+from ..core.small_matrices import sigma_max
 from .forms import completion, misfit, residual
 from .quantification import Bounded, Quantification
-from .small_matrices import sigma_max
 from .weights.certificate import Method, certify
 from .weights.check import Checks, checking_grid
 from .weights.cover import Cover, Structure, cover_ratio

@@ -17,10 +17,10 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from ..core.norms import hinf_norm
+from ..core.small_matrices import sigma_max
 from .bilinear import BilinearAxis
 from .forms import Form, as_form, completion, member, misfit, residual
 from .nominal.choice import Criterion, NominalChoice, choose_nominal, choose_nominals
-from .small_matrices import sigma_max
 from .weights.check import Residuals, between_points
 from .weights.cover import Cover, Structure, as_structure
 from .weights.fit import fit_weight

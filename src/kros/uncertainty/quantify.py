@@ -19,6 +19,7 @@ from ..core.errors import IdentificationError
 from ..core.loading import loader
 from ..core.lti import StateSpace
 from ..core.settings import require_kind
+from ..core.small_matrices import sigma_max
 from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored
@@ -28,7 +29,6 @@ from .nominal.choice import choose_nominals
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
 from .settings import UncertaintySettings
-from .small_matrices import sigma_max
 from .systems import quantify_systems
 
 _KIND, _BEST = "choice", "unit"

@@ -26,9 +26,9 @@ from ..core.artifacts import load_artifact, save_artifact
 from ..core.errors import ConfigError, DataError
 from ..core.frequency import check_grid
 from ..core.loading import check_shapes, loader
+from ..core.small_matrices import sigma_max, squared
 from ..identify import ModelSamples
 from .forms import Form, as_form, residual
-from .small_matrices import sigma_max, squared
 from .validation import check_scale
 
 Array = npt.NDArray[Any]

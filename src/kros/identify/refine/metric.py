@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.linalg import adjoint
+from ...core.small_matrices import entries_last, pseudo_inverse_first
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[Any]
@@ -65,7 +66,7 @@ class ResponsePrior:
         Phi = np.linalg.inv(shifted - W[:, None, :, :n])
         G = Phi @ W[:, None, :, n:] * self.input_scale
         G0 = np.linalg.solve(shifted - self.A, self.B + 0j * z[:, None, None]) * self.input_scale
-        left = np.linalg.pinv(G / self.output_scale[:, None]) / self.output_scale
+        left = entries_last(pseudo_inverse_first(G / self.output_scale[:, None])) / self.output_scale
         E = left @ (G - G0)
         Z = np.concatenate([G, np.broadcast_to(np.diag(self.input_scale), (*G.shape[:2], m, m))], axis=-2)
         return np.asarray(E), np.asarray(left @ Phi), np.asarray(self.T.T @ Z @ (np.eye(m) - E))

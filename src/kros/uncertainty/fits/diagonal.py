@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import KrosError
-from ..small_matrices import entries_first, sigma_max_first
+from ...core.small_matrices import entries_first, sigma_max_first
 from ..weights.cover import Cover, optimal_cover
 from .joint import NEPER_DB, Fitted, JointFit, follow
 from .magnitude import majorant

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.small_matrices import entries_first, lower_factor, multiply, pseudo_inverse_first, sigma_max_first
 from ...identify.refine.minimax import Score, smallest_largest
 from ..forms import Form
-from ..small_matrices import entries_first, lower_factor, multiply, pseudo_inverse_first, sigma_max_first
 
 Array = npt.NDArray[Any]
 

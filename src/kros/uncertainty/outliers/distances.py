@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.small_matrices import entries_first, sigma_max_first, squared
 from ..forms import Form, residual
-from ..small_matrices import entries_first, sigma_max_first, squared
 
 Array = npt.NDArray[Any]
 

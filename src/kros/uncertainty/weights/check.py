@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ...core.frequency import bilinear_squared, dense_grid
 from ...core.lti import StateSpace
-from ..small_matrices import sigma_max
+from ...core.small_matrices import sigma_max
 from .certificate import Certificate, Method, certify
 from .pencils import ResidualSystems
 

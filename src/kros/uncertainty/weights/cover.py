@@ -25,8 +25,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError
+from ...core.small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
 from ..forms import member
-from ..small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
 
 Array = npt.NDArray[Any]
 

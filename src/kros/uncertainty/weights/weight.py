@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace, gain
+from ...core.small_matrices import sigma_max
 from ..fits.diagonal_response import diagonal_response
-from ..small_matrices import sigma_max
 from .certificate import Method
 from .cover import Cover, Perturbation, Structure
 

@@ -11,8 +11,9 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+import re
 import stat
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -23,6 +24,8 @@ from .errors import DataError
 log = logging.getLogger(__name__)
 
 FOLDER, OWN = "stages", "run"
+_PART = r"(?!\.\.?(?:/|\Z))[^/\\:\0]+"
+_ORDINARY = re.compile(f"{_PART}(?:/{_PART})*")  # names that no system reads as anything else
 _SCHEMA, _BLOCK = 1, 1 << 20
 _LARGE = 8 << 20  # bytes; a larger file with the size and time that it was left with is not read again
 
@@ -108,8 +111,8 @@ def _parsed(folder: Path, stage: str, content: Any) -> Record:
     texts = [content["key"], *runs, *(text for table in tables for pair in table.items() for text in pair)]
     if wrong := [text for text in texts if not isinstance(text, str)]:
         raise ValueError(f"{wrong[0]!r} should be a text")
-    for name in (*content["files"], *runs, *content.get("own", {})):
-        place(folder, name)
+    for above in dict.fromkeys(_parts(folder, name)[:-1] for name in (*content["files"], *runs, *content.get("own", {}))):
+        _folder(folder, above)
     return Record(stage, content["key"], seconds, tables[0], tables[1], runs, tables[2])
 
 
@@ -121,16 +124,28 @@ def place(folder: Path, name: str) -> Path:
     DataError
         When the name leads out of the folder, directly or through a link.
     """
-    parts = PurePosixPath(name).parts
-    windows = PureWindowsPath(name)
+    parts = _parts(folder, name)
+    return _folder(folder, parts[:-1]) / parts[-1]
+
+
+def _parts(folder: Path, name: str) -> tuple[str, ...]:
+    """The folders and the file of a name."""
+    if _ORDINARY.fullmatch(name):
+        return tuple(name.split("/"))
+    parts, windows = PurePosixPath(name).parts, PureWindowsPath(name)
     if not parts or ".." in parts or "/".join(parts) != name or windows.anchor or "\0" in name:
         raise DataError(f"Run folder {folder}: {name!r} is not the name of a file inside it.")
+    return parts
+
+
+def _folder(folder: Path, parts: Sequence[str]) -> Path:
+    """The folder below a run folder, none of which is a link."""
     path = folder
-    for part in parts[:-1]:
+    for part in parts:
         path = path / part
         if path.is_symlink():
             raise DataError(f"Run folder {folder}: {path} is a link, and results stay inside the folder; put a folder in its place.")
-    return path / parts[-1]
+    return path
 
 
 def records(folder: Path) -> list[Record]:

@@ -60,8 +60,10 @@ def print_of(values: npt.NDArray[np.float64], channels: Sequence[Channel]) -> Pr
         return Print(digest, np.zeros(0, np.uint64))
     hashes = _stretches(values)
     smallest = np.argpartition(hashes, min(_LOOKED_AT, len(hashes)) - 1)[:_LOOKED_AT]
-    stretches = values[smallest[:, None] + np.arange(STRETCH)][..., states]
-    moving = (np.diff(stretches, axis=1) != 0).sum(axis=1).min(axis=1) >= STRETCH // 2
+    signals = np.ascontiguousarray(values[:, states].T)
+    changes = np.zeros((len(states), len(values)), np.int32)
+    np.cumsum(signals[:, 1:] != signals[:, :-1], axis=1, dtype=np.int32, out=changes[:, 1:])
+    moving = (changes[:, smallest + STRETCH - 1] - changes[:, smallest]).min(axis=0) >= STRETCH // 2
     return Print(digest, np.unique(hashes[smallest[moving]])[:KEPT])
 
 

@@ -209,7 +209,11 @@ def weighted(shares: Array) -> Array:
 
 
 def _decibels(mean_squares: Array, weights: Array) -> Array:
-    return np.asarray((10 * np.log10(np.maximum(mean_squares, 1e-30)) * weights).sum(axis=(-2, -1)) / WEIGHT)
+    """Weighted means of levels, shape (n_samples,), of mean squares of shape (n_samples, q, bands): band by band, as they lie in memory."""
+    level = np.zeros(len(mean_squares))
+    for channel, band in np.argwhere(weights > 0):
+        level += weights[channel, band] * np.log10(np.maximum(mean_squares[:, channel, band], 1e-30))
+    return level * (10 / WEIGHT)
 
 
 def monitor_facts(monitor: Monitor) -> dict[str, Any]:

@@ -132,10 +132,12 @@ typedef struct {
     whole samples;
     whole q;
     whole bands;
-    const double *nu;         /* (samples, machines, q), divided by their size */
+    const double *nu;         /* (samples, machines, q) */
     const uint8_t *judged;    /* (samples, machines): the others hold what was */
     const double *filters;    /* (bands, 3) */
+    const double *size;       /* (q): what innovations are divided by */
     const double *gains;      /* (2): share that the first sample replaces, and the last one */
+    const double *largest;    /* (1): sizes beyond which more says nothing, and what is not a number counts as */
     double *squares;          /* (machines, q, bands, samples) */
 } monitor_job;
 
@@ -695,13 +697,14 @@ int kros_monitor(const monitor_job *s)
                 b[l] = filter[0], a1[l] = filter[1], a2[l] = filter[2];
             }
             const uint8_t *judged = s->judged + i / s->q;
-            const double *nu = s->nu + i;
+            const double *nu = s->nu + i, size = s->size[i % s->q], most = s->largest[0];
             double gain = s->gains[0];
             for (whole k = 0; k < samples; k += TILE) {
                 const whole length = samples - k < TILE ? samples - k : TILE;
                 for (whole j = 0; j < length; j++) {
                     if (judged[(k + j) * s->machines]) {
-                        const vec v = b * nu[(k + j) * signals], band = v + one;
+                        const double of = nu[(k + j) * signals] / size;
+                        const vec v = b * (!(of < most) ? most : of < -most ? -most : of), band = v + one;
                         one = two - a1 * band, two = -v - a2 * band;
                         p += gain * (band * band - p);
                         gain /= 1.0 + gain;

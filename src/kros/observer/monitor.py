@@ -148,15 +148,15 @@ class Monitor:
         ndarray, shape (n_samples, batch, q, bands)
             Perhaps a view with the samples innermost in memory.
         """
-        scaled = innovation / self.size
-        scaled = np.clip(np.where(np.isnan(scaled), LARGEST, scaled), -LARGEST, LARGEST)
         if (loops := library()) is not None:
             samples, machines, q = innovation.shape
             course = np.empty((machines, q, len(self.filters), samples))
-            job = {"machines": machines, "samples": samples, "q": q, "bands": len(self.filters), "nu": scaled, "judged": judged}
-            job |= {"filters": self.filters, "gains": (max(self.first, self.forget), self.forget), "squares": course}
-            loops.call("kros_monitor", ("monitor_job", job))
+            job = {"machines": machines, "samples": samples, "q": q, "bands": len(self.filters), "nu": innovation, "judged": judged}
+            job |= {"filters": self.filters, "size": self.size, "gains": (max(self.first, self.forget), self.forget), "largest": (LARGEST,)}
+            loops.call("kros_monitor", ("monitor_job", job | {"squares": course}))
             return np.moveaxis(course, -1, 0)
+        scaled = innovation / self.size
+        scaled = np.clip(np.where(np.isnan(scaled), LARGEST, scaled), -LARGEST, LARGEST)
         found = np.zeros((*innovation.shape, len(self.filters)))
         for machine in range(innovation.shape[1]):
             taken = np.flatnonzero(judged[:, machine])

@@ -47,36 +47,30 @@ class Sensitivities:
     def __init__(self, blocks: Sequence[Block], resting: Sequence[int]) -> None:
         from scipy.linalg import block_diag
 
-        self._resting = list(resting)
+        F, G, H = joined(blocks)
+        self._resting, self._channels = list(resting), G.shape[1]
         self._reflections = np.repeat([_reflections(b.F) for b in blocks], 2, axis=0)
         A, B = lattice(self._reflections)
-        F, G, H = joined(blocks)
         (n, channels), order = G.shape, len(A)
-        self._order, self._channels = order, channels
         own = np.repeat(np.arange(len(blocks)), [len(b.F) for b in blocks])  # block of every state
-        poles = np.stack([np.resize(np.append(np.linalg.eigvals(b.F), 0.0), 2) for b in blocks])
-
-        def through(right: Array) -> Array:
-            """Solve with every block's characteristic polynomial of A, one eigenvalue at a time, which keeps what slow poles would lose."""
-            first, second = (np.eye(order) - poles[:, i, None, None] * A for i in range(2))
-            return np.asarray(np.linalg.solve(second, np.linalg.solve(first, right)).real)
-
         behind = block_diag(*(b.behind for b in blocks))
-        impulse = through(B[None, :, None])[..., 0]  # (block, order)
-        states = np.einsum("ic,ik->ick", G, impulse[own]) - np.einsum("ic,ik->ick", behind @ G, (impulse @ A.T)[own])  # Y
-        driven = through((A @ states.reshape(-1, order).T)[None])  # (block, order, n * channels)
-        driven = np.stack([driven, A @ driven]).reshape(2, len(blocks), order, n, channels)
-        impulses = np.stack([impulse, impulse @ A.T])
+        solve = _Polynomials(blocks, A)
+        # Channels through a block's filter, now and one sample before, then the states Y, which are sums of these.
+        filtered = solve(B[None, :, None])[..., 0][own]  # (n, order)
+        filtered = np.stack([filtered, filtered @ A.T])
+        states = np.einsum("ic,ik->ick", G, filtered[0]) - np.einsum("ic,ik->ick", behind @ G, filtered[1])
+        # The states through every block's filter again: what an addition of them to a state does.
+        again = solve((A @ states.reshape(-1, order).T)[None])
+        again = np.stack([again, A @ again]).reshape(2, len(blocks), order, n, channels)[:, own]
         share = np.stack([H, -H @ behind])
-        signals = np.zeros((len(H), n, n + channels, channels, order))
-        signals[:, :, :n] = np.einsum("zoi,zikjc->oijck", share, driven[:, own], optimize=True)
-        direct = np.einsum("zoi,zik->oik", share, impulses[:, own])
-        for c in range(channels):
-            signals[:, :, n + c, c] = direct
+        responses = np.zeros((len(H), n, n + channels, channels, order))
+        responses[:, :, :n] = np.einsum("zoi,zikjc->oijck", share, again, optimize=True)
+        responses[:, :, range(n, n + channels), range(channels)] = np.einsum("zoi,zik->oik", share, filtered)[:, :, None]
+        # What was constant before the first sample stays so.
         held = np.linalg.solve(np.eye(n) - F, np.hstack([G, np.eye(n)]))
-        settled, at_rest = H @ held[:, channels:], np.hstack([held[:, :channels].T, np.eye(channels)])  # (channels, n + channels)
-        constant = np.einsum("oi,cs->oisc", settled, at_rest[self._resting])
-        self.responses = np.concatenate([signals.reshape(*signals.shape[:3], -1), constant], axis=-1)
+        at_rest = np.hstack([held[:, :channels].T, np.eye(channels)])[self._resting]
+        constant = np.einsum("oi,cs->oisc", H @ held[:, channels:], at_rest)
+        self.responses = np.concatenate([responses.reshape(*responses.shape[:3], -1), constant], axis=-1)
         self.states = np.concatenate([states.reshape(n, -1), held[:, self._resting]], axis=-1)
 
     def signals(self, z: Array, rest: Array, every: int) -> Array:
@@ -91,9 +85,21 @@ class Sensitivities:
         """
         moving = (z - rest[..., None]).reshape(-1, z.shape[-1])
         found = lattice_along(self._reflections, moving, every)
-        found = found.reshape(self._order, self._channels, -1, found.shape[-1]).swapaxes(0, 1)
+        found = found.reshape(len(found), self._channels, -1, found.shape[-1]).swapaxes(0, 1)
         held = np.broadcast_to(rest[self._resting][..., None], (len(self._resting), *found.shape[2:]))
         return np.concatenate([found.reshape(-1, *found.shape[2:]), held])
+
+
+class _Polynomials:
+    """Characteristic polynomials of all blocks at the basis's A."""
+
+    def __init__(self, blocks: Sequence[Block], A: Array) -> None:
+        poles = np.stack([np.resize(np.append(np.linalg.eigvals(b.F), 0.0), 2) for b in blocks])
+        self._first, self._second = (np.eye(len(A)) - poles[:, i, None, None] * A for i in range(2))
+
+    def __call__(self, right: Array) -> Array:
+        """Solve for one right side, shape (1, order, k); one eigenvalue at a time keeps the digits that slow poles would lose."""
+        return np.asarray(np.linalg.solve(self._second, np.linalg.solve(self._first, right)).real)
 
 
 def _reflections(F: Array) -> tuple[float, float]:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from kros.core.lti import StateSpace, gain
 from kros.data import EpisodeBatch, EpisodeKey
-from kros.evaluate.errors import summarise
+from kros.evaluate.errors import summarise_all
 from kros.lifting import Lifting
 from kros.observer import ExtendedKalman, FilteredDifference, Observer, Runtime, run_observer, run_observers, track_parameter
 from kros.observer.baselines.learned import Features
@@ -32,7 +32,7 @@ LINEAR = Lifting(("position", "velocity", "current"))
 ORDERS = (0, 4, 9, 12)  # of the corrections: gains, worst-case H2, residual-shaped, the paper's
 COUNTS = (8, 2, 2, 2)  # of either lifting, for refined and plain models together
 MEMORIES = 12  # states of the subspace-identified predictor
-TOGETHER = 2  # run side by side: at this size a study has memory for no more
+TOGETHER, EPISODES = 2, 32  # observers and episodes that a study of this size runs side by side
 
 
 def main() -> None:
@@ -42,13 +42,10 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=19_000)
     options = parser.parse_args()
     rng = np.random.default_rng(0)
-    shape = (options.samples, options.episodes)
-    states, u = 0.1 * rng.normal(size=(*shape, 3)), 0.1 * rng.normal(size=(*shape, 2))
-    y, phase = np.ascontiguousarray(states[..., :1]), {"phase": rng.uniform(-3, 3, size=shape[1])}
-    lengths = np.full(shape[1], shape[0])
+    blocks = [Block.of(rng, options.samples, min(EPISODES, options.episodes - i)) for i in range(0, options.episodes, EPISODES)]
     found: dict[str, float] = {}
 
-    def timed(name: str, work: Callable[[], Any], count: int = 1) -> Any:
+    def timed(name: str, work: Callable[[], Any], count: float = 1) -> Any:
         start = time.process_time()
         result = work()
         found[name] = count * (time.process_time() - start)
@@ -56,35 +53,85 @@ def main() -> None:
         sys.stdout.flush()
         return result
 
+    def every(run: Callable[[Block], Any]) -> None:
+        for block in blocks:
+            run(block)
+
     for lifting, name in ((KOOPMAN, "Koopman"), (LINEAR, "linear")):
-        values = phase if lifting.parameters else None
+        memory = observer(with_internal(lifting), 0)
+        timed(f"{name} formulas, once a process", partial(load, [observer(lifting, 0), memory], blocks[0].first(2)))
         for order, count in zip(ORDERS, COUNTS, strict=True):
-            work = partial(run_observers, [observer(lifting, order)] * TOGETHER, y, u, values)
-            estimate = timed(f"{count} {name} observers, {order} filter states", work, count // TOGETHER)[0]
-        work = partial(run_observer, observer(with_internal(lifting), 0), y, u, values)
-        timed(f"1 {name} subspace-identified predictor of {MEMORIES} states", work)
+            work = partial(every, partial(side_by_side, [observer(lifting, order)] * TOGETHER))
+            timed(f"{count} {name} observers, {order} filter states", work, count // TOGETHER)
+        timed(f"1 {name} subspace-identified predictor of {MEMORIES} states", partial(every, partial(side_by_side, [memory])))
     A = np.pad(0.3 * rng.normal(size=(3, 4)), ((0, 1), (0, 0)))
     extended = ExtendedKalman(KOOPMAN, A, np.zeros((4, 2)), (0,), ("a", "b"), 0.01 * np.eye(3), np.eye(1), np.eye(3))
-    timed("extended Kalman filter", lambda: extended.run(y, u, phase))
-    timed("filtered difference", lambda: FilteredDifference(3, ((0, 1),), 100.0, DT).run(y, u))
-    features = Features.of(KOOPMAN, (0,), y, u)
-    few = {"phase": phase["phase"][:36]}
-    batch = EpisodeBatch(tuple(EpisodeKey("a", "", str(i)) for i in range(shape[1])), lengths, states, u, DT, phase)
-    moments = timed(
-        "learned estimator, moments",
-        lambda: Moments.of(features, (batch.take([i]) for i in range(shape[1]))),
-    )
-    timed("learned estimator", lambda: moments.estimator().run(y, u, phase))
+    timed("extended Kalman filter", lambda: every(lambda block: extended.run(block.y, block.u, block.phase)))
+    timed("filtered difference", lambda: every(lambda block: FilteredDifference(3, ((0, 1),), 100.0, DT).run(block.y, block.u)))
+    features = Features.of(KOOPMAN, (0,), blocks[0].y, blocks[0].u)
+    moments = timed("learned estimator, moments", lambda: Moments.of(features, (part for block in blocks for part in block.one_by_one())))
+    timed("learned estimator", lambda: every(lambda block: moments.estimator().run(block.y, block.u, block.phase)))
     estimates = 2 * (sum(COUNTS) + 1) + 3
-    timed(f"errors and spectra of {estimates} estimates", lambda: summarise(estimate, states, lengths, DT), estimates)
+    made = [run_observers([observer(LINEAR, 0)] * TOGETHER, block.y, block.u) for block in blocks]
+    summaries = partial(every, lambda block: summarise_all(made[blocks.index(block)], block.states, block.lengths, DT))
+    timed(f"errors and spectra of {estimates} estimates", summaries, estimates / TOGETHER)
     sys.stdout.write(f"{'all of the above':58s} {sum(found.values()):7.2f} s\n\nnot part of a study:\n")
+    short, block = min(10_000, options.samples), blocks[0]
     timed(
-        "20 candidates side by side, 36 episodes of 10 s",
-        lambda: run_observers([observer(KOOPMAN, 0)] * 20, y[:10_000, :36], u[:10_000, :36], few),
+        "20 candidates side by side, 32 episodes of 10 s",
+        lambda: run_observers([observer(KOOPMAN, 0)] * 20, block.y[:short], block.u[:short], block.phase),
     )
     late = observer(KOOPMAN, 9, Runtime(delay=3, upper=np.array([9.0, 9.0, 9.0])))
-    timed("an observer with a delay of 3 samples and limits", lambda: run_observer(late, y, u, phase))
-    timed("phase-locked loop", lambda: track_parameter(observer(KOOPMAN, 9), y, u, phase))
+    timed(
+        "an observer with a delay of 3 samples and limits", lambda: every(lambda block: run_observer(late, block.y, block.u, block.phase))
+    )
+    timed("phase-locked loop, 32 episodes", lambda: track_parameter(observer(KOOPMAN, 9), block.y, block.u, block.phase))
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Episodes that run side by side, the batch innermost in memory as in a study."""
+
+    states: np.ndarray
+    y: np.ndarray
+    u: np.ndarray
+    phase: dict[str, np.ndarray]
+    lengths: np.ndarray
+
+    @classmethod
+    def of(cls, rng: np.random.Generator, samples: int, episodes: int) -> Block:
+        """Draw signals."""
+        states, u = (0.1 * rng.normal(size=(samples, width, episodes)).swapaxes(1, 2) for width in (3, 2))
+        return cls(
+            states, np.ascontiguousarray(states[..., :1]), u, {"phase": rng.uniform(-3, 3, size=episodes)}, np.full(episodes, samples)
+        )
+
+    def first(self, samples: int) -> Block:
+        """The first samples."""
+        return replace(
+            self, states=self.states[:samples], y=self.y[:samples], u=self.u[:samples], lengths=np.minimum(self.lengths, samples)
+        )
+
+    def of_lifting(self, lifting: Lifting) -> dict[str, np.ndarray] | None:
+        """Parameters of a lifting; None where it has none."""
+        return self.phase if lifting.parameters else None
+
+    def one_by_one(self) -> Iterator[EpisodeBatch]:
+        """Every episode by itself."""
+        keys = tuple(EpisodeKey("a", "", str(i)) for i in range(len(self.lengths)))
+        batch = EpisodeBatch(keys, self.lengths, self.states, self.u, DT, self.phase)
+        return (batch.take([i]) for i in range(len(keys)))
+
+
+def side_by_side(observers: list[Observer], block: Block) -> np.ndarray:
+    """Run observers of one model on some episodes."""
+    return run_observers(observers, block.y, block.u, block.of_lifting(observers[0].lifting))
+
+
+def load(observers: list[Observer], block: Block) -> None:
+    """Run observers so that their formulas and the compiled loops are there."""
+    for each in observers:
+        side_by_side([each], block)
 
 
 def with_internal(lifting: Lifting) -> Lifting:

@@ -27,7 +27,6 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.errors import IdentificationError
-from ..core.linalg import qr_triangle
 from ..core.loading import loader
 
 log = logging.getLogger(__name__)
@@ -179,10 +178,9 @@ def _speed_per_reference(angle: Array, reference: Array, steady: npt.NDArray[np.
 
 def _error_phase(turn: Array, error: Array) -> tuple[float, float]:
     """Phase and amplitude of the error at the disturbance's frequency; drift and second harmonic are fitted beside it."""
-    ramp, sine, cosine = np.linspace(-1, 1, turn.size), np.sin(turn), np.cos(turn)
-    second = 2 * sine * cosine, 1 - 2 * sine**2
-    R = qr_triangle(np.stack([sine, cosine, *second, np.ones_like(ramp), ramp, ramp**2, error]).T)
-    along_sin, along_cos = np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=None)[0][:2]
+    ramp = np.linspace(-1, 1, turn.size)
+    columns = np.stack([np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn), np.ones_like(ramp), ramp, ramp**2], axis=1)
+    along_sin, along_cos = np.linalg.lstsq(columns, error, rcond=None)[0][:2]
     return float(np.arctan2(along_cos, along_sin)), float(np.hypot(along_cos, along_sin))
 
 

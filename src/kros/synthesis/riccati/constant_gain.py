@@ -110,12 +110,13 @@ def _only_gain(A: Array, C: Array, poles: Array) -> Array | None:
     try:
         W = np.vstack([np.linalg.solve((A - p * np.eye(len(A))).T, C[0]) for p in poles])
         size = np.abs(W).max(axis=1)
+        if size.min() < np.finfo(float).tiny:  # nothing is measured
+            return None
         L = np.linalg.solve(W / size[:, None], 1 / size).real[:, None]
-    except np.linalg.LinAlgError:
+        reached = np.linalg.eigvals(A - L @ C)
+    except np.linalg.LinAlgError:  # singular, or no numbers any more
         return None
-    reached = np.linalg.eigvals(A - L @ C)
-    close = np.isfinite(reached).all() and max(np.abs(reached - p).min() for p in poles) <= _CLOSE
-    return L if close else None
+    return L if max(np.abs(reached - p).min() for p in poles) <= _CLOSE else None
 
 
 def _one_of_many_gains(A: Array, C: Array, poles: Array) -> Array:

@@ -197,6 +197,16 @@ def test_filters_and_recursions_are_alike(every, both):
 
 
 @needs_compiler
+@pytest.mark.parametrize("lost", [0, 100, 139, 299, 300])
+def test_a_sample_that_is_no_number_is_not_felt_before_it_is_there(lost, both):
+    x = np.random.default_rng(6).normal(size=(1, 301))
+    x[0, lost] = np.nan
+    found, wanted = both(lambda: filtered(x, np.zeros(1), -1.2, 0.5))
+    assert_same(found, wanted)
+    assert np.isfinite(found[0]).sum() == lost + 1
+
+
+@needs_compiler
 @pytest.mark.parametrize("every", [1, 4, 70])
 def test_models_in_blocks_and_lattices_are_alike(every, both):
     rng = np.random.default_rng(5)

@@ -34,7 +34,10 @@ def filtered(x: Array, rest: Array, a1: float, a2: float, every: int = 1) -> tup
     from scipy.signal import lfilter
 
     at_rest = (rest / (1.0 + a1 + a2))[..., None]
-    held = np.asarray(lfilter([0.0, 1.0], [1.0, a1, a2], x - rest[..., None])) + at_rest
+    moved = (
+        np.asarray(lfilter([1.0], [1.0, a1, a2], (x - rest[..., None])[..., :-1])) + at_rest
+    )  # x[k] has no part in held[k], whatever it is
+    held = np.concatenate([at_rest, moved], axis=-1)[..., : x.shape[-1]]
     return held[..., ::every], np.concatenate([at_rest, held[..., every - 1 : -1 : every]], axis=-1)[..., :kept]
 
 
@@ -118,7 +121,7 @@ def blocks_along(F: Array, G: Array, H: Array, z: Array, rest: Array, held: Arra
     for k in range(samples - 1):
         h[k + 1] = F @ h[k] + driven[k]
     h += held
-    return h.reshape(samples, -1, batch)[::every].transpose(1, 2, 0) if states else np.einsum("obd,kbde->oek", H, h)
+    return h.reshape(samples, 2 * blocks, batch)[::every].transpose(1, 2, 0) if states else np.einsum("obd,kbde->oek", H, h)
 
 
 def lattice_along(reflections: Array, x: Array, every: int = 1) -> Array:

@@ -228,6 +228,11 @@ def test_means_of_many_units_are_those_of_the_definition():
             among = [i for i, (unit, own) in enumerate(groups) if unit not in without and condition in (None, own, "another")]
             for found, wanted in zip(moments._means(1, without, condition), (gram, cross), strict=True):
                 np.testing.assert_allclose(found, wanted[among, 1].mean(axis=0), atol=1e-14)
+    alone = [rows for rows, _, _ in moments._blocks if len(rows) == 1]
+    assert alone
+    assert all(
+        np.shares_memory(sums, gram) == (rows in alone) for rows, sums, _ in moments._blocks
+    )  # most a study may take is not taken twice
 
 
 def test_learned_estimator_refuses_what_it_cannot_use():

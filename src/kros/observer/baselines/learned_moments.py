@@ -210,6 +210,8 @@ class Moments:
 
 
 def _sum(moments: Array, groups: Sequence[int]) -> Array:
+    if len(groups) == 1:
+        return np.asarray(moments[groups[0]])  # no copy: with few units these are all of them
     total = np.zeros(moments.shape[1:])
     for i in groups:
         total += moments[i]

@@ -5,15 +5,21 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
+from functools import partial
 
 import pytest
 
 from kros.core.errors import KrosError
+from kros.core.work import Work
 from kros.study.engine.executors import open_executor
 
 
 def square(x: int) -> int:
     return x * x
+
+
+def refuse() -> None:
+    raise KrosError("as it should")
 
 
 def endless(_: int) -> None:
@@ -28,6 +34,17 @@ def die(_: int) -> None:
 def test_results_come_in_order(workers):
     with open_executor(workers) as executor:
         assert list(executor.map(square, range(5))) == [0, 1, 4, 9, 16]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_work_that_was_begun_comes_in_order_where_it_is_wanted(workers):
+    with open_executor(workers) as executor:
+        work = Work(executor)
+        results, wrong = work.begin("first", (partial(square, x) for x in range(5))), work.begin("wrong", [refuse])
+        assert work.run("meanwhile", [partial(square, 9)]) == [81]
+        assert results() == [0, 1, 4, 9, 16]
+        with pytest.raises(KrosError, match="as it should"):
+            wrong()
 
 
 def test_work_that_is_abandoned_is_not_waited_for():

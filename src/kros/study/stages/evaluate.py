@@ -135,7 +135,7 @@ def _outcomes(
     That many episodes are side by side in the compiled loops at once, and their estimates are put where those of others were.
     """
     found = []
-    for start in range(0, len(keys), _EPISODES):
+    for start in range(0, len(keys) or 1, _EPISODES):  # none at all are refused where they are read
         batch = EpisodeBatch.read(population, keys[start : start + _EPISODES], parameters=units, truths=truths)
         batch = as_shown(batch, sensor, population.states)
         batch = replace(batch, states=np.ascontiguousarray(batch.states.swapaxes(1, 2)).swapaxes(1, 2))  # in memory as estimates are

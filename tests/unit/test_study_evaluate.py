@@ -1,0 +1,48 @@
+"""Estimates of many episodes, block by block."""
+
+import numpy as np
+import pytest
+
+from kros.core.errors import DataError
+from kros.data import Channel, EpisodeKey, Role, TrueChannel, from_arrays
+from kros.study.stages import evaluate
+
+STATES = Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE)
+CHANNELS = (*STATES, Channel("u", Role.INPUT), TrueChannel("v_true", Role.TRUTH, of="v"))
+
+
+def population_of(count):
+    rng = np.random.default_rng(0)
+    episodes = {f"unit {i}": [np.cumsum(rng.normal(size=(600 + 70 * ((3 * i) % 5), 4)), axis=0)] for i in range(count)}
+    return from_arrays(episodes, CHANNELS, 0.01)
+
+
+def run(batch):
+    """Two estimates, with a memory behind their states."""
+    memory = np.ones((*batch.states.shape[:2], 1))
+    return [np.concatenate([share * batch.states, memory], axis=-1)[None] for share in (0.9, 1.2)]
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 7])
+def test_outcomes_of_blocks_are_those_of_all_episodes_at_once(at_once, monkeypatch):
+    population = population_of(8)
+    given = run, population, population.episodes, {}, (6, 0, 5, 1), {}
+    whole = evaluate._outcomes(*given)
+    monkeypatch.setattr(evaluate, "_EPISODES", at_once)
+    for found, wanted, share in zip(evaluate._outcomes(*given), whole, (0.9, 1.2), strict=True):
+        for name in ("rms", "percent", "start_percent", "rest_percent", "spectra", "freqs_hz"):
+            np.testing.assert_allclose(getattr(found.summary, name), getattr(wanted.summary, name), rtol=1e-12)
+        for name in ("states", "rms", "error_percent", "lag_s"):
+            np.testing.assert_allclose(getattr(found.true, name), getattr(wanted.true, name), rtol=1e-9)
+        for piece, row in zip(found.shown, given[4], strict=True):
+            np.testing.assert_array_equal(piece, share * population.read(population.episodes[row])[:, :2])
+
+
+def test_no_episodes_are_refused_with_a_reason():
+    with pytest.raises(DataError, match="no episodes were named; check the split"):
+        evaluate._outcomes(run, population_of(1), (), {}, (), {})
+
+
+def test_an_episode_that_does_not_exist_is_named():
+    with pytest.raises(DataError, match="unit 9"):
+        evaluate._outcomes(run, population_of(1), (EpisodeKey("unit 9", "default", "0"),), {}, (), {})

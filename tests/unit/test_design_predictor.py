@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from kros.core.errors import DataError
 from kros.data.population import EpisodeKey
 from kros.design.certificates import certify_running, other_conditions
 from kros.design.methods.design import design
-from kros.design.methods.predictor import Plan, on_the_circle
+from kros.design.methods.predictor import EFFORTS, Plan, on_the_circle, recordings
 from kros.design.methods.residual_shaped import TUNED, tuned
 from kros.design.methods.tuned import held_out, tuned_where_better
 from kros.design.settings import PredictorSettings, SynthesisSettings
@@ -18,6 +19,8 @@ from kros.design.uncertain_set import certificate
 from kros.design.validation import TrainingSet, hidden_mean
 from kros.lifting import Lifting
 from kros.observer import Sensor, relift_certificate
+from kros.observer.limits import Limit
+from kros.observer.predictor.choice import _held_out
 from kros.plants import PLANTS
 from kros.report.verdict import verdict
 from kros.synthesis import kalman
@@ -91,6 +94,25 @@ def test_a_study_makes_an_observer_and_says_how(made, tuning):
     assert observer.lifting.functions == ("sin(100*position + phase)", "cos(100*position + phase)")
     judge = tuning.read()
     assert max(judge.percent(observer)) < 20
+
+
+@pytest.mark.parametrize("free", [0, 1])
+def test_machines_that_start_at_a_limit_are_learned_from_whole_recordings(tuning, free, monkeypatch):
+    """Where only one unit moves before it meets a limit, no other one can be judged."""
+    own, effort = replace(task(tuning), limits={"current": Limit(lower=-0.3, upper=0.3)}), EFFORTS["quick"]
+    batch = recordings(own, effort).read_whole().on_time.batch
+    until = np.where(np.array(batch.units) == batch.units[0], 1000 * free, 0)
+    monkeypatch.setattr("kros.design.methods.predictor.before_limits", lambda *_: until)
+    found, whole = Plan.of(own, effort, batch), Plan.of(own, effort, batch, whole=True)
+    assert found.recipe == whole.recipe
+    assert found.emphasis == whole.emphasis
+    assert found.fill is not None
+
+
+def test_units_that_none_can_judge_are_refused():
+    past = SimpleNamespace(units=("a", "b"), conditions=("on at a limit",) * 2)
+    with pytest.raises(DataError, match="no unit that is left out can be judged"):
+        _held_out(past, {"on": np.ones(1)}, lambda _, rows: np.ones((len(rows), 1)))
 
 
 def test_told_of_the_sensor_it_is_better_than_untold_and_certified(made, tuning):

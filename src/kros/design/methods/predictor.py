@@ -160,6 +160,10 @@ class Plan:
         every = Basis(delays[-1], tuple(dict.fromkeys(pole for poles in lags for pole in poles)))
         importance, until, fill = importance_of(task), None if whole else before_limits(task, batch), None
         past = PastMoments.of(on_the_circle(models.lifting), models.measured, batch, every, until)
+        moved = {key.unit for key in batch.keys if key.condition == first}
+        judged = {unit for unit, condition in zip(past.units, past.conditions, strict=True) if condition == first}
+        if not whole and len(judged) < min(2, len(moved)):  # the others start at a limit, and none is left to judge by another one
+            return cls.of(task, effort, batch, whole=True)
         if whole:
             past, fill = filled_in(past, batch, *sides(task.limits, models.lifting.states[: batch.states.shape[-1]]))
             batch = fill(batch)

@@ -17,6 +17,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from ...core.errors import DataError
 from ...data import EpisodeBatch
 from ...synthesis.residual_shaped.shaping_filter import Basis
 from ..tuning.blocks import Array, Model, blocks_of, estimates_along
@@ -210,6 +211,10 @@ def _held_out(past: PastMoments, emphasis: Mapping[str, Array], missed: Callable
             shape = (-1,) + (1,) * (own[0].ndim - 1)
             total = total + counts.reshape(shape) * np.mean(np.log(own), axis=0) / 2
             weights = weights + counts.reshape(shape)
+    if not weights.any():
+        raise DataError(
+            "Predictor: no unit that is left out can be judged by the others; record more units, or movements that stay off the limits."
+        )
     return np.asarray(total / weights)
 
 

@@ -81,8 +81,8 @@ class Seen:
         """Yield results in the order of the tasks; see `Work.recall`."""
         known, named = self._read(title), {kind.__name__: kind for kind in kinds}
         found: list[Any] = [self._restored(known, mark, named, usable, task) for task, mark in zip(tasks, marks, strict=True)]
-        new = [task for task, result in zip(tasks, found, strict=True) if result is None]
-        computed = work.map(title, function, new)
+        new = [(mark, task) for mark, task, result in zip(marks, tasks, found, strict=True) if result is None]
+        computed = work.map(title, _Packing(function, kept=self.changed is not None), new)
         if not new and set(marks) == set(known):
             yield from found
             return
@@ -91,16 +91,16 @@ class Seen:
         with self._kept(title, fresh) as keep:
             try:
                 for mark, result in zip(marks, found, strict=True):
-                    value = next(computed) if result is None else result
+                    value, member = next(computed) if result is None else (result, b"")
                     if mark is not None:
                         text = left.pop(mark, "") if result is not None else ""
-                        keep(mark, text or json.dumps(_packed(value), separators=(",", ":")))
+                        keep(member or (_member(mark, text or _text(value)) if self.changed is not None else b""))
                         fresh |= set() if text else {mark}
                     yield value
                 next(computed, None)  # its progress is told to the end
             except BaseException:  # where it ends early, all that is known stays known
                 for mark in left.keys() - fresh:
-                    keep(mark, left[mark])
+                    keep(_member(mark, left[mark]))
                 raise
 
     def _path(self, title: str) -> Path:
@@ -131,20 +131,19 @@ class Seen:
         return value if usable is None or usable(task, value) else None
 
     @contextmanager
-    def _kept(self, title: str, fresh: set[str]) -> Iterator[Callable[[str, str], None]]:
+    def _kept(self, title: str, fresh: set[str]) -> Iterator[Callable[[bytes], object]]:
         """Give what writes one result; the file is in its place once all are there, and where it ends early if there are fresh ones."""
         if self.changed is None:
-            yield lambda mark, text: None
+            yield lambda member: None
             return
         path = self._path(title)
         temporary = path.with_name(f".{path.name}")
         above = [folder for folder in (path.parent, path.parent.parent) if not folder.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            # Without a name and a time, the bytes depend on the content alone.
-            with temporary.open("wb") as raw, gzip.GzipFile("", "wb", _LEVEL, raw, mtime=0) as file:
-                file.write(f"{self.key}\n".encode())
-                yield lambda mark, text: _write(file, mark, text)
+            with temporary.open("wb") as file:
+                file.write(_compressed(f"{self.key}\n"))
+                yield file.write
         except BaseException:
             with suppress(OSError):
                 if fresh:
@@ -162,8 +161,30 @@ class Seen:
         self.changed(path)
 
 
-def _write(file: gzip.GzipFile, mark: str, text: str) -> None:
-    file.write(f"{mark}\t{text}\n".encode())
+@dataclass(frozen=True)
+class _Packing:
+    """A function that returns its result and, where it is kept, the result as it is written: one process would be busy packing those of all workers."""
+
+    function: Callable[[Any], Any]
+    kept: bool
+
+    def __call__(self, marked: tuple[str | None, Any]) -> tuple[Any, bytes]:
+        mark, task = marked
+        value = self.function(task)
+        return value, b"" if mark is None or not self.kept else _member(mark, _text(value))
+
+
+def _member(mark: str, text: str) -> bytes:
+    return _compressed(f"{mark}\t{text}\n")
+
+
+def _compressed(line: str) -> bytes:
+    """A file is many of these; without a name and a time, the bytes depend on the content alone."""
+    return gzip.compress(line.encode(), _LEVEL, mtime=0)
+
+
+def _text(value: Any) -> str:
+    return json.dumps(_packed(value), separators=(",", ":"))
 
 
 def _packed(value: Any) -> Any:

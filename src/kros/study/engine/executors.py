@@ -17,6 +17,7 @@ from .cluster import open_dask
 from .threads import single_threaded
 
 T = TypeVar("T")
+_CHUNKS = 128  # of a map of many tasks, which are small: handing each out by itself costs the parent as much as a tenth of the work
 
 
 class ProcessExecutor:
@@ -33,7 +34,8 @@ class ProcessExecutor:
         KrosError
             When a worker process was ended from outside.
         """
-        return _results(self._pool.map(function, tasks))
+        tasks = list(tasks)
+        return _results(self._pool.map(function, tasks, chunksize=max(1, len(tasks) // _CHUNKS)))
 
 
 def _results(found: Iterator[T]) -> Iterator[T]:

@@ -82,7 +82,8 @@ class Seen:
         known, named = self._read(title), {kind.__name__: kind for kind in kinds}
         found: list[Any] = [self._restored(known, mark, named, usable, task) for task, mark in zip(tasks, marks, strict=True)]
         new = [(mark, task) for mark, task, result in zip(marks, tasks, found, strict=True) if result is None]
-        computed = work.map(title, _Packing(function, kept=self.changed is not None), new)
+        keeps = self.changed is not None
+        computed = work.map(title, _Packing(function, keeps), new)
         if not new and set(marks) == set(known):
             yield from found
             return
@@ -92,9 +93,9 @@ class Seen:
             try:
                 for mark, result in zip(marks, found, strict=True):
                     value, member = next(computed) if result is None else (result, b"")
-                    if mark is not None:
+                    if mark is not None and keeps:
                         text = left.pop(mark, "") if result is not None else ""
-                        keep(member or (_member(mark, text or _text(value)) if self.changed is not None else b""))
+                        keep(member or _member(mark, text or _text(value)))
                         fresh |= set() if text else {mark}
                     yield value
                 next(computed, None)  # its progress is told to the end

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
+from .removed import refusing
+
 
 def lazy_names(package: str, home: Mapping[str, str], public: Sequence[str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the ``__getattr__`` and ``__dir__`` of a package (PEP 562).
@@ -20,10 +22,11 @@ def lazy_names(package: str, home: Mapping[str, str], public: Sequence[str]) -> 
     public : sequence of str
         Its ``__all__``.
     """
+    unknown = refusing(package)
 
     def find(name: str) -> Any:
         if name not in home:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            return unknown(name)
         value = getattr(import_module(f".{home[name]}", package), name)
         setattr(sys.modules[package], name, value)
         return value

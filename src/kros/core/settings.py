@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from .errors import ConfigError
 from .files import did_you_mean, shortened
+from .removed import instead_of
 
 T = TypeVar("T")
 
@@ -37,10 +38,12 @@ class Settings(BaseModel):
 
     @classmethod
     def _explain(cls, error: Any) -> str:
+        key, found = ".".join(p for p in error["loc"] if isinstance(p, str)), error.get("input")
+        if reason := instead_of(f"{key}={found}" if isinstance(found, str) and error["type"] != "extra_forbidden" else key):
+            return reason
         if error["type"] == "extra_forbidden":
             known = cls._names_in(error["loc"][:-1])
             return f"unknown key{did_you_mean(error['loc'][-1], known) or ';'} known are {', '.join(known)}"
-        found = error.get("input")
         return f"{error['msg'].lower()}, found {shortened(repr(found))}" if not isinstance(found, dict) else str(error["msg"]).lower()
 
     @classmethod

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from collections.abc import Sequence
+from typing import Literal, get_args
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from ..core.errors import ConfigError
 from ..core.settings import Settings
@@ -34,13 +34,6 @@ class SynthesisSettings(Settings):
     )
     tune: bool = Field(False, description="whether residual_h2 is tuned on training episodes, which takes some seconds a kind of model")
     time_limit_s: float = Field(60.0, gt=0, description="for the optimisation of mixed")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, raw: Any) -> Any:
-        if isinstance(raw, Mapping) and "noise" in raw:
-            raise ValueError("noise is declared with the sensor since version 0.2, [sensor.position] noise = 1e-6; move it there")
-        return raw
 
 
 class PredictorSettings(Settings):

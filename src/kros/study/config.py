@@ -19,8 +19,6 @@ from ..observer.limits import Limit
 from ..observer.sensor import Sensor
 from ..uncertainty.settings import UncertaintySettings
 
-RENAMED = {"memory": "predictor"}  # sections of a study, old and new
-
 
 class Stage(str, Enum):
     """Stages in the order in which data flow.
@@ -198,7 +196,7 @@ def validate_config(raw: dict[str, Any], base: Path, origin: str = "study", over
     """
     for override in overrides:
         _apply(raw, override)
-    config = _validated(raw, f"Study {origin}")
+    config = StudyConfig.of(raw, f"Study {origin}")
     source = (base / config.data.source).resolve()
     return config.model_copy(update={"data": config.data.model_copy(update={"source": source})})
 
@@ -212,17 +210,9 @@ def stored_config(raw: Any, path: Path) -> StudyConfig:
         Damaged, or of another version of kros.
     """
     try:
-        return _validated(raw, f"Run {path.parent}: {path.name}")
+        return StudyConfig.of(raw, f"Run {path.parent}: {path.name}")
     except ConfigError as error:
         raise ConfigError(f"{error} It is damaged, or of another version of kros; run the study again.") from error
-
-
-def _validated(raw: Any, origin: str) -> StudyConfig:
-    """Validate, with every problem in one message."""
-    for old, new in RENAMED.items():
-        if isinstance(raw, dict) and old in raw:
-            raise ConfigError(f"{origin}: [{old}] is called [{new}] since version 0.2; rename it.")
-    return StudyConfig.of(raw, origin)
 
 
 def _apply(raw: dict[str, Any], override: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from ..core.settings import Settings
 
@@ -32,10 +32,3 @@ class UncertaintySettings(Settings):
     drop_outliers: bool = Field(False, description="units that are flagged take no part in models, weights and synthesis")
     outlier_form: FORMS = Field("additive", description="of the residuals that outlier scores are made of")
     false_alarm_rate: float = Field(3e-3, gt=0, lt=1, description="probability with which a unit like the others is flagged")
-
-    @field_validator("structure", mode="before")
-    @classmethod
-    def _known(cls, value: str) -> str:
-        if value == "full":
-            raise ValueError("full weights are no longer there; choose 'auto' or 'diagonal', whose sets are somewhat larger")
-        return value

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from kros.core import StateSpace
-from kros.design.methods.coprime_models import as_problem, unit_ratio
 from kros.observer.certificate.majorants import energy, majorants
 from kros.observer.residual.signal_bounds import scaled_into, signal_lower_bounds
-from kros.synthesis import worst_case_h2
 from kros.synthesis.residual_shaped.shaping_filter import Basis, circle_weights, shaping_filter
-from kros.synthesis.worst_case.certificate import certify
 from kros.uncertainty.coprime.bands import BandEnergies
-from kros.uncertainty.coprime.models import ModelDifferences
 from kros.uncertainty.coprime.signals import SignalSet
 
 RNG = np.random.default_rng(11)
@@ -91,73 +86,3 @@ def test_a_filter_scaled_into_energies_is_inside_by_quadrature() -> None:
     root = np.linalg.inv(np.linalg.cholesky(mean))
     ratio = np.linalg.eigvalsh(root @ inside @ root.conj().swapaxes(-1, -2))
     assert 0.5 < ratio.max() <= 1 + 1e-6
-
-
-def differences(units: int = 3) -> tuple[ModelDifferences, np.ndarray, np.ndarray]:
-    """A state that follows its input: what the units' rows make of both nearly cancels."""
-    edges = np.linspace(0, np.pi, 25)
-    u = np.cumsum(RNG.standard_normal((300, 1)), axis=0)
-    x = np.hstack([u + 0.01 * RNG.standard_normal((300, 1)), 0.1 * RNG.standard_normal((300, 1))])
-    driven = BandEnergies.of(np.hstack([u, x])[:, None], [300], edges)
-    change = 0.1 * RNG.standard_normal((units, 2, 1))
-    B = np.zeros((2, 1)) + change
-    A = F + np.concatenate([-change, 0.02 * RNG.standard_normal((units, 2, 1))], axis=-1)
-    joint = BandEnergies(edges, driven.energy[0])
-    nominal = (A[0], B[0])
-    return (
-        ModelDifferences.of(*nominal, (A, B), [f"u{i}" for i in range(units)], joint, DT, max_order=3),
-        joint.energy,
-        np.concatenate([B, A], -1),
-    )
-
-
-def test_cross_terms_keep_what_cancels_small_and_every_unit_is_covered() -> None:
-    found, phi, rows = differences()
-    assert found.weight.cover_max <= 1
-    alone = np.einsum("unk,fk->ufnk", rows - rows[0], np.sqrt(np.einsum("bii->bi", phi).real))
-    assert np.linalg.norm(found.residuals) < 0.3 * np.linalg.norm(alone)
-    density = np.einsum("unk,fkl,uml->ufnm", rows - rows[0], phi, rows - rows[0])
-    width = (np.pi / np.diff(np.linspace(0, np.pi, 25)))[:, None, None]
-    close = 1e-9 * float(np.max(np.abs(alone) ** 2) * width.max())  # what keeps a spectrum of full rank, and only adds
-    np.testing.assert_allclose(found.energies(), density * width, rtol=1e-9, atol=close)
-    assert np.linalg.eigvalsh(found.energies() - density * width).min() > -1e-6 * close
-
-
-def test_members_of_the_set_never_exceed_the_certified_error_and_some_come_close() -> None:
-    found, _, _ = differences()
-    problem = as_problem(found, 0.95 * F, C, np.array([0.01]))
-    synthesis = worst_case_h2(problem, max_order=2, tolerance_db=3.0, refinements=1)
-    bound, _ = certify(problem, synthesis.controller)
-    assert synthesis.lower_bound is not None
-    assert synthesis.lower_bound <= bound
-    ratio = unit_ratio(problem, found, synthesis.controller, bound)
-    assert ratio is not None
-    assert 0 < ratio <= 1
-
-    grid = np.linspace(0.1, 49.9, 300)
-    loop = problem.error_system(synthesis.controller).frequency_response(grid)
-    z = np.exp(2j * np.pi * DT * grid)
-    T = loop[..., 3:5] @ np.linalg.inv(z[:, None, None] * np.eye(2) - 0.95 * F) @ found.weight.left.frequency_response(grid)
-    right, noise = found.weight.right.frequency_response(grid), np.sum(np.abs(loop[..., 5:]) ** 2, axis=(-2, -1))
-    reached = 0.0
-    for trial in range(40):
-        X = RNG.standard_normal((300, 2, 3)) + 1j * RNG.standard_normal((300, 2, 3))
-        if trial == 0:  # the largest directions of both sides onto each other
-            U, V = np.linalg.svd(T)[2].conj().swapaxes(-1, -2), np.linalg.svd(right)[0]
-            X = U @ np.eye(2, 3) @ V.conj().swapaxes(-1, -2)
-        X = X / np.linalg.norm(X, 2, axis=(-2, -1))[:, None, None]
-        density = np.sum(np.abs(T @ X @ right) ** 2, axis=(-2, -1)) + noise
-        reached = max(reached, float(np.sqrt(np.trapezoid(density, grid) / 49.8)))
-        assert reached <= bound * 1.02
-    assert reached >= 0.9 * bound
-
-
-@pytest.mark.parametrize("a", [0.3, 0.8])
-def test_loop_gain_of_one_state(a: float) -> None:
-    edges = np.linspace(0, np.pi, 41)
-    white = np.tile(np.diag([1.0, 4.0]) / 40, (40, 1, 1))
-    units = np.full((2, 1, 1), a), np.array([[[0.0]], [[0.0]]])
-    units[0][1] += 0.1
-    found = ModelDifferences.of(units[0][0], units[1][0], units, ["a", "b"], BandEnergies(edges, white), DT, max_order=1)
-    expected = 0.1 / (1 - a)  # E = 0.1 x: largest at zero frequency
-    assert expected * 0.9 <= found.loop_gain(units[0][0]) <= 1.3 * expected

@@ -10,6 +10,7 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("The section [memory] of a study is called [predictor]; rename it.", ("memory",)),
     ("Noise is declared with the sensor, for example [sensor.position] noise = 1e-6; move it there.", ("synthesis.noise",)),
     ("Full weights are no longer part of kros; use structure = 'diagonal', whose set is somewhat larger.", ("uncertainty.structure=full",)),
+    ("The set of worst-case synthesis, of signals or of the form, is chosen on held-out episodes; remove the key set.", ("synthesis.set",)),
 )
 
 

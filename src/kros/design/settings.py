@@ -20,10 +20,6 @@ class SynthesisSettings(Settings):
     methods: tuple[METHODS, ...] = Field(
         ("mixed", "worst_case_h2", "residual_h2", "memory"), description="ways to an observer, each for every kind of model"
     )
-    set: Literal["auto", "signals", "models", "form"] = Field(
-        "auto",
-        description="set that worst-case synthesis is for; auto: of signals or of the form, whichever does better on held-out episodes",
-    )
     injection: Literal["state", "input"] = Field(
         "state", description="where corrections of worst_case_h2 enter; mixed is always the paper's"
     )

@@ -179,10 +179,9 @@ def first_of(ranks: Sequence[tuple[bool, float]]) -> int:
 
 def is_robust(facts: Mapping[str, Any]) -> bool:
     """Tell from the facts about an observer whether it is certified for a set of machines: that around the nominal, or the one that it was designed for."""
-    own = facts.get("set")
-    if own == "signals":
+    if facts.get("set") == "signals":
         return bool(facts.get("set_certified"))
-    return facts.get("models_worst_case_h2" if own == "models" else "worst_case_h2") is not None
+    return facts.get("worst_case_h2") is not None
 
 
 def split_name(observer: str) -> tuple[str, str]:

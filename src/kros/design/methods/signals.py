@@ -18,18 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import KrosError, SynthesisError
-from ...core.lti import StateSpace, block_diagonal, gain
-from ...core.norms import hinf_norm
 from ...observer import Observer, Runtime, relift_certificate, tune_observer
 from ...observer.certificate.signals import SignalBound, signal_bound
 from ...observer.residual.models import refitted_models
 from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_residual, residual_spectra
 from ...observer.residual.signal_bounds import signal_lower_bounds
-from ...synthesis import Injection, ObserverProblem, ResidualProblem, Status, Synthesis, hinf, residual_h2
-from ...synthesis.problem.plants import shaped_plant
-from ...synthesis.residual_shaped.shaping_filter import Basis, shaping_filter
-from ...synthesis.result import enclosed
-from ...uncertainty import Form
+from ...synthesis import ResidualProblem, Status, Synthesis, residual_h2
 from ...uncertainty.coprime.bands import BandEnergies
 from ...uncertainty.coprime.signals import SignalSet
 from ..certificates import certified_on, scales_of
@@ -43,7 +37,6 @@ Array = npt.NDArray[np.float64]
 SIGNALS = "signals"
 UNCOVERED = "the observer is certified for the signals that a model of its own leaves, not for the set around the nominal unit"
 _STEPS, _ROUNDS, _EPISODES = 8, 2, 12
-_POINTS, _SMALL = 2049, Basis(2, (0.95,))
 _UNKNOWN: dict[str, Any] = {"h2_norm": None, "lower_bound": None, "gap_percent": None}  # of tuned gains
 
 
@@ -85,59 +78,6 @@ def design_for_signals(task: DesignTask) -> DesignResult:
     )
     synthesis = replace(best.synthesis, method=task.method, status=Status.CERTIFIED, solve_s=time.perf_counter() - began, notes=notes)
     return DesignResult(task.name, best.observer, synthesis, facts, task.problem, UNCOVERED)
-
-
-def design_for_signals_in_hinf(task: DesignTask) -> DesignResult:
-    """The H-infinity filter of residuals ``W_L w``, W_L a shaping filter of the cover, for the nominal that the H2 observer has.
-
-    ``||W_p T W_L||`` is the largest error, over what the H2 observer is certified for, that any w of energy one can make: a signal may put all of
-    its energy into one frequency.
-    """
-    began, data = time.perf_counter(), task.training.read()
-    best, facts = chosen(task, data)
-    models, batch, n, observer, dt = task.models, data.batch, task.models.lifting.n_states, best.observer, task.models.sample_period_s
-    F = mean_error_dynamics(observer.A, mean_slopes(models.lifting, batch.states, batch.inputs, batch.parameters))
-    W_L = shaping_filter(signals_of(certified_on(task), observer).spectrum(_POINTS), _SMALL, dt)
-    hidden = [i for i in range(n) if i not in models.measured] or list(range(n))
-    one, nothing = gain(np.eye(n), dt), gain(np.zeros((1, 0)), dt)
-    problem = ObserverProblem(
-        nominal=StateSpace(F, np.zeros((n, 1)), np.eye(n), np.zeros((n, 1)), dt),
-        C=task.selector[:, :n],
-        W_L=one,
-        W_R=gain(np.eye(1), dt),
-        input_scale=np.ones(1),
-        output_scale=np.ones(n),
-        noise=task.noise,
-        W_p=np.eye(n)[hidden] / best.bound.cover[hidden, None],
-        correction_penalty=task.settings.penalty,
-        form=Form.ADDITIVE,
-    )
-    found = hinf(shaped_plant(problem, nothing, W_L), injection=Injection.STATE)
-    K = problem.to_physical(found.controller)
-    level = hinf_norm(
-        problem.error_system(K)
-        @ block_diagonal([gain(np.zeros((1, 0)), dt), W_L, gain(np.eye(len(task.noise)), dt), gain(np.zeros((n, 0)), dt)])
-    )
-    rows = np.zeros((models.lifting.n_lifted - n, K.n_inputs))
-    K = StateSpace(K.A, K.B, np.vstack([K.C, np.zeros((len(rows), K.n_states))]), np.vstack([K.D, rows]), dt)
-    lower, gap, notes = enclosed(level, found.lower_bound)
-    synthesis = Synthesis(
-        task.method,
-        K,
-        Status.CERTIFIED,
-        Injection.STATE,
-        hinf_norm=level,
-        lower_bound=lower,
-        gap_percent=gap,
-        solver="riccati",
-        notes=notes,
-    )
-    candidate = Judge(task, certified_on(task))(best.nominal, task.observer(synthesis, observer.A, observer.B), synthesis)
-    if not np.isfinite(candidate.cost):
-        raise SynthesisError(f"H-infinity synthesis for signals: the observer has no certificate ({candidate.bound.reason}).")
-    return DesignResult(
-        task.name, candidate.observer, replace(synthesis, solve_s=time.perf_counter() - began), facts, task.problem, UNCOVERED
-    )
 
 
 def chosen(task: DesignTask, data: ValidationSet) -> tuple[Candidate, dict[str, Any]]:

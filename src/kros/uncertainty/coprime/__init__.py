@@ -1,1 +1,1 @@
-"""Uncertainty where an observer feels it: left coprime factors, as signals and as models."""
+"""Uncertainty where an observer feels it: left coprime factors, as signals."""

@@ -17,7 +17,8 @@ from kros.identify import edmd, free_run, reduce_episode
 from kros.identify.refine import refine_population
 from kros.observer import run_observer
 from kros.synthesis import h2, hinf
-from kros.uncertainty import bounds, choose_nominal, fit_magnitude, optimal_cover, quantify_systems
+from kros.uncertainty import bounds, choose_nominal, fit_magnitude, quantify_systems
+from kros.uncertainty.weights.cover import optimal_cover
 
 FORM = "inverse_input_multiplicative"
 Work = Callable[[], Any]

@@ -28,8 +28,9 @@ from kros.data import read, write_raw
 from kros.identify import edmd, free_run, reduce_episode
 from kros.observer import run_observer
 from kros.synthesis import Block, h2, hinf, mixed, mu_upper
-from kros.uncertainty import bounds, choose_nominal, fit_magnitude, optimal_cover
+from kros.uncertainty import bounds, choose_nominal, fit_magnitude
 from kros.uncertainty.bilinear import BilinearAxis
+from kros.uncertainty.weights.cover import optimal_cover
 
 pytestmark = pytest.mark.filterwarnings("default")
 FORM = "inverse_input_multiplicative"

@@ -2,11 +2,10 @@
 
     python benchmarks/covers.py --populations stiff:0:1 stiff:1:3 soft:2:1
 
-For every form, kind of model and structure: orders, overbound, time of the fit, and the largest ratio between residuals and weights on a grid
+For every form and kind of model: orders, overbound, time of the fit, and the largest ratio between residuals and weights on a grid
 20 times denser than the fit's, at every pole and zero of the units' models and of the weights, and around the highest maxima found there.
 Residuals come from solves at single frequencies and pseudo-inverses (`numpy.linalg`), not from the package. A population is drives, simulated
-and identified in a folder that `--keep` retains; overbounds of diagonal weights are costs above the optimal cover's, mean log left plus
-mean log right, of scalar ones the magnitude above the largest residual.
+and identified in a folder that `--keep` retains; overbounds are costs above the optimal cover's, mean log left plus mean log right.
 """
 
 from __future__ import annotations
@@ -41,7 +40,6 @@ def main() -> None:
     parser.add_argument("--populations", nargs="+", default=["stiff:0:1", "stiff:1:3", "soft:2:1"], help="loop:seed:spread")
     parser.add_argument("--models", nargs="+", default=["koopman", "linear", "koopman_edmd", "linear_edmd"])
     parser.add_argument("--forms", nargs="+", default=[form.value for form in Form])
-    parser.add_argument("--structures", nargs="+", default=["diagonal", "scalar"])
     parser.add_argument("--max-order", type=int, default=4)
     parser.add_argument("--tolerance-db", type=float, default=1.0)
     parser.add_argument("--units", type=int, default=12)
@@ -55,9 +53,8 @@ def main() -> None:
             for model in options.models:
                 models = ModelSet.load(made / model)
                 for form in options.forms:
-                    for structure in options.structures:
-                        sys.stdout.write(row(models, form, structure, model, population, options) + "\n")
-                        sys.stdout.flush()
+                    sys.stdout.write(row(models, form, model, population, options) + "\n")
+                    sys.stdout.flush()
 
 
 def models_of(place: Path, population: str, units: int) -> Path:
@@ -71,17 +68,17 @@ def models_of(place: Path, population: str, units: int) -> Path:
     return folder / "run" / "models"
 
 
-def row(models: ModelSet, form: str, structure: str, name: str, population: str, options: argparse.Namespace) -> str:
+def row(models: ModelSet, form: str, name: str, population: str, options: argparse.Namespace) -> str:
     """Quantify, verify, and return a row."""
     grid, limits = log_grid(models.sample_period_s), {"max_order": options.max_order, "tolerance_db": options.tolerance_db}
     start = time.process_time()
-    found = quantify_systems(models, form, grid, structure=structure, **limits)
+    found = quantify_systems(models, form, grid, **limits)
     seconds = time.process_time() - start
     ratio = independent_cover_max(found, models.systems())
     weight: Weight = found.weight
     orders = f"{' '.join(map(str, weight.left_orders))}, {' '.join(map(str, weight.right_orders))}"
     return (
-        f"| {form} | {name} | {population} | {structure} | {orders} | {weight.cover_max:.7f} | {ratio:.7f} "
+        f"| {form} | {name} | {population} | {weight.structure.value} | {orders} | {weight.cover_max:.7f} | {ratio:.7f} "
         f"| {weight.overbound_db_max:.2f} | {seconds:.2f} |"
     )
 

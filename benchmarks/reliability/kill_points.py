@@ -34,7 +34,6 @@ reader = "parquet"
 refine = false
 [uncertainty]
 n_freqs = 60
-structure = "scalar"
 max_order = 1
 [synthesis]
 input_weight = 3.0

@@ -25,7 +25,7 @@ from kros.uncertainty import Form, quantify_responses, quantify_systems
 Array = np.ndarray[Any, Any]
 KINDS = ("generic", "lightly damped", "stiff", "nearly identical", "identical", "static", "delayed")
 SHAPES = ((1, 1),) * 6 + ((2, 1), (1, 2), (2, 2)) * 2 + ((3, 2), (2, 3))
-STRUCTURES = ("auto", "scalar", "scalar", "diagonal", "diagonal", "entrywise")
+STRUCTURES = ("auto", "auto", "auto", "entrywise")
 ROUNDING = 1e-7  # of the ratio: products and inverses in double precision
 TIGHT_DB = 0.02  # rounding of what is compared with the tolerance
 EPS = 1e-15
@@ -228,7 +228,7 @@ def limited(seconds: float) -> Iterator[None]:
 def models(case: Case) -> tuple[str, bool]:
     """Judge `quantify_systems`: the bound between grid points, that of the remainder, and the statement about the tolerance."""
     options: dict[str, Any] = {"structure": case.structure, "max_order": case.max_order, "tolerance_db": case.tolerance_db}
-    found = quantify_systems(case.units, case.form, case.freqs_hz, density=4, **options)
+    found = quantify_systems(case.units, case.form, case.freqs_hz, **options)
     nominal, weight, remainder = found.scaled_nominal(), found.weight, found.remainder
     shown = [weight.left, weight.right] + ([remainder.left, remainder.right] if remainder else [])
 
@@ -255,7 +255,7 @@ def models(case: Case) -> tuple[str, bool]:
 def responses(case: Case) -> tuple[str, bool]:
     """Judge `quantify_responses`: the bound at the frequencies given, and the statement about the tolerance."""
     given = np.array([response(u, case.freqs_hz) for u in case.units])
-    options: dict[str, Any] = {"structure": case.structure, "max_order": case.max_order, "tolerance_db": case.tolerance_db}
+    options: dict[str, Any] = {"max_order": case.max_order, "tolerance_db": case.tolerance_db}
     found = quantify_responses(given, case.freqs_hz, case.form, sample_period_s=case.units[0].dt, **options)
     parts = [truth(case.form, found.nominal_response, G) for G in given]
     E, R = np.array([E for E, _ in parts]), np.array([R for _, R in parts])

@@ -28,7 +28,6 @@ reader = "parquet"
 refine = false
 [uncertainty]
 form = "additive"
-structure = "scalar"
 n_freqs = 60
 max_order = 1
 """

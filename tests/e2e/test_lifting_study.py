@@ -32,7 +32,6 @@ refine = false
 [uncertainty]
 n_freqs = 100
 max_order = 1
-structure = "scalar"
 
 [evaluate]
 robustness = false

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("few_figures")
 FAST = (
     'name = "fast"\n[data]\nsource = "{source}"\nreader = "parquet"\n'
     "[identify]\nrefine = false\n"
-    '[uncertainty]\nn_freqs = 60\nstructure = "scalar"\nmax_order = 1\n'
+    "[uncertainty]\nn_freqs = 60\nmax_order = 1\n"
     '[synthesis]\ninput_weight = 3.0\nmethods = ["residual_h2"]\n'
     '[observer]\nbaselines = ["open_loop", "kalman_white"]\n'
     "[evaluate]\nrobustness = false\nmonte_carlo = 0\n"

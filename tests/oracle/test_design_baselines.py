@@ -17,7 +17,7 @@ from kros.plants import DcMotorPopulation
 @pytest.fixture(scope="module")
 def uncertain():
     population = DcMotorPopulation(n_units=4, n_episodes=4, seconds=4.0, seed=11).simulate().population
-    return kros.quantify(kros.identify(population, refine=False), n_freqs=50, max_order=1, structure="scalar")
+    return kros.quantify(kros.identify(population, refine=False), n_freqs=50, max_order=1)
 
 
 def task(uncertain, method):

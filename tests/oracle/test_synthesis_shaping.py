@@ -40,7 +40,7 @@ def test_filters_touch_their_spectra_from_the_asked_side(side: str) -> None:
     ratio = _powers(channels, channels.shaping(Spectrum(phi, None), fit_magnitude, side, OPTIONS).filters) / phi
     at, beyond = (ratio.min(axis=0), ratio.max(axis=0)) if side == "above" else (ratio.max(axis=0), ratio.min(axis=0))
     np.testing.assert_allclose(at, 1.0, rtol=1e-9)
-    own = [fit_magnitude(channels.freqs_hz, np.sqrt(column), DT, side=side, **OPTIONS) for column in phi.T]
+    own = [fit_magnitude(channels.freqs_hz, np.sqrt(column), DT, **OPTIONS) for column in phi.T]
     np.testing.assert_allclose(np.abs(10 * np.log10(beyond)), [fit.overbound_db for fit in own], atol=0.05)
 
 
@@ -48,7 +48,7 @@ def test_spectra_of_one_shape_share_a_fit() -> None:
     calls = []
 
     def counted(*arguments: Any, **options: Any) -> Any:
-        calls.append(options["side"])
+        calls.append(options)
         return fit_magnitude(*arguments, **options)
 
     channels = _channels()
@@ -56,8 +56,8 @@ def test_spectra_of_one_shape_share_a_fit() -> None:
     spectrum = Spectrum(shape[:, None] * np.array([1.0, 0.3]), None)
     above = channels.shaping(spectrum, counted, "above", OPTIONS)
     below = channels.shaping(spectrum, counted, "below", OPTIONS)
-    assert calls == ["above"]
+    assert len(calls) == 1
     assert (_powers(channels, above.filters) >= spectrum.phi * (1 - 1e-9)).all()
     assert (_powers(channels, below.filters) <= spectrum.phi * (1 + 1e-9)).all()
     channels.shaping(Spectrum(spectrum.phi * np.sqrt(shape)[:, None], None), counted, "above", OPTIONS)
-    assert calls == ["above"] * 2
+    assert len(calls) == 2

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kros.uncertainty import optimal_cover
-from kros.uncertainty.weights.cover import cover_ratio
+from kros.uncertainty.weights.cover import cover_ratio, optimal_cover
 
 
 def residuals(seed: int, units: int, freqs: int, p: int, m: int) -> np.ndarray:

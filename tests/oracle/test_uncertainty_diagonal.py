@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from kros.core import StateSpace
-from kros.uncertainty import Form, fit_weight, quantify_systems
+from kros.uncertainty import Form, quantify_systems
 from kros.uncertainty.fits.sections import Sections
+from kros.uncertainty.weights.fit import fit_weight
 
 DT = 1e-3
 FREQS = np.geomspace(5e-2, 500.0, 150)
@@ -88,8 +89,8 @@ def test_higher_orders_are_taken_where_four_are_not_enough() -> None:
         w = 1j * np.tan(np.pi * np.minimum(at, 499.999) * DT)
         return np.prod([(w**2 + 2 * a * w + a**2) / (w**2 + 0.5 * a * w + a**2) for a in (2e-3, 3e-2, 0.4)], axis=0)[None, :, None, None]
 
-    four, _ = fit_weight(peaks, freqs, DT, density=2)
-    six, _ = fit_weight(peaks, freqs, DT, density=2, max_order=6)
+    four, _ = fit_weight(peaks, freqs, DT)
+    six, _ = fit_weight(peaks, freqs, DT, max_order=6)
     assert max(four.left_orders) <= 4 < max(six.left_orders) <= 6
     assert six.overbound_db_max < four.overbound_db_max
 

@@ -11,10 +11,11 @@ import pytest
 from kros.core.lti import StateSpace, gain
 from kros.design.settings import SynthesisSettings
 from kros.design.uncertain_set import usable_problem
-from kros.uncertainty import ResidualSystems, UncertainModel, fit_weight, quantify_systems, residual
+from kros.uncertainty import UncertainModel, quantify_systems, residual
 from kros.uncertainty.weights.certificate import Method
 from kros.uncertainty.weights.cover import Perturbation, Structure
-from kros.uncertainty.weights.pencils import ratio_systems
+from kros.uncertainty.weights.fit import fit_weight
+from kros.uncertainty.weights.pencils import ResidualSystems, ratio_systems
 from kros.uncertainty.weights.weight import EntrywiseWeight
 
 DT = 1e-3
@@ -47,7 +48,7 @@ def scattered(seed: int, p: int, m: int, units: int = 3) -> StateSpace:
 def test_every_entry_is_bounded_and_the_dyads_rebuild_the_residual(shape: tuple[int, int]) -> None:
     p, m = shape
     systems, residuals = additive(scattered(1, p, m))
-    weight, cover = fit_weight(residuals, GRID, DT, structure="entrywise", systems=systems, max_order=2, tolerance_db=3.0, density=4)
+    weight, cover = fit_weight(residuals, GRID, DT, structure="entrywise", systems=systems, max_order=2, tolerance_db=3.0)
     assert isinstance(weight, EntrywiseWeight)
     assert weight.structure is Structure.ENTRYWISE
     assert weight.perturbation is Perturbation.DIAGONAL
@@ -108,7 +109,7 @@ def test_realisations_of_entries(form: str) -> None:
 
 def test_models_keep_their_weights_and_synthesis_refuses_them(tmp_path: Path) -> None:
     units = lags(1 + 0.1 * np.random.default_rng(4).normal(size=(3, 2, 2)) + np.eye(2), np.full((3, 2, 2), 5.0))
-    model = quantify_systems(units, freqs_hz=GRID, structure="entrywise", max_order=2, tolerance_db=3.0, density=2)
+    model = quantify_systems(units, freqs_hz=GRID, structure="entrywise", max_order=2, tolerance_db=3.0)
     model.save(tmp_path)
     loaded = UncertainModel.load(tmp_path).weight
     assert isinstance(loaded, EntrywiseWeight)
@@ -125,7 +126,7 @@ def test_continuous_models() -> None:
     poles = np.array([-1.0, -1.3, -0.8])[:, None, None] * np.eye(2)
     coupled = np.array([[1.0, 0.4], [-0.2, 1.0]])
     units = StateSpace(poles, np.broadcast_to(coupled, (3, 2, 2)), np.broadcast_to(np.eye(2), (3, 2, 2)), np.zeros((3, 2, 2)), 0.0)
-    model = quantify_systems(units, "additive", np.geomspace(0.01, 10, 60), structure="entrywise", max_order=2, tolerance_db=3.0, density=2)
+    model = quantify_systems(units, "additive", np.geomspace(0.01, 10, 60), structure="entrywise", max_order=2, tolerance_db=3.0)
     freqs = np.geomspace(0.01, 10, 500)
     E = residual("additive", units[model.nominal].frequency_response(freqs), units.frequency_response(freqs))
     assert isinstance(model.weight, EntrywiseWeight)

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DimensionError
-from kros.core.lti import StateSpace, gain
-from kros.uncertainty import Cover, Form, Weight, fit_magnitude, magnitude_tightness
-from kros.uncertainty.fits.magnitude import Tightness
+from kros.core.lti import gain
+from kros.uncertainty import Cover, Form, Weight
 from kros.uncertainty.unit_residuals import UnitResiduals, shown_rows, unit_residuals, unstructured_excess, weight_ratio
 from kros.uncertainty.weights.cover import Structure
 
@@ -87,29 +86,3 @@ def test_round_trips(tmp_path: Path) -> None:
         found.entry_excess,
     )
     np.testing.assert_array_equal(again.ratio, found.ratio)
-    curve = Tightness(np.arange(1, 3), np.array([2.0, 1.0]), np.array([1.0, 0.5]), np.arange(1, 3))
-    curve.save(tmp_path / "order")
-    np.testing.assert_array_equal(Tightness.load(tmp_path / "order").proven_db, curve.proven_db)
-
-
-def test_order_of_a_system_shows_in_its_curve() -> None:
-    """Two far apart resonances need order four: below that a bound is proven that no fit of those orders beats, at it the distance is gone."""
-
-    def resonance(freq_hz: float, damping: float) -> np.ndarray:
-        pole = np.exp(2 * np.pi * freq_hz * DT * complex(-damping, np.sqrt(1 - damping**2)))
-        A = np.array([[pole.real, pole.imag], [-pole.imag, pole.real]])
-        system = StateSpace(A, np.array([[1.0], [0.0]]), np.array([[0.3, 0.1]]), np.array([[1.0]]), DT)
-        return np.abs(system.frequency_response(freqs)[:, 0, 0])
-
-    freqs = np.geomspace(0.02, 50.0, 90)
-    magnitude = resonance(0.5, 0.2) * resonance(15.0, 0.1)
-    curve = magnitude_tightness(freqs, magnitude, DT, range(1, 6))
-    assert np.all(np.diff(curve.overbound_db) <= 1e-9)
-    assert np.all(np.diff(curve.proven_db) <= 1e-9)
-    assert np.all(curve.proven_db <= curve.overbound_db + 1e-9)
-    assert curve.overbound_db[3] < 0.05
-    assert curve.proven_db[2] > 0.5
-    for order, proven in zip(curve.orders, curve.proven_db, strict=True):
-        assert fit_magnitude(freqs, magnitude, DT, order=int(order)).overbound_db >= proven - 1e-9
-    flat = magnitude_tightness(freqs, np.ones(90), DT, (1, 2))
-    assert flat.overbound_db == pytest.approx(0.0, abs=1e-9)

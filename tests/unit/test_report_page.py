@@ -54,7 +54,6 @@ from kros.report.theme import Tone
 from kros.study.pipeline import RunResult
 from kros.synthesis.result import Injection, Status, Synthesis
 from kros.uncertainty import Cover, Form, OutlierModel, UncertainModel, VariationAndNoise, quantify_systems, residual, score_outliers
-from kros.uncertainty.fits.magnitude import Tightness
 from kros.uncertainty.quantify import UncertainModels
 from kros.uncertainty.unit_residuals import UnitResiduals
 from kros.uncertainty.weights.cover import cover_ratio
@@ -94,9 +93,7 @@ def models(name: str, condition: str, seed: int) -> ModelSet:
 def uncertain() -> dict[str, UncertainModel]:
     found = {}
     for name in ("koopman_edmd", "linear_edmd"):
-        found[name] = quantify_systems(
-            models(name, "noload", 1), freqs_hz=np.geomspace(0.1, 500, 60), unit_ids=UNITS[1:], max_order=2, density=3
-        )
+        found[name] = quantify_systems(models(name, "noload", 1), freqs_hz=np.geomspace(0.1, 500, 60), unit_ids=UNITS[1:], max_order=2)
     return found
 
 
@@ -197,7 +194,7 @@ def scores(condition: str) -> OutlierModel:
 
 def beside_others(name: str) -> UnitResiduals:
     found = models(name, "load", 2)
-    covered = quantify_systems(found, freqs_hz=np.geomspace(0.1, 500, 40), unit_ids=UNITS[1:], max_order=2, density=3, structure="scalar")
+    covered = quantify_systems(found, freqs_hz=np.geomspace(0.1, 500, 40), unit_ids=UNITS[1:], max_order=2)
     inside = beside(covered, found)
     outer = np.concatenate([3 * inside.entries[:1], inside.entries]), np.concatenate([3 * inside.ratio[:1], inside.ratio])
     return dataclasses.replace(inside, unit_ids=UNITS, outside=UNITS[:1], entries=outer[0], ratio=outer[1])
@@ -206,9 +203,6 @@ def beside_others(name: str) -> UnitResiduals:
 def write_diagnostics(run: Path, uncertain: dict[str, UncertainModel]) -> None:
     for name, model in uncertain.items():
         noise(model).save(run / "uncertainty" / name / "noise")
-        Tightness(np.arange(1, 4), np.array([5.0, 2.0, 0.5]), np.array([5.0, 1.0, 0.0]), np.arange(1, 4)).save(
-            run / "uncertainty" / name / "order"
-        )
         beside(model, models(name, "noload", 1)).save(run / "uncertainty" / name / "units")
         beside_others(name).save(run / "outliers" / f"{name}@load" / "others")
     for condition, folder in (("noload", "koopman_edmd"), ("load", "koopman_edmd@load")):
@@ -602,9 +596,8 @@ def test_phase_figure_shows_the_calibration(finished: tuple[Path, dict[str, Any]
 def test_plot_takes_every_result(uncertain: dict[str, UncertainModel]) -> None:
     population = from_arrays({"a": [np.zeros((50, 5)) + np.arange(50.0)[:, None]]}, CHANNELS, sample_period_s=DT)
     before = dict(matplotlib.rcParams)
-    order = Tightness(np.arange(1, 3), np.array([5.0, 2.0]), np.zeros(2), np.arange(1, 3))
     some = (population, models("koopman_edmd", "noload", 1), uncertain["linear_edmd"], synthesis(4, "mixed"))
-    for result in (*some, noise(uncertain["linear_edmd"]), scores("load"), order):
+    for result in (*some, noise(uncertain["linear_edmd"]), scores("load")):
         figure = plot(result)
         assert isinstance(figure, Figure)
         assert figure.axes

@@ -34,7 +34,7 @@ def population() -> Population:
 @pytest.fixture(scope="module")
 def uncertain(population: Population) -> UncertainModels:
     models = kros.identify(population, refine=False)
-    return kros.quantify(models, n_freqs=60, max_order=1, structure="scalar")
+    return kros.quantify(models, n_freqs=60, max_order=1)
 
 
 def test_from_arrays_to_a_step(uncertain: UncertainModels, population: Population) -> None:
@@ -73,7 +73,7 @@ def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Populati
         kros.run(population, "out", data={"reader": "parquet"})
     with pytest.raises(ConfigError, match="'learned': it is a baseline"):
         kros.synthesize(uncertain, method="learned")
-    with pytest.raises(ConfigError, match=r"Synthesize: penalti: unknown key; did you mean 'penalty'\? known are methods, set, injection"):
+    with pytest.raises(ConfigError, match=r"Synthesize: penalti: unknown key; did you mean 'penalty'\? known are methods, injection"):
         kros.synthesize(uncertain, penalti=1.0)
     with pytest.raises(ConfigError, match="Identify: alpha_factor"):
         kros.identify(population, alpha_factor=0.5)
@@ -183,6 +183,6 @@ def test_models_are_saved_with_their_recordings(uncertain: UncertainModels, tmp_
 
 def test_systems_are_quantified_by_the_same_verb(uncertain: UncertainModels) -> None:
     systems = uncertain.models.models().systems()
-    options = {"freqs_hz": np.geomspace(0.5, 100, 40), "structure": "scalar", "max_order": 1}
+    options = {"freqs_hz": np.geomspace(0.5, 100, 40), "max_order": 1}
     found = kros.quantify(systems, "additive", **options)
     assert found.peak_db == quantify_systems(systems, "additive", **options).peak_db

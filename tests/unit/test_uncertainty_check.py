@@ -8,12 +8,12 @@ import pytest
 from kros.core import KrosError, StateSpace
 from kros.core.errors import ConfigError
 from kros.core.frequency import log_grid
-from kros.uncertainty import ResidualSystems, quantify_systems
+from kros.uncertainty import quantify_systems
 from kros.uncertainty.fits.sections import Sections
 from kros.uncertainty.fits.spectral import RationalMagnitude, cascade, roots, spectral_factor
 from kros.uncertainty.responses import unresolved_peaks
 from kros.uncertainty.weights.check import between_points, checking_grid, joined, nearest
-from kros.uncertainty.weights.pencils import peaks_hz
+from kros.uncertainty.weights.pencils import ResidualSystems, peaks_hz
 
 
 def test_joined_frequencies_increase_and_none_is_there_twice() -> None:
@@ -154,6 +154,6 @@ def test_models_from_recordings_are_quantified_from_their_lowest_frequency() -> 
         def systems(self, units: tuple[str, ...]) -> list[StateSpace]:
             return [pair(0.7, 1.0), pair(0.7, 1.0, 1.2)]
 
-    found = quantify_systems(Recorded(), "additive", max_order=1, tolerance_db=20.0, density=1)
+    found = quantify_systems(Recorded(), "additive", max_order=1, tolerance_db=20.0)
     assert found.freqs_hz[0] == pytest.approx(0.02)
     assert found.freqs_hz[-1] == 0.5

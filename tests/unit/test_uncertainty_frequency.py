@@ -7,8 +7,9 @@ import pytest
 
 from kros.core.errors import ConfigError, KrosError
 from kros.core.frequency import bilinear_squared, check_grid, dense_grid, log_grid, nyquist_hz
-from kros.uncertainty import Form, choose_nominals
+from kros.uncertainty import Form
 from kros.uncertainty.fits.spectral import RationalMagnitude, basis, roots, spectral_factor
+from kros.uncertainty.nominal.choice import choose_nominals
 
 DT = 1e-3
 

@@ -9,7 +9,33 @@ from typing import Any
 REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("The section [memory] of a study is called [predictor]; rename it.", ("memory",)),
     ("Noise is declared with the sensor, for example [sensor.position] noise = 1e-6; move it there.", ("synthesis.noise",)),
-    ("Full weights are no longer part of kros; use structure = 'diagonal', whose set is somewhat larger.", ("uncertainty.structure=full",)),
+    (
+        "Structures of weights to choose from are no longer part of kros; remove the key structure, weights are diagonal, or scalar where these are loose.",
+        ("uncertainty.structure",),
+    ),
+    (
+        "What the fit of a weight is made of is no longer public; use quantify_systems or quantify_responses.",
+        (
+            "kros.uncertainty.ResidualSystems",
+            "kros.uncertainty.fit_weight",
+            "kros.uncertainty.optimal_cover",
+        ),
+    ),
+    (
+        "Order against tightness of weights is no longer part of kros; use fit_magnitude, whose result has overbound_db and proven_db.",
+        ("kros.uncertainty.magnitude_tightness",),
+    ),
+    (
+        "Where a form is exact is no longer a function of its own; use misfit, which is zero there.",
+        (
+            "kros.uncertainty.completion",
+            "kros.uncertainty.existence",
+        ),
+    ),
+    (
+        "The nominals of all forms are no longer one function; use choose_nominal for each form.",
+        ("kros.uncertainty.choose_nominals",),
+    ),
     ("The set of worst-case synthesis, of signals or of the form, is chosen on held-out episodes; remove the key set.", ("synthesis.set",)),
 )
 

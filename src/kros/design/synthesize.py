@@ -63,7 +63,7 @@ class Design:
     --------
     >>> import kros
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1, structure="scalar")
+    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1)
     >>> design = kros.synthesize(uncertain, "kalman_tuned", methods=())
     >>> design.observer.lifting.states, design.synthesis.status.value, design.facts["order"]
     (('position', 'velocity', 'current'), 'optimal', 0)
@@ -179,7 +179,7 @@ def synthesize(
     --------
     >>> import kros
     >>> drives = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> uncertain = kros.quantify(kros.identify(drives, refine=False), n_freqs=50, max_order=1, structure="scalar")
+    >>> uncertain = kros.quantify(kros.identify(drives, refine=False), n_freqs=50, max_order=1)
     >>> design = kros.synthesize(uncertain, "kalman_tuned", methods=())
     >>> design.name, design.observer.start([0.0]).states
     ('linear_edmd/kalman_tuned', ('position', 'velocity', 'current'))

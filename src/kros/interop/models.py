@@ -24,7 +24,6 @@ def quantify_models(
     freqs_hz: npt.ArrayLike | None = None,
     *,
     nominal: Any = None,
-    extra: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> UncertaintyForControl:
     """Quantify how models of python-control differ from a nominal one.
@@ -42,11 +41,9 @@ def quantify_models(
     freqs_hz : array_like, shape (frequency,), Hz, optional
         Response data bring their own.
     nominal : int, str, system or response data, optional
-        The best by ``criterion`` by default.
-    extra : mapping of str to systems or response data, optional
-        Further candidates for the nominal.
+        The best unit by default.
     **options
-        Of `kros.uncertainty.quantify_systems` or `quantify_responses`: ``criterion``, ``output_scale``, ``input_scale``, ``structure``, ``max_order``,
+        Of `kros.uncertainty.quantify_systems` or `quantify_responses`: ``output_scale``, ``input_scale``, ``max_order``,
         ``tolerance_db`` and others. Weights act on scaled signals.
 
     Returns
@@ -77,27 +74,23 @@ def quantify_models(
         options["unit_ids"], models = tuple(models), list(models.values())
     if not len(models):
         raise DataError("quantify_models: found no models; give at least two.")
-    others = extra or {}
     if all(is_system(model) for model in models):
         base = from_control(nominal) if is_system(nominal) else nominal
-        candidates = {name: from_control(model) for name, model in others.items()}
-        return uncertainty_to_control(
-            quantify_systems([from_control(m) for m in models], form, freqs_hz, nominal=base, extra=candidates, **options)
-        )
+        return uncertainty_to_control(quantify_systems([from_control(m) for m in models], form, freqs_hz, nominal=base, **options))
     if not all(isinstance(model, control.FRD) for model in models):
         kinds = sorted({type(model).__name__ for model in models})
         raise DimensionError(f"quantify_models: found {' and '.join(kinds)} in one list; give all as systems or all as control.FRD.")
     if freqs_hz is not None:
         raise ConfigError("quantify_models: response data bring their own frequencies; drop freqs_hz.")
-    freqs, period = _common_axis([*models, *others.values(), *([nominal] if isinstance(nominal, control.FRD) else [])])
+    freqs, period = _common_axis([*models, *([nominal] if isinstance(nominal, control.FRD) else [])])
     base = _response(nominal) if isinstance(nominal, control.FRD) else nominal
-    responses, more = [_response(model) for model in models], {name: _response(model) for name, model in others.items()}
+    responses = [_response(model) for model in models]
     shapes = {response.shape for response in responses}
     if len(shapes) > 1:
         raise DimensionError(
             f"quantify_models: responses differ in shape (frequency, outputs, inputs): {sorted(shapes)}; bring them to one."
         )
-    model = quantify_responses(np.array(responses), freqs, form, sample_period_s=period, nominal=base, extra=more, **options)
+    model = quantify_responses(np.array(responses), freqs, form, sample_period_s=period, nominal=base, **options)
     G = model.nominal_response
     scaled = G / model.output_scale[:, None] * model.input_scale
     data, scaled_data = (control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, period or 0) for g in (G, scaled))

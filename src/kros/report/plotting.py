@@ -22,14 +22,13 @@ PLOTS = {
     "ModelSet": "models.bode:bode_figure",
     "UncertainModel": "uncertainty.uncertain_model:uncertain_figure",
     "VariationAndNoise": "uncertainty.variation:variation_figure",
-    "Tightness": "uncertainty.weight_orders:orders_figure",
     "OutlierModel": "outliers.scores:scores_figure",
     "Synthesis": "synthesis.correction:synthesis_figure",
     "Observer": "synthesis.correction:observer_figure",
     "ErrorSummary": "observers.summary:summary_figure",
 }
 """Name of a result's class -> file of a figure and the function in it that draws the result. Its further parameters are the options of `plot`."""
-_SIDE_BY_SIDE = ("VariationAndNoise", "Tightness", "OutlierModel")  # figures that take several results by name
+_SIDE_BY_SIDE = ("VariationAndNoise", "OutlierModel")  # figures that take several results by name
 
 
 def plot(result: Any, **options: Any) -> Figure:

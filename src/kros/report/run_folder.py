@@ -24,7 +24,6 @@ from ..identify.refine import RefinedModels
 from ..observer import Observer
 from ..synthesis.result import Synthesis
 from ..uncertainty import OutlierModel, UncertainModel, VariationAndNoise
-from ..uncertainty.fits.magnitude import Tightness
 from ..uncertainty.unit_residuals import UnitResiduals
 
 Array = npt.NDArray[Any]
@@ -172,11 +171,6 @@ class RunFolder:
         """Variation and noise, by kind of model."""
         reason = "variation and noise were not separated; it takes two training episodes of every unit"
         return _in_order(self._load("uncertainty", "noise/*.json", VariationAndNoise.load, reason))
-
-    @cached_property
-    def orders(self) -> dict[str, Tightness]:
-        """Overbound over order, by kind of model."""
-        return _in_order(self._load("uncertainty", "order/*.json", Tightness.load, "no weights of different orders have been compared"))
 
     @cached_property
     def unit_residuals(self) -> dict[str, UnitResiduals]:

@@ -16,7 +16,6 @@ from ..evaluate.intervals import interval_rows
 from ..observer.limits import Limit, limits_of
 from ..synthesis.result import Synthesis
 from ..uncertainty import UncertainModel, VariationAndNoise
-from ..uncertainty.fits.magnitude import Tightness
 from .config import Stage
 from .engine.context import Context
 from .engine.store import Store
@@ -133,16 +132,13 @@ def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
 
 
 def diagnostic_entry(store: Store, name: str) -> dict[str, Any]:
-    """Return what was found out about one uncertain model beside its weights: share of noise, and overbounds of a scalar magnitude over order."""
+    """Return what was found out about one uncertain model beside its weights: the share of noise."""
     entry: dict[str, Any] = {}
     if store.holds("uncertainty", name, "noise"):
         noise = VariationAndNoise.load(store.path("uncertainty", name, "noise"))
         place = int(noise.residual.max(axis=0).argmax())
         shares = {"median": np.median(noise.noise_share), "at_peak": noise.noise_share[place], "peak_hz": noise.freqs_hz[place]}
         entry["noise_share"] = shares
-    if store.holds("uncertainty", name, "order"):
-        order = Tightness.load(store.path("uncertainty", name, "order"))
-        entry["order_db"] = {"orders": order.orders, "overbound": order.overbound_db, "proven": order.proven_db}
     return entry
 
 

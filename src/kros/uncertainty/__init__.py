@@ -12,20 +12,19 @@ Examples
 ('1', True)
 """
 
+from ..core.removed import refusing
 from ..core.small_matrices import sigma_max
-from .fits.magnitude import FittedMagnitude, fit_magnitude, magnitude_tightness
-from .forms import Form, bounds, completion, existence, misfit, rebuild, residual
+from .fits.magnitude import FittedMagnitude, fit_magnitude
+from .forms import Form, bounds, misfit, rebuild, residual
 from .model import ResponseUncertainty, UncertainModel
-from .nominal.choice import NominalChoice, choose_nominal, choose_nominals
+from .nominal.choice import NominalChoice, choose_nominal
 from .outliers.model import OutlierModel, score_outliers
 from .outliers.score import OutlierScore
 from .quantify import UncertainModels, quantify
 from .responses import quantify_responses
 from .systems import quantify_systems
 from .variation import VariationAndNoise, variation_and_noise
-from .weights.cover import Cover, optimal_cover
-from .weights.fit import fit_weight
-from .weights.pencils import ResidualSystems
+from .weights.cover import Cover
 from .weights.weight import Weight
 
 __all__ = [
@@ -35,7 +34,6 @@ __all__ = [
     "NominalChoice",
     "OutlierModel",
     "OutlierScore",
-    "ResidualSystems",
     "ResponseUncertainty",
     "UncertainModel",
     "UncertainModels",
@@ -43,14 +41,8 @@ __all__ = [
     "Weight",
     "bounds",
     "choose_nominal",
-    "choose_nominals",
-    "completion",
-    "existence",
     "fit_magnitude",
-    "fit_weight",
-    "magnitude_tightness",
     "misfit",
-    "optimal_cover",
     "quantify",
     "quantify_responses",
     "quantify_systems",
@@ -60,3 +52,5 @@ __all__ = [
     "sigma_max",
     "variation_and_noise",
 ]
+
+__getattr__ = refusing(__name__)

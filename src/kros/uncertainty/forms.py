@@ -29,13 +29,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
-from ..core.linalg import adjoint
 from ..core.small_matrices import condition_number, entries_first, entries_last, multiply, pseudo_inverse_first, sigma_max
 
 Array = npt.NDArray[Any]
 E = TypeVar("E", bound=Enum)
 
-_OUTSIDE = 1e-9  # what may stick out of a range, relative to the matrix tested
 MAX_CONDITION = 1e12  # beyond this an inverse form cannot rebuild the plant
 
 
@@ -173,32 +171,6 @@ def inverted_matrix(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) 
     return np.eye(product.shape[-1]) - product
 
 
-def existence(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> Array:
-    """Tell where, shape (...), a residual of this form rebuilds the perturbed plant exactly.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import existence
-    >>> nominal = np.array([[1.0], [0.0]])  # two outputs, one input
-    >>> bool(existence("input_multiplicative", nominal, 1.2 * nominal)), bool(existence("input_multiplicative", nominal, nominal + [[0], [0.1]]))
-    (True, False)
-    """
-    form = as_form(form)
-    G, Gp = _plants(nominal, perturbed)
-    if form is Form.ADDITIVE:
-        return np.ones(np.broadcast_shapes(G.shape, Gp.shape)[:-2], bool)
-    inner, outer = (G, Gp) if form.inverse else (Gp - G, G)
-    rows = form in (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
-    inside = _in_range(adjoint(inner), adjoint(outer)) if rows else _in_range(inner, outer)
-    if form is Form.INVERSE_ADDITIVE:
-        inside &= _in_range(adjoint(Gp), adjoint(G))
-    if not form.inverse:
-        return inside
-    matrix = inverted_matrix(form, G, residual(form, G, Gp))
-    return inside & (condition_number(matrix) < MAX_CONDITION)
-
-
 def bounds(form: Form | str, responses: Array, *, paper: bool = False, nominals: Sequence[int] | None = None) -> Array:
     """Return the largest residual over the other units, for every nominal asked for.
 
@@ -265,32 +237,7 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
 
 
 def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike, E: Array | None = None) -> tuple[Array, Array]:
-    """Return residuals and the additive remainder that completes them: `Gp = rebuild(form, G, E) + R` for every unit and frequency.
-
-    Parameters
-    ----------
-    form : Form or str
-    nominal, responses : array_like, shape (..., p, m), complex
-        Leading axes broadcast.
-    E : ndarray, shape (..., p', m'), optional
-        Residuals, when already computed.
-
-    Returns
-    -------
-    E : ndarray, shape (..., p', m')
-        As `residual`, but zero where the matrix that the form inverts has a condition number above 1e12.
-    R : ndarray, shape (..., p, m)
-        Zero but for rounding where the form is exact, and `Gp - G` where E was set to zero.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import completion, rebuild
-    >>> nominal, unit = np.array([[1.0], [0.0]]), np.array([[1.2], [0.1]])
-    >>> E, R = completion("input_multiplicative", nominal, unit)
-    >>> (rebuild("input_multiplicative", nominal, E) + R).round(9).ravel().tolist(), R.round(9).ravel().tolist()
-    ([1.2, 0.1], [0.0, 0.1])
-    """
+    """Return residuals, zero where an inverse form is near singular, and the remainder: `Gp = rebuild(form, G, E) + R` everywhere."""
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
     E = residual(form, G, Gp) if E is None else E
     if form.inverse:
@@ -325,9 +272,3 @@ def _inverse(matrices: Array) -> Array:
         regular = np.linalg.cond(matrices) < 1 / np.finfo(float).eps
         safe = np.where(regular[..., None, None], matrices, np.eye(matrices.shape[-1]))
         return np.where(regular[..., None, None], np.linalg.inv(safe), np.nan)
-
-
-def _in_range(inner: Array, outer: Array) -> Array:
-    """Tell where range(inner) lies in range(outer)."""
-    out = inner - outer @ (np.linalg.pinv(outer) @ inner)
-    return np.linalg.norm(out, axis=(-2, -1)) <= _OUTSIDE * np.linalg.norm(inner, axis=(-2, -1))

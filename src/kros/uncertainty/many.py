@@ -22,8 +22,8 @@ from ..core.small_matrices import sigma_max
 from .forms import completion, misfit, residual
 from .quantification import Bounded, Quantification
 from .weights.certificate import Method, certify
-from .weights.check import Checks, checking_grid
-from .weights.cover import Cover, Structure, cover_ratio
+from .weights.check import DENSITY, Checks, checking_grid
+from .weights.cover import Cover, cover_ratio
 from .weights.pencils import Part, ResidualSystems, peaks_hz
 from .weights.weight import Weight
 
@@ -38,7 +38,7 @@ _MARGIN = 1e-9
 
 def is_many(asked: Quantification, n_units: int, time: Any) -> bool:
     """Tell whether units are so many that those that decide are sought; entrywise weights and continuous time have no such way."""
-    return n_units > MANY and isinstance(time, float) and asked.structure is not Structure.ENTRYWISE
+    return n_units > MANY and isinstance(time, float) and not asked.entrywise
 
 
 def bound_many(asked: Quantification, base: StateSpace, units: StateSpace, freqs_hz: Array) -> Bounded:
@@ -126,7 +126,7 @@ class _Many:
 
     @property
     def _grid(self) -> Array:
-        return checking_grid(self.freqs_hz, self.base.dt, self.asked.density, filled=True)
+        return checking_grid(self.freqs_hz, self.base.dt, DENSITY, filled=True)
 
     def proofs(self, weights: Mapping[Part, Weight], rows: Array, certain: bool) -> dict[Part, _Proof]:
         """Compare weights with all units, as those of few units are.
@@ -138,7 +138,7 @@ class _Many:
         for block in self.blocks():
             own = self.units[block]
             also = peaks_hz(ResidualSystems(self.asked.form, self.base, own), self._grid, self.base.dt)
-            claimed = Checks(self.asked.density, also).claimed(self.freqs_hz, self.base.dt)
+            claimed = Checks(also).claimed(self.freqs_hz, self.base.dt)
             parts = completion(self.asked.form, self.base.frequency_response(claimed), own.frequency_response(claimed))
             for (part, weight), E in zip(weights.items(), parts, strict=False):
                 known = _ratio(weight, E, claimed)

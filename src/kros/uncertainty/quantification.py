@@ -19,10 +19,10 @@ from ..core.errors import ConfigError
 from ..core.norms import hinf_norm
 from ..core.small_matrices import sigma_max
 from .bilinear import BilinearAxis
-from .forms import Form, as_form, completion, member, misfit, residual
-from .nominal.choice import Criterion, NominalChoice, choose_nominal, choose_nominals
+from .forms import Form, as_form, completion, misfit, residual
+from .nominal.choice import NominalChoice
 from .weights.check import Residuals, between_points
-from .weights.cover import Cover, Structure, as_structure
+from .weights.cover import Cover, Structure
 from .weights.fit import fit_weight
 from .weights.pencils import Part, ResidualSystems
 from .weights.weight import Weight
@@ -30,8 +30,8 @@ from .weights.weight import Weight
 Array = npt.NDArray[Any]
 Responder = Callable[[Array], Array]
 
-AUTO = "auto"  # structure: diagonal weights, or scalar ones where these are not good enough
-POOLED = "pooled"  # name of a nominal that is neither unit nor candidate
+AUTO, ENTRYWISE = "auto", "entrywise"  # structures: diagonal or scalar weights; the paper's
+POOLED = "pooled"  # name of a nominal that is no unit
 _LOG = logging.getLogger(__name__)
 _EXACT = 1e-9  # relative misfit up to which a form is said to rebuild every unit: rounding
 _WORTH_SAYING = 0.01  # a misfit that makes another form worth a thought
@@ -55,40 +55,23 @@ class Bounded:
 
 @dataclass(frozen=True)
 class Quantification:
-    """What is asked for: options of `quantify_systems`, read and checked; no structure stands for the automatic one."""
+    """What is asked for: options of `quantify_systems`, read and checked."""
 
     form: Form
-    criterion: Criterion
-    structure: Structure | None
+    entrywise: bool
     max_order: int
     tolerance_db: float
-    density: int = 10
 
     @classmethod
-    def of(
-        cls,
-        form: Form | str,
-        criterion: Criterion | str,
-        structure: Structure | str,
-        max_order: int,
-        tolerance_db: float,
-        density: int = 10,
-    ) -> Quantification:
+    def of(cls, form: Form | str, structure: str, max_order: int, tolerance_db: float) -> Quantification:
         """Check the options; unknown ones, or an order or tolerance out of range, are a `ConfigError`."""
-        if not (isinstance(max_order, (int, np.integer)) and max_order >= 0 and tolerance_db >= 0 and density >= 1):
+        if not (isinstance(max_order, (int, np.integer)) and max_order >= 0 and tolerance_db >= 0):
             raise ConfigError(
-                f"Quantify: max_order = {max_order!r} should be a whole number from 0, tolerance_db = {tolerance_db} not negative, "
-                f"density = {density} at least 1."
+                f"Quantify: max_order = {max_order!r} should be a whole number from 0, tolerance_db = {tolerance_db} not negative."
             )
-        known = None if structure == AUTO else as_structure(structure)
-        return cls(as_form(form), member(Criterion, criterion, "Nominal criterion"), known, max_order, tolerance_db, density)
-
-    def choose(self, responses: Array, extra: Array, freqs_hz: Array) -> dict[Form, NominalChoice]:
-        """Return the nominal of every form with the lowest peak, and of the form asked for by its criterion."""
-        choices = choose_nominals(responses, extra=extra)
-        if self.criterion is not Criterion.PEAK:
-            choices[self.form] = choose_nominal(responses, self.form, self.criterion, extra=extra, freqs_hz=freqs_hz)
-        return choices
+        if structure not in (AUTO, ENTRYWISE):
+            raise ConfigError(f"Weight structure {structure!r} is unknown; choose {AUTO!r}, or {ENTRYWISE!r} for the paper's.")
+        return cls(as_form(form), structure == ENTRYWISE, max_order, tolerance_db)
 
     def bound(
         self,
@@ -127,13 +110,13 @@ class Quantification:
     ) -> Bounded:
         G, Gp = residuals.responses(freqs_hz)
         E = residuals.of_form(freqs_hz)
-        options: dict[str, Any] = {"max_order": self.max_order, "density": self.density, "also_hz": also_hz, "sampled": sampled}
+        options: dict[str, Any] = {"max_order": self.max_order, "also_hz": also_hz, "sampled": sampled}
 
         def fit(structure: Structure) -> tuple[Weight, Cover]:
             of_form: Residuals = between_points(E, freqs_hz) if sampled else residuals.of_form
             return fit_weight(of_form, freqs_hz, dt, structure=structure, tolerance_db=self.tolerance_db, systems=systems, **options)
 
-        weight, cover = self._automatic(fit) if self.structure is None else fit(self.structure)
+        weight, cover = fit(Structure.ENTRYWISE) if self.entrywise else self._automatic(fit)
         ratio, bound = misfit(self.form, G, Gp, E), sigma_max(E).max(axis=0)
         if not _leaves_out(self.form, ratio):
             return Bounded(bound, cover, weight, ratio)
@@ -166,25 +149,24 @@ class Quantification:
     def fields(
         self,
         unit_ids: tuple[str, ...],
-        names: tuple[str, ...],
         index: int,
         freqs_hz: Array,
         scales: tuple[Array, Array],
         choices: Mapping[Form, NominalChoice],
         found: Bounded,
     ) -> dict[str, Any]:
-        """Return the fields of `Uncertainty` for the nominal `index` among `names` of units and other candidates, -1 for a model of its own."""
-        name = names[index] if index >= 0 else POOLED
+        """Return the fields of `Uncertainty` for the nominal `index` among the units, -1 for a model of its own."""
+        name = unit_ids[index] if index >= 0 else POOLED
         return {
             "form": self.form,
             "unit_ids": unit_ids,
-            "nominal": index if index < len(unit_ids) else -1,
+            "nominal": index,
             "nominal_id": name,
             "freqs_hz": freqs_hz,
             "output_scale": scales[0],
             "input_scale": scales[1],
             "bounds": {f: choice.bound for f, choice in choices.items()} | {self.form: found.bound},
-            "nominals": {f: names[choice.index] for f, choice in choices.items()} | {self.form: name},
+            "nominals": {f: unit_ids[choice.index] for f, choice in choices.items()} | {self.form: name},
             **{key: getattr(found, key) for key in ("cover", "weight", "misfit", "remainder", "remainder_cover")},
         }
 

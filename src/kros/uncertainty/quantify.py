@@ -23,9 +23,9 @@ from ..core.small_matrices import sigma_max
 from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored
-from .forms import Form, residual
+from .forms import residual
 from .model import UncertainModel
-from .nominal.choice import choose_nominals
+from .nominal.choice import choose_nominal
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
 from .settings import UncertaintySettings
@@ -61,7 +61,7 @@ class UncertainModels:
     --------
     >>> import kros
     >>> motors = kros.plants.DcMotorPopulation(n_units=3, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1, structure="scalar")
+    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1)
     >>> list(uncertain.sets), uncertain.nominal in motors.unit_ids
     (['linear_edmd'], True)
     """
@@ -133,7 +133,7 @@ def quantify(models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: 
     work : Work, optional
         Where it runs.
     **settings
-        Of `UncertaintySettings`: ``form``, ``nominal``, ``structure``, ``n_freqs``, ``max_order``, ``tolerance_db``, ``drop_outliers``,
+        Of `UncertaintySettings`: ``form``, ``nominal``, ``n_freqs``, ``max_order``, ``tolerance_db``, ``drop_outliers``,
         ``outlier_form``, ``false_alarm_rate``.
 
     Returns
@@ -150,7 +150,7 @@ def quantify(models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: 
     >>> import kros
     >>> drives = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     >>> models = kros.identify(drives, refine=False)
-    >>> uncertain = kros.quantify(models, n_freqs=50, max_order=1, structure="scalar")
+    >>> uncertain = kros.quantify(models, n_freqs=50, max_order=1)
     >>> uncertain.sets["linear_edmd"].cover_max <= 1  # no unit is outside of the set
     True
     """
@@ -181,7 +181,7 @@ def choose_unit(models: ModelSet, units: list[str], settings: UncertaintySetting
     """Return the nominal unit: the one asked for, else the best of the first kind of models, which all others share as in the paper."""
     if settings.nominal is None or (settings.nominal == _BEST and _BEST not in units):
         responses = models.scaled_responses(models.frequencies(settings.n_freqs), units)
-        return units[choose_nominals(responses)[Form(settings.form)].index]
+        return units[choose_nominal(responses, settings.form).index]
     if settings.nominal not in units:
         raise IdentificationError(
             f"uncertainty.nominal = {settings.nominal!r}: is not among the units {', '.join(units)}; name one of them."
@@ -199,7 +199,6 @@ def quantify_models(models: ModelSet, units: list[str], settings: UncertaintySet
         output_scale=models.output_scale,
         input_scale=models.input_scale,
         nominal=nominal,
-        structure=settings.structure,
         max_order=settings.max_order,
         tolerance_db=settings.tolerance_db,
     )

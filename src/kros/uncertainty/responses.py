@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,10 @@ from ..core.frequency import check_grid
 from .bilinear import BilinearAxis
 from .forms import Form, check_responses
 from .model import ResponseUncertainty
-from .nominal.choice import Criterion
+from .nominal.choice import choose_nominals
 from .quantification import AUTO, Quantification
-from .validation import check_ids, check_names, check_scale, find_nominal
+from .validation import check_ids, check_scale, find_nominal
 from .weights.check import nearest
-from .weights.cover import Structure
 
 Array = npt.NDArray[Any]
 
@@ -36,9 +35,6 @@ def quantify_responses(
     output_scale: npt.ArrayLike | None = None,
     input_scale: npt.ArrayLike | None = None,
     nominal: int | str | npt.ArrayLike | None = None,
-    criterion: Criterion | str = Criterion.PEAK,
-    extra: Mapping[str, npt.ArrayLike] | None = None,
-    structure: Structure | str = AUTO,
     max_order: int = 4,
     tolerance_db: float = 1.0,
 ) -> ResponseUncertainty:
@@ -56,10 +52,8 @@ def quantify_responses(
     sample_period_s : float, s
         Of the systems behind the responses, and of the weights; zero for continuous time, in which weights are fitted through the bilinear map of the axis.
     nominal : int, str or array_like of shape (frequency, p, m), optional
-        A unit, the name of a candidate, or a response of its own; by default the best by `criterion`.
-    extra : mapping of str to array_like, shape (frequency, p, m), optional
-        Further candidates for the nominal by name.
-    unit_ids, output_scale, input_scale, criterion, structure, max_order, tolerance_db
+        A unit, or a response of its own; by default the best unit.
+    unit_ids, output_scale, input_scale, max_order, tolerance_db
         As of `quantify_systems`.
 
     Returns
@@ -73,7 +67,7 @@ def quantify_responses(
     DataError
         Fewer than two units, NaN.
     ConfigError
-        Frequencies that do not increase or are above Nyquist; unknown form, criterion or nominal.
+        Frequencies that do not increase or are above Nyquist; unknown form or nominal.
 
     Examples
     --------
@@ -88,24 +82,20 @@ def quantify_responses(
     >>> round(float(abs(found.weight.left.frequency_response([1.0])[0, 0, 0])), 6)
     0.2
     """
-    asked = Quantification.of(form, criterion, structure, max_order, tolerance_db)
+    asked = Quantification.of(form, AUTO, max_order, tolerance_db)
     G = check_responses(responses)
     freqs = check_grid(freqs_hz, sample_period_s or None)
     if G.shape[1] != len(freqs):
         raise DimensionError(f"Quantify: responses at {G.shape[1]} frequencies need as many in freqs_hz, found {len(freqs)}.")
     ids = check_ids(unit_ids, len(G))
-    check_names(ids, extra or {})
-    names = (*ids, *(extra or {}))
-    candidates = [*G, *(np.asarray(value) for value in (extra or {}).values())]
     own = nominal is not None and not isinstance(nominal, str) and np.ndim(nominal) > 0
-    for name, value in zip((*names, "the nominal"), [*candidates, np.asarray(nominal)] if own else candidates, strict=False):
+    for name, value in zip((*ids, "the nominal"), [*G, np.asarray(nominal)] if own else G, strict=False):
         _check(name, value, G.shape[1:], freqs)
     scales = check_scale("output", output_scale, G.shape[2]), check_scale("input", input_scale, G.shape[3])
-    scaled = np.array(candidates) / scales[0][:, None] * scales[1]
-    units = scaled[: len(G)]
-    choices = asked.choose(units, scaled[len(G) :], freqs)
-    index = -1 if own else find_nominal(nominal, names, choices[asked.form].index)
-    chosen = np.asarray(nominal) if own else candidates[index]
+    units = G / scales[0][:, None] * scales[1]
+    choices = choose_nominals(units)
+    index = -1 if own else find_nominal(nominal, ids, choices[asked.form].index)
+    chosen = np.asarray(nominal) if own else G[index]
     base = chosen / scales[0][:, None] * scales[1]
     time = sample_period_s if sample_period_s > 0 else BilinearAxis.over(freqs)
     found = asked.bound(lambda f: base[nearest(freqs, f)], lambda f: units[:, nearest(freqs, f)], freqs, time, sampled=True)
@@ -124,7 +114,7 @@ def quantify_responses(
         sample_period_s=float(sample_period_s),
         certificate=certificate,
         unresolved_hz=unresolved,
-        **asked.fields(ids, names, index, freqs, scales, choices, found),
+        **asked.fields(ids, index, freqs, scales, choices, found),
     )
 
 

@@ -25,7 +25,6 @@ class UncertaintySettings(Settings):
     nominal: str | None = Field(
         None, description='a unit, or "unit" for the best one; by default observers that are free to may have the mean of the units instead'
     )
-    structure: Literal["auto", "diagonal", "scalar", "entrywise"] = Field("auto", description="of the weights")
     n_freqs: int = Field(1000, ge=50, description="points of the frequency grid")
     max_order: int = Field(4, ge=1, le=8, description="largest order of an entry of a weight")
     tolerance_db: float = Field(1.0, gt=0, description="how far a weight may be above the bound of the residuals")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from ..core.frequency import check_grid, dense_grid, log_grid
@@ -14,11 +13,10 @@ from .bilinear import BilinearAxis, beyond, continuous_grid
 from .forms import Form
 from .many import bound_many, is_many
 from .model import UncertainModel, scale_system
-from .nominal.choice import Criterion
+from .nominal.choice import choose_nominals
 from .quantification import AUTO, Bounded, Quantification
-from .validation import check_candidate, find_nominal, read_candidates, read_models
-from .weights.check import checking_grid
-from .weights.cover import Structure
+from .validation import check_candidate, find_nominal, read_models
+from .weights.check import DENSITY, checking_grid
 from .weights.pencils import ResidualSystems, peaks_hz
 
 Array = npt.NDArray[Any]
@@ -33,12 +31,9 @@ def quantify_systems(
     output_scale: npt.ArrayLike | None = None,
     input_scale: npt.ArrayLike | None = None,
     nominal: int | str | StateSpace | None = None,
-    criterion: Criterion | str = Criterion.PEAK,
-    extra: Mapping[str, StateSpace] | None = None,
-    structure: Structure | str = AUTO,
+    structure: str = AUTO,
     max_order: int = 4,
     tolerance_db: float = 1.0,
-    density: int = 10,
 ) -> UncertainModel:
     """Quantify how the units of a population differ from a nominal one.
 
@@ -60,20 +55,14 @@ def quantify_systems(
     output_scale, input_scale : array_like, shape (p,) and (m,), optional
         Ranges of outputs and inputs over the population; residuals and weights are in these units. Ones by default.
     nominal : int, str or StateSpace, optional
-        Unit (or name in `extra`) to use as nominal, or a model of its own; by default the best by `criterion`.
-    criterion : {"peak", "area"}
-        What the nominal of this form makes small, see `choose_nominal`; those of the other forms have the lowest peaks.
-    extra : mapping of str to StateSpace, optional
-        Further candidates for the nominal by name, for example a pooled model; they are no units, and need not be covered.
-    structure : {"auto", "diagonal", "scalar", "entrywise"}
-        Of the weights. Automatic ones are diagonal, or scalar where diagonal ones come close to an ill-posed set or are fitted badly; entrywise ones
-        bound the entries and are sound for a diagonal perturbation only.
+        Unit to use as nominal, or a model of its own; by default the unit with the lowest peak, see `choose_nominal`.
+    structure : {"auto", "entrywise"}
+        Of the weights. Automatic ones are diagonal, or scalar where diagonal ones come close to an ill-posed set or are fitted badly; the paper's
+        entrywise ones bound the entries, which is sound for a diagonal perturbation only.
     max_order : int
         Largest order of one entry of a weight.
     tolerance_db : float, dB
         Overbound at which a lower order is good enough.
-    density : int
-        How much denser the grid is on which the bound is verified.
 
     Returns
     -------
@@ -87,7 +76,7 @@ def quantify_systems(
     DataError
         Fewer than two units, unstable models, NaN.
     ConfigError
-        Unknown form, criterion, structure or nominal, frequencies above Nyquist, an order or tolerance out of range.
+        Unknown form, structure or nominal, frequencies above Nyquist, an order or tolerance out of range.
 
     Examples
     --------
@@ -100,36 +89,33 @@ def quantify_systems(
     >>> model.nominal, model.cover_max <= 1
     (1, True)
     """
-    asked = Quantification.of(form, criterion, structure, max_order, tolerance_db, density)
+    asked = Quantification.of(form, structure, max_order, tolerance_db)
     system, ids, scales = read_models(models, unit_ids, output_scale, input_scale)
-    others = read_candidates(extra, system, ids)
     freqs, time = _axis(system, freqs_hz, getattr(models, "longest_s", None))
     units = scale_system(system, *scales)
     responses = units.frequency_response(freqs)
-    of_others = np.array([scale_system(s, *scales).frequency_response(freqs) for s in others.values()]).reshape(-1, *responses.shape[1:])
-    choices = asked.choose(responses, of_others, freqs)
-    names = (*ids, *others)
+    choices = choose_nominals(responses)
     if isinstance(nominal, StateSpace):
         check_candidate(nominal, system, "the nominal")
         index, chosen = -1, nominal
     else:
-        index = find_nominal(nominal, names, choices[asked.form].index)
-        chosen = system[index] if index < len(ids) else others[names[index]]
+        index = find_nominal(nominal, ids, choices[asked.form].index)
+        chosen = system[index]
     base = scale_system(chosen, *scales)
     found = bound_many(asked, base, units, freqs) if is_many(asked, len(ids), time) else _bound_all(asked, base, units, freqs, time)
-    return UncertainModel(nominal_system=chosen, **asked.fields(ids, names, index, freqs, scales, choices, found))
+    return UncertainModel(nominal_system=chosen, **asked.fields(ids, index, freqs, scales, choices, found))
 
 
 def _bound_all(asked: Quantification, base: StateSpace, units: StateSpace, freqs: Array, time: float | BilinearAxis) -> Bounded:
     """Return weights from the residuals of all units at once."""
     if isinstance(time, BilinearAxis):
         residuals = ResidualSystems(asked.form, time.discrete(base), time.discrete(units))
-        grid, dt = dense_grid(time.discrete_hz(freqs), time.period_s, asked.density), time.period_s
+        grid, dt = dense_grid(time.discrete_hz(freqs), time.period_s, DENSITY), time.period_s
         grid = grid[grid <= time.discrete_hz(freqs[-1])]
         exact = None  # beyond the end of the grid residuals count as constant, which those of the mapped systems are not
     else:
         residuals, dt = ResidualSystems(asked.form, base, units), time
-        grid, exact = checking_grid(freqs, dt, asked.density, filled=True), residuals
+        grid, exact = checking_grid(freqs, dt, DENSITY, filled=True), residuals
     also = peaks_hz(residuals, grid, dt)
     return asked.bound(base.frequency_response, units.frequency_response, freqs, time, systems=exact, also_hz=also)
 

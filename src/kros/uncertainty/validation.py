@@ -1,8 +1,8 @@
-"""What a quantification is given: models or responses of units, candidates for the nominal, scales and options, read and checked, every refusal by name."""
+"""What a quantification is given: models or responses of units, a nominal, scales and options, read and checked, every refusal by name."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -72,24 +72,8 @@ def stack_systems(models: Any) -> StateSpace:
     return models
 
 
-def check_names(ids: Collection[str], others: Collection[str]) -> None:
-    """Raise a `ConfigError` when further candidates have names of units."""
-    double = sorted(set(ids) & set(others))
-    if double:
-        raise ConfigError(f"Quantify: candidates {double} have the name of a unit; give them others.")
-
-
-def read_candidates(extra: Mapping[str, StateSpace] | None, system: StateSpace, ids: tuple[str, ...]) -> dict[str, StateSpace]:
-    """Further candidates, checked like units."""
-    others = dict(extra or {})
-    check_names(ids, others)
-    for name, candidate in others.items():
-        check_candidate(candidate, system, f"candidate {name}")
-    return others
-
-
 def find_nominal(nominal: Any, names: tuple[str, ...], best: int) -> int:
-    """Row of the nominal among units and further candidates: the one asked for by name or row, otherwise the best."""
+    """Row of the nominal among the units: the one asked for by name or row, otherwise the best."""
     if isinstance(nominal, str):
         if nominal not in names:
             raise ConfigError(f"Quantify: nominal {nominal!r} is not among the units {', '.join(names[:10])}.")

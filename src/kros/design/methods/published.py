@@ -9,7 +9,6 @@ import numpy as np
 from ...core.lti import StateSpace, gain
 from ...synthesis import Injection, ObserverProblem, mixed
 from ...uncertainty import quantify_systems
-from ...uncertainty.weights.cover import Structure
 from ...uncertainty.weights.weight import EntrywiseWeight
 from ..task import DesignResult, DesignTask
 
@@ -44,7 +43,7 @@ def entrywise_weight(task: DesignTask) -> EntrywiseWeight:
         output_scale=models.output_scale,
         input_scale=models.input_scale,
         nominal=task.unit,
-        structure=Structure.ENTRYWISE,
+        structure="entrywise",
         max_order=task.max_order,
     )
     assert isinstance(found.weight, EntrywiseWeight)

@@ -75,7 +75,7 @@ class SignalBound:
     >>> from kros.data import EpisodeBatch
     >>> from kros.observer import relift_certificate, signal_bound
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1, structure="scalar")
+    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1)
     >>> observer = kros.synthesize(uncertain, "kalman_tuned", methods=()).observer
     >>> bound = signal_bound(relift_certificate(observer), observer, EpisodeBatch.read(motors, motors.keys()))
     >>> bound.states, bound.bounds.shape, bool((bound.errors <= bound.bounds).all())

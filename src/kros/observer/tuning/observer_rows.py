@@ -70,7 +70,7 @@ def tune_observer(observer: O, batch: EpisodeBatch, iterations: int = 25) -> tup
     >>> from kros.data import EpisodeBatch
     >>> from kros.observer import tune_observer
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=2.0, seed=3).simulate().population
-    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1, structure="scalar")
+    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1)
     >>> observer = kros.synthesize(uncertain, "kalman_tuned", methods=()).observer
     >>> tuned, criterion = tune_observer(observer, EpisodeBatch.read(motors, motors.keys()), iterations=2)
     >>> criterion[-1] <= criterion[0]

@@ -40,7 +40,6 @@ FIGURES: dict[str, Row] = {
     "signal_set": Row("Residuals of recorded motion", "uncertainty.signals"),
     "variation": Row("Manufacturing or finite recordings", "uncertainty.variation"),
     "weights": Row("Weights over the optimal cover", "uncertainty.weights"),
-    "weight_orders": Row("Order against tightness", "uncertainty.weight_orders"),
     "forms_entrywise": Row("Six uncertainty forms, entry by entry", "uncertainty.forms_entrywise"),
     "weights_entrywise": Row("Weights entry by entry", "uncertainty.weights_entrywise"),
     "synthesis": Row("Plant, weights and correction filters", "synthesis.bode"),

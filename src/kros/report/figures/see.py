@@ -12,7 +12,6 @@ SEE = {
     "signal_set": "The thick line should lie just above all units, at every frequency.",
     "variation": "Where blue lines stand clear of the gold band units really differ; inside it recordings are too short to tell.",
     "weights": "Lines should lie close to their shade: what is between them is uncertainty that no unit shows.",
-    "weight_orders": "The order in use is enough where its ring lies near the bar, or below the dashed line.",
     "forms_entrywise": "Every thin line lies below the thick one: entries alone make a form look smaller than it is.",
     "weights_entrywise": "Black lines lie above all blue ones: entries are bounded, which is less than bounding the perturbation.",
     "synthesis": "Where the weights are low the correction may be small; where they are high it has to follow the measurements.",

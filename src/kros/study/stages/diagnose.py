@@ -1,7 +1,6 @@
 """What the report tells about the uncertainty beside its weights; nothing that later stages use.
 
 models of resampled episodes    --> how much of the residuals finite recordings make    uncertainty/<model>/noise
-largest residual over frequency --> overbound over order, with what is proven           uncertainty/<model>/order
 residuals of all units          --> beside the weights                                  uncertainty/<model>/units
 the most conspicuous unit       --> against the cover of all the others                 outliers/<models>/others
 """
@@ -22,25 +21,22 @@ from ...uncertainty import (
     Form,
     UncertainModel,
     VariationAndNoise,
-    choose_nominals,
-    magnitude_tightness,
-    optimal_cover,
     residual,
     variation_and_noise,
 )
-from ...uncertainty.fits.magnitude import Tightness
+from ...uncertainty.nominal.choice import choose_nominal
 from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.settings import UncertaintySettings
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
+from ...uncertainty.weights.cover import optimal_cover
 from ..engine.context import Context
 from .resampling import resampling
 
 log = logging.getLogger(__name__)
 
-_NOISE_POINTS, _ORDER_POINTS, _POINTS = 80, 120, 240  # frequencies
+_NOISE_POINTS, _POINTS = 80, 240  # frequencies
 _MOST_UNITS = 60  # whose models are resampled
 _ENTRY_ORDER = 3  # of fits to single entries, which are looked at and decide nothing
-_FURTHER_ORDERS = 1  # beyond those that a weight may have
 
 
 class _Result(Protocol):
@@ -57,8 +53,6 @@ def diagnose(context: Context, found: UncertainModels) -> None:
     models = found.models
     noise = [(kind, task) for kind, uncertain in found.sets.items() for task in _noise(context, kind, uncertain)]
     tasks: list[Task] = [(folder / kind / "noise", task) for kind, task in noise]  # those that read recordings begin
-    highest = config.max_order + _FURTHER_ORDERS
-    tasks += [(folder / kind / "order", partial(order_curve, uncertain, highest)) for kind, uncertain in found.sets.items()]
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
     tasks += [(folder / kind / "units", partial(beside_weights, models.models(kind), found.sets[kind], config)) for kind in pair]
     tasks += _others(context, found.scores)
@@ -116,13 +110,6 @@ def _not_told_apart(name: str, error: KrosError) -> None:
     log.info("%s: variation and noise are not told apart: %s", name, error)
 
 
-def order_curve(uncertain: UncertainModel, highest: int) -> Tightness:
-    """Return the overbound of a scalar magnitude over its order, on part of the grid; what is proven there holds on all of it."""
-    every = max(1, len(uncertain.freqs_hz) // _ORDER_POINTS)
-    bound = uncertain.bounds[uncertain.form][::every]
-    return magnitude_tightness(uncertain.freqs_hz[::every], bound, uncertain.sample_period_s, range(1, highest + 1))
-
-
 def beside_weights(models: ModelSet, uncertain: UncertainModel, config: UncertaintySettings) -> UnitResiduals:
     """Return the residuals of all covered units beside the weights of a study."""
     every = max(1, len(uncertain.freqs_hz) // _POINTS)
@@ -153,7 +140,7 @@ def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Task]:
     if len(others) < 2:
         return []
     responses = sets[0].scaled_responses(sets[0].frequencies(_POINTS), others)
-    nominal = others[choose_nominals(responses)[Form(context.config.uncertainty.form)].index]
+    nominal = others[choose_nominal(responses, context.config.uncertainty.form).index]
     return [
         (
             context.store.draft("outliers", context.identified.place(models.name, condition), "others"),

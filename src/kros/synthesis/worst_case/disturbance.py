@@ -222,7 +222,7 @@ class Channels:
         shape = np.round(np.log(magnitude / magnitude.max()), _ALIKE)
         key = shape.tobytes(), fit, tuple(sorted(options.items()))
         if key not in self._fits:
-            self._fits[key] = fit(self.freqs_hz, np.exp(shape), self.problem.nominal.dt, side="above", **options).system
+            self._fits[key] = fit(self.freqs_hz, np.exp(shape), self.problem.nominal.dt, **options).system
         return self._fits[key]
 
 

@@ -49,7 +49,7 @@ def worst_case_h2(
     rtol : float
         Accuracy of the certificate's quadrature.
     fit : callable, optional
-        ``fit(freqs_hz, magnitude, dt, order=, max_order=, tolerance_db=, side=)`` with a result whose ``.system`` is a filter; default
+        ``fit(freqs_hz, magnitude, dt, order=, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter; default
         `kros.uncertainty.fit_magnitude`.
     causal : bool
         Estimate the worst causal perturbation as well.

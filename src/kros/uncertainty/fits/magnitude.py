@@ -1,4 +1,4 @@
-r"""Log-Chebyshev fit of a magnitude by a stable, minimum-phase system, from above or from below.
+r"""Log-Chebyshev fit of a magnitude by a stable, minimum-phase system from above.
 
 Of all squared magnitudes `n / d` of one order with `m^2 <= n / d <= gamma m^2` on the grid, the one with the smallest `gamma` is found:
 a quasi-convex problem, solved by a handful of linear programs (`minimax`). After every program the true ratios are recomputed, `n` is lifted
@@ -10,22 +10,16 @@ Basis and spectral factor: see `spectral`. In `tau = tan^2(theta / 2)` the fit h
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
-from enum import Enum
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
-from ...core.loading import loader
 from ...core.lti import StateSpace, gain
-from ..forms import member
 from .minimax import Grid, Programs
 from .spectral import RationalMagnitude, basis, log_knots, on_half_line, roots, spectral_factor
 
@@ -43,13 +37,6 @@ _HALVINGS, _BOTTOMS = 30, 25  # of the search for an alternation
 _GAIN = 0.9  # a further order that brings the overbound in dB to this share needs no other start
 
 
-class Side(str, Enum):
-    """Which side of the data the fit stays on."""
-
-    ABOVE = "above"
-    BELOW = "below"
-
-
 @dataclass(frozen=True, eq=False)
 class FittedMagnitude:
     """A system whose magnitude bounds data.
@@ -61,12 +48,10 @@ class FittedMagnitude:
     order : int
     overbound_db : float, dB
         Largest distance between the system's magnitude and the data; the smallest is zero.
-    side : Side
     within_tolerance : bool
         Whether `overbound_db` is within the tolerance asked for.
     proven_db : float, dB
-        No system of this order stays closer to the data on the same grid than this: proven by the alternation of the fit around them,
-        whatever the programs did.
+        No system of this order stays closer to the data on the same grid than this.
 
     Examples
     --------
@@ -74,14 +59,13 @@ class FittedMagnitude:
     >>> from kros.uncertainty import fit_magnitude
     >>> freqs_hz = np.geomspace(0.1, 50, 30)
     >>> fitted = fit_magnitude(freqs_hz, 1 / (1 + freqs_hz / 5), 0.01, max_order=2)
-    >>> fitted.within_tolerance, fitted.overbound_db >= fitted.proven_db
-    (True, True)
+    >>> fitted.within_tolerance
+    True
     """
 
     system: StateSpace
     order: int
     overbound_db: float
-    side: Side
     within_tolerance: bool
     proven_db: float = float("nan")
 
@@ -95,7 +79,6 @@ def fit_magnitude(
     min_order: int = 0,
     max_order: int = 4,
     tolerance_db: float = 1.0,
-    side: Side | str = Side.ABOVE,
 ) -> FittedMagnitude:
     r"""Return a discrete system whose magnitude is the tightest uniform bound of the data.
 
@@ -104,7 +87,7 @@ def fit_magnitude(
     freqs_hz : array_like, shape (n_freqs,), Hz
         Increasing, from zero at least to Nyquist at most; both ends allowed.
     magnitude : array_like, shape (n_freqs,)
-        Non-negative. Values below 1e-8 of the largest count as that; all zero gives the zero system (only from above).
+        Non-negative. Values below 1e-8 of the largest count as that; all zero gives the zero system.
     sample_period_s : float, s
     order : int, optional
         Best fit of at most this order; by default the smallest order within the tolerance, or the best up to `max_order`.
@@ -112,8 +95,6 @@ def fit_magnitude(
         Orders that are tried.
     tolerance_db : float, dB
         Largest distance accepted when the order is chosen.
-    side : {"above", "below"}
-        Smallest majorant or largest minorant of the data.
 
     Returns
     -------
@@ -122,7 +103,7 @@ def fit_magnitude(
     Raises
     ------
     DataError
-        Magnitudes negative, NaN or infinite; from below, all zero.
+        Magnitudes negative, NaN or infinite.
     KrosError
         When no program of any order could be solved.
 
@@ -140,15 +121,14 @@ def fit_magnitude(
     >>> bool(np.all(gain_at_freqs >= 1 / np.hypot(1.0, freqs / 3.0) + 0.01))
     True
     """
-    side = member(Side, side, "Magnitude fit: side")
     freqs = check_grid(freqs_hz, sample_period_s)
-    values = _check_magnitude(magnitude, freqs, side)
+    values = _check_magnitude(magnitude, freqs)
     highest = max_order if order is None else order
     if highest < 0:
         raise ConfigError(f"Magnitude fit: orders should not be negative, found order {order}, max_order {max_order}.")
     if not values.any():
-        return FittedMagnitude(gain([[0.0]], sample_period_s), 0, 0.0, side, True)
-    problem = _Problem(freqs, values, sample_period_s, side)
+        return FittedMagnitude(gain([[0.0]], sample_period_s), 0, 0.0, True)
+    problem = _Problem(freqs, values, sample_period_s)
     best: FittedMagnitude | None = None
     lower: _Bound | None = None
     if order is not None:
@@ -161,71 +141,11 @@ def fit_magnitude(
             best = found
         if best is not None and best.within_tolerance:
             break
-    if best is None and min_order:
-        return fit_magnitude(freqs, magnitude, sample_period_s, order, max_order=max_order, tolerance_db=tolerance_db, side=side)
     if best is None:
         raise KrosError(
             f"Magnitude fit: no system of order up to {highest} found for {len(freqs)} points; raise max_order or smooth the data."
         )
     return best
-
-
-@dataclass(frozen=True, eq=False)
-class Tightness:
-    """Overbounds of the fits of one magnitude over orders, what no fit of an order goes below (zero where nothing is proven), and states of the fit."""
-
-    orders: Array
-    overbound_db: Array
-    proven_db: Array
-    states: Array
-
-    def save(self, folder: Path) -> None:
-        """Write ``tightness.json``."""
-        save_artifact(Path(folder), "tightness", vars(self))
-
-    @classmethod
-    @loader
-    def load(cls, folder: Path) -> Tightness:
-        """Read what `save` wrote."""
-        content, _ = load_artifact(Path(folder), "tightness")
-        return cls(**{f.name: np.array(content[f.name]) for f in fields(cls)})
-
-
-def magnitude_tightness(
-    freqs_hz: npt.ArrayLike, magnitude: npt.ArrayLike, sample_period_s: float, orders: Iterable[int] = range(1, 9)
-) -> Tightness:
-    """Return the overbound of the best fit of each order to one magnitude, each fit started from the one an order lower.
-
-    Orders, or a magnitude, that cannot be fitted are refused as by `fit_magnitude`. A system of lower order counts as one of every higher order.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import magnitude_tightness
-    >>> freqs = np.geomspace(1e-3, 500.0, 200)
-    >>> curve = magnitude_tightness(freqs, 1 / np.hypot(1.0, freqs / 3.0) + 0.01, 1e-3, range(1, 4))
-    >>> bool(curve.overbound_db[-1] < curve.overbound_db[0])
-    True
-    """
-    chosen = np.array(list(orders), int)
-    fits = _fit_orders(freqs_hz, magnitude, sample_period_s, int(chosen.max(initial=0)))
-    best = [min((f for f in fits if f.order <= n), key=lambda f: f.overbound_db) for n in chosen]
-    proven = [max((f.proven_db for f in fits if f.order >= n), default=0.0) for n in chosen]  # of an order, hence of every lower one
-    return Tightness(chosen, np.array([f.overbound_db for f in best]), np.array(proven), np.array([f.order for f in best]))
-
-
-def _fit_orders(freqs_hz: npt.ArrayLike, magnitude: npt.ArrayLike, sample_period_s: float, highest: int) -> list[FittedMagnitude]:
-    """Fits of order 0, 1, ..., each started from the one before; fewer where programs fail."""
-    constant = fit_magnitude(freqs_hz, magnitude, sample_period_s, order=0)
-    if constant.overbound_db == 0:
-        return [constant]
-    freqs, values = np.asarray(freqs_hz, float), np.asarray(magnitude, float)
-    problem = _Problem(freqs, np.maximum(values, _FLOOR * values.max()), sample_period_s, Side.ABOVE)
-    found, lower = [constant], None
-    for order in range(highest + 1):
-        fit, lower = problem.fit(order, 0.0, lower, last=True)
-        found += [fit] if fit is not None and order > 0 else []
-    return found
 
 
 def alternation_db(ratio: npt.ArrayLike, count: int) -> float:
@@ -234,18 +154,6 @@ def alternation_db(ratio: npt.ArrayLike, count: int) -> float:
     Let the squared fit `n / d` have degree N in tau, and its ratio to the data swing `count = 2 N + 2` times in turn above H and below L.
     Another `n' / d'` whose ratio stays within less than H / L would, scaled, be below the fit at every high and above it at every low point:
     `n' d - n d'` of degree 2 N would change sign 2 N + 1 times. This is de la Vallee Poussin's bound for a ratio instead of a difference.
-
-    Parameters
-    ----------
-    ratio : array_like, shape (n_points,)
-        Fit over data, in the order of the frequencies.
-    count : int
-        Alternations needed, at least two.
-
-    Returns
-    -------
-    float, dB
-        Of magnitudes, when the ratio is one; the largest H / L for which the alternation exists, between zero and `max / min`.
     """
     level = _turning(20 * np.log10(np.asarray(ratio, float)))
     low, high = 0.0, float(np.ptp(level))
@@ -297,12 +205,11 @@ class _Problem:
     freqs: Array
     values: Array
     dt: float
-    side: Side
 
     def fit(self, order: int, tolerance_db: float, lower: _Bound | None, *, last: bool) -> tuple[FittedMagnitude | None, _Bound | None]:
         """Fit one order, starting from the bound of a lower order; None where the programs fail."""
         tau = bilinear_squared(self.freqs, self.dt)
-        targets = self.values ** (2 if self.side is Side.ABOVE else -2)  # to stay above
+        targets = self.values**2  # to stay above
         unit = float(np.exp(np.mean(np.log(targets))))
         hopeless = np.inf if last else 10 ** (_HOPELESS * tolerance_db / 10)
         found = _minimax(tau, targets / unit, order, lower, hopeless)
@@ -315,20 +222,17 @@ class _Problem:
             return None, lower
 
     def _finish(self, rational: RationalMagnitude, unit: float, tolerance_db: float) -> FittedMagnitude:
-        """Factorise, and lift (or lower) by the deficit of the system as evaluated."""
+        """Factorise, and lift by the deficit of the system as evaluated."""
         bound = RationalMagnitude(rational.numerator * unit, rational.denominator, rational.knots)
-        if self.side is Side.BELOW:
-            bound = RationalMagnitude(bound.denominator, bound.numerator, bound.knots)
         system = spectral_factor(bound, self.dt)
         ratio = np.abs(system.frequency_response(self.freqs)[:, 0, 0]) / self.values
-        margin = 1 + 1e-12
         if not (ratio.min() > 0 and np.isfinite(ratio).all()):
             raise KrosError("Magnitude fit: the system vanishes or is infinite at a frequency of the grid; try another order.")
-        touch = margin / ratio.min() if self.side is Side.ABOVE else 1 / (margin * ratio.max())
+        touch = (1 + 1e-12) / ratio.min()
         system = StateSpace(system.A, system.B, system.C * touch, system.D * touch, system.dt)
         overbound = float(20 * np.log10(ratio.max() / ratio.min()))
         proven = alternation_db(ratio, 2 * system.n_states + 2)
-        return FittedMagnitude(system, system.n_states, overbound, self.side, overbound <= tolerance_db, proven)
+        return FittedMagnitude(system, system.n_states, overbound, overbound <= tolerance_db, proven)
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,7 +305,7 @@ def _extremes(ratio: Array, low: float, high: float) -> Array:
     return np.flatnonzero(dips | peaks)
 
 
-def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array, side: Side) -> Array:
+def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array) -> Array:
     """Return magnitudes with a relative floor."""
     values = np.asarray(magnitude, float)
     if values.shape != freqs.shape:
@@ -411,6 +315,4 @@ def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array, side: Side) -> Arra
         raise DataError(
             f"Magnitude fit: magnitudes should be finite and not negative, found {values[where]} at {freqs[where]} Hz; look at the responses."
         )
-    if side is Side.BELOW and not values.any():
-        raise DataError("Magnitude fit: nothing but zero fits below a magnitude of zero; ask for a bound from above.")
     return np.maximum(values, _FLOOR * values.max())

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.small_matrices import entries_first, lower_factor, multiply, pseudo_inverse_first, sigma_max_first
-from ...identify.refine.minimax import Score, smallest_largest
+from ...identify.refine.minimax import smallest_largest
 from ..forms import Form
 
 Array = npt.NDArray[Any]
@@ -84,39 +84,19 @@ class Geometry:
         return sigma_max_first(multiply(D, _known(base.L)))
 
 
-def search(geometry: Geometry, candidates: Plants, units: Plants, score: Score) -> tuple[int, Array, Array, Array]:
-    """Return the candidate whose bound has the lowest score.
-
-    Parameters
-    ----------
-    geometry : Geometry
-    candidates : Plants
-        Among them the units themselves: a residual of zero with itself changes no maximum.
-    units : Plants
-    score : callable
-        From bounds (..., frequency) to scores (...), non-negative and never falling when a bound rises.
-
-    Returns
-    -------
-    index : int
-        Best candidate; of several equal ones the first.
-    bound : ndarray, shape (frequency,)
-        Its largest residual over the units.
-    scores : ndarray, shape (candidate,)
-        Where a candidate was evaluated its score, elsewhere a lower bound.
-    evaluated : ndarray of bool, shape (candidate,)
-        Which scores are exact.
-    """
-    count, n_freqs = candidates.G.shape[2:]
+def search(geometry: Geometry, units: Plants) -> tuple[int, Array, Array, Array]:
+    """Return the unit whose bound has the lowest peak: its row, its bound, peaks (or lower bounds) of all, and which are exact."""
+    count, n_freqs = units.G.shape[2:]
 
     def against(rows: Array, witness: Array) -> Array:
         one_each = units.part(witness, np.arange(n_freqs))
         parts = blocks(len(rows), n_freqs)
-        return np.concatenate([geometry.sigma(candidates.part(rows[part]), one_each.part(None)) for part in parts])
+        return np.concatenate([geometry.sigma(units.part(rows[part]), one_each.part(None)) for part in parts])
 
-    return smallest_largest(
-        (count, n_freqs), _central(candidates), lambda row: bound_of(geometry, candidates.one(row), units), against, score
-    )
+    def bound(row: int) -> tuple[Array, Array]:
+        return bound_of(geometry, units.one(row), units)
+
+    return smallest_largest((count, n_freqs), _central(units), bound, against, lambda found: found.max(axis=-1))
 
 
 def bound_of(geometry: Geometry, nominal: Plants, units: Plants) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ from .pencils import ResidualSystems
 Array = npt.NDArray[Any]
 Residuals = Callable[[Array], Array]
 
+DENSITY = 10  # how much denser than that of a fit the grid of its check is
 _TAIL = 16  # points towards DC and Nyquist, four a decade
 _BETWEEN = 3  # steps between known points in which a fit is held up
 _EVEN, _A_DECADE = 101, 30  # frequencies at which a bound is checked at least
@@ -29,7 +30,6 @@ _SAME = 1e-9  # relative distance of frequencies that are one
 class Checks:
     """How a weight is checked."""
 
-    density: int = 10  # how much denser than the grid of the fit
     also_hz: Array | None = None  # (n,), Hz, optional: further frequencies, where residuals peak between the points
     systems: ResidualSystems | None = None  # for a proof by level sets
     # residuals are known at the frequencies of the fit only: there, and beyond their ends, the bound is claimed. Between them the fit
@@ -40,7 +40,7 @@ class Checks:
         """Return the frequencies at which a fit is checked."""
         if self.sampled:
             return checking_grid(freqs_hz, sample_period_s, _BETWEEN)
-        return checking_grid(freqs_hz, sample_period_s, self.density, self.also_hz, filled=True)
+        return checking_grid(freqs_hz, sample_period_s, DENSITY, self.also_hz, filled=True)
 
     def of_fit(self, freqs_hz: Array) -> Array:
         """Return the frequencies that a fit follows: those asked for, and the peaks between them."""

@@ -47,52 +47,13 @@ def fit_weight(
     structure: Structure | str = Structure.DIAGONAL,
     max_order: int = 4,
     tolerance_db: float = 1.0,
-    density: int = 10,
     systems: ResidualSystems | None = None,
     also_hz: npt.ArrayLike | None = None,
     sampled: bool = False,
 ) -> tuple[Weight, Cover]:
-    """Fit weights to residuals that can be evaluated at any frequency.
-
-    Parameters
-    ----------
-    residuals : callable
-        From frequencies (n,), Hz, to residuals of shape (unit, n, p', m'), complex.
-    freqs_hz : ndarray, shape (frequency,), Hz
-    sample_period_s : float, s
-    structure : Structure or str
-    max_order : int
-        Largest order of an entry, up to about eight.
-    tolerance_db : float, dB
-        Overbound at which lower orders are good enough: of scalar weights the smallest order within it is taken; of diagonal ones orders start
-        at four, are lowered entry by entry while the overbound stays within it, and raised by two in all entries where it does not.
-    density : int
-        How much denser the grid of the final check is.
-    systems : ResidualSystems, optional
-        The systems behind the residuals: the bound is then tested at all frequencies, by level sets, and not on a grid alone.
-    also_hz : array_like, shape (n,), Hz, optional
-        Where the bound is checked besides, see `peaks_hz`.
-    sampled : bool
-        The residuals are known at `freqs_hz` only. The bound is claimed there and, as the ends stand for what is beyond them, towards DC and
-        Nyquist; between the points the weight is not lifted.
-
-    Returns
-    -------
-    Weight
-    Cover
-        The optimal cover at `freqs_hz`, against which the overbound is measured.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import fit_weight
-    >>> shape = lambda freqs_hz: (0.1 * np.array([-1, 1])[:, None] / (1 + np.asarray(freqs_hz) / 5))[..., None, None]
-    >>> weight, cover = fit_weight(shape, np.geomspace(0.1, 50, 30), 0.01, structure="scalar", max_order=2)
-    >>> weight.cover_max <= 1, weight.within_tolerance
-    (True, True)
-    """
+    """Fit weights to residuals, a function of frequencies (n,), Hz, and return them with the optimal cover at `freqs_hz`."""
     structure = as_structure(structure)
-    checks = Checks(density, None if also_hz is None else np.asarray(also_hz, float), systems, sampled)
+    checks = Checks(None if also_hz is None else np.asarray(also_hz, float), systems, sampled)
     fit = _fit_entries if structure is Structure.ENTRYWISE else _fit_checked
     return fit(residuals, freqs_hz, sample_period_s, structure, (max_order, tolerance_db), checks)
 

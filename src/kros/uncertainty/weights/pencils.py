@@ -41,35 +41,12 @@ class Part(str, Enum):
 
 @dataclass(frozen=True, eq=False)
 class ResidualSystems:
-    """The systems behind residuals, scaled as these are.
-
-    Parameters
-    ----------
-    form : Form or str
-    nominal : StateSpace
-        Discrete, one system.
-    units : StateSpace
-        Discrete, the unit axis first.
-    entry : tuple of int, optional
-        Row and column of the residual where that entry alone is bounded.
-    part : Part
-        The residual of the form, or the additive remainder that it leaves.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.core import StateSpace
-    >>> from kros.uncertainty import ResidualSystems
-    >>> nominal = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
-    >>> units = StateSpace(np.full((2, 1, 1), 0.5), np.array([[[0.9]], [[1.2]]]), np.ones((2, 1, 1)), np.zeros((2, 1, 1)), 0.01)
-    >>> ResidualSystems("additive", nominal, units).form
-    'additive'
-    """
+    """The systems behind residuals, scaled as these are; discrete, units with the unit axis first."""
 
     form: Form | str
     nominal: StateSpace
     units: StateSpace
-    entry: tuple[int, int] | None = None
+    entry: tuple[int, int] | None = None  # row and column of the residual where that entry alone is bounded
     part: Part = Part.RESIDUAL
 
 

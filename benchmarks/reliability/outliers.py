@@ -89,15 +89,14 @@ def scored(recorded: Recorded) -> OutlierModel:
         output_scale=models.output_scale,
         input_scale=models.input_scale,
         false_alarm_rate=RATE,
-        deviations=[recorded.deviations(e) for e in evidence],
     )
 
 
 def new_unit(rng: np.random.Generator, recorded: Recorded, model: OutlierModel, episodes: int, samples: int, severity: float) -> str:
     """Record, identify and score one new unit; return what is said about it."""
     evidence = Evidence.of(record(rng, plant(rng, severity), episodes, samples), recorded.models, {})
-    score = model.score("new", recorded.response([evidence])[0], recorded.deviations(evidence))
-    return recorded.judged(score, evidence).status.value
+    score = model.score("new", recorded.response([evidence])[0])
+    return recorded.qualified(score, evidence).status.value
 
 
 def population(rng: np.random.Generator, episodes: list[int]) -> Recorded:

@@ -1,4 +1,4 @@
-"""The tail model against Monte Carlo and textbook order statistics, masking, and outliers known by construction."""
+"""The tail model against Monte Carlo and textbook order statistics, and outliers known by construction."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ import pytest
 from scipy import stats
 
 from kros.uncertainty import Form, score_outliers
-from kros.uncertainty.outliers.groups import excess, separate
+from kros.uncertainty.outliers.separation import excess, separate
 from kros.uncertainty.outliers.tail import (
     SHAPE,
     exceedance,
-    group_factors,
-    group_statistics,
     gumbel,
-    largest_group,
     leave_one_out_bounds,
     prediction_bound,
     prediction_factor,
@@ -54,44 +51,20 @@ def test_leave_one_out_bounds_equal_those_of_the_others() -> None:
     assert np.isinf(leave_one_out_bounds(scores[:3], 0.01)).all()
 
 
-def test_group_statistics_equal_their_definition() -> None:
-    scores = np.random.default_rng(3).gumbel(size=12)
-    ordered = np.sort(scores)
-    for g, T in enumerate(group_statistics(scores), start=1):
-        location, scale = gumbel(ordered[: 12 - g])
-        assert pytest.approx((ordered[12 - g] - location) / scale, rel=1e-10) == T
-
-
-@pytest.mark.parametrize("count", [6, 12, 38])
-def test_share_of_scores_in_groups_beyond_their_factors_is_the_rate(count: int) -> None:
-    """The smallest group of independent scores, as one step of the search takes it, on draws of another seed."""
-    rate = 0.01
-    T = group_statistics(stats.genextreme.rvs(-SHAPE, size=(100_000, count), random_state=88))
-    beyond = np.array(group_factors(count, rate)) < T
-    size = np.where(beyond.any(axis=1), beyond.argmax(axis=1) + 1, 0)
-    assert 0.75 * rate <= size.mean() / count <= 1.05 * rate
-
-
-def test_whole_search_flags_the_nominal_share_of_independent_scores() -> None:
+def test_whole_search_flags_at_most_the_nominal_share_of_independent_scores() -> None:
     """Twelve units that each exceed at a frequency of their own, so that nobody's score depends on the others."""
     rng, flagged, trials = np.random.default_rng(5), 0, 1500
     for _ in range(trials):
         flagged += int((~separate(np.diag(stats.genextreme.rvs(-SHAPE, size=12, random_state=rng) + 30.0), 0.01).inliers).sum())
     share = flagged / (12 * trials)
-    assert share == pytest.approx(0.01, abs=4 * np.sqrt(0.01 / (12 * trials)))
+    assert 0.005 <= share <= 0.01 + 4 * np.sqrt(0.01 / (12 * trials))
 
 
-def test_sizes_of_groups() -> None:
-    assert [largest_group(n) for n in (2, 3, 4, 6, 12, 38)] == [0, 0, 1, 2, 4, 8]
-    assert group_factors(3, 0.01) == ()
-
-
-def test_excess_over_the_cover_and_over_the_second_largest() -> None:
+def test_excess_over_the_cover() -> None:
     levels = np.array([[0.0, 3.0], [2.0, 1.0], [-5.0, 2.0], [5.0, 2.5]])
     score, where = excess(levels)
     np.testing.assert_allclose(score, [0.5, -2.0, -1.0, 3.0])
     np.testing.assert_array_equal(where, [1, 1, 1, 0])
-    np.testing.assert_allclose(excess(levels, 2)[0], [1.0, 2.0, -0.5, 5.0])
 
 
 def test_reference_is_held_forty_decibels_below_its_peak() -> None:
@@ -121,32 +94,8 @@ def test_a_gross_outlier_is_found_in_every_form_and_with_every_nominal(form: For
     assert all(s.agreement <= 0.5 for s in model.scores[:-1])
 
 
-@pytest.mark.parametrize("form", [Form.ADDITIVE, Form.INVERSE_INPUT_MULTIPLICATIVE])
-def test_outliers_that_are_alike_do_not_hide_one_another(form: Form) -> None:
-    G = population([*GOOD, 8.0, 8.0, 8.0])
-    G[-2:] = G[-3] * np.array([1.001, 0.999])[:, None, None, None]
-    model = score_outliers(G, FREQS, form)
-    assert [k for k, s in enumerate(model.scores) if s.outlier] == [11, 12, 13]
-    assert all(s.score_db > s.threshold_db for s in model.scores[11:])
-    assert all(s.score_db <= s.threshold_db for s in model.scores[:11])
-
-
-def test_without_groups_twins_would_stay_hidden() -> None:
-    """The check can fail: neither twin exceeds the other by itself."""
-    G = population([*GOOD, 8.0, 8.0])
-    G[-1] = 1.001 * G[-2]
-    model = score_outliers(G, FREQS)
-    alone = model.by_nominal_db.shape
-    assert alone == (13, 13)
-    levels = np.random.default_rng(4).normal(size=(12, 5))
-    levels[-2:] = 30.0 + 0.1 * np.arange(2)[:, None]
-    score = excess(levels)[0]
-    assert not group_statistics(score)[0] > group_factors(12, 0.003)[0]
-    np.testing.assert_array_equal(np.flatnonzero(~separate(levels, 0.003).inliers), [10, 11])
-
-
 def test_units_that_differ_in_nothing_but_gain_are_flagged_at_the_rate() -> None:
-    """All their scores come from one and the same frequency, so that the upper ones look like a group."""
+    """All their scores come from one and the same frequency."""
     rng, flagged, found = np.random.default_rng(21), 0, 0
     for _ in range(100):
         gains = np.append(1 + 0.02 * rng.normal(size=20), 1.5)

@@ -113,8 +113,8 @@ def score_condition(
         keys, used = everything[unit, models.condition], training[unit, models.condition]
         evidence = Evidence.of(factor, models, parameters[unit]).part([keys.index(k) for k in used])
         known = recorded.same_recordings(factor) | ({unit} & set(recorded.units))
-        (response,), deviations = recorded.response([evidence]), recorded.deviations(evidence)
-        score = recorded.qualified(outliers.score(unit, response, deviations, known), evidence)
+        (response,) = recorded.response([evidence])
+        score = recorded.qualified(outliers.score(unit, response, known), evidence)
         seconds = float(factor.n_samples.sum()) * models.sample_period_s
         rows.append(score_row(score, models.condition, len(keys), seconds) | {"left_out": sorted(known)})
     return rows

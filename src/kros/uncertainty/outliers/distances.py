@@ -63,21 +63,7 @@ def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
 
 
 def joined(form: Form, known: Distances, rows: Array, nominals: Array, response: Array, freqs_hz: Array) -> Distances:
-    """Return the distances of some units of a population and one more, in the scales of the population, which one unit of many does not move.
-
-    Parameters
-    ----------
-    form : Form
-    known : Distances
-        Of the population.
-    rows : ndarray of int, shape (unit,)
-        Units of the population, in increasing order.
-    nominals : ndarray, shape (nominal, frequency, p, m), complex
-        Responses of the population's nominals.
-    response : ndarray, shape (frequency, p, m), complex
-        Of the one more, which comes last.
-    freqs_hz : ndarray, shape (frequency,), Hz
-    """
+    """Return distances of some units of a population, and of one more, which comes last, in the scales of the population."""
     there = np.flatnonzero(np.isin(known.nominals, rows))
     own = scaled_levels(form, nominals[there], response, known, freqs_hz)
     levels = np.concatenate([known.levels[rows], np.median(own, axis=0)[None]])
@@ -93,11 +79,6 @@ def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances
     """Return smoothed levels of residuals in the scales of a population, shape (..., frequency), dB; responses broadcast against each other."""
     E = residual(form, nominal, perturbed) / found.left[:, :, None] / found.right[:, None, :]
     return _smooth(20 * np.log10(np.maximum(sigma_max_first(entries_first(E)), _LEAST)), freqs_hz)
-
-
-def median_levels(form: Form, nominals: Array, perturbed: Array, found: Distances, freqs_hz: Array, own: npt.NDArray[np.bool_]) -> Array:
-    """Return the median of levels over nominals, shape (unit, frequency), dB; `own`, shape (nominal, unit), tells which pairs do not count."""
-    return _median(scaled_levels(form, nominals[:, None], perturbed, found, freqs_hz), own)
 
 
 def largest_entries(form: Form, responses: Array, found: Distances, units: Array, rows: Array) -> list[tuple[int, int]]:

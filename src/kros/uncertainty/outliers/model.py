@@ -11,17 +11,15 @@ the only nominal, as the paper states its criterion: the range over the nominals
 
 Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold is the bound of a
 generalised extreme value model of the others' scores at the stated rate (`tail`): an extrapolation, and labelled as such. Units are taken
-out one at a time while they are beyond; where none is, groups that hide one another are looked for (`groups`), up to a third of the units
-and eight at once. With three units nothing can be flagged: two scores make no model. Two units are refused.
-
-All this compares estimates that are equally good. A unit whose estimate is known to scatter more than the others' takes no part in their cover
-and has a bound of its own, from the others estimated as badly (`noise`). What a score would have shown stands beside it (`scoring`, `score`).
+out one at a time while they are beyond (`separation`), up to a third of the units. With three units nothing can be flagged: two scores make no
+model. Two units are refused. All this compares estimates that are equally good: units that were recorded for too little are told apart before
+(`recorded`). What a score would have shown stands beside it (`scoring`, `score`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -35,10 +33,9 @@ from ...core.loading import check_shapes, loader
 from ..forms import Form, as_form, check_responses
 from ..validation import check_scale
 from .distances import Distances, balance, distances, joined
-from .groups import separate
-from .noise import AS_GOOD, Others, noisier_than, spread
 from .score import OutlierScore
-from .scoring import Nominals, margins_of, scores_of, with_noise
+from .scoring import Nominals, margins_of, scores_of
+from .separation import separate
 
 Array = npt.NDArray[Any]
 
@@ -46,7 +43,6 @@ FALSE_ALARM_RATE = 3e-3
 _FREQUENCIES = 120
 MANY = 200  # inliers from which on a unit that is scored does not change how they are scaled
 _FEWEST = 2  # others that a unit can be compared with
-_NOISY = 2.0  # ratio of variances beyond which a unit takes no part in the cover of the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +57,6 @@ class OutlierModel:
     freqs_hz : ndarray, shape (frequency,), Hz
     responses : ndarray, shape (unit, frequency, p, m), complex
         In scaled coordinates.
-    noise : ndarray, shape (unit, frequency, p, m)
-        Variances of these estimates, zero where nothing is known about them.
     output_scale, input_scale : ndarray, shape (p,) and (m,)
     scores : tuple of OutlierScore
         Of all units that were scored when the model was made, outliers among them.
@@ -93,7 +87,6 @@ class OutlierModel:
     unit_ids: tuple[str, ...]
     freqs_hz: Array
     responses: Array
-    noise: Array
     output_scale: Array
     input_scale: Array
     scores: tuple[OutlierScore, ...]
@@ -103,9 +96,7 @@ class OutlierModel:
     nominal_ids: tuple[str, ...]
     by_nominal_db: Array
 
-    def score(
-        self, unit: str, response: npt.ArrayLike, deviations: npt.ArrayLike | None = None, without: Collection[str] = ()
-    ) -> OutlierScore:
+    def score(self, unit: str, response: npt.ArrayLike, without: Collection[str] = ()) -> OutlierScore:
         """Score a new unit.
 
         Parameters
@@ -113,8 +104,6 @@ class OutlierModel:
         unit : str
         response : array_like, shape (frequency, p, m), complex
             At `freqs_hz`, in physical units.
-        deviations : array_like, shape (draw, frequency, p, m), complex, optional
-            Draws of the error of that estimate. Without them it counts as known as well as the inliers are.
         without : collection of str
             Inliers that are not compared with, such as the unit itself.
 
@@ -125,9 +114,9 @@ class OutlierModel:
         Raises
         ------
         DimensionError
-            When response or deviations do not have the shape of the population's.
+            When the response does not have the shape of the population's.
         DataError
-            When one of them is not finite, or fewer than two inliers are left.
+            When it is not finite, or fewer than two inliers are left.
         """
         rows = np.array([k for k, other in enumerate(self.unit_ids) if other not in without], dtype=int)
         if len(rows) < _FEWEST:
@@ -147,12 +136,7 @@ class OutlierModel:
         (score,) = scores_of(
             self.form, everyone, self.freqs_hz, found, ~last, (margin,), (unit,), self.threshold_db, summary, [len(last) - 1]
         )
-        if deviations is None:
-            return score
-        draws = _deviations(unit, deviations, G.shape) / self.output_scale[:, None] * self.input_scale
-        within = replace(self._known, levels=self._known.levels[rows]) if many else None
-        others = Others.of(self.form, self.responses[rows], self.noise[rows], self.freqs_hz, self.false_alarm_rate, within)
-        return with_noise(score, everyone[-1], others, draws)
+        return score
 
     @cached_property
     def _known(self) -> Distances:
@@ -197,7 +181,7 @@ class OutlierModel:
         )
 
 
-_ARRAYS = ("freqs_hz", "responses", "noise", "output_scale", "input_scale", "by_nominal_db")
+_ARRAYS = ("freqs_hz", "responses", "output_scale", "input_scale", "by_nominal_db")
 
 
 def score_outliers(
@@ -209,7 +193,6 @@ def score_outliers(
     output_scale: npt.ArrayLike | None = None,
     input_scale: npt.ArrayLike | None = None,
     false_alarm_rate: float = FALSE_ALARM_RATE,
-    deviations: Sequence[npt.ArrayLike] | None = None,
 ) -> OutlierModel:
     """Score every unit of a population against the others.
 
@@ -225,9 +208,6 @@ def score_outliers(
         Ranges; without both, those at which the responses' typical entries are equal, so that units of measure never matter.
     false_alarm_rate : float
         Nominal rate per unit of the tail model.
-    deviations : sequence of array_like, shape (draw, frequency, p, m), complex, optional
-        Of every unit, draws of the error of its estimate, such as responses of resampled episodes minus those of all. Without them all
-        estimates count as equally good.
 
     Returns
     -------
@@ -261,10 +241,7 @@ def score_outliers(
     freqs, G = freqs[rows], G[:, rows]
     given = output_scale is not None or input_scale is not None
     scales = (check_scale("output", output_scale, G.shape[2]), check_scale("input", input_scale, G.shape[3])) if given else balance(G)
-    model = _compared(G / scales[0][:, None] * scales[1], ids, freqs, form, rate, scales)
-    if deviations is None:
-        return model
-    return _with_deviations(model, G, ids, _Draws(deviations, ids, rows, G.shape[1:]))
+    return _compared(G / scales[0][:, None] * scales[1], ids, freqs, form, rate, scales)
 
 
 def scored_frequencies(freqs_hz: Array) -> Array:
@@ -289,7 +266,6 @@ def _compared(G: Array, ids: tuple[str, ...], freqs: Array, form: Form, rate: fl
         unit_ids=tuple(ids[k] for k in inliers),
         freqs_hz=freqs,
         responses=G[inliers],
-        noise=np.zeros(G[inliers].shape),
         output_scale=scales[0],
         input_scale=scales[1],
         scores=scores,
@@ -299,68 +275,6 @@ def _compared(G: Array, ids: tuple[str, ...], freqs: Array, form: Form, rate: fl
         nominal_ids=tuple(ids[k] for k in found.nominals),
         by_nominal_db=summary.excess_db,
     )
-
-
-def _with_deviations(model: OutlierModel, G: Array, ids: tuple[str, ...], draws: Sequence[Array]) -> OutlierModel:
-    """Score units that are known less well than most by themselves, G and draws in physical units, all others among themselves."""
-    scales = model.output_scale, model.input_scale
-    noise = np.stack([spread(d) for d in draws]) * (scales[1] / scales[0][:, None]) ** 2
-    middle = np.median(noise, axis=0)
-    worse = np.array([noisier_than(middle, own) for own in noise])
-    well = np.flatnonzero(worse <= _NOISY)
-    if len(well) < _FEWEST + 1:
-        well = np.arange(len(G))
-    if len(well) < len(G):
-        model = _compared(
-            G[well] / scales[0][:, None] * scales[1],
-            tuple(ids[k] for k in well),
-            model.freqs_hz,
-            model.form,
-            model.false_alarm_rate,
-            scales,
-        )
-    places = {unit: k for k, unit in enumerate(ids)}
-    model = replace(model, noise=np.stack([noise[places[u]] for u in model.unit_ids]))
-    scores = {s.unit: s for s in model.scores}
-    for k, unit in enumerate(ids):
-        if unit not in scores or (scores[unit].outlier and worse[k] > AS_GOOD):
-            scores[unit] = model.score(unit, G[k], draws[k])
-    by_nominal = np.full((len(model.nominal_ids), len(ids)), np.nan)
-    by_nominal[:, well] = model.by_nominal_db
-    return replace(model, scores=tuple(scores[u] for u in ids), by_nominal_db=by_nominal)
-
-
-@dataclass(frozen=True, eq=False)
-class _Draws(Sequence[Array]):
-    """Checked deviations of all units at the chosen frequencies, each when it is asked for: together they may be too large for memory."""
-
-    deviations: Sequence[npt.ArrayLike]
-    ids: tuple[str, ...]
-    rows: Array
-    shape: tuple[int, ...]
-
-    def __post_init__(self) -> None:
-        if len(self.deviations) != len(self.ids):
-            raise DataError(f"Outlier scores: need the deviations of every unit, found {len(self.deviations)} for {len(self.ids)} units.")
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def __getitem__(self, k: Any) -> Any:
-        found, shape, rows = np.asarray(self.deviations[k]), self.shape, self.rows
-        if found.ndim == len(shape) + 1 and found.shape[2:] == shape[1:] and found.shape[1] > rows[-1]:
-            found = found[:, rows]
-        return _deviations(self.ids[k], found, shape)
-
-
-def _deviations(unit: str, draws: npt.ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Checked deviations of one unit."""
-    found = np.asarray(draws)
-    if found.shape[1:] != shape or not len(found) or not np.isfinite(found).all():
-        raise DimensionError(
-            f"Scoring unit {unit}: deviations should be finite and of shape (draws, {', '.join(map(str, shape))}), found {found.shape}."
-        )
-    return found
 
 
 def _population(

@@ -16,6 +16,7 @@ from ..settings import UncertaintySettings
 from .model import OutlierModel, score_outliers, scored_frequencies
 from .recorded import Recorded
 from .score import OutlierScore
+from .tail import LEAST_SCORES
 
 log = logging.getLogger(__name__)
 
@@ -55,18 +56,24 @@ def score_condition(factors: EpisodeFactors, models: ModelSet, settings: Uncerta
     freqs = scored_frequencies(models.frequencies(settings.n_freqs))
     recorded = Recorded.of(factors, models, freqs)
     evidence = list(recorded.units.values())
+    responses, ids = recorded.response(evidence), models.unit_ids
+    enough = [k for k, data in enumerate(evidence) if recorded.suffices(data)]
+    well = enough if len(enough) >= LEAST_SCORES else list(range(len(ids)))
     outliers = score_outliers(
-        recorded.response(evidence),
+        responses[well],
         freqs,
         settings.outlier_form,
-        unit_ids=models.unit_ids,
+        unit_ids=tuple(ids[k] for k in well),
         output_scale=models.output_scale,
         input_scale=models.input_scale,
         false_alarm_rate=settings.false_alarm_rate,
-        deviations=recorded.all_deviations(),
     )
-    qualified = tuple(recorded.qualified(*pair) for pair in zip(outliers.scores, evidence, strict=True))
-    return replace(outliers, scores=qualified), [data.n_samples for data in evidence]
+    known = {score.unit: score for score in outliers.scores}
+    scores = [known.get(unit) or outliers.score(unit, G) for unit, G in zip(ids, responses, strict=True)]
+    by_nominal = np.full((len(outliers.nominal_ids), len(ids)), np.nan)
+    by_nominal[:, well] = outliers.by_nominal_db
+    qualified = tuple(recorded.qualified(*pair) for pair in zip(scores, evidence, strict=True))
+    return replace(outliers, scores=qualified, by_nominal_db=by_nominal), [data.n_samples for data in evidence]
 
 
 def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:

@@ -15,7 +15,6 @@ import numpy as np
 
 LARGEST_DB = 26.0  # beyond the cover of the others: twenty times as far away as any of them is
 LARGEST_PERCENT = 200.0  # change of gain: three times as large
-LARGEST_RISE_DB = 6.0  # of the bound, by the unit's own noise: a defect would have to be twice as large to be seen
 
 
 class Status(StrEnum):
@@ -40,8 +39,7 @@ class OutlierScore:
     unit : str
     score_db : float, dB
         The excess, referred to the threshold: a unit that is out covers the others and lowers their scores, and with them its own
-        threshold; the difference is added to its excess, so that one threshold serves all units. What the noise of the unit's own estimate
-        adds to its bound is taken off likewise.
+        threshold; the difference is added to its excess, so that one threshold serves all units.
     threshold_db : float, dB
     outlier : bool
     freq_hz : float, Hz
@@ -64,7 +62,7 @@ class OutlierScore:
     detectable_entry : tuple of int
         Output and input of the entry.
     more_data : float
-        How many times as long the unit would have to be recorded for its own noise to hide little; one where the recordings suffice.
+        How many times as long the unit would have to be recorded; one where the recordings suffice.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Scores of units from distances: who covers whom, what a unit exceeds that by, and what its own noise adds to its bound.
+"""Scores of units from distances: who covers whom, and what a unit exceeds that by.
 
 Beside a score stands the smallest change of a unit that it would have shown, as a change of gain: a level in dB says little to people who build
 machines. One entry of a unit's response, changed by one percent, is a residual of some level at every frequency; a level is proportional to the change
@@ -8,7 +8,7 @@ to first order, so what it takes to reach the bound follows in percent.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,8 @@ import numpy.typing as npt
 
 from ..forms import Form
 from .distances import Distances, largest_entries, scaled_levels
-from .groups import excess, held
-from .noise import Others
-from .score import LARGEST_RISE_DB, OutlierScore, Status, room_db
+from .score import OutlierScore, Status, room_db
+from .separation import excess, held
 from .tail import leave_one_out_bounds
 
 Array = npt.NDArray[Any]
@@ -129,29 +128,6 @@ def _without_one(levels: Array, inliers: npt.NDArray[np.bool_]) -> Callable[[int
     largest, top = levels[here].max(axis=0), here[ordered[-1]]
     second = levels[here[ordered[0]], np.arange(levels.shape[1])]
     return lambda unit: np.where(top == unit, second, largest)
-
-
-def with_noise(score: OutlierScore, G: Array, others: Others, draws: Array) -> OutlierScore:
-    """Take off a score what the noise of its own estimate adds to its bound, and say whether that hides too much."""
-    bounds = others.bounds(G, draws)
-    if bounds is None:
-        return score
-    usual, noisy = bounds
-    lift = max(0.0, noisy - score.detectable_db)
-    outlier = score.outlier and score.excess_db > max(noisy, score.detectable_db)
-    room = room_db(usual, score.detectable_percent * 10 ** ((usual - score.detectable_db) / 20))
-    allowed = min(LARGEST_RISE_DB, room) if room >= 0 else LARGEST_RISE_DB
-    enough = noisy - usual <= allowed
-    status = Status.NOT_ENOUGH_DATA if not enough else Status.OK if room >= 0 else Status.CANNOT_TELL
-    return replace(
-        score,
-        score_db=score.score_db - lift,
-        outlier=outlier,
-        status=Status.OUTLIER if outlier else status,
-        detectable_db=score.detectable_db + lift,
-        detectable_percent=score.detectable_percent * 10 ** (lift / 20),
-        more_data=1.0 if enough else others.more_data(G, draws, allowed),
-    )
 
 
 def change_levels(form: Form, responses: Array, found: Distances, freqs_hz: Array) -> Array:

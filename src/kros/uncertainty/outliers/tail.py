@@ -7,11 +7,9 @@ A score is a maximum over frequency, so the scores of good units are modelled as
 with a fixed shape xi, location and scale unknown. They are measured by two statistics that move with both, the first two sample L-moments
 (Hosking, *L-moments*, J. R. Stat. Soc. B 52, 1990): ``b = l2 / ln 2`` and ``a = l1 - gamma b``, location and scale themselves for xi = 0.
 What is measured in them has a distribution that depends on the number of scores and xi alone: small samples get wider bounds, not wrong ones.
-Those distributions are drawn once, with a fixed seed:
+That distribution is drawn once, with a fixed seed:
 
-    T_g = (s_(n-g+1) - a_g) / b_g            the least of the g largest scores, a_g and b_g from the n - g others
-    P(a score > a + q_1 b) = 3/4 rate        one unit at a time, a and b of the n - 1 others
-    E[g; T_g > q_g, g > 1] = n rate / 4      groups of two and more, shared out equally
+    P(a score > a + q b) = rate              a and b of the n - 1 others
 
 so under the model a good unit is flagged with a probability of at most `rate`. The shape was chosen on simulated drives, others than those
 that the documented rates come from: with a normal model or xi = 0 more of them were flagged than the rate says.
@@ -28,22 +26,14 @@ import numpy.typing as npt
 Array = npt.NDArray[Any]
 
 LEAST_SCORES = 3  # a location, a scale, and one that tests them
-LARGEST_GROUP = 8
-_DRAWS = 400_000
 _NUMBERS = 4_000_000
-_SHARE_OF_GROUPS = 0.25
 SHAPE = 0.1  # xi
 _HALVINGS = 55
 _ASYMPTOTIC = 60  # from here on the correction of the factor is proportional to 1 / n
 
 
-def largest_group(count: int) -> int:
-    """Return how many of `count` units may be outliers: a third, at most eight, and three others have to stay."""
-    return max(0, min(count // 3, count - LEAST_SCORES, LARGEST_GROUP))
-
-
 def prediction_bound(scores: Array, rate: float) -> Array:
-    """Return what one further score exceeds with probability `rate`, from scores of shape (..., score), dB; infinity with fewer than three."""
+    """Return what one further score exceeds with probability `rate`, from scores of shape (..., score), dB; infinity of fewer than three."""
     scores = np.asarray(scores, float)
     if scores.shape[-1] < LEAST_SCORES:
         return np.full(scores.shape[:-1], np.inf)
@@ -92,33 +82,6 @@ def exceedance(x: Array) -> Array:
     with np.errstate(divide="ignore"):
         log_power = np.log(np.maximum(1 + SHAPE * x, 0.0)) / SHAPE
     return np.asarray(-np.expm1(-np.exp(-np.maximum(log_power, -700.0))))
-
-
-@lru_cache(maxsize=64)
-def group_factors(count: int, rate: float) -> tuple[float, ...]:
-    """Return q_1, q_2, ... for a number of scores; empty where nothing can be told."""
-    sizes = largest_group(count)
-    if sizes == 0:
-        return ()
-    single = prediction_factor(count - 1, (1 - _SHARE_OF_GROUPS) * rate)
-    if sizes == 1:
-        return (single,)
-    T = group_statistics(standard_draws(np.random.default_rng(1), (min(_DRAWS, _NUMBERS // count), count)))
-    levels = [_SHARE_OF_GROUPS * min(count * rate, 1.0) / (sizes - 1) / g for g in range(2, sizes + 1)]
-    return (single, *(float(np.quantile(T[:, g - 1], 1 - level)) for g, level in enumerate(levels, start=2)))
-
-
-def group_statistics(scores: Array) -> Array:
-    """Return T_1, T_2, ... of scores of shape (..., n): shape (..., group)."""
-    x = np.sort(scores, axis=-1)
-    n = x.shape[-1]
-    g = np.arange(1, largest_group(n) + 1)
-    m = n - g
-    first, second = x.cumsum(axis=-1)[..., m - 1], (x * np.arange(n)).cumsum(axis=-1)[..., m - 1]
-    scale = (2 * second - (m - 1) * first) / (m * (m - 1)) / np.log(2)
-    over = x[..., m] - (first / m - np.euler_gamma * scale)
-    tiny = np.finfo(float).eps * np.abs(x).max(axis=-1, keepdims=True)
-    return np.asarray(np.divide(over, scale, out=np.where(over > tiny, np.inf, 0.0), where=scale > tiny))
 
 
 def gumbel(scores: Array) -> tuple[Array, Array]:

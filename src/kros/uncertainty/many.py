@@ -42,22 +42,7 @@ def is_many(asked: Quantification, n_units: int, time: Any) -> bool:
 
 
 def bound_many(asked: Quantification, base: StateSpace, units: StateSpace, freqs_hz: Array) -> Bounded:
-    """Return weights for the residuals of many units and for the remainder.
-
-    Parameters
-    ----------
-    asked : Quantification
-    base : StateSpace
-        The nominal, discrete, scaled as the units.
-    units : StateSpace
-        The unit axis first.
-    freqs_hz : ndarray, shape (frequency,), Hz
-
-    Returns
-    -------
-    Bounded
-        The cover is sound for all units and optimal for those that decide.
-    """
+    """Return weights for the residuals of many discrete units and for the remainder; sound for all, and optimal for those that decide."""
     many = _Many(asked, base, units, freqs_hz)
     rows = many.deciding()
     for last in (False,) * (_ROUNDS - 1) + (True,):
@@ -129,10 +114,7 @@ class _Many:
         return checking_grid(self.freqs_hz, self.base.dt, DENSITY, filled=True)
 
     def proofs(self, weights: Mapping[Part, Weight], rows: Array, certain: bool) -> dict[Part, _Proof]:
-        """Compare weights with all units, as those of few units are.
-
-        Unless it has to be `certain`, nothing more is proven from where units beyond the weights that are not among `rows` were found on the grid.
-        """
+        """Compare weights with all units, as those of few units are."""
         found: dict[Part, list[_Proof]] = {part: [] for part in weights}
         proving = True
         for block in self.blocks():

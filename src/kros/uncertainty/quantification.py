@@ -84,18 +84,7 @@ class Quantification:
         also_hz: Array | None = None,
         sampled: bool = False,
     ) -> Bounded:
-        """Return weights for the residuals and for the remainder, in the time of the responses.
-
-        Parameters
-        ----------
-        nominal, units : callable
-            From frequencies (n,), Hz, to responses of shape (n, p, m) and (unit, n, p, m) in scaled coordinates.
-        freqs_hz : ndarray, shape (frequency,), Hz
-        time : float, s, or BilinearAxis
-            Sampling period, or the map of the axis for continuous time.
-        systems, also_hz, sampled
-            As of `fit_weight`; on the mapped axis for continuous time. Sampled responses are asked for at no frequencies but those given.
-        """
+        """Return weights for the residuals and the remainder, from responses as functions of Hz; a map of the axis for continuous time."""
         if isinstance(time, BilinearAxis):
             back = time.continuous_hz
             grid, dt = time.discrete_hz(freqs_hz), time.period_s
@@ -128,11 +117,7 @@ class Quantification:
         return Bounded(bound, cover, weight, ratio, *remainder)
 
     def _automatic(self, fit: Callable[[Structure], tuple[Weight, Cover]]) -> tuple[Weight, Cover]:
-        """Diagonal weights, or scalar ones where these are better.
-
-        Diagonal weights are tighter than scalar ones channel by channel, but their product can be larger, for which inverse forms pay by
-        ``1 / (1 - |W_R W_L|)``, and they may bend too sharply to be fitted.
-        """
+        """Diagonal weights, or scalar ones where these are better."""
         diagonal = fit(Structure.DIAGONAL)
         weight = diagonal[0]
         loop = self.form.inverse and self.form is not Form.INVERSE_ADDITIVE
@@ -221,11 +206,7 @@ def _by_pieces(function: Callable[..., Array], *units: Array) -> Array:
 
 
 def _leaves_out(form: Form, ratio: Array) -> bool:
-    """Tell whether an additive remainder is needed, and warn.
-
-    A misfit is small or large beside the *error* of an observer, which is a difference of responses: where all units agree, a thousandth of the
-    response may be more than all that the weights allow. So anything beyond rounding joins the set.
-    """
+    """Tell whether an additive remainder is needed, and warn."""
     unknown = int(np.isnan(ratio).sum())
     if unknown:
         _LOG.warning(

@@ -119,10 +119,7 @@ def quantify_responses(
 
 
 def unresolved_peaks(bound: Array) -> npt.NDArray[np.intp]:
-    """Return the indices of inner local maxima from which a bound, shape (frequency,), falls by more than 3 dB to a neighbour.
-
-    A resonance falls by 3 dB within its half-width: three points within its width show one that falls less.
-    """
+    """Return the indices of inner local maxima from which a bound, shape (frequency,), falls by more than 3 dB to a neighbour."""
     middle, before, after = bound[1:-1], bound[:-2], bound[2:]
     peaks = (middle >= before) & (middle >= after) & (middle > np.maximum(_RESOLVED * np.minimum(before, after), _ROUNDING * bound.max()))
     return np.flatnonzero(peaks) + 1

@@ -33,41 +33,18 @@ _ARRAYS = ("freqs_hz", "entries", "ratio", "largest", "entry_weights", "entry_or
 
 @dataclass(frozen=True, eq=False)
 class UnitResiduals:
-    """Sizes of the residuals of many units against one nominal.
-
-    Parameters
-    ----------
-    form : Form
-    nominal_id : str
-    unit_ids : tuple of str
-        Units that are kept, at most 200 of those covered, and all others.
-    outside : tuple of str
-        Units that the weights do not have to cover.
-    freqs_hz : ndarray, shape (frequency,), Hz
-    entries : ndarray, shape (unit, frequency, p', m')
-        Magnitudes of the residual's entries, in scaled coordinates.
-    ratio : ndarray, shape (unit, frequency)
-        ``sigma_max(W_L^-1 E W_R^-1)``.
-    largest : ndarray, shape (frequency, p', m')
-        Largest entries of all covered units.
-    entry_weights : ndarray, shape (frequency, p', m')
-        Magnitudes of the systems that bound `largest`, entry by entry. They are no cover: a perturbation within them may exceed every
-        contraction between them.
-    entry_orders : ndarray of int, shape (p', m')
-    entry_excess : float
-        Largest ``sigma_max(W^-1 E)`` of a covered unit, W the entrywise systems as one matrix, where it can be inverted; NaN where it is not square.
-    """
+    """Sizes of the residuals of many units against one nominal."""
 
     form: Form
     nominal_id: str
-    unit_ids: tuple[str, ...]
-    outside: tuple[str, ...]
-    freqs_hz: Array
-    entries: Array
-    ratio: Array
-    largest: Array
-    entry_weights: Array
-    entry_orders: Array
+    unit_ids: tuple[str, ...]  # units that are kept, at most 200 of those covered, and all others
+    outside: tuple[str, ...]  # units that the weights do not have to cover
+    freqs_hz: Array  # (frequency,), Hz
+    entries: Array  # (unit, frequency, p', m'): magnitudes of the residual's entries, in scaled coordinates
+    ratio: Array  # (unit, frequency): ``sigma_max(W_L^-1 E W_R^-1)``
+    largest: Array  # (frequency, p', m'): largest entries of all covered units
+    entry_weights: Array  # (frequency, p', m')
+    entry_orders: Array  # (p', m')
     entry_excess: float = float("nan")
 
     def rows(self, *, inside: bool) -> list[int]:
@@ -110,29 +87,7 @@ def unit_residuals(
     max_order: int = 4,
     tolerance_db: float = 1.0,
 ) -> UnitResiduals:
-    """Return the residuals of units against a nominal, beside weights.
-
-    Parameters
-    ----------
-    form : Form
-    nominal, responses : ndarray, shape (frequency, p, m) and (unit, frequency, p, m), complex
-        In scaled coordinates.
-    weights : Weight or Cover
-        Systems, or magnitudes at the frequencies.
-    freqs_hz : ndarray, shape (frequency,), Hz
-    sample_period_s : float, s
-    unit_ids : sequence of str
-    nominal_id : str
-    outside : collection of str
-        Units that the weights need not cover; they take no part in the entrywise bounds.
-    max_order, tolerance_db
-        Of the bound of one entry, as of `fit_magnitude`.
-
-    Raises
-    ------
-    DimensionError
-        When there is not one name for each response, or nobody is covered.
-    """
+    """Return residuals of units against a nominal, responses (unit, frequency, p, m) in scaled coordinates, beside weights or a cover."""
     inside = np.array([u not in outside for u in unit_ids], dtype=bool)
     if len(unit_ids) != len(responses) or not inside.any():
         raise DimensionError(

@@ -44,10 +44,7 @@ def check_ids(unit_ids: Sequence[str] | None, count: int) -> tuple[str, ...]:
 
 
 def stack_systems(models: Any) -> StateSpace:
-    """Return a batch from a batch, or from a sequence of systems with the same outputs, inputs and sampling period.
-
-    Systems with fewer states than others get further ones that are stable and do nothing. Others raise a `DimensionError`.
-    """
+    """Return a batch from a batch, or from a sequence of systems with the same outputs, inputs and sampling period."""
     if not isinstance(models, StateSpace):
         if isinstance(models, str) or not isinstance(models, Iterable):
             raise DimensionError(

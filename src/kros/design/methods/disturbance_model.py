@@ -17,18 +17,9 @@ _NOISES = ((0.0, 0.0), (1e-2, 0.0), (0.0, 1e-1), (0.0, 1.0))  # process, measure
 
 @dataclass(frozen=True)
 class DisturbanceModel:
-    """Disturbances of an observer problem.
+    """Disturbances of an observer problem."""
 
-    Parameters
-    ----------
-    input_weight : float or "identity"
-        Corner of the low-pass spectrum of the scaled inputs in Hz, or white inputs as in the paper.
-    process_noise, measurement_noise : float
-        Standard deviation of white noise on every state and measurement per sample, as a share of the largest value; measurements have at least
-        the noise that was found in the recordings.
-    """
-
-    input_weight: float | str = IDENTITY
+    input_weight: float | str = IDENTITY  # corner of the low-pass spectrum of the scaled inputs in Hz, or white inputs as in the paper
     process_noise: float = 0.0
     measurement_noise: float = 0.0
 

@@ -33,11 +33,7 @@ def design_kalman_white(task: DesignTask) -> DesignResult:
 
 
 def design_kalman_tuned(task: DesignTask) -> DesignResult:
-    """Kalman gains for the white process noise that does best on training episodes.
-
-    Its shape is the full covariance of the one-step residuals that the model leaves on the episodes of all units, or the same share of every state's
-    largest value; its size is swept over sixteen decades. The model is the nominal unit's, or that with rows fitted to single steps of all units.
-    """
+    """Kalman gains for the white process noise that does best on training episodes."""
     models, data, n = task.models, task.training.read(), task.models.lifting.n_states
     lifting, batch, R = models.lifting, data.batch, np.diag(task.noise**2)
     nominal = models.index(task.unit)
@@ -55,10 +51,7 @@ def design_kalman_tuned(task: DesignTask) -> DesignResult:
 
 
 def design_luenberger(task: DesignTask) -> DesignResult:
-    """Poles of the original states' error dynamics placed as much faster than the model's as does best on training episodes.
-
-    Rows of lifted functions are computed anew at every step and need no correction.
-    """
+    """Poles of the original states' error dynamics placed as much faster than the model's as does best on training episodes."""
     n = task.models.lifting.n_states
     candidates = luenberger_candidates(task.dynamics[:n, :n], task.selector[:, :n], task.models.sample_period_s)
     tried = [Tried(_padded(found, task.models.lifting.n_lifted), {"poles_faster_by": factor}) for factor, found in candidates]
@@ -75,10 +68,7 @@ class Tried:
 
 
 def best_of(task: DesignTask, tried: Sequence[Tried], data: ValidationSet, **off: float) -> DesignResult:
-    """Return the candidate with the least error of the hidden states on training episodes, the geometric mean over them; the model alone where none is better.
-
-    What is handed out is so never worse than the model alone, in that mean; facts say where correction is off.
-    """
+    """Return the candidate of least error of the hidden states on training episodes; the model alone where none is better."""
     candidates = [Tried(without_correction(task), off), *tried]
     models = [(None, None) if t.model is None else (t.model.A, t.model.B) for t in candidates]
     observers = [task.observer(t.synthesis, *model) for t, model in zip(candidates, models, strict=True)]

@@ -51,23 +51,13 @@ _CIRCLE = {"sin": "cos", "cos": "sin"}
 
 @dataclass(frozen=True)
 class Effort:
-    """How much a predictor may cost.
+    """How much a predictor may cost."""
 
-    Parameters
-    ----------
-    samples, groups : int
-        Of recordings, in so many units and conditions at most.
-    delays, internal : tuple of int
-        Candidates.
-    steps : int
-        Of tuning.
-    """
-
-    samples: int
-    groups: int
-    delays: tuple[int, ...]
-    internal: tuple[int, ...]
-    steps: int
+    samples: int  # of recordings, in so many units and conditions at most
+    groups: int  # of recordings, in so many units and conditions at most
+    delays: tuple[int, ...]  # candidates
+    internal: tuple[int, ...]  # candidates
+    steps: int  # of tuning
 
 
 EFFORTS = {
@@ -77,13 +67,7 @@ EFFORTS = {
 
 
 def design_predictor(task: DesignTask) -> DesignResult:
-    """An observer whose hidden states are identified from the past of what it sees, with internal states that hold it.
-
-    Raises
-    ------
-    SynthesisError
-        Where the lifting reads what is not measured or past, everything is measured, recordings are too short, or the observer diverges.
-    """
+    """An observer whose hidden states are identified from the past of what it sees, with internal states that hold it."""
     began, effort = time.perf_counter(), EFFORTS[task.predictor.effort]
     try:
         data, settle = recordings(task, effort).read_whole(), partial(settled, task, reaching(task))
@@ -138,10 +122,7 @@ def recordings(task: DesignTask, effort: Effort) -> TrainingSet:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a predictor is made by.
-
-    Moments of the recordings, the recipe that units which were left out have chosen, what counts how much, and what fills in what limits hide.
-    """
+    """What a predictor is made by."""
 
     past: PastMoments
     recipe: Recipe
@@ -202,10 +183,7 @@ class Plan:
         return self._started(task, replace(data, batch=some(data.batch, asked.episodes)), few, made[int(np.argmin(without))])
 
     def _started(self, task: DesignTask, data: ValidationSet, few: EpisodeBatch, observer: Observer) -> Observer:
-        """Return the observer with a start in motion, unless recordings start better without: what is unknown where machines move may be known at rest.
-
-        Of several conditions that of synthesis alone is tried as well: where it is clear what holds a machine, nothing has to be corrected.
-        """
+        """Return the observer with a start in motion, unless recordings start better without."""
         first = [i for i, key in enumerate(few.keys) if key.condition == task.training.keys[0].condition]
         parts = [few] if len(first) == len(few.keys) else [few, few.take(first)]
         tried = [*(with_start(observer, part, self.past.static, self.past.free) for part in parts), observer]

@@ -14,16 +14,7 @@ from ..task import DesignResult, DesignTask
 
 
 def design_published(task: DesignTask) -> DesignResult:
-    """Mixed synthesis with a weight for every entry of the residual in front of a full perturbation, as in the paper's Figures 8 and 10.
-
-    Such weights do not cover the residuals (`EntrywiseWeight.unstructured_excess` says by how much); what the record calls certified is the filter, on
-    the covering set of all other observers. Input and performance weights are the identity on scaled signals.
-
-    Raises
-    ------
-    SynthesisError
-        Where there is no usable set, that of the entrywise weights is ill-posed, or no filter survives verification.
-    """
+    """Mixed synthesis with a weight for every entry of the residual in front of a full perturbation, as in the paper's Figures 8 and 10."""
     problem = task.require_problem()
     weight = entrywise_weight(task)
     found = mixed(as_published(problem, weight.matrix()), time_limit_s=task.settings.time_limit_s)

@@ -25,11 +25,7 @@ _TUNE_S, _STEPS = 5.0, 8
 
 
 def design_residual_h2(task: DesignTask) -> DesignResult:
-    """Kalman gains for the one-step residuals that a model leaves on the training episodes of all units.
-
-    The model is the nominal unit's, or that with some rows fitted to single steps. Those that promise the smallest errors of the hidden states are
-    compared on the training episodes, by the same rule as all observers that are tuned.
-    """
+    """Kalman gains for the one-step residuals that a model leaves on the training episodes of all units."""
     models = promising(task)[:_COMPARED]
     syntheses = [gains_for(task, model) for model in models]
     observers = [

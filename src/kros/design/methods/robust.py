@@ -68,13 +68,7 @@ def best_model(task: DesignTask, problem: ObserverProblem, design: Callable[[Obs
 
 
 def best_design(task: DesignTask, designs: Sequence[Callable[[], Synthesis]]) -> tuple[int, Synthesis]:
-    """Return which design does best on training episodes, and its synthesis.
-
-    Raises
-    ------
-    SynthesisError
-        The last reason, where none can be made.
-    """
+    """Return which design does best on training episodes, and its synthesis."""
     made: dict[int, Synthesis] = {}
     reason = ""
     for number, design in enumerate(designs):

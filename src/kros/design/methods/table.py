@@ -13,24 +13,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Method:
-    """One way to an observer.
-
-    Parameters
-    ----------
-    name : str
-    seconds : float
-        Roughly what it takes: those that take longest start first, so that no worker waits for them in the end.
-    rank : int
-        The observer of the lowest rank is deployed where none is named and others are no better.
-    not_refined, refined_only : str
-        Why it is not made for refined models, or for these alone; empty where it is made for all.
-    """
+    """One way to an observer."""
 
     name: str
-    seconds: float
-    rank: int
-    not_refined: str = ""
-    refined_only: str = ""
+    seconds: float  # roughly what it takes: those that take longest start first, so that no worker waits for them in the end
+    rank: int  # the observer of the lowest rank is deployed where none is named and others are no better
+    not_refined: str = ""  # why it is not made for refined models, or for these alone; empty where it is made for all
+    refined_only: str = ""  # why it is not made for refined models, or for these alone; empty where it is made for all
 
 
 _LIFTED = "the paper's problem spends its correction on lifted modes that the observer as it runs does not have"

@@ -28,31 +28,7 @@ def tuned_where_better(
     settle: Callable[[ValidationSet, Observer], Observer] = lambda _, observer: observer,
     score: Callable[[ValidationSet, Sequence[Observer]], Array] | None = None,
 ) -> tuple[Observer, dict[str, Any]]:
-    """Tune an observer on most training episodes, and return what is better on the others.
-
-    The tuned one is kept where it does not get worse on the episodes that tuning did not see, survives missing measurements if the first one does, and is
-    certified as it runs.
-
-    Parameters
-    ----------
-    task : DesignTask
-    data : ValidationSet
-        Training episodes.
-    start : Observer
-    tune : callable
-        From episodes and an observer to a better one.
-    settle : callable
-        What is done to the observer that is kept, with the first episodes of all units.
-    score : callable, optional
-        From the episodes that tuning did not see and observers to errors, shape (observer,): what was tuned for. By default the geometric mean of the
-        hidden states' mean errors.
-
-    Returns
-    -------
-    Observer
-    dict
-        For the records: whether the tuned one was kept, and the errors that decided.
-    """
+    """Tune an observer on most training episodes, and return what is better on the others."""
     held = held_out(data.batch.keys)
     unseen = data.part([i for i in range(len(held)) if held[i]])
     first = data.part([i for i, key in enumerate(data.batch.keys) if key.unit not in {k.unit for k in data.batch.keys[:i]}])

@@ -38,19 +38,10 @@ _RIDGE = 1e-6  # of the largest energy, in every direction: where all lie in few
 
 @dataclass(frozen=True, eq=False)
 class BandEnergies:
-    """Energies of signals in bands of frequency, per sample.
+    """Energies of signals in bands of frequency, per sample."""
 
-    Parameters
-    ----------
-    edges : ndarray, shape (b + 1,), rad per sample
-        Increasing from zero to pi.
-    energy : ndarray, shape (..., b, n, n), complex Hermitian
-        ``Phi_b`` over the number of samples, both signs of frequency folded in: the traces of all bands sum to the mean square of a sample.
-        Leading axes are episodes or units; none for a cover.
-    """
-
-    edges: Array
-    energy: Array
+    edges: Array  # (b + 1,), rad per sample: increasing from zero to pi
+    energy: Array  # (..., b, n, n)
 
     def __post_init__(self) -> None:
         edges, energy = check_edges(self.edges), np.asarray(self.energy, dtype=complex)
@@ -61,22 +52,7 @@ class BandEnergies:
 
     @classmethod
     def of(cls, signal: Array, lengths: npt.ArrayLike, edges: npt.ArrayLike, samples: npt.ArrayLike | None = None) -> BandEnergies:
-        """Return the energies of every episode, exact for signals that are zero before and after.
-
-        Parameters
-        ----------
-        signal : ndarray, shape (n_samples, batch, n)
-        lengths : array_like of int, shape (batch,)
-            Samples of every episode that count; what follows is taken as zero.
-        edges : array_like, shape (b + 1,), rad per sample
-        samples : array_like, shape (batch,), optional
-            What energies are divided by: the samples over which an error is averaged. Default is `lengths`.
-
-        Returns
-        -------
-        BandEnergies
-            With energies of shape (batch, b, n, n).
-        """
+        """Return energies (batch, b, n, n) of the episodes of a signal (n_samples, batch, n) that is zero before and after."""
         signal, lengths, edges = np.asarray(signal, dtype=float), np.asarray(lengths, dtype=int), check_edges(edges)
         if signal.ndim != 3 or lengths.shape != signal.shape[1:2] or not ((lengths > 0) & (lengths <= len(signal))).all():
             raise DimensionError(
@@ -128,28 +104,7 @@ def check_edges(edges: npt.ArrayLike) -> Array:
 
 
 def cover(energies: Array, weight: Array | None = None) -> Array:
-    r"""Return a matrix in every band that is no smaller than any of those given.
-
-    Least is ``tr(weight M)`` subject to ``M >= E_k``, for which the dual ``max sum_k tr(E_k Y_k)``, ``sum_k Y_k = 1``, ``Y_k >= 0`` is solved by the
-    fixed-point iteration of optimal measurements [1]_; there ``M = sum_k E_k Y_k``. That is enlarged until it covers, so it does whatever the
-    iteration has reached.
-
-    Parameters
-    ----------
-    energies : ndarray, shape (k, b, n, n)
-        Positive semidefinite.
-    weight : ndarray, shape (b, n, n), optional
-        Positive definite: what the cover is for. By default every channel counts by the inverse of its mean, so that units of measure change nothing.
-
-    Returns
-    -------
-    ndarray, shape (b, n, n)
-
-    References
-    ----------
-    .. [1] M. Jezek, J. Rehacek and J. Fiurasek, "Finding optimal strategies for minimum-error quantum-state discrimination",
-       Physical Review A 65 (2002) 060301.
-    """
+    """Return no smaller than any energy (k, b, n, n), of least `tr(weight M)`: Jezek, Rehacek, Fiurasek, Phys. Rev. A 65 (2002) 060301."""
     n = energies.shape[-1]
     mean = np.sqrt(np.einsum("kbii->bi", energies).real / len(energies))
     mean[mean <= 0] = 1.0

@@ -26,17 +26,10 @@ from .bands import Array, BandEnergies, band_edges
 
 @dataclass(frozen=True, eq=False)
 class SignalSet:
-    """Residuals of a population along its recordings.
-
-    Parameters
-    ----------
-    unit_ids : tuple of str
-    energies : BandEnergies
-        Of every unit, shape (unit, b, n, n): the mean over its episodes, per sample.
-    """
+    """Residuals of a population along its recordings."""
 
     unit_ids: tuple[str, ...]
-    energies: BandEnergies
+    energies: BandEnergies  # of every unit, shape (unit, b, n, n): the mean over its episodes, per sample
 
     def __post_init__(self) -> None:
         if self.energies.energy.ndim != 4 or len(self.energies.energy) != len(self.unit_ids):
@@ -51,21 +44,7 @@ class SignalSet:
         start: Array | None = None,
         edges: npt.ArrayLike | None = None,
     ) -> SignalSet:
-        """Return the set of residuals along recordings.
-
-        Parameters
-        ----------
-        residual : ndarray, shape (n_samples, batch, n)
-            One-step residuals (`kros.observer.residual.one_step`), of the states that are recorded.
-        lengths : array_like of int, shape (batch,)
-            Residuals of every episode that count.
-        units : sequence of str, length batch
-            The unit of every episode.
-        start : ndarray, shape (batch, n), optional
-            Error of the first estimate; none by default.
-        edges : array_like, rad per sample, optional
-            Of bands; default `band_edges` of the longest episode.
-        """
+        """Return the set of one-step residuals (n_samples, batch, n) of episodes, with the error of the first estimate in front."""
         lengths = np.asarray(lengths, dtype=int)
         first = np.zeros((1, *residual.shape[1:])) if start is None else np.asarray(start, dtype=float)[None]
         signal, samples = np.concatenate([first, residual]), lengths + 1  # as many estimates, the first among them
@@ -78,19 +57,7 @@ class SignalSet:
         return self.energies.cover()
 
     def spectrum(self, n_points: int, weights: npt.ArrayLike | None = None) -> Array:
-        """Return a spectral density, evenly spread over every band, of the cover or of a mixture of units.
-
-        Parameters
-        ----------
-        n_points : int
-            Equal steps from zero to Nyquist; the mean over the circle (`circle_weights`) is the mean square.
-        weights : array_like, shape (unit,), optional
-            Of a mixture; the cover by default.
-
-        Returns
-        -------
-        ndarray, shape (n_points, n, n), complex
-        """
+        """Return a density (n_points, n, n) from zero to Nyquist, even over every band, of the cover or of a mixture of units."""
         edges = self.energies.edges
         energy = self.cover.energy if weights is None else np.tensordot(np.asarray(weights, dtype=float), self.energies.energy, 1)
         total = np.concatenate([np.zeros((1, *energy.shape[1:])), np.cumsum(energy, axis=0)])

@@ -13,11 +13,7 @@ Array = npt.NDArray[Any]
 
 
 def diagonal_response(system: StateSpace, freqs_hz: npt.ArrayLike) -> Array:
-    """Return the diagonal of the response of one square system, shape (frequency, size), complex.
-
-    Where A is block upper triangular with blocks of at most two states, `(zeta - A) x = b` is solved from the last block up, all frequencies at
-    once, and what a channel does not reach is left out; other systems are solved as they are.
-    """
+    """Return the diagonal of the response of one square system, shape (frequency, size); chains of sections from the last block up."""
     freqs = np.asarray(freqs_hz, float)
     blocks = _blocks(system.A)
     if any(b.stop - b.start > 2 for b in blocks):

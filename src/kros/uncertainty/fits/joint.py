@@ -58,11 +58,7 @@ class JointFit:
         return int(self.residuals.shape[1])
 
     def descend(self, start: Sections, temperatures: Sequence[float], steps: int, enough_db: float = -np.inf) -> Fitted:
-        """Return better sections of the same orders, raised to be sound at the frequencies of the fit.
-
-        From sections with the left entries first, through temperatures one after the other, each with so many steps at most, until the excess cost is
-        low enough.
-        """
+        """Return better sections of the same orders, raised to be sound at the frequencies of the fit."""
         state, damping = _State.of(self, start), _DAMPING[1]
         for temperature in temperatures:
             for _ in range(steps):

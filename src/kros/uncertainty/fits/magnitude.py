@@ -149,12 +149,7 @@ def fit_magnitude(
 
 
 def alternation_db(ratio: npt.ArrayLike, count: int) -> float:
-    r"""Return a lower bound on the overbound of any magnitude of one order, from the ratio of one such fit to the data.
-
-    Let the squared fit `n / d` have degree N in tau, and its ratio to the data swing `count = 2 N + 2` times in turn above H and below L.
-    Another `n' / d'` whose ratio stays within less than H / L would, scaled, be below the fit at every high and above it at every low point:
-    `n' d - n d'` of degree 2 N would change sign 2 N + 1 times. This is de la Vallee Poussin's bound for a ratio instead of a difference.
-    """
+    """Return what no magnitude stays closer to the data than, dB, from a fit's ratio to them (de la Vallee Poussin's bound for ratios)."""
     level = _turning(20 * np.log10(np.asarray(ratio, float)))
     low, high = 0.0, float(np.ptp(level))
     for _ in range(_HALVINGS):
@@ -244,11 +239,7 @@ class _Bound:
 
 
 def _minimax(tau: Array, targets: Array, order: int, lower: _Bound | None, hopeless: float) -> _Bound | None:
-    """Best n / d of one order above the targets, positive on the whole axis; `lower` is the best of an order less.
-
-    The problem has no local optima, but programs are solved in finite precision: knots where the data bend come first, evenly spaced ones
-    and those at the roots just found follow where a further order has not helped.
-    """
+    """Best n / d of one order above the targets, positive on the whole axis; `lower` is the best of an order less."""
     if order == 0:
         return _Bound(RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0)), float(targets.max() / targets.min()))
     programs = Programs(_PROGRAMS if np.isinf(hopeless) else _PROGRAMS // 2)

@@ -33,10 +33,7 @@ _STALLED_DB = 5e-3
 
 @dataclass
 class Programs:
-    """How many linear programs may still be solved: bad data would take thousands, one after the other, and gain nothing.
-
-    `active` are the rows that were active in the last program on the same grid, where the next one starts.
-    """
+    """How many linear programs may still be solved: bad data would take thousands, one after the other, and gain nothing."""
 
     left: int
     active: Array | None = None

@@ -27,21 +27,7 @@ _STEPS = 50  # for every unknown: about ten times what programs take
 
 
 def solve(A: Array, g: Array, active: Array | None = None) -> tuple[Array, Array] | None:
-    """Return the solution and the active rows, none where no program was solved.
-
-    Parameters
-    ----------
-    A : ndarray, shape (rows, n)
-        Rows of size one.
-    g : ndarray, shape (n,)
-    active : ndarray, shape (n - 1,), optional
-        Rows that were active in a program like this.
-
-    Returns
-    -------
-    x : ndarray, shape (n,)
-    active : ndarray, shape (n - 1,)
-    """
+    """Return x and the n - 1 active rows of: minimise the last of x under `A x <= 0`, `g x = 1`; none where no program was solved."""
     try:
         found = None if active is None else _solve(A, *_near(A, g, active))
         return _solve(A, *_from_nothing(g)) if found is None else found

@@ -55,10 +55,7 @@ class Sections:
         return cls(np.zeros(len(corners)), entry.astype(int), sign, pair.astype(bool), corner.astype(float), np.full(len(rows), width))
 
     def like(self, entries: Array, magnitude: RationalMagnitude) -> Sections:
-        """Return the same with poles, zeros and level of a magnitude in some entries.
-
-        A `KrosError` is raised when the magnitude is zero or infinite at DC or Nyquist, or its roots are not found.
-        """
+        """Return the same with poles, zeros and level of a magnitude in some entries."""
         others, level = ~np.isin(self.entry, entries), self.level.copy()
         sides = [roots(c, magnitude.knots)[0] for c in (magnitude.numerator, magnitude.denominator)]
         if any(len(side) < len(magnitude.knots) or 0 in side for side in sides):

@@ -75,11 +75,7 @@ def log_knots(tau: Array, log: Array, count: int, even: float) -> Array:
 
 
 def roots(coefficients: Array, knots: Array) -> tuple[list[complex], float]:
-    """Return the roots in tau of `sum a_k phi_k`, and the coefficient of the highest power (its value at Nyquist where that is not zero).
-
-    Eigenvalues of the companion matrix, then Aberth's iteration in 60 digits: the roots differ by many decades. A `KrosError` is raised when they do not
-    settle, or all coefficients are zero.
-    """
+    """Return the roots in tau of `sum a_k phi_k`, and the coefficient of the highest power; those that do not settle are refused."""
     import mpmath
 
     order = len(knots)
@@ -129,11 +125,7 @@ def on_half_line(found: Sequence[complex]) -> list[float]:
 
 
 def spectral_factor(magnitude: RationalMagnitude, sample_period_s: float) -> StateSpace:
-    """Return the stable, minimum-phase system, with as many states as knots, whose squared magnitude is given.
-
-    A `KrosError` is raised when numerator or denominator is not positive on the whole axis, or their roots lie so near to it that no system in double
-    precision has them.
-    """
+    """Return the stable, minimum-phase system, with as many states as knots, whose squared magnitude is given."""
     zero_roots, lead_n = roots(magnitude.numerator, magnitude.knots)
     pole_roots, lead_d = roots(magnitude.denominator, magnitude.knots)
     bad = on_half_line(zero_roots) + on_half_line(pole_roots)

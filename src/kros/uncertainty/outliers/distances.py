@@ -92,10 +92,7 @@ def largest_entries(form: Form, responses: Array, found: Distances, units: Array
 
 
 def typical(squares: Array) -> tuple[Array, Array]:
-    """Return left and right scales that bring squared entries to equal row and column sums.
-
-    From shape (frequency, p', m') to (frequency, p') and (frequency, m').
-    """
+    """Return left and right scales that bring squared entries to equal row and column sums."""
     row = _positive(squares.max(axis=2, keepdims=True))
     column = _positive((squares / row).max(axis=1, keepdims=True))
     weights = np.maximum(squares / row / column, _SMALLEST)

@@ -24,15 +24,7 @@ log = logging.getLogger(__name__)
 def score_population(
     models: IdentifiedModels, settings: UncertaintySettings, work: Work | None = None
 ) -> tuple[dict[str, OutlierModel], list[dict[str, Any]]]:
-    """Score every unit against the others in every condition, whatever group it is filed under.
-
-    Returns
-    -------
-    dict of str to OutlierModel
-        By the place of the models in `IdentifiedModels.sets`.
-    list of dict
-        One row a score, see `score_row`.
-    """
+    """Score every unit in every condition, whatever its group: models by place in `IdentifiedModels.sets`, and a row for each score."""
     places = {condition: models.place(models.edmd_kinds[0], condition) for condition in models.population.conditions}
     known = {condition: models.sets[place] for condition, place in places.items() if place in models.sets}
     for condition, own in known.items():
@@ -77,23 +69,7 @@ def score_condition(factors: EpisodeFactors, models: ModelSet, settings: Uncerta
 
 
 def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:
-    """Return a score as a row of metrics.
-
-    Parameters
-    ----------
-    score : OutlierScore
-    condition : str
-    episodes : int
-        Recorded, those that are held out among them.
-    recorded_s : float, s
-
-    Returns
-    -------
-    dict
-        ``unit, condition, score, threshold`` (dB), ``outlier``; ``status``; where the score comes from; ``detectable``, the smallest change of gain
-        that would have been flagged in percent, with ``detectable_db``, ``detectable_hz`` and ``detectable_entry`` (output, input); ``episodes`` and
-        ``recorded_s``, and what would be needed of both.
-    """
+    """Return a score as a row of metrics, with what was recorded (episodes, held-out ones too, and seconds) and what is needed."""
     row = {"unit": score.unit, "condition": condition, "score": score.score_db, "threshold": score.threshold_db, "outlier": score.outlier}
     row |= {key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db", "agreement")}
     row |= {"status": score.status, "detectable": score.detectable_percent}

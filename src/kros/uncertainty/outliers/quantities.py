@@ -32,27 +32,14 @@ KNOWN = 0.75  # of the units, that a quantity has to be known of
 
 @dataclass(frozen=True, eq=False)
 class Quantities:
-    """Quantities of some units in one condition.
-
-    Parameters
-    ----------
-    unit_ids : tuple of str
-    names : tuple of str
-        Of the quantities.
-    values, deviations : ndarray, shape (unit, quantity)
-        NaN where a quantity is not known; deviations are those of its estimate.
-    floor : ndarray, shape (quantity,)
-        Differences that nobody looks at.
-    covariates : mapping of str to ndarray, shape (unit,)
-        Mean of what was recorded beside; NaN where it was not recorded.
-    """
+    """Quantities of some units in one condition."""
 
     unit_ids: tuple[str, ...]
-    names: tuple[str, ...]
-    values: Array
-    deviations: Array
-    floor: Array
-    covariates: Mapping[str, Array]
+    names: tuple[str, ...]  # of the quantities
+    values: Array  # (unit, quantity): naN where a quantity is not known; deviations are those of its estimate
+    deviations: Array  # (unit, quantity): naN where a quantity is not known; deviations are those of its estimate
+    floor: Array  # (quantity,): differences that nobody looks at
+    covariates: Mapping[str, Array]  # (unit,): mean of what was recorded beside; NaN where it was not recorded
 
     def of(self, rows: Any) -> Quantities:
         """Return those of some units."""
@@ -63,35 +50,18 @@ class Quantities:
 
 @dataclass(frozen=True)
 class QuantityScore:
-    """What single quantities say of one unit.
+    """What single quantities say of one unit."""
 
-    Parameters
-    ----------
-    status : Status
-        ``cannot tell`` where no score stands.
-    score, threshold : float or None
-        Deviations from what the others say, and what one more good unit exceeds with the stated probability.
-    quantity : str or None
-        That of the score, with its `value`, what the others make of it (`expected`) and by how much one more of them deviates (`deviation`).
-    value, expected, deviation : float or None
-    units : int
-        That it was compared with.
-    covariates : tuple of str
-        Regressed out.
-    reason : str
-        Why there is no score, or what was not regressed out.
-    """
-
-    status: Status
-    score: float | None = None
-    threshold: float | None = None
+    status: Status  # ``cannot tell`` where no score stands
+    score: float | None = None  # deviations from what the others say, and what one more good unit exceeds with the stated probability
+    threshold: float | None = None  # deviations from what the others say, and what one more good unit exceeds with the stated probability
     quantity: str | None = None
     value: float | None = None
     expected: float | None = None
     deviation: float | None = None
-    units: int = 0
-    covariates: tuple[str, ...] = ()
-    reason: str = ""
+    units: int = 0  # that it was compared with
+    covariates: tuple[str, ...] = ()  # regressed out
+    reason: str = ""  # why there is no score, or what was not regressed out
 
     @property
     def outlier(self) -> bool:
@@ -104,35 +74,7 @@ class QuantityScore:
 
 
 def score_quantities(population: Quantities, unit: Quantities, rate: float, without: Collection[str] = ()) -> QuantityScore:
-    """Score one unit against a population.
-
-    Parameters
-    ----------
-    population : Quantities
-    unit : Quantities
-        Of one unit.
-    rate : float
-        Probability that one more good unit exceeds the threshold.
-    without : collection of str
-        Units that are not compared with.
-
-    Returns
-    -------
-    QuantityScore
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty.outliers.quantities import Quantities, score_quantities
-    >>> rng = np.random.default_rng(0)
-    >>> def gains(values, temperature):
-    ...     ids, known = tuple(map(str, range(len(values)))), np.zeros((len(values), 1))
-    ...     return Quantities(ids, ("gain",), np.array(values)[:, None], known, np.zeros(1), {"temperature": np.array(temperature)})
-    >>> temperature = rng.uniform(20, 40, 20)
-    >>> population = gains(1 + 0.01 * temperature + 0.01 * rng.normal(size=20), temperature)
-    >>> [score_quantities(population, gains([g], [t]), 0.003).status.value for g, t in ((1.39, 39.0), (1.18, 39.0), (1.6, 60.0))]
-    ['ok', 'outlier', 'cannot tell']
-    """
+    """Score one unit against a population without some units; the rate is that with which one more good unit is flagged."""
     here = population.of([k for k, name in enumerate(population.unit_ids) if name not in without])
     names, reason = _shared(here, unit)
     often = np.count_nonzero(np.isfinite(here.values), axis=0) >= KNOWN * len(here.unit_ids)

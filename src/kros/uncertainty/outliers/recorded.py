@@ -29,18 +29,10 @@ _LEAST = 0.5  # of the middle unit's samples: the variance of an estimate is at 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Episodes that a unit is identified from.
+    """Episodes that a unit is identified from."""
 
-    Parameters
-    ----------
-    factor : Factor
-        Parameter-free, batch (episode,).
-    lifted : ndarray, shape (episode, q, q)
-        Factors of ``[Psi | Theta_plus]``.
-    """
-
-    factor: Factor
-    lifted: Array
+    factor: Factor  # parameter-free, batch (episode,)
+    lifted: Array  # (episode, q, q): factors of ``[Psi | Theta_plus]``
 
     @classmethod
     def of(cls, factor: Factor, models: ModelSet, parameters: Mapping[str, float]) -> Evidence:
@@ -62,20 +54,11 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """What a study recorded in one condition.
+    """What a study recorded in one condition."""
 
-    Parameters
-    ----------
-    models : ModelSet
-        Of the kind that is scored.
-    units : mapping of str to Evidence
-        Training episodes of every unit of `models`.
-    freqs_hz : ndarray, shape (frequency,), Hz
-    """
-
-    models: ModelSet
-    units: Mapping[str, Evidence]
-    freqs_hz: Array
+    models: ModelSet  # of the kind that is scored
+    units: Mapping[str, Evidence]  # training episodes of every unit of `models`
+    freqs_hz: Array  # (frequency,), Hz
 
     @classmethod
     def of(cls, factors: EpisodeFactors, models: ModelSet, freqs_hz: Array) -> Recorded:

@@ -64,23 +64,7 @@ class Certificate:
 
 
 def certify(ratio: Ratio, freqs_hz: Array, left: StateSpace, right: StateSpace, systems: ResidualSystems | None = None) -> Certificate:
-    """Find the largest ratio between residuals and weights over all frequencies from DC to Nyquist.
-
-    Parameters
-    ----------
-    ratio : callable
-        From frequencies (n,), Hz, to `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, n).
-    freqs_hz : ndarray, shape (frequency,), Hz
-        Dense grid to start from.
-    left, right : StateSpace
-        Square weights with stable inverses.
-    systems : ResidualSystems, optional
-        For the test by level sets. Not for the inverse additive form.
-
-    Returns
-    -------
-    Certificate
-    """
+    """Return the largest ratio (unit, n) from DC to Nyquist, from a dense grid, Hz, and by level sets where the systems are known."""
     known = ratio(freqs_hz)
     freq, peak = _sharpened(ratio, freqs_hz, known.max(axis=0))
     pencils = [] if systems is None or peak <= 0 else ratio_systems(systems, left, right)

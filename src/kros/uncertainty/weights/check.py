@@ -62,10 +62,7 @@ class Checks:
 
 
 def checking_grid(freqs_hz: Array, sample_period_s: float, density: int, also_hz: Array | None = None, *, filled: bool = False) -> Array:
-    """Return a dense grid that goes on from its ends to DC and Nyquist, in decades of tau: a fit is free to bend wherever nobody looks.
-
-    A filled one has a hundred evenly spaced frequencies and thirty a decade at least, however few are given.
-    """
+    """Return a dense grid that goes on from its ends to DC and Nyquist, in decades of tau: a fit is free to bend wherever nobody looks."""
     dense = dense_grid(freqs_hz, sample_period_s, density)
     inner = dense[(dense > 0) & (bilinear_squared(dense, sample_period_s) < np.inf)]
     tails = 10.0 ** (np.arange(1, _TAIL + 1) / 4)
@@ -91,12 +88,7 @@ def joined(freqs_hz: Array, others_hz: Array) -> tuple[Array, Array]:
 
 
 def between_points(E: Array, freqs_hz: Array) -> Residuals:
-    """Return residuals (unit, frequency, p', m') that are known at some frequencies at any frequency.
-
-    For fits that should not make much of what they do not know: between two points they are those of the nearer one, with the largest 3 dB below the
-    smaller of both. A smooth weight is above that, and one that follows the points and dips between them is not. Beyond the ends they are those of
-    the ends.
-    """
+    """Return residuals at any frequency: those of the nearest point, between two points 3 dB below the smaller of both."""
     size = sigma_max(E).max(axis=0)
 
     def at(asked_hz: Array) -> Array:

@@ -119,10 +119,7 @@ def optimal_cover(
 
 
 def cover_ratio(E: Array, left: Array, right: Array) -> Array:
-    """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), for magnitudes (frequency, p') and (frequency, m').
-
-    Zero residuals are covered by anything, also by a weight of zero.
-    """
+    """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), for magnitudes (frequency, p') and (frequency, m')."""
     first = entries_first(E)
     l_inv, r_inv = (1 / np.maximum(v, _TINY) for v in (left.T, right.T))
     return sigma_max_first(first * l_inv[:, None, None, :] * r_inv[None, :, None, :])
@@ -134,11 +131,7 @@ def _scaled_left(first: Array, left: Array, right: Array) -> Array:
 
 
 def _descend(first: Array, size: Array, p: int, pull: float, squarings: tuple[int, ...]) -> Array:
-    """Minimise the smoothed cost over x of shape (p' + m', frequency).
-
-    Newton's method runs on part of the frequencies and of the units, and x is interpolated: the scale s, which is recomputed for all
-    frequencies and units, keeps every x sound.
-    """
+    """Minimise the smoothed cost over x of shape (p' + m', frequency)."""
     alive = np.flatnonzero(size > 0)
     n = first.shape[0] + first.shape[1]
     if not alive.size:

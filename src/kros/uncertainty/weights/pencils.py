@@ -126,11 +126,7 @@ def ratio_systems(systems: ResidualSystems, left: StateSpace, right: StateSpace)
 
 
 def peaks_hz(systems: ResidualSystems, grid_hz: Array, sample_period_s: float) -> Array:
-    """Return frequencies in and around every mode of the residuals that a grid from DC to Nyquist passes over, not beyond the grid.
-
-    Modes of the plants, and where the inverted plant vanishes. A mode `s = a + j b` is a peak or a notch of the half-width |a|; those wider than the
-    steps of the grid are left out.
-    """
+    """Return frequencies in and around every mode of the residuals that a grid from DC to Nyquist passes over, not beyond the grid."""
     form = as_form(systems.form)
     wide = systems.nominal.n_outputs < systems.nominal.n_inputs
     inverted = [Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE] if wide else []

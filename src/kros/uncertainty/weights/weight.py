@@ -143,11 +143,7 @@ class EntrywiseWeight(Weight):
 
 
 def unstructured_excess(W: Array, E: Array) -> float:
-    """Return the largest ``sigma_max(W^-1 E)`` where entrywise weights have an inverse; NaN where they have none, or are not square.
-
-    From responses W, shape (frequency, p', m'), and residuals E, shape (unit, frequency, p', m'). Above one, residuals leave the set ``W Delta`` with a full
-    perturbation, although every entry is bounded.
-    """
+    """Return the largest ``sigma_max(W^-1 E)`` of entrywise weights (frequency, p, p) over residuals; NaN where W has no inverse."""
     if W.shape[-1] != W.shape[-2] or not np.abs(W).max():
         return float("nan")
     usable = np.linalg.cond(W) < _SINGULAR

@@ -230,10 +230,8 @@ def _facts(weight: Weight) -> dict[str, Any]:
     own = {"unstructured_excess": weight.unstructured_excess} if isinstance(weight, EntrywiseWeight) else {}
     same = (
         "structure",
-        "perturbation",
         "cover_max",
         "overbound_db_max",
-        "overbound_entry_db",
         "within_tolerance",
         "method",
         "remaining_margin",
@@ -269,7 +267,6 @@ def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], d
         "cover_max": facts["cover_max"],
         "overbound_db_max": facts["overbound_db_max"],
         "within_tolerance": facts["within_tolerance"],
-        "overbound_entry_db": _number(facts.get("overbound_entry_db")),
         "method": Method(facts.get("method", Method.GRID)),
         "remaining_margin": _number(facts.get("remaining_margin")),
     }

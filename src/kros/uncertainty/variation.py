@@ -35,6 +35,7 @@ Array = npt.NDArray[Any]
 
 _AT_ONCE = 4_000_000  # complex numbers in memory
 _MOST_NOMINALS = 64
+_LEVEL = 0.95  # of the band
 _ARRAYS = ("freqs_hz", "residual", "band", "total", "noise")
 
 
@@ -91,11 +92,6 @@ class VariationAndNoise:
         """Share of the squared residual that estimation explains, shape (frequency,), within [0, 1]."""
         return np.minimum(self.ratio, 1.0)
 
-    @property
-    def variation_share(self) -> Array:
-        """Share of the squared residual that the units' differences explain, shape (frequency,)."""
-        return 1.0 - self.noise_share
-
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``variation_and_noise.json``."""
         content = {"form": self.form, "unit_ids": self.unit_ids, "nominal": self.nominal, "level": self.level}
@@ -126,7 +122,6 @@ def variation_and_noise(
     nominal: int = 0,
     output_scale: npt.ArrayLike | None = None,
     input_scale: npt.ArrayLike | None = None,
-    level: float = 0.95,
 ) -> VariationAndNoise:
     """Compare the residuals between units with those between resampled models of the same unit.
 
@@ -141,8 +136,6 @@ def variation_and_noise(
         Row of the unit against which residuals are shown; the shares do not depend on it.
     output_scale, input_scale : array_like, shape (n,) and (m,), optional
         Ranges of lifted states and inputs, as in `ModelSet`; ones by default.
-    level : float
-        Quantile of the band over the draws.
 
     Returns
     -------
@@ -155,7 +148,7 @@ def variation_and_noise(
     DimensionError
         When scales do not fit, or are not positive.
     ConfigError
-        When `level` is no probability, the nominal no unit, or the frequencies no grid.
+        When the nominal is no unit, or the frequencies are no grid.
 
     Examples
     --------
@@ -170,7 +163,7 @@ def variation_and_noise(
     True
     """
     form, freqs = as_form(form), check_grid(freqs_hz, sample_period_s)
-    units, draws, n, m = _require(models, nominal, level)
+    units, draws, n, m = _require(models, nominal)
     scale = check_scale("output", output_scale, n)[:, None] / check_scale("input", input_scale, m)
     # Responses of the estimates, scaled: (unit, frequency, n, m).
     G = models.estimate.responses(freqs, sample_period_s) / scale
@@ -179,12 +172,12 @@ def variation_and_noise(
         for part in _parts(len(freqs), draws * n * max(n, m)):
             other = models.responses(row, freqs[part], sample_period_s) / scale  # (draw, frequency, n, m)
             noise[part] += _mean_square(residual(form, other, np.roll(other, 1, axis=0))) / units
-            band[row, part] = np.quantile(sigma_max(residual(form, G[row, part], other)), level, axis=0)
+            band[row, part] = np.quantile(sigma_max(residual(form, G[row, part], other)), _LEVEL, axis=0)
     return VariationAndNoise(
         form=form,
         unit_ids=models.unit_ids,
         nominal=nominal,
-        level=level,
+        level=_LEVEL,
         freqs_hz=freqs,
         residual=sigma_max(residual(form, G[nominal], G)),
         band=band,
@@ -208,7 +201,7 @@ def _mean_square(E: Array) -> Array:
     return np.asarray(squared(E).sum(axis=(-2, -1)).mean(axis=0))
 
 
-def _require(models: ModelSamples, nominal: int, level: float) -> tuple[int, int, int, int]:
+def _require(models: ModelSamples, nominal: int) -> tuple[int, int, int, int]:
     units, draws, n, m = *models.samples.A.shape[:2], models.samples.A.shape[-1], models.samples.B.shape[-1]
     if units < 2 or draws < 2:
         raise DataError(f"Variation and noise: needs at least two units and two draws of each, found {units} and {draws}.")
@@ -217,10 +210,8 @@ def _require(models: ModelSamples, nominal: int, level: float) -> tuple[int, int
             raise DataError(
                 f"Variation and noise: unit {unit} has a model or a draw that is not finite; leave the unit out, or raise alpha."
             )
-    if not 0 < level < 1 or not 0 <= nominal < units:
-        raise ConfigError(
-            f"Variation and noise: the level should be between 0 and 1 and the nominal a row of {units} units, found {level} and {nominal}."
-        )
+    if not 0 <= nominal < units:
+        raise ConfigError(f"Variation and noise: the nominal should be a row of {units} units, found {nominal}.")
     return units, draws, n, m
 
 

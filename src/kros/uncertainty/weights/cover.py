@@ -39,24 +39,12 @@ _DIFFERENCE = 1e-5
 _TINY = 1e-300
 
 
-class Perturbation(str, Enum):
-    """Which perturbations Delta a weight is sound for."""
-
-    FULL = "full"
-    DIAGONAL = "diagonal"
-
-
 class Structure(str, Enum):
     """Which entries of the weights are free."""
 
     SCALAR = "scalar"
     DIAGONAL = "diagonal"
     ENTRYWISE = "entrywise"
-
-    @property
-    def perturbation(self) -> Perturbation:
-        """Perturbations with which weights of this structure reach every residual they were made for."""
-        return Perturbation.DIAGONAL if self is Structure.ENTRYWISE else Perturbation.FULL
 
 
 @dataclass(frozen=True, eq=False)

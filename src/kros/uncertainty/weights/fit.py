@@ -111,7 +111,6 @@ def _fit_entries(
         cover_max=max(w.cover_max for w in fits),
         overbound_db_max=float((20 * np.log10(fitted[some] / sizes[some])).mean(axis=1).max(initial=0.0)),
         within_tolerance=all(w.within_tolerance for w in fits),
-        overbound_entry_db=max(w.overbound_entry_db for w in fits),
         method=Method.LEVEL_SETS if all(w.method is Method.LEVEL_SETS for w in fits) else Method.GRID,
         remaining_margin=min(w.remaining_margin for w in fits),
     )

@@ -24,7 +24,7 @@ from ...core.lti import StateSpace, gain
 from ...core.small_matrices import sigma_max
 from ..fits.diagonal_response import diagonal_response
 from .certificate import Method
-from .cover import Cover, Perturbation, Structure
+from .cover import Cover, Structure
 
 Array = npt.NDArray[Any]
 
@@ -51,9 +51,6 @@ class Weight:
     within_tolerance : bool
         Whether the overbound of the weight as returned, at every frequency of the grid, is within the tolerance asked for: `overbound_db_max`,
         and of entrywise weights that of every entry.
-    overbound_entry_db : float, dB
-        Largest fitted over optimal `left_i right_j` over the grid and all (i, j). The optimal cover is rarely unique: a large value beside a
-        small `overbound_db_max` says that another cover of nearly the same cost was taken.
     method : Method
         How the bound between grid points is known, see `certificate`.
     remaining_margin : float
@@ -79,14 +76,8 @@ class Weight:
     cover_max: float
     overbound_db_max: float
     within_tolerance: bool = True
-    overbound_entry_db: float = float("nan")
     method: Method = Method.GRID
     remaining_margin: float = float("nan")
-
-    @property
-    def perturbation(self) -> Perturbation:
-        """Perturbations Delta for which the weight is sound: ``full``, or ``diagonal`` alone for entrywise weights."""
-        return self.structure.perturbation
 
     def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""
@@ -110,10 +101,7 @@ class Weight:
         """Return the weight with its overbounds over the optimal cover at some frequencies; zero where nothing is to be covered."""
         used, some = self.magnitudes(freqs_hz), best.left.min(axis=1) > 0
         excess = float((used.at(some).cost_db() - best.at(some).cost_db()).max()) if some.any() else 0.0
-        optimal, entries = best.entries(), 0.0
-        if optimal.any():
-            entries = float(20 * np.log10(np.max(used.entries()[optimal > 0] / optimal[optimal > 0])))
-        return replace(self, overbound_db_max=excess, overbound_entry_db=entries, within_tolerance=excess <= tolerance_db)
+        return replace(self, overbound_db_max=excess, within_tolerance=excess <= tolerance_db)
 
 
 @dataclass(frozen=True, eq=False)

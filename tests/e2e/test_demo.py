@@ -206,7 +206,6 @@ def test_new_units_are_scored(kros, demo, recorded, tmp_path):
     assert {(r["unit"], r["condition"]) for r in scores} == {(u, c) for u in ("000000", "001001", "001002") for c in ("noload", "load")}
     assert all(np.isfinite(r["score"]) for r in scores)
     assert result.exit_code == (3 if any(r["outlier"] for r in scores) else 0)
-    assert {r[name]["units"] for r in scores for name in ("static_gains", "residual_power")} == {4, 5}
     recorded.rename(tmp_path / "elsewhere")
     try:
         assert kros("check", demo, fresh, "--json", "--workers", 1).stdout == result.stdout

@@ -22,7 +22,6 @@ from ..config import Stage, StudyConfig
 from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
-from .beside import beside_lines, scores_beside, with_beside
 from .field import FieldRecordings
 from .innovation import level_text, monitored, monitored_line
 from .recordings import check_channels, hidden_states, identify_on, load_calibration, open_data, training_keys, unit_parameters
@@ -39,8 +38,7 @@ def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]
     list of dict
         One row a unit and condition that the study knows: ``unit, condition, score, threshold, outlier, status, detectable, freq_hz`` and more
         (see `kros.uncertainty.outliers.population.score_row`), ``left_out``, units of the study that it was not compared with, and where the deployed
-        observer has a monitor its ``level_db`` and ``bands_db``, which flags nothing where there is a score. ``static_gains`` and ``residual_power`` compare
-        these with the study's units, recorded covariates regressed out (`QuantityScore`); ``outlier_by`` says which of all flagged the unit.
+        observer has a monitor its ``level_db`` and ``bands_db``, which flags nothing where there is a score.
     """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (config, store):
         return scored(config, store, data, workers)
@@ -60,7 +58,7 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[
         recordings = FieldRecordings.open(config, store, data)
         watched = monitored(recordings) if hidden or observer.monitor is not None else []
         if hidden:
-            return in_order(beside(config, store, watched, recordings))
+            return in_order(watched)
         check_channels(population, observer)
     if not folders:
         raise ConfigError(
@@ -81,14 +79,7 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[
         (row["unit"], row["condition"]): {key: row[key] for key in ("level_db", "level_rate", "level_units", "bands_db")} for row in watched
     }
     rows = [row | levels.get((row["unit"], row["condition"]), {}) for row in rows]
-    return in_order(rows if observer is None else beside(config, store, rows, recordings))
-
-
-def beside(config: StudyConfig, store: Store, rows: list[dict[str, Any]], recordings: FieldRecordings) -> list[dict[str, Any]]:
-    """Return rows with what static gains and residual powers say of each."""
-    known = {(row["unit"], row["condition"]): row["left_out"] for row in rows}
-    found = scores_beside(config, store, recordings.observer, recordings.population, recordings.values, known)
-    return [with_beside(row, found.get((row["unit"], row["condition"]), {})) for row in rows]
+    return in_order(rows)
 
 
 def in_order(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -126,18 +117,12 @@ def factors_of(store: Store, condition: str) -> EpisodeFactors:
 
 
 def check_line(row: dict[str, Any]) -> str:
-    """Return a row of `check_units` for people at a terminal, with what stands beside it in lines of their own."""
-    return "\n".join([_line(row), *beside_lines(row)])
-
-
-def _line(row: dict[str, Any]) -> str:
+    """Return a row of `check_units` for people at a terminal."""
     if "missing" in row:
         return monitored_line(row)
     threshold = "none, too few units" if row["threshold"] is None else f"{row['threshold']:.2f} dB"
     line = f"{row['unit']}  {row['condition']}  score {row['score']:.2f} dB (threshold {threshold})"
     line += f"  {row['status'].upper() if row['outlier'] else row['status']}"
-    if row["outlier"] and row.get("outlier_by", ["model"]) != ["model"]:
-        line += f" by {', '.join(row['outlier_by']).replace('_', ' ')}"
     if row.get("level_db") is not None:
         line += f", innovation {level_text(row)}"
     if row["outlier"]:

@@ -6,11 +6,8 @@ from dataclasses import replace
 from shutil import copyfile
 
 from ...core.artifacts import save_artifact
-from ...data.population import EpisodeKey
 from ...design.certificates import save_running
 from ...design.synthesize import synthesize_all
-from ...design.unit_quantities import FOLDER, UnitQuantities
-from ...observer import Observer
 from ..engine.context import Context
 
 
@@ -33,15 +30,3 @@ def run(context: Context) -> None:
     copyfile(draft("observers", f"{found.deployed}.json"), draft("observers", "deployed.json"))
     save_running(draft("observers"), found.running)
     save_artifact(draft("observers"), "observers", {"names": list(found.designs), "deployed": found.deployed, "facts": found.facts})
-    quantities(context, found.designs[found.deployed].observer).save(draft(FOLDER))
-
-
-def quantities(context: Context, observer: Observer) -> UnitQuantities:
-    """Return static gains and residual powers of the units behind the observers."""
-    facts, values = context.facts, context.identified.parameters
-    units = values.keys() & set(facts.pooled)
-    groups: dict[tuple[str, str], list[EpisodeKey]] = {}
-    for key in facts.train:
-        if key.unit in units:
-            groups.setdefault((key.unit, key.condition), []).append(key)
-    return UnitQuantities.of(observer, context.population, groups, values, context.work)

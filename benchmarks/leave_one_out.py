@@ -37,7 +37,7 @@ from kros.study.engine.progress import Lines
 
 HOME, HIDDEN, LEARNED, ENTRYWISE = "noload", ("velocity", "current"), "learned", "koopman_edmd/paper"
 SHOWN = (
-    *("koopman/open_loop", "koopman/kalman_tuned", "koopman/luenberger", "koopman/ekf", "filtered_difference", LEARNED),
+    *("koopman/open_loop", "koopman/kalman_tuned", "koopman/ekf", "filtered_difference", LEARNED),
     *(PAPER, ENTRYWISE, "linear_edmd/paper", "koopman/worst_case_h2", "koopman/residual_h2", "koopman_edmd/residual_h2"),
     *("linear/residual_h2", "koopman/memory", "linear/memory"),
 )

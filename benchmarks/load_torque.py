@@ -29,7 +29,6 @@ from kros.motor_drive import AngleLoad, calibrate_load, calibrate_torque, load_f
 from kros.motor_drive.accuracy import load_accuracy
 from kros.motor_drive.signals import low_passed, without_level
 from kros.observer import Observer, identify_predictor, relift_certificate, run_observer
-from kros.observer.baselines.kalman import noise_covariances
 from kros.observer.residual.models import one_step_rows
 from kros.observer.residual.one_step import one_step_residual
 from kros.plants import HarmonicDrivePopulation
@@ -235,7 +234,7 @@ class Drives:
     def from_current(self, kind: str) -> list[dict[str, Any]]:
         """The paper's estimate: error of the current of an observer that knows no load, here a Kalman predictor; the current is recorded."""
         model, Q = self.unloaded_model(kind)
-        _, R = noise_covariances(Q[None], np.array([COUNT_RAD]))
+        R = np.array([[COUNT_RAD**2 / 12]])
         n = model.lifting.n_states
         gains = kalman(model.A[:n, :n], np.eye(n)[[0]], Q, R, self.dt).controller.D
         D = np.vstack([gains, np.zeros((len(model.A) - n, 1))])

@@ -43,7 +43,7 @@ KINDS = ("koopman", "linear")
 STUDY: dict[str, Any] = {
     "uncertainty": {"n_freqs": 300},
     "synthesis": {"methods": ["worst_case_h2", "residual_h2"]},
-    "observer": {"baselines": ["open_loop", "kalman_white"]},
+    "observer": {"baselines": ["open_loop", "kalman_tuned"]},
 }
 
 

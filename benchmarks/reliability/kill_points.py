@@ -39,7 +39,7 @@ max_order = 1
 input_weight = 3.0
 methods = ["residual_h2"]
 [observer]
-baselines = ["open_loop", "kalman_white"]
+baselines = ["open_loop", "kalman_tuned"]
 [evaluate]
 robustness = false
 monte_carlo = 0

@@ -41,7 +41,7 @@ input_weight = 3.0
 methods = ["worst_case_h2"]
 
 [observer]
-baselines = ["open_loop", "kalman_white"]
+baselines = ["open_loop", "kalman_tuned"]
 """
 INPUTS = ("target_position", "target_velocity")
 GIVEN = (

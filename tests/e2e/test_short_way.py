@@ -105,7 +105,7 @@ def test_a_study_of_arrays_of_a_folder_and_of_a_file_is_the_same(example: tuple[
         "identify": {"refine": False},
         "uncertainty": {"n_freqs": 60, "max_order": 1},
         "synthesis": {"methods": ["residual_h2"], "input_weight": 3.0},
-        "observer": {"baselines": ["open_loop", "kalman_white"]},
+        "observer": {"baselines": ["open_loop", "kalman_tuned"]},
     }
     file = [f"{table}.{key}={json.dumps(value)}" for table, keys in quick.items() for key, value in keys.items()]
     write_parquet(names["population"], folder / "parquet")

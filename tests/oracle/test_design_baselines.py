@@ -6,7 +6,7 @@ from scipy.linalg import solve_discrete_are
 
 import kros
 from kros.data import EpisodeBatch
-from kros.design.methods.gains import design_kalman_tuned, design_luenberger
+from kros.design.methods.gains import design_kalman_tuned
 from kros.design.settings import PredictorSettings, SynthesisSettings
 from kros.design.synthesize import tasks_of
 from kros.observer import in_sizes, run_observer
@@ -61,14 +61,6 @@ def test_the_tuned_filter_is_at_least_as_good_as_the_textbooks(uncertain):
     )
     assert "position" in found.facts["rows_fitted_to_single_steps"]
     assert "rows fitted to single steps" in found.uncovered
-
-
-def test_luenberger_gains_that_are_worse_than_none_are_not_handed_out(uncertain):
-    found = design_luenberger(task(uncertain, "luenberger"))
-    assert found.facts["training_error_to_open_loop"] <= 1
-    assert found.facts["correction_off"] == (found.facts["poles_faster_by"] == 1)
-    if found.facts["correction_off"]:
-        np.testing.assert_array_equal(found.synthesis.controller.D, 0)
 
 
 def test_covariance_of_residuals_counts_every_sample_of_every_episode_once():

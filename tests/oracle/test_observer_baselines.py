@@ -15,7 +15,6 @@ from kros.lifting import Lifting
 from kros.observer import ExtendedKalman, FilteredDifference, Observer, run_observer, run_observers
 from kros.observer.baselines.difference import cutoffs_hz, rates
 from kros.observer.baselines.extended_kalman import start_covariance
-from kros.observer.baselines.kalman import luenberger_candidates
 from kros.observer.baselines.learned import Features
 from kros.observer.baselines.learned_moments import Choice, Moments
 from kros.synthesis import Injection, kalman
@@ -242,18 +241,6 @@ def test_learned_estimator_refuses_what_it_cannot_use():
     one = Features.of(lifting, (0,), states[..., :1], u)
     with pytest.raises(DimensionError, match="expected 1 measurements"):
         one.channels(states, u, phases)
-
-
-def test_placed_poles_are_the_models_made_faster():
-    A, C = np.array([[0.9, 0.1], [-0.1, 0.8]]), np.eye(1, 2)
-    for factor, synthesis in luenberger_candidates(A, C, DT):
-        reached = np.linalg.eigvals(A - synthesis.controller.D @ C)
-        np.testing.assert_allclose(np.sort_complex(reached), np.sort_complex(np.linalg.eigvals(A) ** factor), atol=1e-6)
-    assert list(luenberger_candidates(A, np.zeros((1, 2)), DT)) == []
-    alternating = np.array([[-0.5, 0.2], [0.0, 0.8]])  # a pole that alternates keeps its sign
-    factor, synthesis = next(luenberger_candidates(alternating, np.ones((1, 2)), DT))
-    reached = np.sort(np.linalg.eigvals(alternating - synthesis.controller.D @ np.ones((1, 2))).real)
-    np.testing.assert_allclose(reached, [-(0.5**factor), 0.8**factor], atol=1e-6)
 
 
 def test_observers_side_by_side_are_the_same_observers():

@@ -9,7 +9,7 @@ from kros.data import EpisodeBatch
 from kros.evaluate.errors import summarise
 from kros.lifting import Lifting
 from kros.observer import Observer, run_observer
-from kros.observer.baselines.kalman import kalman_candidates, noise_covariances
+from kros.observer.baselines.kalman import kalman_candidates
 from kros.synthesis import Injection
 
 LIFTING = Lifting(("position", "velocity", "current"), ("sin(10*position + phase)",), ("phase",))
@@ -133,13 +133,6 @@ def test_candidates_sweep_at_least_six_decades():
     assert sizes[0] < 1e-2
     assert sizes[-1] > 0.8
     assert all(np.diff(sizes) > -1e-9)
-
-
-def test_white_noise_guess_is_residuals_and_quantisation():
-    residual = np.stack([np.eye(2), 3 * np.eye(2)])
-    Q, R = noise_covariances(residual, np.array([0.12]))
-    np.testing.assert_allclose(Q, 2 * np.eye(2))
-    np.testing.assert_allclose(R, [[0.12**2 / 12]])
 
 
 def test_summary_counts_only_real_samples_and_finds_power_in_a_band():

@@ -48,7 +48,7 @@ def test_severities_are_told_in_the_unit_of_their_axis():
 
 
 def test_the_figure_shows_the_kind_of_model_that_is_handed_over():
-    names = ["k/open_loop", "k/luenberger", "k/residual_h2", "l/residual_h2", "learned"]
+    names = ["k/open_loop", "k/residual_h2", "l/residual_h2", "learned"]
     assert shown_observers(names, "k/residual_h2") == ["k/residual_h2", "k/open_loop", "learned"]
 
 

@@ -51,9 +51,9 @@ def test_from_arrays_to_a_step(uncertain: UncertainModels, population: Populatio
 
 
 def test_everything_is_designed_where_no_method_is_named(uncertain: UncertainModels) -> None:
-    observer = {"baselines": ("open_loop", "kalman_white")}
+    observer = {"baselines": ("open_loop", "kalman_tuned")}
     design = kros.synthesize(uncertain, methods=("residual_h2",), observer=observer)
-    assert design.name.split("/")[1] in ("open_loop", "kalman_white", "residual_h2")
+    assert design.name.split("/")[1] in ("open_loop", "kalman_tuned", "residual_h2")
     with pytest.raises(SynthesisError, match="there is no such observer"):
         kros.synthesize(uncertain, methods=(), observer=observer | {"deployed": "koopman/memory"})
 

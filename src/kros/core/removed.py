@@ -36,6 +36,10 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
         "The nominals of all forms are no longer one function; use choose_nominal for each form.",
         ("kros.uncertainty.choose_nominals",),
     ),
+    (
+        "The observers kalman_white and luenberger are no longer part of kros; use kalman_tuned.",
+        ("observer.baselines=kalman_white", "observer.baselines=luenberger"),
+    ),
     ("The set of worst-case synthesis, of signals or of the form, is chosen on held-out episodes; remove the key set.", ("synthesis.set",)),
 )
 

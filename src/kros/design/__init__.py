@@ -6,8 +6,8 @@ Examples
 >>> from kros.plants import DcMotorPopulation
 >>> motors = DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
 >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50)
->>> kros.design.synthesize(uncertain, method="kalman_white", methods=()).name
-'linear_edmd/kalman_white'
+>>> kros.design.synthesize(uncertain, method="kalman_tuned", methods=()).name
+'linear_edmd/kalman_tuned'
 """
 
 from .synthesize import Design, synthesize

@@ -11,7 +11,7 @@ from ..core.errors import ConfigError
 from ..core.settings import Settings
 
 METHODS = Literal["mixed", "paper", "worst_case_h2", "worst_case_hinf", "residual_h2", "memory"]
-BASELINES = Literal["open_loop", "kalman_white", "kalman_tuned", "luenberger", "ekf", "filtered_difference", "learned", "mean_profile"]
+BASELINES = Literal["open_loop", "kalman_tuned", "ekf", "filtered_difference", "learned", "mean_profile"]
 
 
 class SynthesisSettings(Settings):

@@ -35,7 +35,6 @@ AXES = {
     Kind.PHASE: Axis("phase error (rad)", logarithmic=False),
     Kind.DELAY: Axis("delay (samples)"),
 }
-_LEFT_OUT = ("kalman_white", "luenberger")
 _LOOKS = {
     "worst_case_h2": Look(Tone.BLUE.light),
     "worst_case_hinf": Look(Tone.BLUE.light, "--"),
@@ -85,9 +84,9 @@ def curves(rows: Sequence[Mapping[str, Any]], condition: str, what: str = "mean"
 
 
 def shown_observers(names: Sequence[str], deployed: str | None) -> list[str]:
-    """Return the few observers of a figure: the deployed one first, of one kind of model, without those that nobody would tune so."""
+    """Return the few observers of a figure: the deployed one first, of one kind of model."""
     model = split_observer(deployed or (names[0] if names else ""))[0]
-    kept = [n for n in names if n == deployed or (split_observer(n)[0] in (model, "") and split_observer(n)[1] not in _LEFT_OUT)]
+    kept = [n for n in names if n == deployed or split_observer(n)[0] in (model, "")]
     return sorted(kept, key=lambda n: n != deployed)
 
 

@@ -12,9 +12,7 @@ from .theme import Tone
 
 _METHODS = {
     "open_loop": "open loop",
-    "kalman_white": "white-noise Kalman",
     "kalman_tuned": "tuned Kalman",
-    "luenberger": "Luenberger",
     "ekf": "extended Kalman",
     "mixed": "mixed H2-H∞",
     "paper": "mixed H2-H∞, entrywise weights",
@@ -30,9 +28,7 @@ _METHODS = {
 }
 _METHOD_TONES = {
     "open_loop": Tone.GREY,
-    "kalman_white": Tone.GOLD,
     "kalman_tuned": Tone.PURPLE,
-    "luenberger": Tone.GOLD,
     "ekf": Tone.PURPLE,
     "filtered_difference": Tone.GOLD,
     "learned": Tone.GREEN,

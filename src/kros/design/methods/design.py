@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from ...core.errors import SynthesisError
 from ..task import DesignResult, DesignTask
-from .gains import design_kalman_tuned, design_kalman_white, design_luenberger, design_open_loop
+from .gains import design_kalman_tuned, design_open_loop
 from .predictor import design_predictor
 from .published import design_published
 from .residual_shaped import design_residual_h2
@@ -15,9 +15,7 @@ from .sets import design_worst_case
 
 DESIGNS: dict[str, Callable[[DesignTask], DesignResult]] = {
     "open_loop": design_open_loop,
-    "kalman_white": design_kalman_white,
     "kalman_tuned": design_kalman_tuned,
-    "luenberger": design_luenberger,
     "mixed": design_mixed,
     "paper": design_published,
     "worst_case_h2": design_worst_case,

@@ -1,4 +1,4 @@
-"""Constant gains: the model alone, Kalman filters and the Luenberger observer, each the best of its kind on training episodes."""
+"""Constant gains: the model alone, and the Kalman filter that does best on training episodes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 
 from ...core.errors import SynthesisError
 from ...core.lti import gain
-from ...observer.baselines.kalman import kalman_candidates, luenberger_candidates, noise_covariances
+from ...observer.baselines.kalman import kalman_candidates
 from ...observer.residual.models import Refitted, refitted_models
 from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_covariance
-from ...synthesis import Synthesis, kalman
+from ...synthesis import Synthesis
 from ..task import DesignResult, DesignTask, without_correction
 from ..validation import ValidationSet, hidden_mean
 from .residual_shaped import FITTED
@@ -24,12 +24,6 @@ EQUAL, RESIDUAL = "equal share of every range", "one-step residuals"
 def design_open_loop(task: DesignTask) -> DesignResult:
     """The nominal model without correction."""
     return task.designed(without_correction(task))
-
-
-def design_kalman_white(task: DesignTask) -> DesignResult:
-    """Kalman gains for noise guessed as anybody would: one-step residuals and quantisation."""
-    Q, R = noise_covariances(task.models.residual_covariance, task.noise * np.sqrt(12))
-    return task.designed(kalman(task.dynamics, task.selector, Q, R, task.models.sample_period_s))
 
 
 def design_kalman_tuned(task: DesignTask) -> DesignResult:
@@ -48,14 +42,6 @@ def design_kalman_tuned(task: DesignTask) -> DesignResult:
                 facts = {"process_noise_level": level, "process_noise_shape": name}
                 tried.append(Tried(_padded(found, lifting.n_lifted), facts, model if model.rows else None))
     return best_of(task, tried, data, process_noise_level=0.0)
-
-
-def design_luenberger(task: DesignTask) -> DesignResult:
-    """Poles of the original states' error dynamics placed as much faster than the model's as does best on training episodes."""
-    n = task.models.lifting.n_states
-    candidates = luenberger_candidates(task.dynamics[:n, :n], task.selector[:, :n], task.models.sample_period_s)
-    tried = [Tried(_padded(found, task.models.lifting.n_lifted), {"poles_faster_by": factor}) for factor, found in candidates]
-    return best_of(task, tried, task.training.read(), poles_faster_by=1.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,9 +26,7 @@ _LIFTED = "the paper's problem spends its correction on lifted modes that the ob
 _FITTED = "it is fitted to recordings, not to models, and would be that of the refined ones again"
 METHODS = (
     Method("open_loop", 0.0, 9),
-    Method("kalman_white", 0.0, 8),
     Method("kalman_tuned", 1.0, 6),
-    Method("luenberger", 0.5, 7),
     Method("mixed", 3.0, 3, not_refined=_LIFTED),
     Method("paper", 1.5, 10, not_refined=_LIFTED),
     Method("worst_case_h2", 4.0, 1),

@@ -1,1 +1,1 @@
-"""Estimators to compare with: Kalman and Luenberger gains, extended Kalman filter, filtered difference, a learned estimator."""
+"""Estimators to compare with: Kalman gains, extended Kalman filter, filtered difference, a learned estimator."""

@@ -255,7 +255,7 @@ MAPPING: dict[str, Any] = {
 STUDY: dict[str, Any] = {
     "name": "s",
     "data": {"source": "csv", "reader": "csv", "csv": MAPPING, "prepare": [{"step": "trim", "start": 1}], "exclude": ["a"]},
-    "lifting": {"functions": ["sin(position)"], "families": [{"kind": "harmonics", "angle": "position", "ratio": 3}], "parameters": []},
+    "lifting": {"functions": ["sin(position)"], "families": [{"kind": "harmonics", "angle": "position", "ratio": 3}]},
     "identify": {"alpha": 90.0, "refine": False},
     "uncertainty": {"form": "additive", "max_order": 3},
     "synthesis": {"methods": ["mixed"], "noise": {"position": 1e-3}},

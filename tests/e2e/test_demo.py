@@ -14,7 +14,7 @@ from kros.plants.harmonic_drive.control import VELOCITY_POLE
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.pipeline import load_run
-from kros.study.stages.resampling import resampled_models
+from kros.study.stages.resampling import resampling
 from kros.uncertainty import UncertainModel, VariationAndNoise
 from kros.uncertainty.unit_residuals import UnitResiduals
 
@@ -249,7 +249,7 @@ def test_resampled_models_surround_the_stored_ones(demo, name):
     units = list(reversed(models.unit_ids[1:]))
     rows = [models.index(u) for u in units]
     with open_executor(1, None) as executor:
-        samples = resampled_models(Context(config, store, Work(executor)), name, units)
+        samples = resampling(Context(config, store, Work(executor)), name, units)()
     assert samples.unit_ids == tuple(units)
     np.testing.assert_allclose(samples.estimate.A, models.A[rows], atol=1e-9)
     np.testing.assert_allclose(samples.estimate.B, models.B[rows], atol=1e-9)

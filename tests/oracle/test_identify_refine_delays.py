@@ -7,14 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kros.core import DataError, IdentificationError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
 from kros.identify import Factor, combine, episode_factors, free_run, lifted_factor, reduce_episode
 from kros.identify.refine import RefinedModels, RefineOptions, refine_population
 from kros.identify.refine.episodes import episode_normals
 from kros.identify.refine.segments import Segments, read_segments
 from kros.identify.refine.sensitivity import normal_equations
-from kros.identify.refine.validation_set import free_run_errors
 from kros.lifting import Lifting
 
 DELAYED = Lifting(
@@ -128,66 +126,3 @@ def test_normal_equations_by_episode_add_up_with_delays() -> None:
     whole = normal_equations(V[:, :2], models.whitening, BILINEAR, {}, segments, models.sigma)
     place = np.r_[0:12]
     np.testing.assert_allclose(by_episode.sum(axis=1)[:, place[:, None], place], whole.matrix[:, :-1, :-1], rtol=1e-9, atol=1e-9)
-
-
-def test_only_the_samples_asked_for_are_judged() -> None:
-    """An input that jumps in the last samples throws the free run out of its limit; it is not run that far."""
-    population, keys, factor, _ = machines(2, 0.01, seed=9)
-    jumping = {key: population.read(key).copy() for key in population.episodes}
-    for values in jumping.values():
-        values[-2:, 2] = 1e4
-    broken = replace(population, source=jumping.__getitem__)
-    few = replace(OPTIONS, strengths=(1.0,), horizons=(5, 20), segments=4)
-    with pytest.raises(IdentificationError, match="reaches"):
-        refine_population(broken, keys, BILINEAR, {}, factor, options=few)
-    models = refine_population(broken, keys, BILINEAR, {}, factor, options=replace(few, validation_samples=200))
-    whole = refine_population(population, keys, BILINEAR, {}, factor, options=few)
-    assert models.trade_off[0].score != whole.trade_off[0].score
-    last = [keys[unit][-1] for unit in keys]
-    A, B = models.units.A, models.units.B
-    rms, top, _ = free_run_errors(A[None], B[None], BILINEAR, {}, broken, last, 200)
-    for row, key in enumerate(last):
-        data = population.read(key)[:203]
-        run = data[:, :2].copy()
-        for k in range(3, 202):
-            u = data[:, 2]
-            run[k + 1] = np.hstack([A[row], B[row]])[:2] @ [*run[k], np.sin(2 * run[k - 3, 0]), u[k - 1], u[k], run[k, 1] * u[k]]
-        np.testing.assert_allclose(rms[0, row], np.sqrt(np.mean((run - data[:, :2]) ** 2, axis=0)), rtol=1e-9)
-        np.testing.assert_array_equal(top[row], np.abs(data[:, :2]).max(axis=0))
-
-
-def test_free_runs_in_blocks_are_those_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
-    population, keys, _, W = machines(3, 0.05, seed=4)
-    rng, units, flat = np.random.default_rng(0), list(keys), [key for episodes in keys.values() for key in episodes]
-    rows = [units.index(key.unit) for key in flat]
-    shift = np.eye(6)[[4, 4]]
-    M = np.stack([np.concatenate([W + 1e-3 * rng.normal(size=W.shape), np.broadcast_to(shift, (3, 2, 6))], axis=1) for _ in range(2)])
-    A, B = M[:, rows][..., :4], M[:, rows][..., 4:]
-    errors = free_run_errors(A, B, BILINEAR, {}, population, flat)
-    for model in range(2):
-        for row, key in enumerate(flat):
-            data = population.read(key)
-            run = free_run(A[model, row], B[model, row], BILINEAR, {}, data[None, :4, :2], data[None, :, 2:])[0]
-            np.testing.assert_allclose(errors[0][model, row], np.sqrt(np.mean((run - data[:, :2]) ** 2, axis=0)), rtol=1e-12)
-            np.testing.assert_array_equal(errors[2][model, row], np.abs(run).max(axis=0))
-    monkeypatch.setattr("kros.identify.refine.validation_set._AT_ONCE", 0)
-    monkeypatch.setattr("kros.identify.refine.validation_set._LEAST", 7)
-    monkeypatch.setattr("kros.identify.refine.validation_set._TOGETHER", 5)
-    for one, other in zip(errors, free_run_errors(A, B, BILINEAR, {}, population, flat), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12)
-
-
-def test_an_episode_that_is_too_short_is_named() -> None:
-    population, keys, _, _ = machines(1, 0.0, seed=1)
-    with pytest.raises(DataError, match=r"episode 0 of unit u0 .* has 600 samples, and delays of up to 599 need at least 601"):
-        read_segments(population, keys, 5, 4, 0, history=599)
-
-
-def test_a_unit_may_rest_in_the_episode_that_judges() -> None:
-    """From rest, without an input, the free run stays there: the error is zero, and so is its share of the largest value."""
-    population, keys, factor, _ = machines(2, 0.01, seed=9)
-    resting = {key: population.read(key) * (key.episode != "3") for key in population.episodes}
-    still = replace(population, source=resting.__getitem__)
-    models = refine_population(still, keys, BILINEAR, {}, factor, options=replace(OPTIONS, strengths=(1.0,), horizons=(5, 20)))
-    assert models.trade_off[-1].held_out_percent == (0.0, 0.0)
-    assert np.abs(models.spectral_radius).max() < 1

@@ -15,9 +15,7 @@ from kros.identify.refine.segments import Segments, held_segments, read_segments
 from kros.lifting import Lifting
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"horizons": ()}, {"horizons": (20, 5)}, {"segments": 0}, {"strengths": (0.0,)}, {"balance": 1.5}, {"validation_samples": 1}]
-)
+@pytest.mark.parametrize("wrong", [{"horizons": ()}, {"horizons": (20, 5)}, {"segments": 0}, {"strengths": (0.0,)}, {"balance": 1.5}])
 def test_options_out_of_range_are_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         RefineOptions(**wrong)

@@ -37,6 +37,18 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
         ("kros.uncertainty.choose_nominals",),
     ),
     (
+        "Margins of stability and the largest residual of identification are no longer settings; identify.alpha_factor keeps models away from the edge.",
+        ("identify.margin", "identify.largest_residual"),
+    ),
+    (
+        "Parameters of a lifting are not named; a formula that reads phase has one for every unit, remove the key parameters.",
+        ("lifting.parameters",),
+    ),
+    (
+        "What is left out at the start of a segment of constant speed is no longer a setting; remove the key settle_s, it is 0.1 s.",
+        ("calibrate.settle_s",),
+    ),
+    (
         "The observers kalman_white and luenberger are no longer part of kros; use kalman_tuned.",
         ("observer.baselines=kalman_white", "observer.baselines=luenberger"),
     ),

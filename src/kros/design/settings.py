@@ -28,8 +28,8 @@ class SynthesisSettings(Settings):
     max_states: int | None = Field(
         None, ge=0, description="most states of the filter of worst_case_h2; reduced and polished where it has more"
     )
-    tune: bool = Field(False, description="whether residual_h2 is tuned on training episodes, which takes some seconds a kind of model")
     time_limit_s: float = Field(60.0, gt=0, description="for the optimisation of mixed")
+    tune: bool = Field(False, description="whether residual_h2 is tuned on training episodes, which takes some seconds a kind of model")
 
 
 class PredictorSettings(Settings):

@@ -158,9 +158,7 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
         return 0.0 if _stable_without(factors, margin) else float(grid[-1])
     first = int(np.argmax(found))
     if start + first == 0:
-        raise IdentificationError(
-            f"EDMD: models stay unstable up to alpha = {grid[0]:.1e} with a stability margin of {margin}; lower identify.margin."
-        )
+        raise IdentificationError(f"EDMD: models stay unstable up to alpha = {grid[0]:.1e} with a stability margin of {margin}.")
     low, high = np.log10(grid[start + first]), np.log10(grid[start + first - 1])
     suspects = [ridge.take(own[first]) for ridge, own in zip(ridges, unstable, strict=True)]
     for _ in range(_BISECTIONS):

@@ -34,7 +34,8 @@ from .kinds import kinds_for
 from .model_set import ModelSet
 from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .ranges import Ranges
-from .refine import RefinedModels, RefineOptions, refine_population
+from .refine import RefinedModels, refine_population
+from .refine.options import LARGEST_RESIDUAL
 from .refine.spread import peak_residual_db
 from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
 
@@ -79,7 +80,7 @@ def identify(
     work : Work, optional
         Where it runs.
     **settings
-        Of `IdentifySettings`: ``alpha``, ``alpha_factor``, ``refine``, ``largest_residual``, ``margin``.
+        Of `IdentifySettings`: ``alpha``, ``alpha_factor``, ``refine``.
 
     Returns
     -------
@@ -148,7 +149,7 @@ def identify_condition(
     longest_s = max(int(f.n_samples.max()) for f in episodes) * population.sample_period_s
     models = [replace(m, longest_s=longest_s) for m in identify_models(base, condition, units, factor, parameters, settings)]
     wanted = settings.refine and condition == facts.identify_on
-    refining = begin_refinement(base, units, factor, parameters, models, settings, work) if wanted else _not_refined
+    refining = begin_refinement(base, units, factor, parameters, models, work) if wanted else _not_refined
     rows = tuple((k.unit, k.episode) for u in units for k in facts.keys("train", u, condition))
     together = Factor(*(np.concatenate([getattr(f, name) for f in episodes]) for name in ("R", "peak", "n_samples")))
     return EpisodeFactors(condition, rows, together), models, refining
@@ -186,8 +187,8 @@ def identify_models(
     alpha = settings.alpha
     if alpha == "auto":
         shared = [(ranges[kind].triangles(factors[kind].R[rows]), lifting.n_lifted) for kind, lifting in liftings.items()]
-        edge = smallest_stabilising_alpha(shared, settings.margin)
-        times = alpha_factor(shared, edge, settings) if on else settings.alpha_factor
+        edge = smallest_stabilising_alpha(shared)
+        times = alpha_factor(shared, edge, settings.alpha_factor) if on else settings.alpha_factor
         alpha = times * edge
         note = "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
         log.info(note, condition, alpha, times)
@@ -214,14 +215,14 @@ def identify_models(
             alpha=float(alpha),
             alpha_in_ranges=settings.alpha == "auto",
         )
-        models.append(fitted(unfitted, factors[kind], settings.margin))
+        models.append(fitted(unfitted, factors[kind]))
     if on:
         for found in models:
             require_stable(found, pooled)
     return models
 
 
-def fitted(models: ModelSet, factor: Factor, margin: float) -> ModelSet:
+def fitted(models: ModelSet, factor: Factor) -> ModelSet:
     """Return a set of models fitted to factors of its units; a regularisation that was searched acts on channels divided by their ranges."""
     matrices = models.fit(factor.R)
     radius = models.ranges.normalise(matrices).spectral_radius()
@@ -230,22 +231,22 @@ def fitted(models: ModelSet, factor: Factor, margin: float) -> ModelSet:
         A=matrices.A,
         B=matrices.B,
         residual_covariance=residual_covariance(factor.R, models.lifting.n_lifted, matrices, factor.n_samples),
-        status=tuple("ok" if r < 1 - margin else f"unstable, spectral radius {radius_text(r)}" for r in radius),
+        status=tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radius),
     )
 
 
-def alpha_factor(shared: list[tuple[Array, int]], edge: float, settings: IdentifySettings) -> float:
+def alpha_factor(shared: list[tuple[Array, int]], edge: float, smallest: float) -> float:
     """Return how many times the smallest stabilising coefficient is taken: doubled until units are near enough for an uncertain set around one of them.
 
-    Where no factor brings them near enough, the configured one stays.
+    Where no factor brings them near enough, the smallest one stays.
     """
-    limit = 20 * np.log10(settings.largest_residual)
+    limit = 20 * np.log10(LARGEST_RESIDUAL)
     for doubled in range(_DOUBLINGS if edge > 0 else 0):
-        factor = settings.alpha_factor * 2.0**doubled
+        factor = smallest * 2.0**doubled
         models = [edmd(R, n, factor * edge) for R, n in shared]
         if not any(peak_residual_db(m.A, m.B, np.ones(m.B.shape[1]), np.ones(m.B.shape[2]), _POINTS) > limit for m in models):
             return factor
-    return settings.alpha_factor
+    return smallest
 
 
 def begin_refinement(
@@ -254,7 +255,6 @@ def begin_refinement(
     factor: Factor,
     parameters: dict[str, Array],
     starts: list[ModelSet],
-    settings: IdentifySettings,
     work: Work,
 ) -> Refining:
     """Begin to refine every kind of model on free-run error, the population first, then each unit with a prior centred on it.
@@ -267,7 +267,7 @@ def begin_refinement(
     pooled = np.array([u in in_pool for u in units])
     factors = [lifted_factor(factor, base.lifting, parameters, start.lifting) for start in starts]
     tasks = [
-        partial(refine_population, base.population, keys, start.lifting, start.parameters, lifted, pooled, refine_options(settings))
+        partial(refine_population, base.population, keys, start.lifting, start.parameters, lifted, pooled)
         for start, lifted in zip(starts, factors, strict=True)
     ]
     results = work.begin("identify (refine)", tasks)
@@ -285,11 +285,6 @@ def begin_refinement(
 
 def _not_refined() -> tuple[list[ModelSet], dict[str, RefinedModels]]:
     return [], {}
-
-
-def refine_options(settings: IdentifySettings) -> RefineOptions:
-    """Return the options of the refinement that settings ask for."""
-    return RefineOptions(margin=max(settings.margin, RefineOptions().margin), largest_residual=settings.largest_residual)
 
 
 def with_matrices(start: ModelSet, name: str, matrices: KoopmanMatrices, lifted: Factor) -> ModelSet:

@@ -38,9 +38,7 @@ def resolve_lifting(
     else:
         sample = partial(_sample, population, test)
         functions = concatenate(declared.functions or (), *(family(table, sample) for table in declared.families))
-    parameters = declared.parameters
-    if parameters is None:
-        parameters = (PHASE,) if any(re.search(rf"\b{PHASE}\b", f) for f in functions + inputs) else ()
+    parameters = (PHASE,) if any(re.search(rf"\b{PHASE}\b", f) for f in functions + inputs) else ()
     lifting = Lifting(population.states, functions, parameters, population.inputs, inputs)
     _ = lifting.separation, lifting.input_separation  # refused before anything is written
     return lifting if lifting.history or inputs else Lifting(population.states, functions, parameters)

@@ -22,9 +22,6 @@ class LiftingSettings(Settings):
     )
     families: tuple[dict[str, Any], ...] = Field((), description="tables with a kind each, whose formulas stand behind the functions")
     input_functions: tuple[str, ...] = Field((), description="further inputs of the model, as formulas of states and inputs")
-    parameters: tuple[str, ...] | None = Field(
-        None, description="names in formulas that every unit has a value of its own for; by default phase, where a formula reads it"
-    )
 
     @field_validator("families")
     @classmethod
@@ -43,16 +40,15 @@ class CalibrationSettings(Settings):
     ratio: float | None = Field(None, gt=0, description="periods a radian; by default that of the formula, here 100")
     reference: str | None = Field(None, description="commanded speed, which is constant for a while in the segments that are used")
     measured: str | None = Field(None, description="speed that follows it and shows the periodic error")
-    settle_s: float = Field(0.1, ge=0, description="left out at the start of every segment")
 
 
 class IdentifySettings(Settings):
     """Regularisation; ``auto`` is `alpha_factor` times the smallest coefficient that stabilises every model.
 
     At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the population is finite; the factor
-    is doubled until the peak residual around the best nominal unit is at most `largest_residual`, where that can be reached.
+    is doubled until the peak residual around the best nominal unit is at most one half, where that can be reached.
     `refine` adds models that are refined on their free-run error, the population first, then each unit, held near the population's model by
-    a prior that is never so weak that the peak residual exceeds `largest_residual`. Spectral radii stay below ``1 - margin``.
+    a prior that is never so weak that the peak residual exceeds one half.
     """
 
     alpha: float | Literal["auto"] = Field(
@@ -61,10 +57,6 @@ class IdentifySettings(Settings):
     )
     alpha_factor: float = Field(4.0, ge=1, description="how far alpha = auto is above the smallest coefficient that stabilises every model")
     refine: bool = Field(True, description="models refined on their free-run error, beside those of the paper's recipe")
-    largest_residual: float = Field(
-        0.5, gt=0, description="peak residual around the best nominal unit that regularisation and refinement keep, where they can"
-    )
-    margin: float = Field(0.0, ge=0, lt=1, description="spectral radii of refined models stay below 1 - margin")
 
     @field_validator("alpha")
     @classmethod

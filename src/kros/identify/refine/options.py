@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from ...core.errors import ConfigError
 
+LARGEST_RESIDUAL = 0.5  # peak residual beyond which the set of models that covers a population is too large for a robust observer
 NEGLIGIBLE_RESIDUAL = 0.1  # peak residual up to which less uncertainty is worth nothing, so that accuracy alone decides
 TOLERANCE = 0.1  # the strongest prior whose held-out error exceeds the lowest by no more than this share is chosen
 GUARD = 2e-3  # spectral radii above one less this are penalised, so that the search slides along the edge of stability
@@ -27,9 +28,6 @@ class RefineOptions:
     strengths : tuple of float
         Strengths of the prior to choose from, tried from the strongest on until weaker ones do not improve the held-out error. At 1 a
         residual of one at all frequencies costs as much as the free-run error of the pooled model (with ``power = 1``; see `metric`).
-    largest_residual : float
-        Priors so weak that the peak residual within the population (inverse input multiplicative form) exceeds this are not chosen: the
-        set of models that covers such a population is too large for a robust observer.
     balance : float
         A state's error counts in units of ``start**balance * range**(1 - balance)``, with `start` the free-run error of the EDMD
         model and `range` that of the state: 0 weighs states by their range, 1 asks every state for the same improvement.
@@ -45,9 +43,6 @@ class RefineOptions:
         Most steps at each strength before one is chosen; each starts where the stronger prior ended.
     bound : float
         A free run on training episodes may reach this times the range of the states.
-    validation_samples : int, optional
-        At most this many samples of each training episode are run freely to choose the strength and to see that runs stay bounded; None
-        runs whole episodes. For plants that no model follows for long, such as those that are unstable in open loop.
 
     Raises
     ------
@@ -64,7 +59,6 @@ class RefineOptions:
     horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)
     segments: int = 24
     strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)
-    largest_residual: float = 0.5
     balance: float = 0.65
     starts: tuple[tuple[int, float], ...] = ((5, 0.8), (320, 0.8))
     pooled_segments: int = 120
@@ -72,21 +66,18 @@ class RefineOptions:
     iterations: int = 15
     path_iterations: int = 8
     bound: float = 10.0
-    validation_samples: int | None = None
 
     def __post_init__(self) -> None:
         good = {
             "horizons": len(self.horizons) > 0 and min(self.horizons, default=0) >= 1 and tuple(sorted(self.horizons)) == self.horizons,
             "segments": self.segments >= 1,
             "strengths": len(self.strengths) > 0 and min(self.strengths, default=0.0) > 0,
-            "largest_residual": self.largest_residual > 0,
             "balance": 0 <= self.balance <= 1,
             "starts": len(self.starts) > 0 and all(0 <= balance <= 1 for _, balance in self.starts),
             "pooled_segments": self.pooled_segments >= 1,
             "margin": 0 <= self.margin < 1,
             "iterations": min(self.iterations, self.path_iterations) >= 1,
             "bound": self.bound >= 1,
-            "validation_samples": self.validation_samples is None or self.validation_samples >= 2,
         }
         for name, fine in good.items():
             if not fine:

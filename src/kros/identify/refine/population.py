@@ -26,7 +26,7 @@ from ..ranges import Ranges
 from .marquardt import Evaluate, Solution, minimise
 from .metric import ResponsePrior
 from .model import RefinedModels, TradeOff
-from .options import GUARD, LEAST_GAIN, NEGLIGIBLE_RESIDUAL, SEED, TOLERANCE, RefineOptions
+from .options import GUARD, LARGEST_RESIDUAL, LEAST_GAIN, NEGLIGIBLE_RESIDUAL, SEED, TOLERANCE, RefineOptions
 from .pooled import matrices_of, normalised, ranges, refine_pooled, restrict, start_pooled
 from .problem import Problem
 from .segments import held_segments, read_segments
@@ -116,12 +116,12 @@ def _refine(
     rows = np.flatnonzero(pooled)
     start, problem, error, span = start_pooled(lifting, parameters, factor, fitted, rows, options)
     spans = ranges(factor, rows, lifting)
-    validation = ValidationSet(population, keys, lifting, parameters, rows, problem, spans, options.validation_samples)
+    validation = ValidationSet(population, keys, lifting, parameters, rows, problem, spans)
     common = refine_pooled(start, restrict(problem, rows), error, span, lambda V: validation.trade_off([V], (np.inf,))[0].score, options)
     prepared = _with_prior(problem, common, factor, rows)
     validation = replace(validation, problem=prepared)
     path, trade_off = _path(prepared, common, validation, options)
-    choice = _choose(trade_off, options)
+    choice = _choose(trade_off)
     log.info("prior of strength %g chosen, held-out score %.4g", trade_off[choice].strength, trade_off[choice].score)
     final = replace(prepared, segments=segments)
     solution = _settle(_strengthen(final, trade_off[choice].strength), path[choice], options)
@@ -131,9 +131,7 @@ def _refine(
         models = matrices_of(V, problem.T, lifting.n_lifted)
         own = {name: values[some] for name, values in parameters.items()}
         ids = tuple(keys)
-        return find_unbounded(
-            models.A, models.B, lifting, own, population, {ids[i]: keys[ids[i]] for i in some}, limit, options.validation_samples
-        )
+        return find_unbounded(models.A, models.B, lifting, own, population, {ids[i]: keys[ids[i]] for i in some}, limit)
 
     solution, strengths = _keep_bounded(final, solution, common, trade_off[choice].strength, unbounded, options)
     units = matrices_of(solution.V, problem.T, lifting.n_lifted)
@@ -201,7 +199,7 @@ def _path(problem: Problem, common: Array, validation: ValidationSet, options: R
         rows += validation.trade_off([V], (strength,))
         log.debug("prior of strength %g: held-out score %.4g, peak residual %.1f dB", strength, rows[-1].score, rows[-1].peak_db)
         idle = len(rows) > _PATIENCE and rows[-1].score > (1 - TOLERANCE / 2) * rows[-1 - _PATIENCE].score
-        if idle or _too_uncertain(rows[-1], options):
+        if idle or _too_uncertain(rows[-1]):
             break
     return path, rows
 
@@ -257,16 +255,16 @@ def _keep_bounded(
     )
 
 
-def _too_uncertain(row: TradeOff, options: RefineOptions) -> bool:
-    return row.peak_db > 20 * np.log10(options.largest_residual)
+def _too_uncertain(row: TradeOff) -> bool:
+    return row.peak_db > 20 * np.log10(LARGEST_RESIDUAL)
 
 
-def _choose(rows: Sequence[TradeOff], options: RefineOptions) -> int:
+def _choose(rows: Sequence[TradeOff]) -> int:
     """The strongest prior whose held-out score is as good as the best, within the tolerance, or a weaker and better one that costs nothing.
 
     Uncertainty costs nothing while the peak residual is negligible. Only the last of the rows may be too uncertain.
     """
-    usable = [row for row in rows if not _too_uncertain(row, options)] or list(rows)
+    usable = [row for row in rows if not _too_uncertain(row)] or list(rows)
     best = min(row.score for row in usable)
     if not np.isfinite(best):
         raise IdentificationError(
@@ -274,7 +272,7 @@ def _choose(rows: Sequence[TradeOff], options: RefineOptions) -> int:
             f"{max(row.strength for row in rows):g}."
         )
     choice = next(i for i, row in enumerate(rows) if row.score <= (1 + TOLERANCE) * best)
-    negligible = 20 * np.log10(min(NEGLIGIBLE_RESIDUAL, options.largest_residual))
+    negligible = 20 * np.log10(NEGLIGIBLE_RESIDUAL)
     free = [i for i, row in enumerate(rows) if i >= choice and row.peak_db <= negligible]
     return min(free, key=lambda i: rows[i].score, default=choice)
 

@@ -28,26 +28,22 @@ def free_run_errors(
     parameters: Mapping[str, Array],
     population: Population,
     keys: Sequence[EpisodeKey],
-    validation_samples: int | None = None,
 ) -> tuple[Array, Array, Array]:
     """Return what the free runs of several models, A (model, unit, n_lifted, n_lifted), differ by from one episode of every unit.
 
     That is the RMS of the error (model, unit, n), infinite where a run diverged, the largest magnitude recorded (unit, n), and that of the run
-    (model, unit, n). Of each episode `validation_samples` are run, those before a free run's start not counted; all by default.
+    (model, unit, n).
     """
-    n, h, models = lifting.n_states, lifting.history, len(A)
+    n, models = lifting.n_states, len(A)
     rms, reached, top = np.full((models, len(keys), n), np.inf), np.full((models, len(keys), n), np.inf), np.zeros((len(keys), n))
     for start in range(0, len(keys), _TOGETHER):
         episodes = {row: population.read(key) for row, key in enumerate(keys[start : start + _TOGETHER], start)}
         by_length: dict[int, list[int]] = {}
         for row, episode in episodes.items():
-            length = len(episode) if validation_samples is None else min(len(episode), h + validation_samples)
-            by_length.setdefault(length, []).append(row)
-        for length, rows in by_length.items():
+            by_length.setdefault(len(episode), []).append(row)
+        for rows in by_length.values():
             own = {name: np.tile(values[rows], models) for name, values in parameters.items()}
-            rms[:, rows], top[rows], reached[:, rows] = _errors(
-                A[:, rows], B[:, rows], lifting, own, [episodes[row][:length] for row in rows]
-            )
+            rms[:, rows], top[rows], reached[:, rows] = _errors(A[:, rows], B[:, rows], lifting, own, [episodes[row] for row in rows])
     return rms, top, reached
 
 
@@ -85,7 +81,6 @@ def find_unbounded(
     population: Population,
     keys: Mapping[str, Sequence[EpisodeKey]],
     limit: Array,
-    validation_samples: int | None = None,
 ) -> dict[int, str]:
     """Run every unit's model, A (unit, n_lifted, n_lifted), over all of its training episodes, and find those whose states leave the limit (n,).
 
@@ -95,7 +90,7 @@ def find_unbounded(
     flat = [(row, key) for row, episodes in enumerate(keys.values()) for key in episodes]
     rows = [row for row, _ in flat]
     own = {name: values[rows] for name, values in parameters.items()}
-    _, _, reached = free_run_errors(A[None, rows], B[None, rows], lifting, own, population, [key for _, key in flat], validation_samples)
+    _, _, reached = free_run_errors(A[None, rows], B[None, rows], lifting, own, population, [key for _, key in flat])
     for which, state in np.argwhere(~(reached[0] <= limit)):
         row, key = flat[which]
         found.setdefault(
@@ -107,7 +102,7 @@ def find_unbounded(
 
 @dataclass(frozen=True, eq=False)
 class ValidationSet:
-    """Scores models on the last training episode of every pooled unit, or on its first `validation_samples` samples."""
+    """Scores models on the last training episode of every pooled unit."""
 
     population: Population
     keys: Mapping[str, Sequence[EpisodeKey]]
@@ -116,7 +111,6 @@ class ValidationSet:
     rows: npt.NDArray[np.int64]
     problem: Problem
     scales: tuple[Array, Array]
-    validation_samples: int | None = None
 
     def trade_off(self, V: Sequence[Array], strengths: Sequence[float]) -> tuple[TradeOff, ...]:
         """Return accuracy and uncertainty of models (unit, n_lifted, p), or of one for all units."""
@@ -125,7 +119,7 @@ class ValidationSet:
         last = [episodes[-1] for episodes in self.keys.values()]
         own = {name: values[self.rows] for name, values in self.parameters.items()}
         ends = [last[row] for row in self.rows]
-        rms, top, _ = free_run_errors(models.A, models.B, self.lifting, own, self.population, ends, self.validation_samples)
+        rms, top, _ = free_run_errors(models.A, models.B, self.lifting, own, self.population, ends)
         span = np.where(top > 0, top, self.scales[0][: self.lifting.n_states])  # a state may rest at zero in the last episode
         percent = np.median(100 * rms / span, axis=1)
         score = np.mean((rms / self.problem.sigma) ** 2, axis=(1, 2))

@@ -18,7 +18,6 @@ from ...core.errors import DataError
 from ...data.population import EpisodeKey, Population
 from ...data.scaled import scale_population
 from ...identify import Factor, KoopmanMatrices, ModelSamples, ModelSet, bootstrap_edmd, bootstrap_refined, episode_weights, lifted_factor
-from ...identify.identify import refine_options
 from ...identify.ranges import Ranges
 from ...identify.refine.episodes import episode_normals
 from ...identify.refine.model import RefinedModels
@@ -32,32 +31,8 @@ DRAWS = 60
 _SEED = 0
 
 
-def resampled_models(context: Context, name: str, units: list[str]) -> ModelSamples:
-    """Return models of resampled training episodes, in the condition that feeds the synthesis.
-
-    Parameters
-    ----------
-    context : Context
-    name : str
-        Kind of model.
-    units : list of str
-
-    Returns
-    -------
-    ModelSamples
-
-    Raises
-    ------
-    DataError
-        When a unit has fewer than two training episodes.
-    IdentificationError
-        When episodes that were drawn leave a model undetermined.
-    """
-    return resampling(context, name, units)()
-
-
 def resampling(context: Context, name: str, units: list[str]) -> Callable[[], ModelSamples]:
-    """Return what `resampled_models` computes, with all it needs, for a process of its own."""
+    """Return what computes models of resampled training episodes, in the condition that feeds synthesis, in a process of its own."""
     models = context.identified.models(name)
     if models.alpha is None:
         return partial(_refined_samples, _refined_models(context, models), tuple(models.index(u) for u in units))
@@ -106,7 +81,6 @@ class _Refined:
     parameters: dict[str, Array]
     factor: Factor
     counts: list[int]
-    options: RefineOptions
     pooled: npt.NDArray[np.bool_]
 
 
@@ -122,14 +96,13 @@ def _refined_models(context: Context, models: ModelSet) -> _Refined:
         dict(models.parameters),
         ranges.factor(factor),
         counts,
-        refine_options(context.config.identify),
         np.array([u in facts.pooled for u in units]),
     )
 
 
 def _refined_samples(of: _Refined, rows: Sequence[int]) -> ModelSamples:
     """Samples of some of the units, in the recordings' units of measure."""
-    normal = episode_normals(of.models, of.population, of.keys, of.lifting, of.parameters, of.factor, of.options, of.pooled)
+    normal = episode_normals(of.models, of.population, of.keys, of.lifting, of.parameters, of.factor, RefineOptions(), of.pooled)
     weights, units = episode_weights(of.counts, DRAWS, _SEED), of.models.units
     return _chosen(
         _restored(bootstrap_refined(units, of.models.whitening, of.models.information, normal, weights, list(of.keys)), of.ranges), rows

@@ -44,19 +44,7 @@ def pack_arrays(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
-    """Return what `pack_arrays` packed.
-
-    Parameters
-    ----------
-    packed : bytes
-    path : Path
-        For messages.
-
-    Raises
-    ------
-    DataError
-        Damaged, packed more tightly than it is written here (a small file may then unpack to any size), or with pickled objects.
-    """
+    """Return what `pack_arrays` packed."""
     try:
         with zipfile.ZipFile(io.BytesIO(packed)) as archive:
             return {_array_name(info): _array(info, archive) for info in archive.infolist()}

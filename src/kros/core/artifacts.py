@@ -170,12 +170,7 @@ def with_checksum(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_checksum(content: Mapping[str, Any], path: Path) -> bool:
-    """Refuse content of `read_json` that is not what its checksum says; False where it has none.
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse content of `read_json` that is not what its checksum says; False where it has none."""
     if CHECKSUM not in content:
         return False
     if content[CHECKSUM] != _digest(content):
@@ -215,13 +210,7 @@ def save_artifact(folder: Path, kind: str, content: Mapping[str, Any], arrays: M
 
 
 def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read what `save_artifact` wrote and check kind, schema version and checksum.
-
-    Raises
-    ------
-    DataError
-        A file that is missing, of another version, or not as it was written.
-    """
+    """Read what `save_artifact` wrote and check kind, schema version and checksum."""
     folder = Path(folder)
     path, archive = folder / f"{kind}.json", folder / "arrays.npz"
     content = read_json(path)

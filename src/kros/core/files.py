@@ -24,16 +24,7 @@ _NAME = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
 
 
 def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) -> None:
-    """Refuse what is not a regular file, or a larger one than is ever read.
-
-    Parameters
-    ----------
-    path : Path
-    limit : int
-        Bytes; one of `kros.core.limits`.
-    error : type of KrosError
-        Raised with the reason.
-    """
+    """Refuse what is not a regular file, or a larger one than is ever read."""
     try:
         status = path.stat()
     except FileNotFoundError as found:
@@ -60,19 +51,7 @@ def read_bytes(path: Path, limit: int, error: type[KrosError] = DataError) -> by
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Parameters
-    ----------
-    path : Path
-    what : str
-        What messages call the file, for example ``Study``.
-
-    Raises
-    ------
-    ConfigError
-        Not a regular file, not UTF-8, not TOML, or tables nested deeper than anything that is read here.
-    """
+    """Read a TOML file."""
     content = read_bytes(path, limits.MAX_TOML_BYTES, ConfigError)
     try:
         return parse_toml(content.decode("utf-8-sig"))
@@ -81,12 +60,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Parse TOML; tables within tables are refused below `limits.MAX_TOML_DEPTH`, since everything that walks them recurses.
-
-    Raises
-    ------
-    ValueError or RecursionError
-    """
+    """Parse TOML; tables within tables are refused below `limits.MAX_TOML_DEPTH`, since everything that walks them recurses."""
     dots = rf"(?<![\w-]){_NAME}(?:[ \t]*\.[ \t]*{_NAME}){{{limits.MAX_TOML_DEPTH}}}"
     if re.search(dots, text):  # before parsing, whose time grows with the square of their number
         raise ValueError(f"a key of more than {limits.MAX_TOML_DEPTH} names")
@@ -109,12 +83,6 @@ def shortened(text: str, longest: int = 300) -> str:
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return a hint for a message where a name is nearly one that is known, else nothing.
-
-    Examples
-    --------
-    >>> did_you_mean("alpa", ["alpha", "refine"])
-    "; did you mean 'alpha'?"
-    """
+    """Return a hint for a message where a name is nearly one that is known, else nothing."""
     close = get_close_matches(str(name), list(known), n=1, cutoff=0.6)
     return f"; did you mean {close[0]!r}?" if close else ""

@@ -28,22 +28,7 @@ def nyquist_hz(sample_period_s: float) -> float:
 
 
 def log_grid(sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0, longest_s: float | None = None) -> Array:
-    """Return logarithmically spaced frequencies that end at Nyquist, the Nyquist frequency included.
-
-    Parameters
-    ----------
-    sample_period_s : float, s
-    n_freqs : int
-        Number of frequencies, at least two.
-    decades : float
-        Width of the band below Nyquist, at most.
-    longest_s : float, s, optional
-        Length of the longest recording behind the models: it resolves no frequency below its inverse, and the grid does not go below that.
-
-    Returns
-    -------
-    ndarray, shape (n_freqs,), Hz
-    """
+    """Return logarithmically spaced frequencies that end at Nyquist, the Nyquist frequency included, shape (n_freqs,), Hz."""
     if n_freqs < 2 or not decades > 0:
         raise ConfigError(
             f"Frequency grid: needs at least two frequencies over a positive number of decades, found {n_freqs} over {decades}."
@@ -60,13 +45,7 @@ def log_grid(sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0, 
 
 
 def check_grid(freqs_hz: npt.ArrayLike, sample_period_s: float | None) -> Array:
-    """Return the frequencies as an array, or say why they are no grid; without a sampling period of continuous time.
-
-    Raises
-    ------
-    ConfigError
-        When they are not finite, not increasing, negative, all zero, or above Nyquist.
-    """
+    """Return the frequencies as an array, or say why they are no grid; without a sampling period of continuous time."""
     freqs = np.atleast_1d(np.asarray(freqs_hz, dtype=float))
     top = np.inf if sample_period_s is None else nyquist_hz(sample_period_s)
     if freqs.ndim != 1 or freqs.size == 0 or not np.isfinite(freqs).all():
@@ -85,12 +64,7 @@ def check_grid(freqs_hz: npt.ArrayLike, sample_period_s: float | None) -> Array:
 
 
 def dense_grid(freqs_hz: Array, sample_period_s: float, factor: int = 10) -> Array:
-    """Return `factor` times as many frequencies, between and at the given ones, with DC and Nyquist added.
-
-    Returns
-    -------
-    ndarray, shape (at least factor * (n_freqs - 1) + 1,), Hz
-    """
+    """Return `factor` times as many frequencies, between and at the given ones, with DC and Nyquist added."""
     inside = freqs_hz[freqs_hz > 0]
     steps = np.arange(factor) / factor
     between = (inside[:-1, None] * (inside[1:] / inside[:-1])[:, None] ** steps).ravel()
@@ -98,13 +72,7 @@ def dense_grid(freqs_hz: Array, sample_period_s: float, factor: int = 10) -> Arr
 
 
 def bilinear_squared(freqs_hz: npt.ArrayLike, sample_period_s: float) -> Array:
-    """Return tau = tan^2(theta / 2); infinity at Nyquist, and full relative precision near DC.
-
-    Parameters
-    ----------
-    freqs_hz : array_like, Hz
-    sample_period_s : float, s
-    """
+    """Return tau = tan^2(theta / 2); infinity at Nyquist, and full relative precision near DC."""
     freqs = np.asarray(freqs_hz, dtype=float)
     half = np.pi * freqs * sample_period_s
     at_top = np.abs(freqs * sample_period_s - 0.5) <= 1e-12

@@ -11,17 +11,7 @@ from .removed import refusing
 
 
 def lazy_names(package: str, home: Mapping[str, str], public: Sequence[str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return the ``__getattr__`` and ``__dir__`` of a package (PEP 562).
-
-    Parameters
-    ----------
-    package : str
-        Its ``__name__``.
-    home : mapping of str to str
-        For every name the module, inside the package, that it lives in.
-    public : sequence of str
-        Its ``__all__``.
-    """
+    """Return the ``__getattr__`` and ``__dir__`` of a package (PEP 562)."""
     unknown = refusing(package)
 
     def find(name: str) -> Any:

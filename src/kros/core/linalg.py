@@ -29,17 +29,7 @@ def qr_triangle(matrix: Array) -> Array:
 
 
 def least_squares(regressors: Array, values: Array, rcond: float | None = None) -> Array:
-    """Return X that makes ``regressors X - values`` smallest, of all such X the smallest one with every regressor in units of its own size.
-
-    Which directions count as dependent then does not change with the units of measure.
-
-    Parameters
-    ----------
-    regressors : ndarray, shape (rows, n)
-    values : ndarray, shape (rows, k)
-    rcond : float, optional
-        Relative singular value below which a direction is dependent; rounding by default.
-    """
+    """Return the least squares X of ``regressors X = values``, of all the smallest one with every regressor in units of its own size."""
     largest = np.abs(regressors).max(axis=0, initial=0.0)
     largest[largest == 0] = 1.0
     size = largest * np.sqrt(np.mean((regressors / largest) ** 2, axis=0))

@@ -18,19 +18,7 @@ T = TypeVar("T")
 
 @contextmanager
 def as_written(what: str, path: Path) -> Iterator[None]:
-    """Turn what content of the wrong kind does to the code that reads it into one error.
-
-    Parameters
-    ----------
-    what : str
-        What is read, for example ``ModelSet``.
-    path : Path
-
-    Raises
-    ------
-    DataError
-        In place of the errors of Python and NumPy; those of kros pass.
-    """
+    """Turn what content of the wrong kind does to the code that reads it into one error."""
     try:
         yield
     except KrosError:
@@ -54,22 +42,7 @@ def loader(load: Callable[[Any, Any], T]) -> Callable[[Any, Any], T]:
 
 
 def check_shapes(arrays: Mapping[str, np.ndarray], axes: Mapping[str, str], sizes: Mapping[str, int], path: Path) -> None:
-    """Check arrays against named axes.
-
-    Parameters
-    ----------
-    arrays : mapping of str to ndarray
-    axes : mapping of str to str
-        A letter an axis, for example ``{"A": "unn", "B": "unm"}``; the same letter is the same length everywhere.
-    sizes : mapping of str to int
-        Lengths that are known.
-    path : Path
-
-    Raises
-    ------
-    DataError
-        Another number of axes or length, or what is not a number.
-    """
+    """Check arrays against named axes."""
     known = dict(sizes)
     for name, letters in axes.items():
         shape, kind = arrays[name].shape, arrays[name].dtype.kind

@@ -41,19 +41,7 @@ else:
 
 @contextmanager
 def locked(folder: Path, shared: bool = False) -> Iterator[None]:
-    """Hold a folder: for writing alone, or for reading together with other readers.
-
-    Parameters
-    ----------
-    folder : Path
-        Exists. One that cannot be written to is read without a lock, since nobody writes there.
-    shared : bool
-
-    Raises
-    ------
-    ConfigError
-        When another process holds it.
-    """
+    """Hold a folder: for writing alone, or for reading together with other readers."""
     handle = _open(folder, shared)
     try:
         if handle is not None and not shared:

@@ -10,11 +10,7 @@ _KEPT, _OF_HEAP = 1 << 28, 1 << 25  # bytes; glibc takes no more than the second
 
 
 def keep_freed_memory() -> None:
-    """Let the C library keep what is freed for the next array, up to 256 MB; elsewhere than in glibc nothing changes.
-
-    Left alone it gives memory back after every few arrays, and every page that is asked for anew is cleared first: of the time of reducing
-    an episode that was a half.
-    """
+    """Let the C library keep what is freed for the next array, up to 256 MB; elsewhere than in glibc nothing changes."""
     with suppress(AttributeError, TypeError, OSError):
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(_TRIM, _KEPT)

@@ -49,11 +49,7 @@ def as_state_space(system: Any) -> StateSpace:
 
 
 def gramian(A: Array, B: Array, dt: float) -> Array:
-    """Controllability Gramian of a stable pair.
-
-    Discrete time: ``P = A P A^T + B B^T``, summed by doubling, in which every step adds a positive semidefinite matrix.
-    Continuous time: ``A P + P A^T + B B^T = 0``.
-    """
+    """Controllability Gramian of a stable pair, ``P = A P A^T + B B^T`` by doubling, in continuous time ``A P + P A^T + B B^T = 0``."""
     Q = B @ B.T
     if dt == 0:
         from scipy.linalg import solve_continuous_lyapunov
@@ -175,10 +171,7 @@ def _first_frequencies(system: StateSpace) -> Array:
 
 
 def crossings(system: StateSpace, gamma: float) -> Array:
-    """Frequencies at which a singular value may equal `gamma`, with the points between them.
-
-    Nearly imaginary eigenvalues count too: a superfluous candidate costs one evaluation, a missed one would cost the bound.
-    """
+    """Frequencies at which a singular value may equal `gamma`, with the points between them."""
     A, B, C, D = system.A, system.B, system.C, system.D
     R = gamma**2 * np.eye(system.n_inputs) - D.T @ D
     F = np.linalg.solve(R, np.hstack([D.T @ C, B.T]))

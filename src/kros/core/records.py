@@ -32,32 +32,15 @@ _LARGE = 8 << 20  # bytes; a larger file with the size and time that it was left
 
 @dataclass(frozen=True)
 class Record:
-    """What a stage left.
-
-    Parameters
-    ----------
-    stage : str
-    key : str
-        Hash of all that the stage depends on.
-    seconds : float
-        Time it took.
-    files : mapping of str to str
-        SHA-256 of every file, by its name relative to the run folder, with slashes.
-    stamps : mapping of str to str
-        Size and time of large files.
-    runs : tuple of str
-        Folders that are runs of their own: their files are listed here too, and looked after there.
-    own : mapping of str to str
-        As `files`, for files of the run that are of no stage.
-    """
+    """What a stage left."""
 
     stage: str
-    key: str = ""
-    seconds: float = 0.0
-    files: Mapping[str, str] = field(default_factory=dict)
-    stamps: Mapping[str, str] = field(default_factory=dict)
-    runs: tuple[str, ...] = ()
-    own: Mapping[str, str] = field(default_factory=dict)
+    key: str = ""  # hash of all that the stage depends on
+    seconds: float = 0.0  # time it took
+    files: Mapping[str, str] = field(default_factory=dict)  # SHA-256 of every file, by its name relative to the run folder, with slashes
+    stamps: Mapping[str, str] = field(default_factory=dict)  # size and time of large files
+    runs: tuple[str, ...] = ()  # folders that are runs of their own: their files are listed here too, and looked after there
+    own: Mapping[str, str] = field(default_factory=dict)  # as `files`, for files of the run that are of no stage
 
     @property
     def all(self) -> dict[str, str]:
@@ -85,13 +68,7 @@ def record_path(folder: Path, stage: str) -> Path:
 
 
 def read_record(folder: Path, stage: str) -> Record | None:
-    """Return the record of a finished stage, or None.
-
-    Raises
-    ------
-    DataError
-        When there is one that cannot be believed.
-    """
+    """Return the record of a finished stage, or None."""
     path = record_path(folder, stage)
     if not is_file(path):
         return None
@@ -117,13 +94,7 @@ def _parsed(folder: Path, stage: str, content: Any) -> Record:
 
 
 def place(folder: Path, name: str) -> Path:
-    """Return the path of a file in a run folder.
-
-    Raises
-    ------
-    DataError
-        When the name leads out of the folder, directly or through a link.
-    """
+    """Return the path of a file in a run folder."""
     parts = _parts(folder, name)
     return _folder(folder, parts[:-1]) / parts[-1]
 
@@ -162,10 +133,7 @@ def records(folder: Path) -> list[Record]:
 
 
 def recorded_files(folder: Path) -> frozenset[str]:
-    """Return the names of all files that belong to a run, without the records themselves.
-
-    A folder without records is nobody's run, such as one that `save` filled piece by piece; there every file counts.
-    """
+    """Return the names of all files that belong to a run, without the records themselves."""
     if not _stages(folder):
         return frozenset(p.relative_to(folder).as_posix() for p in folder.rglob("*") if is_file(p))
     return frozenset(name for record in records(folder) for name in record.all)

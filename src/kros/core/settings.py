@@ -20,13 +20,7 @@ class Settings(BaseModel):
 
     @classmethod
     def of(cls, raw: Any, asked: str) -> Self:
-        """Validate, with every problem in one message that begins with what was asked.
-
-        Raises
-        ------
-        ConfigError
-            When there are unknown names or values out of range.
-        """
+        """Validate, with every problem in one message that begins with what was asked."""
         try:
             return cls.model_validate(raw)
         except ValidationError as error:
@@ -56,13 +50,7 @@ class Settings(BaseModel):
 
 
 def require_kind(value: object, kind: type[T], asked: str, instead: str) -> T:
-    """Return a value of the class that a function takes, and refuse any other.
-
-    Raises
-    ------
-    ConfigError
-        With what was found, and what to do instead.
-    """
+    """Return a value of the class that a function takes, and refuse any other."""
     if not isinstance(value, kind):
         raise ConfigError(f"{asked}: needs {kind.__name__}, found {type(value).__name__}; {instead}.")
     return value

@@ -67,10 +67,7 @@ def sigma_max(matrices: npt.ArrayLike) -> Array:
 
 
 def sigma_max_first(matrices: Array) -> Array:
-    """Return the largest singular value of entries-first matrices (p, m, ...), shape (...).
-
-    With `min(p, m) <= 2` from the closed form of the 2 x 2 Gram matrix, whose discriminant is a sum of squares: nothing cancels.
-    """
+    """Return the largest singular value of entries-first matrices (p, m, ...), shape (...)."""
     p, m = matrices.shape[:2]
     if min(p, m) > 2:
         return np.linalg.norm(entries_last(matrices), 2, axis=(-2, -1))
@@ -92,10 +89,7 @@ def sigma_max_squared(matrices: Array) -> Array:
 
 
 def condition_number(matrices: Array) -> Array:
-    """Return condition numbers of square matrices (..., n, n), shape (...); infinite where singular.
-
-    Of 2 x 2 ones it is `sigma_max^2 / |det|`; rounding in the determinant decides beyond about 1e14 only.
-    """
+    """Return condition numbers of square matrices (..., n, n), shape (...); infinite where singular."""
     if matrices.shape[-1] != 2:
         return np.asarray(np.linalg.cond(matrices))
     entries = entries_first(matrices)
@@ -105,10 +99,7 @@ def condition_number(matrices: Array) -> Array:
 
 
 def pseudo_inverse_first(matrices: Array) -> Array:
-    """Return pseudo-inverses, entries first, of matrices (..., p, m).
-
-    With `min(p, m) = 2` by orthogonalising twice (as accurate as QR); other sizes, and matrices without full rank, go through the SVD.
-    """
+    """Return pseudo-inverses, entries first, of matrices (..., p, m)."""
     if min(matrices.shape[-2:]) != 2:
         return entries_first(np.linalg.pinv(matrices))
     if matrices.shape[-2] < matrices.shape[-1]:
@@ -132,11 +123,7 @@ def pseudo_inverse_first(matrices: Array) -> Array:
 
 
 def lower_factor(pseudo_inverse: Array) -> Array:
-    """Return square `L` with `P P^H = L L^H` for entries-first P of shape (r, s, ...), r <= s.
-
-    `sigma_max(D P) = sigma_max(D L)`: the wide factor shrinks to a triangle, once per unit instead of once per pair. Two rows are orthogonalised
-    twice, as accurate as QR of more; no squared condition number. Rows of zeros give zeros.
-    """
+    """Return square `L` with `P P^H = L L^H` for entries-first P of shape (r, s, ...), r <= s."""
     if pseudo_inverse.shape[0] > 2:
         R = np.linalg.qr(np.conj(np.swapaxes(entries_last(pseudo_inverse), -1, -2)), mode="r")
         return entries_first(np.conj(np.swapaxes(R, -1, -2)))

@@ -94,21 +94,7 @@ class Work:
         kinds: Iterable[type] = (),
         usable: Usable | None = None,
     ) -> Iterator[T]:
-        """Map a function over tasks, in order, without those whose results are known from earlier.
-
-        Parameters
-        ----------
-        title : str
-            Of the map; two different ones must not share a title.
-        function : callable
-        tasks : iterable
-        marks : iterable of str or None
-            Digest of everything that the result of each task follows from; None where that cannot be told, and the task is computed.
-        kinds : iterable of type
-            Dataclasses that results are made of, beside arrays and plain types.
-        usable : callable, optional
-            Told a task and its known result; False where that does not do.
-        """
+        """Map a function over tasks, in order, without those whose results are known from earlier."""
         if self.seen is None:
             return self.map(title, function, tasks)
         return self.seen.recall(self, title, function, list(tasks), list(marks), kinds, usable)

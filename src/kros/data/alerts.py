@@ -15,20 +15,7 @@ _CORRELATED = 0.95  # of a channel with the slope of another one, from which on 
 
 
 def period_alerts(values: npt.NDArray[np.float64], channels: Sequence[Channel], period_s: float) -> tuple[str, ...]:
-    """Return what speaks against a sampling period.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n_samples, n_channels)
-        One episode.
-    channels : sequence of Channel
-    period_s : float, s
-
-    Returns
-    -------
-    tuple of str
-        Sentences; none where nothing does.
-    """
+    """Return what speaks against a sampling period."""
     return (*_size(period_s), *_derivatives(values, channels, period_s), *_sampling(values, channels, period_s))
 
 

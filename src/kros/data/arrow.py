@@ -13,13 +13,7 @@ import numpy.typing as npt
 
 
 def from_numpy(values: npt.NDArray[Any]) -> Any:
-    """Return an Arrow array without nulls that shares the memory of contiguous numbers.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Of dtype float64, int64 or int32.
-    """
+    """Return an Arrow array without nulls that shares the memory of contiguous numbers."""
     import pyarrow as pa
 
     kind = {"float64": pa.float64(), "int64": pa.int64(), "int32": pa.int32()}[values.dtype.name]
@@ -38,13 +32,7 @@ def repeated(text: str, count: int) -> Any:
 
 
 def fill(out: npt.NDArray[np.float64], column: Any) -> None:
-    """Copy a float64 Arrow column of the same length into `out`; nulls become NaN.
-
-    Parameters
-    ----------
-    out : ndarray, shape (n,)
-    column : pyarrow.ChunkedArray
-    """
+    """Copy a float64 Arrow column of the same length into `out`; nulls become NaN."""
     start = 0
     for chunk in column.chunks:
         n, (validity, data) = len(chunk), chunk.buffers()

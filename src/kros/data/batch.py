@@ -141,10 +141,7 @@ class EpisodeBatch:
 
 
 def hold_missing(y: Array) -> Array:
-    """Return measurements with the last one that arrived in place of those that are missing; zero before the first, shape (n_samples, ...).
-
-    For estimators that have no answer of their own to a missing measurement.
-    """
+    """Return measurements, shape (n_samples, ...), with the last one that arrived in place of those that are missing, zero before the first."""
     there = np.isfinite(y)
     if there.all():
         return y

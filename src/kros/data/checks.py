@@ -48,24 +48,7 @@ def parse_on_nan(value: OnNan | str) -> OnNan:
 
 
 def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False) -> None:
-    """Check one episode's samples.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n_samples, n_channels)
-    key : EpisodeKey
-    channels : sequence of Channel
-    gaps : bool
-        Whether samples may be NaN or infinite.
-
-    Raises
-    ------
-    NonFiniteError
-        NaN or infinity.
-    DataError
-        Wrong number of columns, too short, or a state that stands still while other channels move: a sensor that is stuck. (Where nothing moves
-        the machine rests, and an input may be held; neither may in all episodes, see `RestWatch`.)
-    """
+    """Check one episode's samples."""
     if values.ndim != 2 or values.shape[1] != len(channels):
         raise DataError(
             f"{title(key)}: {len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape "
@@ -107,18 +90,7 @@ def check_finite(
     first: int = 0,
     columns: Iterable[int] | None = None,
 ) -> None:
-    """Raise NonFiniteError where a channel holds NaN or infinity.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n_samples, n_channels)
-    key : EpisodeKey
-    channels : sequence of Channel
-    first : int
-        Number of the first sample, for the message.
-    columns : iterable of int, optional
-        Columns to look at; default all.
-    """
+    """Raise NonFiniteError where a channel holds NaN or infinity."""
     for column in range(len(channels)) if columns is None else columns:
         bad = np.flatnonzero(~np.isfinite(values[:, column]))
         if bad.size:
@@ -131,10 +103,7 @@ def check_finite(
 
 
 class RestWatch:
-    """Notice inputs and states that never change over all episodes of one unit and condition.
-
-    An input may be held at another level in every episode. A state may not: what moves it would be seen in no episode.
-    """
+    """Notice inputs and states that never change over all episodes of one unit and condition."""
 
     def __init__(self, channels: Sequence[Channel]) -> None:
         self._columns = [(i, c.name, c.role) for i, c in enumerate(channels) if c.role in (Role.INPUT, Role.STATE)]
@@ -168,18 +137,7 @@ class RestWatch:
 
 
 def check_names(kind: str, names: Iterable[Any]) -> None:
-    """Refuse names that are empty, no text, or hold characters that no file and no table can show.
-
-    Parameters
-    ----------
-    kind : str
-        What they name, for example ``channel``.
-    names : iterable
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse names that are empty, no text, or hold characters that no file and no table can show."""
     for name in names:
         if not isinstance(name, str) or not name.strip():
             raise DataError(f"The name of every {kind} should be text that is not empty, found {name!r}; name it.")
@@ -188,12 +146,7 @@ def check_names(kind: str, names: Iterable[Any]) -> None:
 
 
 def check_period(period_s: Any, what: str) -> float:
-    """Return a sampling period that is a number of seconds above zero.
-
-    Raises
-    ------
-    DataError
-    """
+    """Return a sampling period that is a number of seconds above zero."""
     try:
         seconds = math.nan if isinstance(period_s, bool) or not isinstance(period_s, Real) else float(period_s)
     except OverflowError:
@@ -280,23 +233,7 @@ def check_population(population: Population, allow_single: bool = False) -> None
 
 
 def scan_population(population: Population, on_nan: OnNan | str = OnNan.ERROR) -> Population:
-    """Read every episode once and check it.
-
-    Parameters
-    ----------
-    population : Population
-    on_nan : OnNan or str
-        With ``drop_episode``, episodes with NaN or infinity are left out and logged.
-
-    Returns
-    -------
-    Population
-        Without the dropped episodes.
-
-    Raises
-    ------
-    DataError
-    """
+    """Read every episode once and check it."""
     kept = [key for key, _ in scan_prints(population, on_nan)]
     left = {key.unit for key in kept}
     return replace(population, episodes=tuple(kept), units=tuple(u for u in population.units if u.id in left))
@@ -312,10 +249,7 @@ def scan_prints(population: Population, on_nan: OnNan | str = OnNan.ERROR, look:
 def usable_episodes(
     population: Population, keys: Iterable[EpisodeKey], on_nan: OnNan | str, look: Look | None = None
 ) -> Iterator[tuple[EpisodeKey, npt.NDArray[np.float64], Print]]:
-    """Yield the episodes of one unit and condition that pass all checks, all columns of their samples and what they are recognised by.
-
-    After the last one, what never moved in any of them is refused.
-    """
+    """Yield the episodes of one unit and condition that pass all checks, all columns of their samples and what they are recognised by."""
     policy, columns = parse_on_nan(on_nan), population.columns
     watch = RestWatch(columns)
     key = None

@@ -28,29 +28,14 @@ _PRIME, _MIX = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9)
 
 @dataclass(frozen=True, eq=False)
 class Print:
-    """What one episode is recognised by.
+    """What one episode is recognised by."""
 
-    Parameters
-    ----------
-    digest : bytes
-        Of all samples.
-    hashes : ndarray, shape (at most KEPT,)
-        The smallest hashes of its stretches.
-    """
-
-    digest: bytes
-    hashes: npt.NDArray[np.uint64]
+    digest: bytes  # of all samples
+    hashes: npt.NDArray[np.uint64]  # shape (at most KEPT,); the smallest hashes of its stretches
 
 
 def print_of(values: npt.NDArray[np.float64], channels: Sequence[Channel]) -> Print:
-    """Return the print of an episode.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n_samples, n_channels)
-    channels : sequence of Channel
-        Stretches in which a state stands still are left out: a machine at rest looks like any other one.
-    """
+    """Return the print of an episode."""
     values = np.ascontiguousarray(values) + 0.0  # one zero
     found = sha256(repr(values.shape).encode())
     found.update(values.data)
@@ -96,13 +81,7 @@ def _repeated(hashes: Sequence[npt.NDArray[np.uint64]]) -> list[list[int]]:
 
 
 def refuse_copies(prints: Iterable[tuple[EpisodeKey, Print]]) -> None:
-    """Refuse episodes that are copies of others, whole or in a good part.
-
-    Raises
-    ------
-    DataError
-        Names both.
-    """
+    """Refuse episodes that are copies of others, whole or in a good part."""
     for key, other, shared in copies_among(prints):
         if shared >= 1:
             raise DataError(

@@ -32,55 +32,27 @@ _VARIED = 0.02  # of an input's range
 
 @dataclass(frozen=True, eq=False)
 class FlatTops:
-    """Flat tops of a state at one end of its range in one episode.
-
-    Parameters
-    ----------
-    unit, episode : str
-        The episode's name holds its condition.
-    top : float
-        Largest value of the signal, noise apart.
-    width : float
-        Of the noise.
-    values, lengths : ndarray, shape (runs,)
-        Mean value of every run, and its samples.
-    sides : ndarray of bool, shape (runs, 2)
-        Whether the signal is far away shortly before and after.
-    bend : ndarray, shape (runs,)
-        By how much the middle is above the ends.
-    inputs : ndarray, shape (runs, m)
-        Mean inputs.
-    """
+    """Flat tops of a state at one end of its range in one episode."""
 
     unit: str
-    episode: str
-    top: float
-    width: float
+    episode: str  # the episode's name holds its condition
+    top: float  # largest value of the signal, noise apart
+    width: float  # of the noise
     values: Array
-    lengths: npt.NDArray[np.int64]
-    sides: npt.NDArray[np.bool_]
-    bend: Array
-    inputs: Array
+    lengths: npt.NDArray[np.int64]  # samples of every run, of which `values` are the means
+    sides: npt.NDArray[np.bool_]  # shape (runs, 2); whether the signal is far away shortly before and after
+    bend: Array  # shape (runs,); by how much the middle is above the ends
+    inputs: Array  # shape (runs, m); mean inputs
 
 
 @dataclass(frozen=True)
 class FoundLimit:
-    """Limits of a state that were found.
-
-    Parameters
-    ----------
-    lower, upper : float or None
-        In the recordings' unit; None at an end where there is none.
-    units : tuple of str
-        Units that were seen at them.
-    samples : int
-        How long.
-    """
+    """Limits of a state that were found."""
 
     lower: float | None
-    upper: float | None
-    units: tuple[str, ...]
-    samples: int
+    upper: float | None  # in the recordings' unit; none at an end where there is none
+    units: tuple[str, ...]  # units that were seen at them
+    samples: int  # how long
 
     def __str__(self) -> str:
         ends = [f"{value:.4g}" for value in (self.lower, self.upper) if value is not None]
@@ -102,17 +74,7 @@ def ends_of(unit: str, episode: str, signal: Array, inputs: Array) -> Ends:
 
 
 def found_limit(found: Sequence[Ends], ranges: Array) -> FoundLimit | None:
-    """Return the limits that all episodes of a population speak for; None where they speak for none.
-
-    A limit that was found at one end holds at the other, too, where the state came as far, and no further.
-
-    Parameters
-    ----------
-    found : sequence of Ends
-        Of one state, in all episodes.
-    ranges : ndarray, shape (m,)
-        Range of every input.
-    """
+    """Return the limits that all episodes of a population speak for; None where they speak for none."""
     below, above = [end.lower for end in found], [end.upper for end in found]
     lower, upper = limit_of(below, ranges), limit_of(above, ranges)
     lower = lower or _mirrored(upper, below)
@@ -173,15 +135,7 @@ def flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: floa
 
 
 def limit_of(found: Sequence[FlatTops], ranges: Array) -> _Level | None:
-    """Return the upper limit that flat tops of a population speak for; None where they do not.
-
-    Parameters
-    ----------
-    found : sequence of FlatTops
-        Of one state, in all episodes.
-    ranges : ndarray, shape (m,)
-        Range of every input.
-    """
+    """Return the upper limit that flat tops of a population speak for; None where they do not."""
     cornered = [(f, f.sides.any(axis=1)) for f in found]
     levels = [f.values[ok].max() for f, ok in cornered if ok.any()]
     if not levels:

@@ -13,18 +13,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Kept:
-    """Arrays by key, those that were asked for last, at most so many bytes in all; they cannot be written to.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.data.kept import Kept
-    >>> kept = Kept(limit=800)
-    >>> [float(kept.take(name, lambda: np.full(50, 2.0)).sum()) for name in ("a", "b", "c", "a")]
-    [100.0, 100.0, 100.0, 100.0]
-    >>> sorted(kept.arrays)
-    ['a', 'c']
-    """
+    """Arrays by key, those that were asked for last, at most so many bytes in all; they cannot be written to."""
 
     def __init__(self, limit: int) -> None:
         self.limit, self.size = limit, 0

@@ -18,46 +18,12 @@ from .recording import Recordings
 
 
 def mark_of(*content: Any) -> str:
-    """Return a digest of plain content, dataclasses among it by their `repr`.
-
-    Examples
-    --------
-    >>> from kros.data.marks import mark_of
-    >>> mark_of("unit 7", 3) == mark_of("unit 7", 3) != mark_of("unit 7", 4)
-    True
-    """
+    """Return a digest of plain content, dataclasses among it by their `repr`."""
     return hashlib.sha256(repr(content).encode()).hexdigest()
 
 
 def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
-    """Return a mark of every group of episodes.
-
-    Parameters
-    ----------
-    source : callable
-        That of a `Population`.
-    groups : iterable of sequences of EpisodeKey
-    *declared
-        What else a result follows from.
-
-    Returns
-    -------
-    list of str or None
-        None for all where recordings are in no files, or in those of a reader that does not name them.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> import kros
-    >>> from kros.data.marks import recording_marks
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> with TemporaryDirectory() as folder:
-    ...     kros.data.write_parquet(motors, f"{folder}/recordings")
-    ...     written = kros.read(f"{folder}/recordings")
-    ...     marks = recording_marks(written.source, [written.keys(unit) for unit in written.unit_ids])
-    >>> len(set(marks)), recording_marks(motors.source, [motors.keys("001")])
-    (2, [None])
-    """
+    """Return a mark of every group of episodes."""
     about: list[Any] = []
     while isinstance(source, PreparedSource | EvenRecordings):
         if isinstance(source, PreparedSource):

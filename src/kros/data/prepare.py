@@ -34,31 +34,15 @@ class EvenRecordings:
 
 @dataclass(frozen=True, eq=False)
 class PreparedSource:
-    """Read a recording, check its time, apply the steps, check the result.
+    """Read a recording, check its time, apply the steps, check the result."""
 
-    Parameters
-    ----------
-    recordings : callable
-        Returns a `Recording` for an `EpisodeKey`.
-    channels : tuple of Channel
-        As recorded: states, inputs, truths, covariates.
-    period_s : float
-        As recorded, found in the episode `reference`.
-    reference : EpisodeKey
-    steps : tuple of Step
-    tolerance : float
-        Largest deviation of one time step, in sampling periods.
-    gaps : bool
-        Whether samples may be missing; see `with_gaps`.
-    """
-
-    recordings: Recordings | EvenRecordings
-    channels: tuple[Channel, ...]
-    period_s: float
+    recordings: Recordings | EvenRecordings  # returns a `Recording` for an `EpisodeKey`
+    channels: tuple[Channel, ...]  # as recorded: states, inputs, truths, covariates
+    period_s: float  # as recorded, found in the episode `reference`
     reference: EpisodeKey
     steps: tuple[Step, ...] = ()
-    tolerance: float = TIME_TOLERANCE
-    gaps: bool = False
+    tolerance: float = TIME_TOLERANCE  # largest deviation of one time step, in sampling periods
+    gaps: bool = False  # whether samples may be missing; see `with_gaps`
 
     def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
         """Return one prepared episode, shape (n_samples, n_channels)."""
@@ -93,15 +77,7 @@ def assemble(
     tolerance: float = TIME_TOLERANCE,
     scaling: Scalings | None = None,
 ) -> Population:
-    """Make the population that a reader found: natural order, one sampling period, steps declared, names checked.
-
-    Reads at most the first episode, for the sampling period where none is given. `units` are facts; a unit without any is known by its id.
-
-    Raises
-    ------
-    DataError
-        Empty, duplicate episodes or channels, no state, inputs before states.
-    """
+    """Make the population that a reader found: natural order, one sampling period, steps declared, names checked."""
     check_structure(channels, list(recordings.places))
     if channels != columns_in_order(channels):
         raise DataError(

@@ -24,32 +24,18 @@ Float = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One episode before or between preparation steps.
-
-    Parameters
-    ----------
-    key : EpisodeKey
-    values : ndarray, shape (n_samples, n_channels)
-    time_s : ndarray, shape (n_samples,), s, or None
-        None where the samples are known to be even.
-    """
+    """One episode before or between preparation steps."""
 
     key: EpisodeKey
-    values: Float
-    time_s: Float | None = None
+    values: Float  # shape (n_samples, n_channels)
+    time_s: Float | None = None  # shape (n_samples,), s; None where the samples are known to be even
 
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """Episodes as a reader found them, read one at a time; what reads a format overrides `read`. Can be pickled when `places` can.
+    """Episodes as a reader found them, read one at a time; what reads a format overrides `read`. Can be pickled when `places` can."""
 
-    Parameters
-    ----------
-    places : mapping of EpisodeKey
-        Where each episode is.
-    """
-
-    places: Mapping[EpisodeKey, Any]
+    places: Mapping[EpisodeKey, Any]  # where each episode is
 
     def read(self, key: EpisodeKey, place: Any) -> Recording:
         """Return one episode as recorded."""
@@ -76,13 +62,7 @@ def title(key: EpisodeKey) -> str:
 
 
 def estimate_period(recording: Recording) -> float:
-    """Return the median time step, rounded to six digits so that 0.0010000000000000009 s reads 0.001 s.
-
-    Raises
-    ------
-    DataError
-        When the recording has fewer than two samples, or time does not advance.
-    """
+    """Return the median time step, rounded to six digits so that 0.0010000000000000009 s reads 0.001 s."""
     time = recording.time_s
     if time is None or len(time) < 2:
         found = 0 if time is None else len(time)
@@ -118,22 +98,7 @@ def check_increasing(recording: Recording) -> None:
 
 
 def check_even(recording: Recording, period_s: float, reference: EpisodeKey, tolerance: float) -> None:
-    """Check that an episode is sampled evenly, at the population's period.
-
-    Parameters
-    ----------
-    recording : Recording
-    period_s : float
-        The population's sampling period, found in the episode `reference`.
-    reference : EpisodeKey
-    tolerance : float
-        Largest deviation of one step, in sampling periods.
-
-    Raises
-    ------
-    DataError
-        Uneven time, or another sampling period.
-    """
+    """Check that an episode is sampled evenly, at the population's period."""
     time = recording.time_s
     if time is None or len(time) < 2:
         return

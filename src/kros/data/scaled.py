@@ -30,14 +30,7 @@ class Scaled:
 
 
 def scale_population(population: Population, sizes: Mapping[str, float]) -> Population:
-    """Return the population with channels divided by sizes; their units of measure are then unknown.
-
-    Parameters
-    ----------
-    population : Population
-    sizes : mapping of str to float
-        By name of a channel; one that is not named stays as it is, and what is true of a state is divided by the state's size.
-    """
+    """Return the population with channels divided by sizes; their units of measure are then unknown."""
     owners = [c.of if isinstance(c, TrueChannel) else c.name for c in population.columns]
     factors = np.array([float(sizes.get(name, 1.0)) for name in owners])
     columns = [replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True)]

@@ -8,23 +8,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Scaling:
-    """From a column of the original recordings to a channel: ``channel[k] = factor * column[k + lag_samples]``, plus what `offset` says.
+    """From a column of the original recordings to a channel: ``channel[k] = factor * column[k + lag_samples]``, plus what `offset` says."""
 
-    Parameters
-    ----------
-    column : str or int, optional
-        Name in the header, or number from 1; None where it differs between units.
-    factor : float
-    lag_samples : int
-        Samples by which the column lagged behind the others.
-    offset : str
-        What was added in every episode, in words; empty where nothing was.
-    """
-
-    column: str | int | None
+    column: str | int | None  # name in the header, or number from 1; none where it differs between units
     factor: float = 1.0
-    lag_samples: int = 0
-    offset: str = ""
+    lag_samples: int = 0  # samples by which the column lagged behind the others
+    offset: str = ""  # what was added in every episode, in words; empty where nothing was
 
 
 Scalings = Mapping[str, Scaling]

@@ -36,37 +36,17 @@ UNLOADED = "noload"
 
 @dataclass(frozen=True)
 class RecordingFacts:
-    """What is known about recordings once all were read.
+    """What is known about recordings once all were read."""
 
-    Parameters
-    ----------
-    identify_on : str
-        Condition whose models feed synthesis.
-    groups : mapping of unit to group
-    train, test : tuple of EpisodeKey
-    resolution : mapping of channel to float
-        Quantisation step found in every measured channel.
-    dropped : tuple of str
-        Episodes that were left out, with the reason.
-    alerts : tuple of str
-        What looks wrong in the recordings without making them unusable.
-    limits : mapping of state to FoundLimit
-        Limits that states which are not measured were seen at.
-    reserve : tuple of str
-        Units that were recorded and take part in nothing: none of the above speaks of them but `dropped` and `alerts`.
-    digests : mapping of EpisodeKey to str
-        Of all samples of every training and test episode, by which results of earlier runs are known again.
-    """
-
-    identify_on: str
+    identify_on: str  # condition whose models feed synthesis
     groups: dict[str, str]
     train: tuple[EpisodeKey, ...]
     test: tuple[EpisodeKey, ...]
-    resolution: dict[str, float]
-    dropped: tuple[str, ...] = ()
-    alerts: tuple[str, ...] = ()
+    resolution: dict[str, float]  # quantisation step found in every measured channel
+    dropped: tuple[str, ...] = ()  # episodes that were left out, with the reason
+    alerts: tuple[str, ...] = ()  # what looks wrong in the recordings without making them unusable
     reserve: tuple[str, ...] = ()
-    limits: Mapping[str, FoundLimit] = field(default_factory=dict)
+    limits: Mapping[str, FoundLimit] = field(default_factory=dict)  # limits that states which are not measured were seen at
     digests: Mapping[EpisodeKey, str] = field(default_factory=dict)
 
     @cached_property
@@ -153,38 +133,7 @@ def survey(
     earlier: Path | None = None,
     wrote: Callable[[Path, str], None] | None = None,
 ) -> tuple[Population, RecordingFacts]:
-    """Read all recordings once, without those that `work` knows from earlier.
-
-    Parameters
-    ----------
-    population : Population
-    test : iterable of str, optional
-        Names of the held-out episodes; default the last tenth of each unit and condition, at least one.
-    identify_on : str, optional
-        Condition whose models feed synthesis; default ``noload``, else the first.
-    on_nan : {"error", "drop_episode"}
-    folder : Path, optional
-        Where the recordings are written as Parquet on the way; default nowhere.
-    work : Work, optional
-        Where it runs.
-    reserve : sequence of str
-        Units that are read, checked and written, and of which the facts say nothing else.
-    earlier : Path, optional
-        What an earlier survey wrote as its `folder`: files of recordings that have not changed are taken from there.
-    wrote : callable, optional
-        Told every file of recordings that was written, and the SHA-256 of its content.
-
-    Returns
-    -------
-    Population
-        Without the episodes that were dropped; that of `folder` where one is given.
-    RecordingFacts
-
-    Raises
-    ------
-    DataError
-        When recordings cannot be used, with the episode.
-    """
+    """Read all recordings once, without those that `work` knows from earlier."""
     if folder is not None:
         folder.mkdir(parents=True)
     tasks = [_Group(population.select([u], [c]), u, c, folder, on_nan) for u, c, _ in population.groups()]

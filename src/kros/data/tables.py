@@ -16,20 +16,7 @@ T = TypeVar("T")
 
 
 def build(kind: type[T], table: Mapping[str, Any], where: str) -> T:
-    """Make a dataclass from a table.
-
-    Parameters
-    ----------
-    kind : type
-        A dataclass with fields of str, int, float, bool, enums, tuples, other dataclasses, mappings, or unions of these.
-    table : mapping
-    where : str
-        What messages call the table, for example ``channel[2]``.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Make a dataclass from a table."""
     if not isinstance(table, Mapping):
         raise ConfigError(f"{where}: should be a table, found {table!r}; correct it.")
     fields = [f for f in dataclasses.fields(kind) if f.init]  # type: ignore[arg-type]

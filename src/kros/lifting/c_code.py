@@ -16,15 +16,9 @@ _DIRECT = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "atan")
 
 @dataclass(frozen=True)
 class Precision:
-    """How real numbers are written in C.
+    """How real numbers are written in C."""
 
-    Parameters
-    ----------
-    type : str
-        ``double`` or ``float``.
-    """
-
-    type: str = "double"
+    type: str = "double"  # ``double`` or ``float``
 
     @property
     def suffix(self) -> str:
@@ -38,21 +32,7 @@ class Precision:
 
 
 def c_code(expression: Any, name: Callable[[str], str], precision: Precision | None = None) -> str:
-    """Return a SymPy tree as a C expression.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-    name : callable
-        From the name of a quantity to what stands for it in C.
-    precision : Precision, optional
-        Double by default.
-
-    Raises
-    ------
-    ConfigError
-        When a node has no expression in C.
-    """
+    """Return a SymPy tree as a C expression."""
     numbers: list[float] = []
     shape = shape_of(expression, numbers)
     text = _Writer(name, precision or Precision(), iter(numbers)).write(shape)

@@ -23,20 +23,7 @@ _NEAR = 1e-12  # relative to the interval: what rounding may hide
 
 
 def slope_bounds_of(formulas: Sequence[Formula], names: Sequence[str], box: Box) -> tuple[Array, Array]:
-    """Return lower and upper bounds of the slopes between any two points of a box, each of shape (len(formulas), len(names)).
-
-    Parameters
-    ----------
-    formulas : sequence of Formula
-    names : sequence of str
-    box : mapping of str to (lower, upper) or number
-        As in `bounds_of`.
-
-    Returns
-    -------
-    lower, upper : ndarray
-        Infinite where a slope is unbounded, and for every quantity that a formula reads where it is not continuous on the box.
-    """
+    """Return lower and upper bounds of the slopes between any two points of a box, each of shape (len(formulas), len(names))."""
     lower, upper = (b.reshape(len(formulas), len(names)) for b in bounds_of([f.derivative(name) for f in formulas for name in names], box))
     for i, formula in enumerate(formulas):
         read = [name in formula.used for name in names]

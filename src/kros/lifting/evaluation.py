@@ -45,18 +45,10 @@ _POWERS: dict[float, Callable[[Any], Any]] = {
 
 @dataclass(frozen=True)
 class Columns:
-    """Expressions evaluated together, one column each.
+    """Expressions evaluated together, one column each."""
 
-    Parameters
-    ----------
-    singles : tuple of (int, evaluator)
-        Columns whose shape no other has.
-    blocks : tuple of (columns, evaluator)
-        Columns of one shape; the evaluator wants values with a trailing axis of length one.
-    """
-
-    singles: tuple[tuple[int, Evaluator], ...]
-    blocks: tuple[tuple[Any, Evaluator], ...]
+    singles: tuple[tuple[int, Evaluator], ...]  # columns whose shape no other has
+    blocks: tuple[tuple[Any, Evaluator], ...]  # columns of one shape; the evaluator wants values with a trailing axis of length one
 
     @classmethod
     def of(cls, expressions: Sequence[Any], first: int = 0) -> Columns:
@@ -93,10 +85,7 @@ def compile_expression(expression: Any) -> Evaluator:
 
 
 def shape_of(expression: Any, numbers: list[float]) -> Shape:
-    """Return the nested tuple that is left of a tree without its numbers, which are appended in its order.
-
-    Terms and factors are sorted by shape, so that the shape does not depend on SymPy's order, which looks at the numbers.
-    """
+    """Return the nested tuple that is left of a tree without its numbers, which are appended in its order."""
     import sympy as sp
 
     if expression.is_Symbol:

@@ -20,11 +20,7 @@ MAX_FORMULAS = 100_000  # of one family
 
 
 def number(value: float) -> str:
-    """Write a number as short as it can be read again without a loss.
-
-    >>> number(100.0), number(0.1), number(-2)
-    ('100', '0.1', '-2')
-    """
+    """Write a number as short as it can be read again without a loss."""
     try:
         value = float(value)
     except OverflowError:
@@ -35,11 +31,7 @@ def number(value: float) -> str:
 
 
 def wrapped(formula: str) -> str:
-    """Put a formula into parentheses where it is more than a name.
-
-    >>> wrapped("position"), wrapped("position + 1")
-    ('position', '(position + 1)')
-    """
+    """Put a formula into parentheses where it is more than a name."""
     return formula if formula.isidentifier() else f"({formula})"
 
 

@@ -31,27 +31,13 @@ MAX_DELAY = 1000
 
 @dataclass(frozen=True)
 class Formula:
-    """One scalar function of named quantities.
+    """One scalar function of named quantities."""
 
-    Parameters
-    ----------
-    text : str
-        As written by the user.
-    names : tuple of str
-        Quantities that may appear.
-    delayed : tuple of str
-        Quantities of which earlier values may appear: ``position[-2]`` is the value two samples before.
-    sizes : tuple of (str, float)
-        Sizes of quantities whose values come divided by them.
-    size : float
-        What the value of the formula is divided by.
-    """
-
-    text: str
-    names: tuple[str, ...]
-    delayed: tuple[str, ...] = ()
-    sizes: tuple[tuple[str, float], ...] = ()
-    size: float = 1.0
+    text: str  # as written by the user
+    names: tuple[str, ...]  # quantities that may appear
+    delayed: tuple[str, ...] = ()  # quantities of which earlier values may appear: ``position[-2]`` is the value two samples before
+    sizes: tuple[tuple[str, float], ...] = ()  # sizes of quantities whose values come divided by them
+    size: float = 1.0  # what the value of the formula is divided by
 
     @cached_property
     def written(self) -> Any:
@@ -91,46 +77,23 @@ class Formula:
         return sp.diff(real, sp.Symbol(name, real=True)).replace(magnitude, sp.Abs).replace(jump, sp.sign)
 
     def c_expression(self, pointers: Sequence[str] = ()) -> str:
-        """Return the formula as a C expression in double precision.
-
-        An earlier value ``position[-1]`` reads a pointer to the present one. Names in `pointers` are such pointers, and their present
-        value is written ``position[0]``.
-        """
+        """Return the formula as a C expression in double precision."""
         return c_code(self.expression, lambda name: f"{name}[0]" if name in pointers else name)
 
 
 def delayed_name(name: str, delay: int) -> str:
-    """Return the name of a quantity `delay` samples ago.
-
-    >>> delayed_name("position", 2)
-    'position[-2]'
-    """
+    """Return the name of a quantity `delay` samples ago."""
     return f"{name}[-{delay}]" if delay else name
 
 
 def base_and_delay(name: str) -> tuple[str, int]:
-    """Return the quantity behind a name, and how many samples before it is meant.
-
-    >>> base_and_delay("angle[-2]"), base_and_delay("angle")
-    (('angle', 2), ('angle', 0))
-    """
+    """Return the quantity behind a name, and how many samples before it is meant."""
     base, _, index = name.partition("[")
     return base, -int(index[:-1]) if index else 0
 
 
 def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
-    """Read a formula into a SymPy tree.
-
-    Allowed are numbers, the given names, ``pi``, ``+ - * / **``, parentheses and the functions
-    sin, cos, tan, exp, log, sqrt, tanh, atan, abs, sign; of the quantities in `delayed` also earlier values, ``position[-1]``.
-
-    What may take long is refused before it does: see `limits`.
-
-    Raises
-    ------
-    ConfigError
-        When the text holds anything else, is too long or too deep, or holds a number that is not finite.
-    """
+    """Read a formula into a SymPy tree. What may take long is refused before it does: see `limits`."""
     if len(require_text(text)) > MAX_LENGTH:
         raise ConfigError(f"Formula of {len(text)} characters: at most {MAX_LENGTH} are read; split it into several functions.")
     try:

@@ -26,19 +26,7 @@ _REALS = (-np.inf, np.inf)
 
 
 def bounds_of(expressions: Sequence[Any], box: Box) -> tuple[Array, Array]:
-    """Return lower and upper bounds of expressions over a box, each of shape (len(expressions),).
-
-    Parameters
-    ----------
-    expressions : sequence of SymPy trees
-    box : mapping of str to (lower, upper) or number
-        Ranges of quantities; what is not named may be anything. An earlier value, ``position[-1]``, has the range of its quantity.
-
-    Raises
-    ------
-    ConfigError
-        When a range is empty or not a number.
-    """
+    """Return lower and upper bounds of expressions over a box, each of shape (len(expressions),)."""
     for name, value in box.items():
         _range(name, value)
     with np.errstate(all="ignore"):

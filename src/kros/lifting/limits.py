@@ -45,13 +45,7 @@ def require_size(tree: ast.AST) -> None:
 
 
 def settled(value: Any) -> Any:
-    """Return the result of one operation with numbers as doubles hold them; whole numbers and fractions that these hold exactly stay.
-
-    Raises
-    ------
-    TooCostlyError
-        When a number is not finite or not real, a power is too high or a product too long.
-    """
+    """Return the result of one operation with numbers as doubles hold them; whole numbers and fractions that these hold exactly stay."""
     import sympy as sp
 
     if value.is_number:

@@ -21,25 +21,12 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Separation:
-    """Lifted functions written as ``sigma(w; q) = M(q) g(w)``.
+    """Lifted functions written as ``sigma(w; q) = M(q) g(w)``."""
 
-    For ``sin(100*position + phase)`` the basis is sin and cos of ``100*position``, so a new phase needs no second pass over the data.
-
-    Parameters
-    ----------
-    window : Window
-        What ``w`` holds.
-    parameters : tuple of str
-    basis : tuple
-        SymPy trees of ``g``.
-    terms : tuple
-        For each function its pairs of a column of ``g`` and the SymPy tree of the coefficient.
-    """
-
-    window: Window
+    window: Window  # what ``w`` holds
     parameters: tuple[str, ...]
-    basis: tuple[Any, ...]
-    terms: tuple[tuple[tuple[int, Any], ...], ...]
+    basis: tuple[Any, ...]  # SymPy trees of ``g``
+    terms: tuple[tuple[tuple[int, Any], ...], ...]  # for each function its pairs of a column of ``g`` and the SymPy tree of the coefficient
 
     @classmethod
     def of(cls, formulas: Sequence[Formula], window: Window, parameters: tuple[str, ...]) -> Separation:

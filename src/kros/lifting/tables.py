@@ -36,26 +36,7 @@ CENTRES: dict[str, Callable[..., Array]] = {
 
 
 def family(table: Table, sample: Sample | None = None) -> Formulas:
-    """Return the formulas of a family given as a table.
-
-    Parameters
-    ----------
-    table : mapping
-        ``kind`` and the arguments of the function behind it. The centres of radial basis functions are a list of points, or a table of their
-        own with ``kind`` grid, random, latin_hypercube or kmeans.
-    sample : callable, optional
-        Gives recorded values of quantities, shape (n_samples, d), for centres by k-means.
-
-    Raises
-    ------
-    ConfigError
-        When the kind or a key is unknown, a key is missing, or a value cannot be used.
-
-    Examples
-    --------
-    >>> family({"kind": "harmonics", "angle": "position", "ratio": 100})
-    ('sin(100*position)', 'cos(100*position)')
-    """
+    """Return the formulas of a family given as a table."""
     arguments = dict(table)
     if isinstance(arguments.get("centres"), Mapping):
         given = arguments["centres"]

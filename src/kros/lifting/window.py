@@ -25,18 +25,11 @@ Index = npt.NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Window:
-    """Layout of a window.
-
-    Parameters
-    ----------
-    states, inputs : tuple of str
-    depths : tuple of (str, int)
-        Deepest delay of every delayed quantity.
-    """
+    """Layout of a window."""
 
     states: tuple[str, ...]
     inputs: tuple[str, ...]
-    depths: tuple[tuple[str, int], ...] = ()
+    depths: tuple[tuple[str, int], ...] = ()  # deepest delay of every delayed quantity
 
     @classmethod
     def of(cls, states: tuple[str, ...], inputs: tuple[str, ...], used: Iterable[str]) -> Window:
@@ -90,18 +83,7 @@ class Window:
         return np.concatenate([x, padding, u], axis=-1)[..., self.present]
 
     def slide(self, x: Array, u: Array) -> Array:
-        """Return the windows of a recording.
-
-        Parameters
-        ----------
-        x : ndarray, shape (..., n_samples, n)
-        u : ndarray, shape (..., n_samples, m)
-
-        Returns
-        -------
-        ndarray, shape (..., n_samples - history, n_window)
-            The first row stands at sample `history`.
-        """
+        """Return the windows of a recording, shape (..., n_samples - history, n_window)."""
         if not self.depths:
             return x
         self.require(x.shape[-2])

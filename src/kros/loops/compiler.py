@@ -24,11 +24,7 @@ def find_compiler() -> str | None:
 
 
 def load(source: str, flags: tuple[str, ...]) -> ctypes.CDLL | None:
-    """Return a C source as a library, compiled where no process of this user has done so on this machine; None where that cannot be, with one log entry.
-
-    Libraries lie in ``$XDG_CACHE_HOME/kros``, or ``~/.cache/kros``, or, where that cannot be written, in a folder of the user's own among temporary
-    files, under the digest of source, flags, compiler and processor. Each appears whole, so that several processes may compile at once.
-    """
+    """Return a C source as a library, compiled once for this user on this machine; None where that cannot be, with one log entry."""
     compiler = find_compiler()
     if compiler is None:
         _log.info("Time loops run in NumPy, several times slower: no C compiler is on the PATH, tried %s.", ", ".join(COMPILERS))

@@ -124,22 +124,7 @@ class Batch(ABC, Generic[T]):
 def runge_kutta(
     rates: Callable[[Array, Array], Array], start: Array, inputs: Array, period_s: float, held: Callable[[Array], Array] = lambda x: x
 ) -> Array:
-    """Integrate by the method of order four, inputs held between samples.
-
-    Parameters
-    ----------
-    rates : callable
-        From states, shape (n_states, n_units, n_episodes), and inputs, shape (n_episodes,), to derivatives of the states.
-    start : ndarray, shape (n_states, n_units, n_episodes)
-    inputs : ndarray, shape (n_episodes, n_samples)
-    period_s : float, s
-    held : callable
-        Keeps states within limits after every step.
-
-    Returns
-    -------
-    ndarray, shape (n_states, n_units, n_episodes, n_samples)
-    """
+    """Integrate by the method of order four, inputs held between samples, shape (n_states, n_units, n_episodes, n_samples)."""
     out = np.empty((inputs.shape[1], *start.shape))
     x, h = start, period_s / SUBSTEPS
     for k in range(len(out)):

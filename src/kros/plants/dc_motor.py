@@ -43,41 +43,18 @@ TRUTHS = tuple(TrueChannel(f"{c.name}_true", Role.TRUTH, c.unit, of=c.name) for 
 
 @dataclass(frozen=True, eq=False)
 class DcMotorTruth:
-    """True parameters of the motors.
+    """True parameters of the motors."""
 
-    Parameters
-    ----------
-    unit_ids : tuple of str
-        Order of the unit axis.
-    resistance : ndarray, shape (n_units,), ohm
-    inductance : ndarray, shape (n_units,), H
-    torque_constant : ndarray, shape (n_units,), N m/A
-        Also the constant of the back electromotive force, V s/rad.
-    inertia : ndarray, shape (n_units,), kg m^2
-    viscous : ndarray, shape (n_units,), N m s/rad
-    coulomb : ndarray, shape (n_units,), N m
-    """
-
-    unit_ids: tuple[str, ...]
-    resistance: Array
-    inductance: Array
-    torque_constant: Array
-    inertia: Array
-    viscous: Array
-    coulomb: Array
+    unit_ids: tuple[str, ...]  # order of the unit axis
+    resistance: Array  # shape (n_units,), ohm
+    inductance: Array  # shape (n_units,), H
+    torque_constant: Array  # shape (n_units,), N m/A; also the constant of the back electromotive force, V s/rad
+    inertia: Array  # shape (n_units,), kg m^2
+    viscous: Array  # shape (n_units,), N m s/rad
+    coulomb: Array  # shape (n_units,), N m
 
     def respond(self, voltage: Array) -> Array:
-        """Simulate all motors from rest, without sensors; voltage held between samples.
-
-        Parameters
-        ----------
-        voltage : ndarray, shape (n_episodes, n_samples), V
-
-        Returns
-        -------
-        ndarray, shape (3, n_units, n_episodes, n_samples)
-            Position, velocity and current, by Runge-Kutta of order four.
-        """
+        """Simulate all motors from rest, without sensors; voltage held between samples, shape (3, n_units, n_episodes, n_samples)."""
         start = np.zeros((3, len(self.unit_ids), len(voltage)))
         return runge_kutta(self._rates, start, voltage, SAMPLE_PERIOD_S, _limited)
 

@@ -34,22 +34,12 @@ CHANNELS = (
 
 @dataclass(frozen=True, eq=False)
 class PendulumTruth:
-    """True parameters of the pendulums.
+    """True parameters of the pendulums."""
 
-    Parameters
-    ----------
-    unit_ids : tuple of str
-        Order of the unit axis.
-    gravity : ndarray, shape (n_units,), 1/s^2
-        Square of the small-angle natural frequency.
-    damping : ndarray, shape (n_units,), 1/s
-    gain : ndarray, shape (n_units,), rad/s^2 per unit of input
-    """
-
-    unit_ids: tuple[str, ...]
-    gravity: Array
-    damping: Array
-    gain: Array
+    unit_ids: tuple[str, ...]  # order of the unit axis
+    gravity: Array  # shape (n_units,), 1/s^2; square of the small-angle natural frequency
+    damping: Array  # shape (n_units,), 1/s
+    gain: Array  # shape (n_units,), rad/s^2 per unit of input
 
     def acceleration(self, position: Array, velocity: Array, torque: Array) -> Array:
         """Angular acceleration of every unit in its own state, rad/s^2; the unit axis is the first of all arrays."""

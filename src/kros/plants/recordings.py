@@ -17,14 +17,7 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """Source of raw episodes.
-
-    Parameters
-    ----------
-    parts : mapping
-        States, shape (n_states, n_samples), inputs, shape (n_inputs, n_samples), and truths, shape (n_truths, n_samples), of each episode.
-        Episodes that follow the same reference share one array of inputs.
-    """
+    """Source of raw episodes."""
 
     parts: Mapping[EpisodeKey, tuple[Array, ...]]
 

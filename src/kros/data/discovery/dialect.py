@@ -25,23 +25,12 @@ _TIME = re.compile(
 
 @dataclass(frozen=True)
 class TableHead:
-    """What the first lines of a file say.
-
-    Parameters
-    ----------
-    dialect : Dialect
-    fields : tuple of str
-        Header; numbers of the columns as text where there is none.
-    units : tuple of str
-        Cells of the row of units of measure, empty where there is none.
-    rows : tuple of tuple of str
-        Cells of the first rows of numbers.
-    """
+    """What the first lines of a file say."""
 
     dialect: Dialect
-    fields: tuple[str, ...]
-    units: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    fields: tuple[str, ...]  # header; numbers of the columns as text where there is none
+    units: tuple[str, ...]  # cells of the row of units of measure, empty where there is none
+    rows: tuple[tuple[str, ...], ...]  # cells of the first rows of numbers
 
     def cells(self, column: int) -> list[str]:
         """Return the first cells of a column."""
@@ -61,13 +50,7 @@ class TableHead:
 
 
 def look_at(path: Path) -> TableHead:
-    """Return how a text file is written.
-
-    Raises
-    ------
-    DataError
-        When no rows of numbers are found in its first lines.
-    """
+    """Return how a text file is written."""
     content = _head(path)
     encoding = encoding_of(content)
     lines = content.decode(encoding, errors="replace").removeprefix("\ufeff").splitlines()

@@ -36,78 +36,29 @@ PIECES, SHORTEST_PIECE = 5, 200  # episodes that a single long recording is cut 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is said about a folder already.
-
-    Parameters
-    ----------
-    measured, inputs : tuple of str
-        Names of channels or of columns.
-    files : str, optional
-        Regular expression in place of the one that is found.
-    period_s : float, optional
-        Where there is no column of time.
-    """
+    """What is said about a folder already."""
 
     measured: tuple[str, ...] = ()
-    inputs: tuple[str, ...] = ()
-    files: str | None = None
-    period_s: float | None = None
+    inputs: tuple[str, ...] = ()  # as `measured`: names of channels or of columns
+    files: str | None = None  # regular expression in place of the one that is found
+    period_s: float | None = None  # where there is no column of time
 
 
 @dataclass(frozen=True)
 class Discovery:
-    """What was found in a folder.
+    """What was found in a folder."""
 
-    Parameters
-    ----------
-    mapping : dict
-        Table ``[data.csv]``, with the keys that are not default.
-    prepare : tuple of dict
-        Steps of preparation that the recordings need.
-    columns : tuple of Column
-        All of them, with their parts.
-    population : Population
-        As the mapping reads it, before preparation.
-    notes : dict of str to str
-        What a key of the mapping rests on.
-    findings : tuple of str
-        What looks wrong.
-    drop_nan : bool
-        Whether episodes with NaN or infinity have to be dropped.
-    """
-
-    mapping: dict[str, Any]
-    prepare: tuple[dict[str, Any], ...]
-    columns: tuple[Column, ...]
-    population: Population
-    notes: dict[str, str] = field(default_factory=dict)
-    findings: tuple[str, ...] = ()
-    drop_nan: bool = False
+    mapping: dict[str, Any]  # table ``[data.csv]``, with the keys that are not default
+    prepare: tuple[dict[str, Any], ...]  # steps of preparation that the recordings need
+    columns: tuple[Column, ...]  # all of them, with their parts
+    population: Population  # as the mapping reads it, before preparation
+    notes: dict[str, str] = field(default_factory=dict)  # what a key of the mapping rests on
+    findings: tuple[str, ...] = ()  # what looks wrong
+    drop_nan: bool = False  # whether episodes with NaN or infinity have to be dropped
 
 
 def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None, work: Work | None = None) -> Discovery:
-    """Describe a folder of text tables or of anybody's Parquet files.
-
-    Parameters
-    ----------
-    source : Path
-    wanted : Wanted, optional
-        What is known already.
-    ask : callable, optional
-        Shown the columns with the parts that are proposed; returns them corrected. Nobody is asked by default.
-    work : Work, optional
-
-    Returns
-    -------
-    Discovery
-
-    Raises
-    ------
-    DataError
-        When there are no recordings, or no column of time and no period.
-    ConfigError
-        When a name is unknown, or what is measured, or an input, cannot be told from names.
-    """
+    """Describe a folder of text tables or of anybody's Parquet files."""
     wanted = wanted or Wanted()
     files = {relative: path for path, relative in csv_files(source)}
     if wanted.files is not None:
@@ -289,13 +240,7 @@ def _decided(columns: Sequence[Column], wanted: Wanted, ask: Ask | None) -> list
 
 
 def assign(columns: Sequence[Column], measured: Sequence[str], inputs: Sequence[str]) -> list[Column]:
-    """Return the columns with measured states and inputs as named, where any are named.
-
-    Raises
-    ------
-    ConfigError
-        When there is no such column.
-    """
+    """Return the columns with measured states and inputs as named, where any are named."""
     decided = list(columns)
     for part, names in ((Part.MEASURED, measured), (Part.INPUT, inputs)):
         places = [_place(decided, name) for name in names]

@@ -62,44 +62,19 @@ class Seen:
 
 @dataclass(frozen=True)
 class Examined:
-    """What all episodes look like.
+    """What all episodes look like."""
 
-    Parameters
-    ----------
-    wrong : dict of EpisodeKey to str
-        Episodes that cannot be used, with the reason.
-    doubts : tuple of str
-        What else looks wrong.
-    resample_s : float or None
-        Period to resample to, where time is uneven.
-    nan : tuple of EpisodeKey
-        Episodes with NaN or infinity.
-    counts : Counter of (unit, condition)
-        Episodes that can be used.
-    shortest : int
-        Samples of the shortest of them.
-    max_gap_s : float or None
-        Longest gap to bridge, where many episodes have gaps.
-    """
-
-    wrong: dict[EpisodeKey, str]
-    doubts: tuple[str, ...]
-    resample_s: float | None
-    nan: tuple[EpisodeKey, ...]
-    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
-    shortest: int = 0
-    max_gap_s: float | None = None
+    wrong: dict[EpisodeKey, str]  # episodes that cannot be used, with the reason
+    doubts: tuple[str, ...]  # what else looks wrong
+    resample_s: float | None  # period to resample to, where time is uneven
+    nan: tuple[EpisodeKey, ...]  # episodes with NaN or infinity
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)  # episodes that can be used, by unit and condition
+    shortest: int = 0  # samples of the shortest of them
+    max_gap_s: float | None = None  # longest gap to bridge, where many episodes have gaps
 
 
 def examine(population: Population, work: Work | None = None) -> Examined:
-    """Read every episode once, as it was recorded.
-
-    Parameters
-    ----------
-    population : Population
-        Without preparation.
-    work : Work, optional
-    """
+    """Read every episode once, as it was recorded."""
     tasks = [population.select([u], [c]) for u, c, _ in population.groups()]
     seen = [s for found in (work or Work()).map("look", _look, tasks) for s in found]
     wrong = {s.key: s.wrong for s in seen if s.wrong}

@@ -32,33 +32,14 @@ _MARKS = re.compile(r"([/_\-. ]+)")
 
 @dataclass(frozen=True)
 class FileNames:
-    """What the paths of a folder say.
+    """What the paths of a folder say."""
 
-    Parameters
-    ----------
-    pattern : str
-        Regular expression with the groups `unit`, `condition`, `episode` and `group`, those that are there.
-    sure : bool
-        Whether words in the names said so; False where places alone decided.
-    """
-
-    pattern: str
-    sure: bool
+    pattern: str  # regular expression with the groups `unit`, `condition`, `episode` and `group`, those that are there
+    sure: bool  # whether words in the names said so; false where places alone decided
 
 
 def infer_names(paths: Sequence[str]) -> FileNames:
-    """Return the expression that tells the files of a folder apart.
-
-    Parameters
-    ----------
-    paths : sequence of str
-        Relative, with ``/``.
-
-    Returns
-    -------
-    FileNames
-        An expression that matches every path, and no two of them alike.
-    """
+    """Return the expression that tells the files of a folder apart."""
     stems, ending = _without_ending(paths)
     for cut in (_words(stems), _aligned(stems), _whole(stems)):
         if cut is None:

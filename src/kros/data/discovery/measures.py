@@ -77,13 +77,7 @@ def _plain(unit: str) -> str:
 
 
 def split_header(text: str) -> Header:
-    """Return the name and the unit in a header such as ``pos [mm]``, ``Weg in mm``, ``i/A`` or ``time_ms``.
-
-    Examples
-    --------
-    >>> split_header("Drehzahl (1/min)")
-    Header(name='Drehzahl', unit='1/min')
-    """
+    """Return the name and the unit in a header such as ``pos [mm]``, ``Weg in mm``, ``i/A`` or ``time_ms``."""
     text = text.strip()
     bracketed = _BRACKETED.match(text)
     if bracketed and bracketed[1]:
@@ -121,13 +115,7 @@ def to_radians(unit: str) -> tuple[float, str] | None:
 
 
 def identifier(text: str, taken: Sequence[str] = ()) -> str:
-    """Return a name for a channel that may stand in formulas and in C source, as close to the header as can be.
-
-    Examples
-    --------
-    >>> identifier("Position Abtrieb"), identifier("q1"), identifier("Öldruck 2")
-    ('position_abtrieb', 'q1', 'oeldruck_2')
-    """
+    """Return a name for a channel that may stand in formulas and in C source, as close to the header as can be."""
     if text.isidentifier() and text.isascii() and text not in taken:
         return text
     spelled = text

@@ -51,35 +51,16 @@ _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("curren
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the recordings.
+    """A column of the recordings."""
 
-    Parameters
-    ----------
-    header : str
-        As in the files; the number of the column where there is no header.
-    name : str
-        Of the channel.
-    unit : str
-        Unit of measure of the channel, after scaling.
-    scale : float
-        To the channel.
-    kind : str
-        Kind of quantity, or nothing.
-    part : Part
-    why : str
-        What the proposal rests on.
-    number : int, optional
-        Of the column, from 1, where its header does not name it alone.
-    """
-
-    header: str
-    name: str
-    unit: str = ""
-    scale: float = 1.0
-    kind: str = ""
+    header: str  # as in the files; the number of the column where there is no header
+    name: str  # of the channel
+    unit: str = ""  # unit of measure of the channel, after scaling
+    scale: float = 1.0  # to the channel
+    kind: str = ""  # kind of quantity, or nothing
     part: Part = Part.LEFT_OUT
-    why: str = ""
-    number: int | None = None
+    why: str = ""  # what the proposal rests on
+    number: int | None = None  # of the column, from 1, where its header does not name it alone
 
     @property
     def reference(self) -> str | int:
@@ -120,14 +101,7 @@ def is_commanded(name: str) -> bool:
 
 
 def time_columns(columns: Sequence[Column], samples: Sequence[Array]) -> list[int]:
-    """Return the columns that may be time, the likeliest first: called so, or increasing evenly.
-
-    Parameters
-    ----------
-    columns : sequence of Column
-    samples : sequence of ndarray, shape (n_columns, n_rows)
-        Of some files.
-    """
+    """Return the columns that may be time, the likeliest first: called so, or increasing evenly."""
     rising = [i for i in range(len(columns)) if all(_rises(s[i]) for s in samples)]
     called = [i for i in rising if columns[i].kind == "time"]
     even = [i for i in rising if i not in called and all(_is_even(s[i]) for s in samples) and not all(_counts(s[i]) for s in samples)]
@@ -160,14 +134,7 @@ def time_scale(unit: str, step: float) -> tuple[float, str]:
 
 
 def propose(columns: Sequence[Column], samples: Sequence[Array]) -> list[Column]:
-    """Return the columns with the part that each is likely to have; time is known already.
-
-    Parameters
-    ----------
-    columns : sequence of Column
-    samples : sequence of ndarray, shape (n_columns, n_rows)
-        Of some files.
-    """
+    """Return the columns with the part that each is likely to have; time is known already."""
     found: list[Column] = []
     for i, column in enumerate(columns):
         spare = column.part is not Part.TIME and _spare(i, column, found, samples)

@@ -34,13 +34,7 @@ class ArrayRecordings(Recordings):
 def declare_channels(
     channels: Sequence[Channel] | None, states: Sequence[str], inputs: Sequence[str], measured: Sequence[str], what: str
 ) -> tuple[Channel, ...]:
-    """Return the channels as given, or those that the names declare.
-
-    Raises
-    ------
-    DataError
-        Both are given, or none; a measured name that is no state.
-    """
+    """Return the channels as given, or those that the names declare."""
     if (channels is None) != bool(states):
         raise DataError(
             f"{what}: give the names of states, inputs and measured, or channels, found states = {list(states)} and channels = {channels!r}."
@@ -121,13 +115,7 @@ def from_arrays(
 
 
 def as_numbers(values: Any) -> npt.NDArray[np.float64]:
-    """Return an array of doubles; text, complex numbers and dates are refused rather than converted.
-
-    Raises
-    ------
-    TypeError, ValueError, OverflowError
-        With the reason.
-    """
+    """Return an array of doubles; text, complex numbers and dates are refused rather than converted."""
     found = np.asarray(values)
     kind = found.dtype.kind
     if kind not in "biufO" or (kind == "O" and any(isinstance(v, (str, bytes, complex)) for v in found.ravel().tolist())):

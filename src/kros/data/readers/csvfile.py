@@ -99,13 +99,7 @@ class Bounded:
 
 @contextmanager
 def opened(path: Path, encoding: str = "utf-8") -> Iterator[Bounded]:
-    """Open a regular text file, unpacked where it ends in ``.gz``; what has two bytes a character is given in UTF-8.
-
-    Raises
-    ------
-    DataError
-        No regular file, too large, unreadable, or not a valid gzip file.
-    """
+    """Open a regular text file, unpacked where it ends in ``.gz``; what has two bytes a character is given in UTF-8."""
     require_regular(path, limits.MAX_TEXT_BYTES)
     opener: Any = gzip.open if path.suffix == ".gz" else open
     try:
@@ -121,10 +115,7 @@ def _has_ascii(encoding: str) -> bool:
 
 
 def first_fields(path: Path, dialect: Dialect = COMMA) -> list[str]:
-    """Return the fields of the header, or of the first line of numbers, without surrounding space and quotes.
-
-    There are as many as in a line of numbers: delimiters at the end of the one or of the other name no column.
-    """
+    """Return the fields of the header, or of the first line of numbers, without surrounding space and quotes."""
     with opened(path, dialect.encoding) as file:
         _skip(file, dialect.skip_rows, path)
         line = _text(file.readline(), path, dialect.encoding)
@@ -151,29 +142,7 @@ def _fields(line: str, path: Path, dialect: Dialect) -> list[str]:
 def read_columns(
     path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect = COMMA, timestamp: str | None = None
 ) -> npt.NDArray[np.float64]:
-    """Read some columns of a file.
-
-    Parameters
-    ----------
-    path : Path
-        ``.csv`` or ``.csv.gz``.
-    names : sequence of str
-        Names of all columns, in order.
-    wanted : sequence of str
-    dialect : Dialect
-    timestamp : str, optional
-        Order of the date, where the first of the columns that are wanted holds timestamps: it is given in seconds.
-
-    Returns
-    -------
-    ndarray, shape (len(wanted), n_rows)
-        One contiguous row per column of the file; empty cells are NaN.
-
-    Raises
-    ------
-    DataError
-        A missing file, a row with more or fewer columns, a cell that is not a number, or more text than is ever read.
-    """
+    """Read some columns of a file, shape (len(wanted), n_rows)."""
     import pyarrow as pa
     from pyarrow import csv as arrow
 

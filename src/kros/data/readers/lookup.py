@@ -25,26 +25,13 @@ KNOWN = ("unit", "condition", "episode", "group")
 
 @dataclass(frozen=True)
 class Lookup:
-    """Rows of a list of recordings.
+    """Rows of a list of recordings."""
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    rows : tuple of mapping
-    """
-
-    path: Path
+    path: Path  # for messages
     rows: tuple[Mapping[str, str], ...]
 
     def completed(self, relative: str, found: Mapping[str, str | None]) -> dict[str, str | None]:
-        """Return what is known about a file, from its path and from its row.
-
-        Raises
-        ------
-        DataError
-            When there is no row, or rows contradict each other.
-        """
+        """Return what is known about a file, from its path and from its row."""
         own = [{k: v for k, v in row.items() if k in KNOWN and v} for row in self.rows if self._is_of(row, relative, found)]
         told = [{k: v for k, v in row.items() if not found.get(k)} for row in own]
         if not told or any(row != told[0] for row in told):
@@ -61,13 +48,7 @@ class Lookup:
 
 
 def read_lookup(source: Path, name: str, mapping: CsvMapping) -> Lookup:
-    """Read a list of recordings, delimited by commas, semicolons or tabs, in UTF-8 or in the encoding of the recordings.
-
-    Raises
-    ------
-    DataError
-        When it cannot be read, or has no column that counts.
-    """
+    """Read a list of recordings, delimited by commas, semicolons or tabs, in UTF-8 or in the encoding of the recordings."""
     path = source / name
     with opened(path, mapping.encoding) as file:
         content = b"".join(iter(file.readline, b""))

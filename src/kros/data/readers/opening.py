@@ -25,12 +25,7 @@ LOOKS = {
 
 
 def detect_reader(source: Path | str) -> str | None:
-    """Return the reader that fits a folder, or None where none does.
-
-    Parameters
-    ----------
-    source : Path
-    """
+    """Return the reader that fits a folder, or None where none does."""
     source = Path(source)
     if (source / f"{INDEX}.json").is_file():
         return "parquet"

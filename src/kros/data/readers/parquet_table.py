@@ -17,13 +17,7 @@ from ..arrow import fill
 
 
 def parquet_fields(path: Path) -> list[str]:
-    """Return the names of a file's columns.
-
-    Raises
-    ------
-    DataError
-        No Parquet file.
-    """
+    """Return the names of a file's columns."""
     from pyarrow import parquet
 
     require_regular(path, sys.maxsize)
@@ -34,18 +28,7 @@ def parquet_fields(path: Path) -> list[str]:
 
 
 def parquet_columns(path: Path, wanted: Sequence[str], timestamp: bool = False) -> npt.NDArray[np.float64]:
-    """Read some columns of a file; with `timestamp` the first of them in seconds since its first row.
-
-    Returns
-    -------
-    ndarray, shape (len(wanted), n_rows)
-        Empty cells are NaN.
-
-    Raises
-    ------
-    DataError
-        No Parquet file, a column that holds no numbers, or more rows than are ever read.
-    """
+    """Read some columns of a file; with `timestamp` the first of them in seconds since its first row, shape (len(wanted), n_rows)."""
     import pyarrow as pa
     from pyarrow import parquet
 

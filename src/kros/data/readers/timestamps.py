@@ -21,17 +21,7 @@ def pattern(order: str) -> str:
 
 
 def seconds_of(column: Any, order: str) -> npt.NDArray[np.float64]:
-    """Return timestamps as seconds since the first one, NaN where a cell holds none.
-
-    Parameters
-    ----------
-    column : pyarrow.ChunkedArray of string
-    order : {"ymd", "dmy", "mdy"}
-
-    Returns
-    -------
-    ndarray, shape (n_rows,), s
-    """
+    """Return timestamps as seconds since the first one, NaN where a cell holds none, shape (n_rows,), s."""
     import pyarrow as pa
     import pyarrow.compute as pc
 

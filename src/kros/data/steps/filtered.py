@@ -22,18 +22,7 @@ PASSBAND = 0.8  # cutoff of the anti-alias filter as a share of the new Nyquist 
 
 
 def lowpass(values: Float, cutoff: float) -> Float:
-    """Filter columns without delay by a windowed sinc; ends are extended by odd reflection.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n_samples, n_channels)
-    cutoff : float
-        Half-amplitude frequency in cycles per sample; 0.5 or more leaves the values alone.
-
-    Returns
-    -------
-    ndarray, shape (n_samples, n_channels)
-    """
+    """Filter columns without delay by a windowed sinc; ends are extended by odd reflection, shape (n_samples, n_channels)."""
     n = len(values)
     half = min(math.ceil(4 / cutoff), n - 1) if cutoff > 0 else 0
     if cutoff >= 0.5 or half < 1:
@@ -50,21 +39,7 @@ def lowpass(values: Float, cutoff: float) -> Float:
 
 
 def resample_even(time_s: Float, values: Float, median_s: float, period_s: float) -> Float:
-    """Bring samples at increasing times to an even grid from the first time on.
-
-    Parameters
-    ----------
-    time_s : ndarray, shape (n_samples,), s
-    values : ndarray, shape (n_samples, n_channels)
-    median_s : float
-        Median step of `time_s`.
-    period_s : float
-        Step of the grid; above `median_s` the values are filtered below the new Nyquist frequency first.
-
-    Returns
-    -------
-    ndarray, shape (n_new, n_channels)
-    """
+    """Bring samples at increasing times to an even grid from the first time on, shape (n_new, n_channels)."""
     finer = math.ceil(period_s / median_s - 1e-3)
     step = period_s / finer
     count = math.floor((time_s[-1] - time_s[0]) / step + 1e-6) + 1

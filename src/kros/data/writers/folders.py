@@ -36,24 +36,7 @@ def same_file(path: Path, target: Path) -> None:
 
 @contextmanager
 def whole_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
-    """Give a folder beside `out` to fill; it is moved there at the end, or removed when anything fails.
-
-    What a killed process left half done goes when `out` is written again, and what it had moved aside comes back.
-
-    Parameters
-    ----------
-    out : Path
-        An empty folder at this place is replaced.
-    overwrite : bool
-        Replace a folder with content too.
-
-    Raises
-    ------
-    DataError
-        `out` exists and is not an empty folder.
-    ConfigError
-        Another process is writing `out`.
-    """
+    """Give a folder beside `out` to fill; it is moved there at the end, or removed when anything fails."""
     out = out.absolute()
     work = out.with_name(f".{out.name}.kros")
     work.mkdir(parents=True, exist_ok=True)

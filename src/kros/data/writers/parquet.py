@@ -40,25 +40,14 @@ COMPRESSION, SIGNALS, COUNTER = "lz4", "BYTE_STREAM_SPLIT", "DELTA_BINARY_PACKED
 
 @dataclass(frozen=True)
 class GroupRecord:
-    """What `write_group` wrote: one unit in one condition.
-
-    Parameters
-    ----------
-    unit, condition, file : str
-    episodes : tuple of str
-        In the order of the row groups.
-    samples : tuple of int
-        Length of each episode.
-    prints : tuple of Print
-        What each episode is recognised by.
-    """
+    """What `write_group` wrote: one unit in one condition."""
 
     unit: str
     condition: str
     file: str
-    episodes: tuple[str, ...]
-    samples: tuple[int, ...]
-    prints: tuple[Print, ...] = ()
+    episodes: tuple[str, ...]  # in the order of the row groups
+    samples: tuple[int, ...]  # length of each episode
+    prints: tuple[Print, ...] = ()  # what each episode is recognised by
 
     @property
     def recognised(self) -> list[tuple[EpisodeKey, Print]]:
@@ -78,28 +67,7 @@ def group_file(unit: str, condition: str) -> str:
 def write_group(
     population: Population, unit: str, condition: str, folder: Path | str, on_nan: str = "error", look: Look | None = None
 ) -> GroupRecord:
-    """Read, prepare, check and write all episodes of one unit and condition.
-
-    Parameters
-    ----------
-    population : Population
-    unit, condition : str
-    folder : Path
-        Exists; the file appears whole or not at all.
-    on_nan : {"error", "drop_episode"}
-    look : callable, optional
-        Is shown every episode's key and samples.
-
-    Returns
-    -------
-    GroupRecord
-        Without episodes, and no file, where every episode was dropped.
-
-    Raises
-    ------
-    DataError
-        An episode that cannot be used, an input that never moves, or no such unit and condition.
-    """
+    """Read, prepare, check and write all episodes of one unit and condition."""
     keys = population.keys(unit, condition)
     if not keys:
         raise DataError(f"Asked to write unit {unit} ({condition}); the population has no episode of it.")
@@ -118,20 +86,7 @@ def write_group(
 
 
 def write_index(population: Population, records: Iterable[GroupRecord], folder: Path | str) -> None:
-    """Write `population.json` for groups that were written; with it the folder is a population.
-
-    Parameters
-    ----------
-    population : Population
-        Whose channels, units and metadata are stored; units without a record are left out.
-    records : iterable of GroupRecord
-    folder : Path
-
-    Raises
-    ------
-    DataError
-        An episode that is a copy of another one.
-    """
+    """Write `population.json` for groups that were written; with it the folder is a population."""
     groups = [g for g in records if g.episodes]
     written = {g.unit for g in groups}
     check_structure(population.columns, [EpisodeKey(g.unit, g.condition, e) for g in groups for e in g.episodes])

@@ -84,14 +84,7 @@ def _write_folder(population: Population, keys: tuple[EpisodeKey, ...], folder: 
 
 
 def raw_csv(values: npt.NDArray[np.float64], sample_period_s: float) -> bytes:
-    """Return one raw file.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n_samples, 5)
-        In the reader's channels and units.
-    sample_period_s : float
-    """
+    """Return one raw file."""
     import pyarrow as pa
     from pyarrow import csv
 

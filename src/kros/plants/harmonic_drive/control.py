@@ -22,11 +22,7 @@ CURRENT_NOISE = 2e-3  # standard deviation, fraction of full scale
 
 
 class Loop(str, Enum):
-    """How stiff the velocity loop is.
-
-    With `STIFF` the gearbox disturbance acts on the velocity error with a lag near 45 degrees at full speed;
-    with `SOFT` the lag straddles 90 degrees over the population.
-    """
+    """How stiff the velocity loop is."""
 
     STIFF = "stiff"
     SOFT = "soft"
@@ -34,21 +30,12 @@ class Loop(str, Enum):
 
 @dataclass(frozen=True)
 class Gains:
-    """Controller gains.
+    """Controller gains."""
 
-    Parameters
-    ----------
-    position : float, 1/s
-    velocity : float, fraction of full scale per rad/s
-    integral : float, fraction of full scale per rad
-    antiwindup : float
-        Share of the excess over the current limit that is taken off the integrator each sample.
-    """
-
-    position: float
-    velocity: float
-    integral: float
-    antiwindup: float = 0.05
+    position: float  # 1/s
+    velocity: float  # fraction of full scale per rad/s
+    integral: float  # fraction of full scale per rad
+    antiwindup: float = 0.05  # share of the excess over the current limit that is taken off the integrator each sample
 
 
 GAINS = {

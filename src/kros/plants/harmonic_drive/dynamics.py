@@ -54,17 +54,7 @@ def transition(p: DriveParameters, loaded: Array) -> Array:
 
 
 class Physics:
-    """State of a batch of trajectories and the code that moves it on by one sample, without allocating.
-
-    Parameters
-    ----------
-    p : DriveParameters
-        One row per trajectory.
-    loaded : ndarray, shape (n,)
-        One where the asymmetric load is mounted, zero elsewhere.
-    q0 : ndarray, shape (n,), rad
-        Angle at which the drive is at rest at the start, in equilibrium with gravity and gearbox.
-    """
+    """State of a batch of trajectories and the code that moves it on by one sample, without allocating."""
 
     def __init__(self, p: DriveParameters, loaded: Array, q0: Array) -> None:
         n = len(p)
@@ -139,19 +129,7 @@ class Physics:
 
 
 def load_torque(p: DriveParameters, recorded: Array) -> Array:
-    """Torque that loads take from the flange, inertia and gravity, N m.
-
-    Parameters
-    ----------
-    p : DriveParameters
-        One row per loaded trajectory.
-    recorded : ndarray, shape (RECORDED, n_samples, n)
-        Their rows from p to i.
-
-    Returns
-    -------
-    ndarray, shape (n_samples, n)
-    """
+    """Torque that loads take from the flange, inertia and gravity, N m, shape (n_samples, n)."""
     q, z = recorded[MEASURED], recorded[MEASURED + 1 :]
     gravity = p.load_moment * np.sin(q - z[TWIST])
     acceleration = (p.stiffness * z[TWIST] + p.damping * (z[W] - z[WL]) - gravity) / (p.flange_inertia + p.load_inertia)

@@ -28,17 +28,7 @@ Array = npt.NDArray[Any]
 
 
 def disturbance_response(p: DriveParameters, gains: Gains, loaded: bool, speed: float = MAX_SPEED) -> Array:
-    """Return H, from disturbance current to velocity error, complex, shape (n_units,).
-
-    Parameters
-    ----------
-    p : DriveParameters
-    gains : Gains
-    loaded : bool
-        Whether the load's inertia is mounted; gravity's slope is left out.
-    speed : float, rad/s
-        Constant speed at the output; the frequency is `100 speed`.
-    """
+    """Return H, from disturbance current to velocity error, complex, shape (n_units,)."""
     omega = GEAR_RATIO * speed
     zeta = np.exp(1j * omega * SAMPLE_PERIOD_S)
     Phi, Gu, Gm = _substep(p, loaded, speed)

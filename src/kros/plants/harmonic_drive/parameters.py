@@ -52,51 +52,22 @@ OUTLIER_LOG_FACTORS = {
 
 @dataclass(frozen=True, eq=False)
 class DriveParameters:
-    """Physical parameters of a batch of drives; every field has the unit axis first.
+    """Physical parameters of a batch of drives; every field has the unit axis first."""
 
-    Parameters
-    ----------
-    motor_inertia : ndarray, shape (n_units,), kg m^2
-        Rotor and wave generator, times the squared gear ratio.
-    flange_inertia : ndarray, shape (n_units,), kg m^2
-        Output flange without load.
-    stiffness : ndarray, shape (n_units,), N m/rad
-        Of the gear (flexspline).
-    damping : ndarray, shape (n_units,), N m s/rad
-        Of the gear.
-    torque_constant : ndarray, shape (n_units,), N m
-        Torque at full-scale current.
-    current_lag_s : ndarray, shape (n_units,), s
-        Time constant of the current loop.
-    coulomb_torque, breakaway_torque : ndarray, shape (n_units,), N m
-        Coulomb friction, and what breakaway adds to it at standstill.
-    stribeck_velocity : ndarray, shape (n_units,), rad/s
-        Where half of the breakaway torque is left.
-    viscous_friction : ndarray, shape (n_units,), N m s/rad
-    load_inertia : ndarray, shape (n_units,), kg m^2
-        Of the asymmetric load, about the output axis.
-    load_moment : ndarray, shape (n_units,), N m
-        Mass times gravity times lever arm of the asymmetric load.
-    ripple : ndarray, shape (n_units, n_harmonics), fraction of full-scale current
-        Amplitudes `a1, a2, ...` of (34).
-    phase_rad : ndarray, shape (n_units, n_harmonics), rad
-        Phases `phi1, phi2, ...` of (34), in [0, 2 pi).
-    """
-
-    motor_inertia: Array
-    flange_inertia: Array
-    stiffness: Array
-    damping: Array
-    torque_constant: Array
-    current_lag_s: Array
-    coulomb_torque: Array
-    breakaway_torque: Array
-    stribeck_velocity: Array
-    viscous_friction: Array
-    load_inertia: Array
-    load_moment: Array
-    ripple: Array
-    phase_rad: Array
+    motor_inertia: Array  # shape (n_units,), kg m^2; rotor and wave generator, times the squared gear ratio
+    flange_inertia: Array  # shape (n_units,), kg m^2; output flange without load
+    stiffness: Array  # shape (n_units,), N m/rad; of the gear (flexspline)
+    damping: Array  # shape (n_units,), N m s/rad; of the gear
+    torque_constant: Array  # shape (n_units,), N m; torque at full-scale current
+    current_lag_s: Array  # shape (n_units,), s; time constant of the current loop
+    coulomb_torque: Array  # shape (n_units,), N m
+    breakaway_torque: Array  # shape (n_units,), N m; what breakaway adds to Coulomb friction at standstill
+    stribeck_velocity: Array  # shape (n_units,), rad/s; where half of the breakaway torque is left
+    viscous_friction: Array  # shape (n_units,), N m s/rad
+    load_inertia: Array  # shape (n_units,), kg m^2; of the asymmetric load, about the output axis
+    load_moment: Array  # shape (n_units,), N m; mass times gravity times lever arm of the asymmetric load
+    ripple: Array  # shape (n_units, n_harmonics), fraction of full-scale current; amplitudes `a1, a2, ...` of (34)
+    phase_rad: Array  # shape (n_units, n_harmonics), rad; phases `phi1, phi2, ...` of (34), in [0, 2 pi)
 
     def __len__(self) -> int:
         return len(self.motor_inertia)

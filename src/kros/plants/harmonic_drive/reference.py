@@ -28,10 +28,7 @@ _TRIES = 1000
 
 
 def episode_reference(seed: int, episode: int, n_samples: int, n_rest: int, period_s: float) -> tuple[Array, Array]:
-    """Return target position and velocity of an episode, each of shape (n_rest + n_samples,), in rad and rad/s.
-
-    The first `n_rest` samples are at rest. Both directions are held at full speed at least once.
-    """
+    """Return target position and velocity of an episode, each of shape (n_rest + n_samples,), in rad and rad/s."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(REFERENCE_STREAM, episode)))
     checkpoints = _draw_checkpoints(rng, n_samples, period_s)
     starts = _start_times(rng, checkpoints, n_samples, period_s) + n_rest
@@ -39,20 +36,7 @@ def episode_reference(seed: int, episode: int, n_samples: int, n_rest: int, peri
 
 
 def profile(checkpoints: Array, starts: Array, n_samples: int, period_s: float) -> tuple[Array, Array]:
-    """Move from checkpoint to checkpoint, leaving each at a given sample.
-
-    Parameters
-    ----------
-    checkpoints : ndarray, shape (n_moves + 1,), rad
-    starts : ndarray, shape (n_moves,)
-        Sample at which each move starts; a move lasts its distance at full speed plus the ramps.
-    n_samples : int
-    period_s : float, s
-
-    Returns
-    -------
-    position, velocity : ndarray, shape (n_samples,), rad and rad/s
-    """
+    """Move from checkpoint to checkpoint, leaving each at a given sample; position and velocity, shape (n_samples,), rad and rad/s."""
     padding = _RAMPS
     lengths = np.abs(np.diff(checkpoints)) / (MAX_SPEED * period_s)
     knots = np.stack([starts, starts + lengths], axis=1).ravel()

@@ -31,38 +31,15 @@ _DIFFERENCE = np.array((1.0 - VELOCITY_POLE) / SAMPLE_PERIOD_S)
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """What a simulation leaves behind, one row per trajectory.
+    """What a simulation leaves behind, one row per trajectory."""
 
-    Parameters
-    ----------
-    states : ndarray, shape (n, 3, n_samples), rad, rad/s and fraction of full scale
-        Position as the encoder quantises it, velocity as filtered difference of it, current without measurement noise.
-    velocity : ndarray, shape (n, 1, n_samples), rad/s
-        True velocity of the motor.
-    load_torque : ndarray of float32, shape (n_loaded, n_samples), fraction of full-scale current
-        Torque that the load takes from the flange, for the loaded trajectories, in their order.
-    """
-
-    states: Array
-    velocity: Array
-    load_torque: Array
+    states: Array  # shape (n, 3, n_samples): quantised position, rad, its filtered difference, rad/s, and current without noise
+    velocity: Array  # shape (n, 1, n_samples), rad/s; true velocity of the motor
+    load_torque: Array  # shape (n_loaded, n_samples), float32, fraction of full-scale current: what the load takes from the flange
 
 
 def simulate(p: DriveParameters, loaded: Array, reference: Array, targets: tuple[Array, Array], gains: Gains) -> Signals:
-    """Simulate all trajectories.
-
-    Parameters
-    ----------
-    p : DriveParameters
-        One row per trajectory.
-    loaded : ndarray, shape (n,)
-        One where the asymmetric load is mounted, zero elsewhere.
-    reference : ndarray of int, shape (n,)
-        Row of `targets` that the trajectory follows.
-    targets : two ndarrays, shape (n_references, n_samples), rad and rad/s
-        Target position and velocity; at rest at the first sample.
-    gains : Gains
-    """
+    """Simulate all trajectories; `targets` hold position (rad) and velocity (rad/s), shape (n_references, n_samples)."""
     n, n_samples = len(p), targets[0].shape[1]
     n_loaded = int(np.count_nonzero(loaded))
     rows = np.cumsum(loaded > 0) - 1

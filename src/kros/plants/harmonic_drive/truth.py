@@ -21,27 +21,14 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """True parameters and signals of a simulated population.
+    """True parameters and signals of a simulated population."""
 
-    Parameters
-    ----------
-    unit_ids : tuple of str
-        Order of the unit axis.
-    parameters : DriveParameters
-    loop : Loop
-    gains : Gains
-    load_rows : mapping
-        Row of `load_signals` of each loaded episode.
-    load_signals : ndarray of float32, shape (n_loaded, n_samples), fraction of full-scale current
-        Torque that the load takes from the flange, in step with the prepared episodes.
-    """
-
-    unit_ids: tuple[str, ...]
+    unit_ids: tuple[str, ...]  # order of the unit axis
     parameters: DriveParameters
     loop: Loop
     gains: Gains
-    load_rows: Mapping[EpisodeKey, int]
-    load_signals: Array
+    load_rows: Mapping[EpisodeKey, int]  # row of `load_signals` of each loaded episode
+    load_signals: Array  # shape (n_loaded, n_samples), float32, in step with the prepared episodes
 
     @property
     def phase_rad(self) -> Array:
@@ -55,10 +42,7 @@ class Truth:
 
     @property
     def lag_rad(self) -> Array:
-        """Phase `eta` of the disturbance's effect on the velocity error at full speed without load, shape (n_units,), rad.
-
-        Negative where the effect trails: forward `sin(100 theta + phi1 + eta)`, reverse `sin(100 theta + phi1 - eta)`.
-        """
+        """Phase `eta` of the disturbance's effect on the velocity error at full speed without load, shape (n_units,), rad."""
         return np.angle(self.response())
 
     def response(self, loaded: bool = False, speed: float = MAX_SPEED) -> Array:
@@ -73,10 +57,7 @@ class Truth:
         return self.unit_ids.index(unit)
 
     def load_torque(self, key: EpisodeKey) -> Array:
-        """Return the torque that the load takes from the flange in an episode, inertia and gravity, shape (n_samples,).
-
-        As a fraction of the unit's full-scale current, in step with the prepared episode, float32; only loaded episodes have one.
-        """
+        """Return the torque that the load takes from the flange in an episode, inertia and gravity, shape (n_samples,)."""
         if key not in self.load_rows:
             raise DataError(f"Asked for the load torque of {key}; only the {len(self.load_rows)} loaded episodes have one.")
         return self.load_signals[self.load_rows[key]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import pickle
 import subprocess
 import sys
@@ -21,7 +20,7 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from kros.core import ConfigError, DataError, IdentificationError
 from kros.identify import edmd
 from kros.identify.factors import triangular
-from kros.interop import KoopmanRegressor, one_step_pairs
+from kros.interop import KoopmanRegressor
 
 A = np.array([[0.95, 0.1], [-0.2, 0.8]])
 B = np.array([0.05, 0.3])
@@ -48,6 +47,13 @@ def recording(lengths: tuple[int, ...] = (60, 40, 50)) -> np.ndarray:
 def frame(ids: tuple[Any, ...] = ("a", "b", "c"), lengths: tuple[int, ...] = (60, 40, 50)) -> pd.DataFrame:
     parts = [pd.DataFrame(episode(n, i), columns=NAMES).assign(episode=e) for i, (e, n) in enumerate(zip(ids, lengths, strict=True))]
     return pd.concat(parts, ignore_index=True)
+
+
+def pairs() -> tuple[np.ndarray, np.ndarray]:
+    """Rows and their next states, of all episodes."""
+    X = recording()
+    inside = np.flatnonzero(np.diff(X[:, 0]) == 0)
+    return X[inside, 1:], X[inside + 1, 1:3]
 
 
 def regressor(**options: Any) -> KoopmanRegressor:
@@ -135,25 +141,8 @@ def test_badly_scaled_states_are_identified() -> None:
     assert abs(model.A_[1, 1] - np.linalg.lstsq(episode()[:-1], episode()[1:, :2], rcond=None)[0][1, 1]) < 1e-9
 
 
-def test_functions_of_inputs() -> None:
-    rng = np.random.default_rng(3)
-    x, rows = 0.3, []
-    for u in rng.normal(size=60):
-        rows.append([x, u])
-        x = 0.7 * x + 0.2 * u - 0.1 * x * u
-    model = KoopmanRegressor(input_functions=["x0*u0"], n_inputs=1, horizon=5).fit(rows)
-    assert np.allclose([model.A_[0, 0], *model.B_[0]], [0.7, 0.2, -0.1], atol=1e-12)
-    assert abs(1 - model.score(rows)) < 1e-12
-    assert np.allclose(model.predict_trajectory(rows)[:, 0], np.array(rows)[:, 0], atol=1e-9)
-
-
-def test_the_system_is_the_model() -> None:
-    system = regressor().fit(recording()).system(0.01)
-    assert (system.n_states, system.n_inputs, system.dt) == (3, 1, 0.01)
-
-
 def test_a_state_that_does_not_vary_is_no_loss() -> None:
-    X, y, _ = one_step_pairs(recording(), n_inputs=1, episode_feature=True)
+    X, y = pairs()
     load = np.full((len(X), 1), 0.3)
     model = KoopmanRegressor(["sin(x0)"], n_inputs=1)
     X, y = np.concatenate([X[:, :2], load, X[:, 2:]], axis=1), np.concatenate([y, load], axis=1)
@@ -163,7 +152,7 @@ def test_a_state_that_does_not_vary_is_no_loss() -> None:
 
 
 def test_a_target_of_another_width_is_refused() -> None:
-    X, y, _ = one_step_pairs(recording(), n_inputs=1, episode_feature=True)
+    X, y = pairs()
     model = regressor(episode_feature=False).fit(X, y)
     with pytest.raises(DataError, match="y has 1 columns, the model has 2 states"):
         model.score(X, y[:, 0])
@@ -188,32 +177,18 @@ def test_episodes_are_not_joined() -> None:
     assert not is_exact(regressor(episode_feature=False).fit(recording()[:, 1:]))
 
 
-def test_groups_end_episodes() -> None:
-    X = recording()
-    assert is_exact(regressor(episode_feature=False).fit(X[:, 1:], groups=[f"unit {i:.0f}" for i in X[:, 0]]))
-    units = X[:, 0].astype(int)
-    exact = regressor(episode_feature=False, horizon=None).fit(X[:, 1:], groups=units)
-    assert abs(1 - exact.score(X[:, 1:], groups=units)) < 1e-12
-    assert exact.score(X[:, 1:]) < 0.99  # joined, the first state of each unit after the first is not the next of the last
-    with pytest.raises(DataError, match="150 rows, found 3"):
-        regressor(episode_feature=False).fit(X[:, 1:], groups=["a", "b", "c"])
-
-
 def test_pairs_of_rows_in_any_order() -> None:
-    X, y, groups = one_step_pairs(recording(), n_inputs=1, episode_feature=True)
-    assert len(X) == len(y) == len(groups) == 150 - 3
+    X, y = pairs()
     order = np.random.default_rng(0).permutation(len(X))
     model = regressor(episode_feature=False).fit(X[order], y[order])
     assert is_exact(model)
     assert abs(1 - model.score(X, y)) < 1e-12
     with pytest.raises(DataError, match="horizon is 3"):
         model.set_params(horizon=3).score(X, y)
-    with pytest.raises(DataError, match="4 columns cannot have 4 inputs"):
-        one_step_pairs(recording(), n_inputs=4)
 
 
 def test_the_columns_that_y_leaves_over_are_inputs() -> None:
-    X, y, _ = one_step_pairs(recording(), n_inputs=1, episode_feature=True)
+    X, y = pairs()
     model = KoopmanRegressor(["sin(x0)"]).fit(X, y)
     assert is_exact(model)
     assert (model.state_names_, model.input_names_) == (("x0", "x1"), ("u0",))
@@ -229,13 +204,6 @@ def test_columns_of_a_frame_are_found_by_name() -> None:
     assert is_exact(regressor().fit(first))
 
 
-def test_a_column_of_time_is_no_state() -> None:
-    timed = frame().assign(t=np.concatenate([0.01 * np.arange(n) for n in (60, 40, 50)]))
-    assert is_exact(regressor(time="t").fit(timed))
-    numbered = np.column_stack([recording(), timed["t"]])
-    assert is_exact(regressor(time=4).fit(numbered))
-
-
 @pytest.mark.parametrize("ids", [(LARGE, LARGE + 1, LARGE + 2), (-5, 0, 10**12), ("7", "8", "007"), (10**30, 10**30 + 1, 10**30 + 2)])
 def test_ids_are_told_apart_exactly(ids: tuple[Any, ...]) -> None:
     assert regressor().fit(frame(ids)).n_pairs_ == 147
@@ -247,16 +215,6 @@ def test_ids_are_told_apart_exactly(ids: tuple[Any, ...]) -> None:
 def test_large_whole_ids_of_an_integer_array_survive() -> None:
     rows = np.array([[LARGE, 1, 5], [LARGE, 2, -2], [LARGE, 4, 3], [LARGE + 1, 3, 1], [LARGE + 1, 7, 2]])
     assert KoopmanRegressor(n_inputs=1, episode_feature=True).fit(rows).n_pairs_ == 3
-
-
-def test_a_forgotten_declaration_of_episodes_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING, logger="kros.interop.rows"):
-        KoopmanRegressor(n_inputs=1, alpha=1e-3).fit(recording())
-        assert "looks like an episode id" in caplog.text
-        caplog.clear()
-        regressor().fit(recording())
-        regressor(episode_feature=False).fit(episode())
-        assert caplog.text == ""
 
 
 # --------------------------------------------------------------------------------------------- together with scikit-learn's own
@@ -281,8 +239,8 @@ def test_a_grid_search_over_whole_episodes_finds_the_true_lifting() -> None:
 
 
 def test_folds_of_pairs_may_be_shuffled() -> None:
-    X, y, _ = one_step_pairs(frame(), n_inputs=1)
-    model = KoopmanRegressor(FUNCTIONS, n_inputs=1)
+    X, y = pairs()
+    model = KoopmanRegressor(["sin(x0)"], n_inputs=1)
     scores = cross_val_score(model, X, y, cv=KFold(5, shuffle=True, random_state=0))
     assert np.all(np.abs(1 - scores) < 1e-12)
 
@@ -362,21 +320,7 @@ def test_an_interleaved_episode_is_refused() -> None:
     assert model.predict(X).shape == (80, 2)  # rows by themselves need no order
 
 
-def timed(t: np.ndarray) -> pd.DataFrame:
-    return frame(("a",), (60,)).assign(t=t)
-
-
-def test_time_that_is_not_sorted_or_even_is_refused() -> None:
-    t = 0.01 * np.arange(60)
-    swapped = t.copy()
-    swapped[[10, 11]] = swapped[[11, 10]]
-    refuses(timed(swapped), DataError, "Episode a: time goes from 0.09 to 0.11 between rows 9 and 10", time="t")
-    refuses(timed(t[::-1]), DataError, "Episode a: time goes from 0.59 to 0.58 between rows 0 and 1", time="t")
-    refuses(timed(np.where(t > 0.3, t + 1, t)), DataError, "time goes from 0.3 to 1.31", time="t")
-    refuses(timed(np.where(t == 0.3, np.nan, t)), DataError, "time holds nan in row 30", time="t")
-    refuses(timed(t), DataError, "time in column 'clock', found columns", time="clock")
-    refuses(recording(), DataError, "time in column 9", time=9)
-    refuses(timed(t), DataError, "holds the episode", time="episode")
+def test_rows_of_a_frame_that_are_not_in_order_are_refused() -> None:
     refuses(frame().sort_values("angle").assign(episode="a"), DataError, "index goes from")
 
 
@@ -389,9 +333,9 @@ def test_values_that_are_not_finite_are_refused(bad: float) -> None:
     for method in (model.predict, model.predict_trajectory, model.score):
         with pytest.raises(DataError, match="row 17, column 'rate'"):
             method(X)
-    pairs, y, _ = one_step_pairs(recording(), n_inputs=1, episode_feature=True)
+    rows, y = pairs()
     y[4, 1] = bad
-    refuses(pairs, DataError, "Target y contains NaN or inf: .* in row 4", y=y, episode_feature=False)
+    refuses(rows, DataError, "Target y contains NaN or inf: .* in row 4", y=y, episode_feature=False)
 
 
 def test_a_function_that_is_not_defined_is_named() -> None:
@@ -445,11 +389,11 @@ def test_parameters_that_are_not_valid_are_refused(options: dict[str, Any], mess
 def test_columns_that_do_not_add_up_are_refused() -> None:
     refuses(recording(), DataError, "3 columns .* n_inputs = 2 and states = ", n_inputs=2)
     refuses(recording(), DataError, "does not agree with n_inputs = 3", n_inputs=3, states=None)
-    X, y, _ = one_step_pairs(recording(), n_inputs=1, episode_feature=True)
+    X, y = pairs()
     refuses(X, DataError, "y with 1 columns", y=y[:, 0], episode_feature=False)
     refuses(X, DataError, "147 rows and y has 100", y=y[:100], episode_feature=False)
     refuses(frame()[["voltage", "angle", "rate", "episode"]], DataError, "reorder it so that the states come first")
-    refuses(frame()[["episode"]], DataError, "no state beside episode")
+    refuses(frame()[["episode"]], DataError, "no state beside the episode")
     refuses(frame()[[*NAMES, "episode", "episode"]], DataError, "2 columns named 'episode'")
     refuses(recording()[0], DataError, "Expected 2D array")
 
@@ -468,7 +412,6 @@ def test_rows_of_another_layout_than_in_fit_are_refused() -> None:
     ("package", "call"),
     [
         ("sklearn", "kros.interop.KoopmanRegressor"),
-        ("pykoop", "kros.interop.from_pykoop(None)"),
         ("control", "kros.interop.to_control"),
     ],
 )

@@ -53,6 +53,15 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
         ("observer.baselines=kalman_white", "observer.baselines=luenberger"),
     ),
     ("The set of worst-case synthesis, of signals or of the form, is chosen on held-out episodes; remove the key set.", ("synthesis.set",)),
+    (
+        "Fitted pykoop pipelines are no longer part of kros; identify their functions with kros.identify, recordings go both ways with kros.data.",
+        (
+            "kros.interop.AdoptedModel",
+            "kros.interop.from_pykoop",
+            "kros.interop.models_from_pykoop",
+        ),
+    ),
+    ("Pairs of rows are no longer part of kros; use y of KoopmanRegressor.fit, or GroupKFold.", ("kros.interop.one_step_pairs",)),
 )
 
 

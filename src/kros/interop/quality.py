@@ -17,24 +17,7 @@ _ROUNDING = 1e-12
 
 
 def check_excitation(R: Array, names: Sequence[str], n_states: int, n_lifted: int, n_pairs: int) -> None:
-    """Name the first column that plain least squares cannot tell from those before it.
-
-    Parameters
-    ----------
-    R : ndarray, shape (p, p)
-        Triangular factor of the columns.
-    names : sequence of str
-        Of the columns: states, lifted functions, inputs.
-    n_states, n_lifted : int
-    n_pairs : int
-
-    Raises
-    ------
-    DataError
-        Fewer transitions than columns.
-    IdentificationError
-        A column that depends on those before it.
-    """
+    """Name the first of the columns (states, lifted functions, inputs) that plain least squares cannot tell from those before it."""
     if n_pairs < len(names):
         raise DataError(
             f"Found n_samples = {n_pairs} transitions for {len(names)} unknowns of every row of [A B] "

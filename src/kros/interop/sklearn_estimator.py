@@ -10,7 +10,6 @@ One model is fitted to all rows, of whatever unit. A batch of units with a model
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -18,12 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError, MissingDependencyError
-from ..core.lti import StateSpace
 from ..identify import edmd, free_run
 from ..identify.factors import triangular
 from ..lifting import Lifting
 from .quality import check_excitation, r_squared
-from .rows import Columns, episode_edges, finite, is_whole, log_forgotten_episodes, split_columns
+from .rows import Columns, episode_edges, finite, is_whole, split_columns
 
 try:
     from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
@@ -33,7 +31,6 @@ except ImportError as error:
         "KoopmanRegressor needs scikit-learn 1.6 or newer; install it (pip install 'kros[sklearn]'), or identify with kros.identify."
     ) from error
 
-log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 
 
@@ -50,16 +47,14 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     columns of a DataFrame       states, inputs; a column named ``episode`` is the episode wherever it stands
     ===========================  ==================================================================================
 
-    Episode ids are whole numbers or text. Rows of an episode have to stand together and are never sorted. Where `y` is given, episodes,
-    units and time are ignored.
+    Episode ids are whole numbers or text. Rows of an episode have to stand together and are never sorted. Where `y` is given, episodes
+    are ignored.
 
     Parameters
     ----------
     functions : sequence of str
         Lifted functions as formulas of the states, such as ``"sin(100*position)"``; none for a linear model. Rows stand by themselves, so
         there are no delays (``position[-1]``): put earlier samples into columns of their own.
-    input_functions : sequence of str
-        Formulas of inputs and states that stand behind the inputs, such as ``"current*voltage"``.
     states : sequence of str, optional
         Names of the states, which the formulas use. A DataFrame has to begin with columns of these names. Default: the names of the
         DataFrame, else ``x0, x1, ...``.
@@ -69,16 +64,14 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Tikhonov coefficient, added to the unnormalised Gram matrix; zero for plain least squares.
     episode_feature : bool
         Whether the first column of an array is the episode.
-    time : str or int, optional
-        Column of time, by name or by position in an array. Time is checked (increasing, in even steps), and is no state.
     horizon : int or None
         `score` compares predictions this many samples ahead, from every sample, with the recorded inputs; None: the free run of the
         whole episode from its first state.
 
     Notes
     -----
-    `fit` sets ``A_``, shape (n_lifted, n_lifted), and ``B_``, shape (n_lifted, n_inputs + n_input_functions); ``lifting_``, ``state_names_`` and
-    ``input_names_``; ``n_pairs_``, the number of transitions; ``n_features_in_``, the number of columns with episode and time; and
+    `fit` sets ``A_``, shape (n_lifted, n_lifted), and ``B_``, shape (n_lifted, n_inputs); ``lifting_``, ``state_names_`` and
+    ``input_names_``; ``n_pairs_``, the number of transitions; ``n_features_in_``, the number of columns with the episode; and
     ``feature_names_in_``, their names, where `X` was a DataFrame.
 
     Examples
@@ -99,26 +92,22 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         functions: Sequence[str] = (),
         *,
-        input_functions: Sequence[str] = (),
         states: Sequence[str] | None = None,
         n_inputs: int | None = None,
         alpha: float = 0.0,
         episode_feature: bool = False,
-        time: str | int | None = None,
         horizon: int | None = 1,
     ) -> None:
         self.functions = functions
-        self.input_functions = input_functions
         self.states = states
         self.n_inputs = n_inputs
         self.alpha = alpha
         self.episode_feature = episode_feature
-        self.time = time
         self.horizon = horizon
 
     # ------------------------------------------------------------------------------------------------------- identification
 
-    def fit(self, X: Any, y: Any = None, groups: npt.ArrayLike | None = None) -> Self:
+    def fit(self, X: Any, y: Any = None) -> Self:
         """Fit one model to all rows.
 
         Parameters
@@ -126,8 +115,6 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         X : array_like or DataFrame, shape (n_samples, n_columns)
         y : array_like, shape (n_samples, n_states) or (n_samples,), optional
             Next states. Default: the next row of the same episode.
-        groups : array_like, shape (n_samples,), optional
-            Ids of units; an episode ends where the unit changes. There is still one model for all.
 
         Returns
         -------
@@ -137,8 +124,8 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises
         ------
         DataError
-            Rows that cannot be used as they are: NaN, ids that rounding may have merged, an interleaved or a too short episode,
-            unsorted time. Also a ValueError.
+            Rows that cannot be used as they are: NaN, ids that rounding may have merged, an interleaved or a too short episode.
+            Also a ValueError.
         ConfigError
             A parameter or a formula that is not valid.
         IdentificationError
@@ -152,9 +139,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._name_columns(columns, values.shape[1], None if target is None else target.shape[1])
         values = finite(values, self.state_names_ + self.input_names_, "Input X")
         if target is None:
-            edges = episode_edges(columns, groups, len(values))
-            if columns.episodes is None:
-                log_forgotten_episodes(values, self.state_names_[0])
+            edges = episode_edges(columns, len(values))
             now = np.delete(np.arange(len(values)), edges[1:] - 1)
             before, after = values[now], values[now + 1, : self._n_states]
         else:
@@ -164,7 +149,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _identify(self, before: Array, after: Array) -> None:
         n, n_lifted = self._n_states, self.lifting_.n_lifted
-        names = (*self.lifting_.names, *self.input_names_, *self.lifting_.input_functions)
+        names = (*self.lifting_.names, *self.input_names_)
         rows = np.concatenate([self._psi(before[:, :n], before[:, n:]), self._lift(after)], axis=1)
         finite(rows, (*names, *self.lifting_.names), "A lifted function of X is not defined everywhere: the lifted X")
         R = triangular(rows)
@@ -179,7 +164,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _psi(self, x: Array, u: Array) -> Array:
         with np.errstate(all="ignore"):
-            return np.concatenate([self._lift(x), self.lifting_.lift_inputs(u, x)], axis=1)
+            return np.concatenate([self._lift(x), u], axis=1)
 
     # ----------------------------------------------------------------------------------------------------------- prediction
 
@@ -201,14 +186,13 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         predicted = self._step(values[:, : self._n_states], values[:, self._n_states :])
         return predicted[:, 0] if self._one_dimensional else predicted
 
-    def predict_trajectory(self, X: Any, groups: npt.ArrayLike | None = None) -> Array:
+    def predict_trajectory(self, X: Any) -> Array:
         """Predict whole episodes from their first state and the recorded inputs.
 
         Parameters
         ----------
         X : array_like or DataFrame, shape (n_samples, n_columns)
             Of the states only the first row of each episode is used; the state is retracted and lifted again at every step.
-        groups : array_like, shape (n_samples,), optional
 
         Returns
         -------
@@ -217,9 +201,9 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self)
         columns, values = self._read_fitted(X)
-        return self._free_run(values, episode_edges(columns, groups, len(values)))
+        return self._free_run(values, episode_edges(columns, len(values)))
 
-    def score(self, X: Any, y: Any = None, groups: npt.ArrayLike | None = None) -> float:
+    def score(self, X: Any, y: Any = None) -> float:
         """Return R2 of the prediction `horizon` samples ahead, the mean over the states.
 
         A state that does not vary counts one where it is predicted to rounding, else zero.
@@ -229,8 +213,6 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         X : array_like or DataFrame, shape (n_samples, n_columns)
         y : array_like, shape (n_samples, n_states), optional
             Next states, only for ``horizon = 1``. Default: the rows of `X` themselves, later in the same episode.
-        groups : array_like, shape (n_samples,), optional
-            Ids of units, as in `fit`.
 
         Returns
         -------
@@ -252,7 +234,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             predicted = self.predict(X)
             return r_squared(self._read_target(y, len(predicted)), predicted)
         columns, values = self._read_fitted(X)
-        edges = episode_edges(columns, groups, len(values))
+        edges = episode_edges(columns, len(values))
         truth = values[:, : self._n_states]
         if self.horizon is None:
             later = np.delete(np.arange(len(values)), edges[:-1])
@@ -263,12 +245,6 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         for k in range(self.horizon):  # all rows at once
             x = self._step(x, values[start + k, self._n_states :])
         return r_squared(truth[start + self.horizon], x)
-
-    def system(self, sample_period_s: float) -> StateSpace:
-        """Return the model as a linear system from inputs to lifted states."""
-        check_is_fitted(self)
-        n, m = self.B_.shape
-        return StateSpace(self.A_, self.B_, np.eye(n), np.zeros((n, m)), sample_period_s)
 
     def _step(self, x: Array, u: Array) -> Array:
         n = self._n_states
@@ -291,7 +267,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return len(self.state_names_)
 
     def _check_parameters(self) -> None:
-        for name, value in (("functions", self.functions), ("input_functions", self.input_functions), ("states", self.states)):
+        for name, value in (("functions", self.functions), ("states", self.states)):
             if isinstance(value, str):
                 raise ConfigError(f"KoopmanRegressor: {name} should be a list of texts, found the text {value!r}; write [{value!r}].")
         if not isinstance(self.alpha, (int, float, np.number)) or not 0 <= float(self.alpha) < np.inf:
@@ -304,10 +280,10 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _read(self, X: Any, *, reset: bool) -> tuple[Columns, Array]:
         """Return ids and numbers, after the checks that scikit-learn makes of every estimator."""
         options = {"dtype": np.float64, "ensure_all_finite": False, "estimator": self, "input_name": "X"}
-        if (not self.episode_feature and self.time is None and not hasattr(X, "iloc")) or hasattr(X, "toarray"):
+        if (not self.episode_feature and not hasattr(X, "iloc")) or hasattr(X, "toarray"):
             values = validate_data(self, X, reset=reset, dtype=np.float64, ensure_all_finite=False)
             return Columns(values, None), values
-        columns = split_columns(X, episode_feature=self.episode_feature, time=self.time)
+        columns = split_columns(X, episode_feature=self.episode_feature)
         validate_data(self, X if hasattr(X, "iloc") else np.asarray(X), reset=reset, skip_check_array=True)
         return columns, check_array(columns.values, **options)
 
@@ -318,7 +294,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if values.shape[1] != len(names):
             found = columns.names or f"{values.shape[1]} columns"
             raise DataError(
-                f"The model has the states and inputs {names}, found {found} besides episode and time; pass rows in the layout of `fit`, where an "
+                f"The model has the states and inputs {names}, found {found} besides the episode; pass rows in the layout of `fit`, where an "
                 "array has the episode first (episode_feature = True) and a frame has it by name."
             )
         return columns, finite(values, names, "Input X")
@@ -343,7 +319,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 )
             names = wanted + names[n_states:]
         self.state_names_, self.input_names_ = names[:n_states], names[n_states:]
-        self.lifting_ = Lifting(self.state_names_, tuple(self.functions), (), self.input_names_, tuple(self.input_functions))
+        self.lifting_ = Lifting(self.state_names_, tuple(self.functions), (), self.input_names_)
         if self.lifting_.history:
             raise ConfigError(
                 f"KoopmanRegressor: the functions read {', '.join(self.lifting_.window.earlier)}, but rows stand by themselves; put earlier samples "
@@ -363,10 +339,8 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if len(found) > 1 or not 1 <= count <= n_columns:
             raise DataError(
                 f"X has {n_columns} columns of states and inputs, which does not agree with {' and '.join(counts)}; "
-                "states and inputs should add up to the columns, without those of episode and time, and at least one is a state."
+                "states and inputs should add up to the columns, without that of the episode, and at least one is a state."
             )
-        if n_targets is not None and self.n_inputs is None and self.states is None and count < n_columns:
-            log.info("the columns of y leave %d of the %d columns of X, which are taken as inputs", n_columns - count, n_columns)
         return count
 
     def __sklearn_tags__(self) -> Any:

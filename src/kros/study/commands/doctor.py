@@ -11,7 +11,6 @@ _OPTIONAL = {
     "distributed": "maps over units on a cluster (kros run --scheduler)",
     "pandas": "reading long data frames",
     "scikit-learn": "the estimator protocol",
-    "pykoop": "adopting fitted pykoop pipelines",
     "control": "exchange with python-control",
     "sdpa-python": "another semidefinite solver",
     "mosek": "another semidefinite solver, commercial",

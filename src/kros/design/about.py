@@ -25,19 +25,7 @@ _LOSSES = {
 def about(
     task: DesignTask, identified: IdentifiedModels, observer: Observer, certificate: ReliftCertificate, facts: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what `kros.observer.about.About` describes, in the recordings' units.
-
-    Parameters
-    ----------
-    task : DesignTask
-    identified : IdentifiedModels
-    observer : Observer
-        In the recordings' units.
-    certificate : ReliftCertificate
-        As the observer runs.
-    facts : mapping
-        What the metrics say of it.
-    """
+    """Return what `kros.observer.about.About` describes, in the recordings' units."""
     population, known, calibration = identified.population, identified.facts, identified.calibration
     as_it_runs = {"certified": certificate.certified, "reason": certificate.reason, "gain": certificate.gain}
     found: dict[str, Any] = {

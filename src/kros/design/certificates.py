@@ -44,13 +44,7 @@ _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has
 
 @dataclass(frozen=True, eq=False)
 class Running:
-    """What is known about one observer as it runs: its certificate, a row for every unit, bounds for recorded signals, and the size of its errors.
-
-    `hidden_percent` is the geometric mean, over conditions and the states that are not measured, of the mean error on training episodes, percent of the
-    largest value;
-    `dropout_percent` the largest error of a state in a short run in which measurements stop arriving, `dropout` what is proven of losses at the rate that is
-    declared of the sensor.
-    """
+    """What is known about one observer as it runs."""
 
     name: str
     certificate: ReliftCertificate

@@ -49,26 +49,7 @@ class Estimator(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Baseline:
-    """A baseline that was tuned or trained.
-
-    Parameters
-    ----------
-    by_unit : mapping of str to Estimator
-        The estimator for a unit; the empty name for all others.
-    measured : tuple of int
-    estimated : tuple of int
-        States that it estimates.
-    facts : dict
-        For the records.
-    takes_missing : bool
-        Whether it knows what to do where a measurement is missing; others get the last one that arrived.
-    restarts : bool
-        Whether it starts again where an observer would.
-    limits : (ndarray, ndarray), optional
-        Lower and upper limits of the states, shape (n,), that cut off estimates as they do those of an observer.
-    seen : Seen, optional
-        Largest sizes in training: samples are screened as those of an observer are.
-    """
+    """A baseline that was tuned or trained."""
 
     by_unit: Mapping[str, Estimator]
     measured: tuple[int, ...]
@@ -104,13 +85,7 @@ class Baseline:
 
 
 def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Array) -> Baseline:
-    """Tune the extended Kalman filter of a nominal model: process noise over eight decades, of two shapes, all run side by side.
-
-    Raises
-    ------
-    SynthesisError
-        When every candidate diverges on the training episodes.
-    """
+    """Tune the extended Kalman filter of a nominal model: process noise over eight decades, of two shapes, all run side by side."""
     data, lifting, n = training.read(), models.lifting, models.lifting.n_states
     row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
     batch = data.batch
@@ -150,15 +125,7 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
 
 
 def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
-    """Choose the cut-off of the filtered difference and find its scale.
-
-    Which state is the rate of which measurement the recordings say, and units of measure such as rad and rad/s where these do not.
-
-    Raises
-    ------
-    ConfigError
-        When no state is found to be the rate of a measured one.
-    """
+    """Choose the cut-off of the filtered difference and find its scale."""
     population, data = training.population, training.read()
     states, y, lengths = data.batch.states, data.measurements(measured), data.batch.lengths
     channels = [c for c in population.channels if c.name in population.states]
@@ -183,21 +150,7 @@ def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baselin
 
 
 def make_learned(training: TrainingSet, lifting: Lifting, measured: tuple[int, ...]) -> Baseline:
-    """Train the learned estimator on whole training episodes of all units, once for every unit without it.
-
-    Parameters
-    ----------
-    training : TrainingSet
-        Of all episodes (`TrainingSet.whole`), of which as many count as a fixed amount of work allows, some seconds of it; always one of every unit
-        and condition.
-    lifting : Lifting
-    measured : tuple of int
-
-    Raises
-    ------
-    DataError
-        When every state is measured, or there is one unit only.
-    """
+    """Train the learned estimator on whole training episodes of all units, once for every unit without it."""
     few = training.first_of_units().read()
     y, u = hold_missing(few.measurements(measured)), few.batch.inputs
     features = Features.of(lifting, measured, y, u)

@@ -18,22 +18,7 @@ _SAMPLES = 5_000_000  # read at most, once every unit and condition has been rea
 
 
 def make_mean_profile(training: TrainingSet, measured: tuple[int, ...], population: Population, keys: Iterable[EpisodeKey]) -> Baseline:
-    """Average the states of training episodes that are the same motions as some episodes, over units, once for every unit without it.
-
-    Parameters
-    ----------
-    training : TrainingSet
-        Of all episodes (`TrainingSet.whole`).
-    measured : tuple of int
-    population : Population
-    keys : iterable of EpisodeKey
-        Episodes that will be estimated; of these the inputs are read, nothing else.
-
-    Raises
-    ------
-    DataError
-        When there are no inputs, every state is measured, or an episode's inputs are not those of training episodes of two units.
-    """
+    """Average the states of training episodes that are the same motions as some episodes, over units, once for every unit without it."""
     n = len(population.states)
     estimated = [i for i in range(n) if i not in measured]
     if not population.inputs or not estimated:

@@ -37,22 +37,7 @@ MOVING = 0.1  # of the RMS step of a measurement: less is rest
 
 
 def fit_monitor(observer: Observer, training: TrainingSet, rate: float, work: Work | None = None) -> Monitor | None:
-    """Return the monitor of an observer; None with fewer than three units.
-
-    Parameters
-    ----------
-    observer : Observer
-    training : TrainingSet
-        In the observer's units of measure.
-    rate : float
-        Probability that one more good unit exceeds the bound.
-    work : Work, optional
-        Where the observer runs.
-
-    Returns
-    -------
-    Monitor or None
-    """
+    """Return the monitor of an observer; None with fewer than three units."""
     tasks = list(_tasks(observer, training, settling(observer)))
     met = (work or Work()).map("monitor", _met, tasks)
     own = {task.group: found for task, found in zip(tasks, met, strict=True) if found}
@@ -146,20 +131,7 @@ def _alarms(above: npt.NDArray[np.bool_]) -> int:
 def bound_of_peaks(peaks: Sequence[Sequence[float]], rate: float) -> float:
     r"""Return what the highest level of one more unit, on as many motions of its own, exceeds with probability `rate`, in dB.
 
-    The highest levels of units are draws with a tail (`uncertainty.outliers.tail.prediction_bound`, :math:`b`). Where few motions were recorded, which
-    units share, their mean :math:`\bar m` moves with those too:
-
-    .. math:: \bar m + \sqrt{(b - \bar m)^2 + \max(t_{e-1}^2 - t_5^2,\, 0)\, 2v}
-
-    :math:`v` is half the mean square by which :math:`\bar m` differs between halves of the e episodes, :math:`t` are quantiles of Student's distribution.
-    What is left of six motions the tail covers: good simulated drives exceeded bounds from 12 units and 6 motions in 38 of 1920 cases, at 2 %.
-
-    Parameters
-    ----------
-    peaks : sequence of sequence of float
-        Highest levels in the episodes of every unit, in the order of their motions, dB.
-    rate : float
-        Share of good units that may exceed the bound.
+    With few episodes e, which units share, :math:`\bar m + \sqrt{(b - \bar m)^2 + \max(t_{e-1}^2 - t_5^2,\, 0)\, 2v}`, v from halves of the episodes.
     """
     from scipy.special import stdtrit
 
@@ -175,16 +147,7 @@ def bound_of_peaks(peaks: Sequence[Sequence[float]], rate: float) -> float:
 
 
 def steady(largest: Mapping[tuple[str, str], Array]) -> Array:
-    """Return weights of levels, shape (q, bands), whose mean differs least from unit to unit of a condition; they are not negative and sum to one.
-
-    Covariances are shrunk to the diagonal, since units are few, and no variance counts less than half the median one: a band that holds nothing but
-    the noise of a sensor is the same in all units, whatever is wrong with them.
-
-    Parameters
-    ----------
-    largest : mapping of (unit, condition) to ndarray, shape (q, bands)
-        Levels in dB.
-    """
+    """Return weights of levels, shape (q, bands), whose mean differs least from unit to unit of a condition; largest (q, bands)."""
     from scipy.optimize import nnls
 
     by_condition: dict[str, list[Array]] = {}

@@ -105,19 +105,7 @@ class Design:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Designs:
-    """All observers of a population.
-
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        By name, those that could be made.
-    deployed : str
-        The one that goes into machines.
-    facts : dict
-        What is known about every observer by name, the reason among it where one could not be made.
-    running : tuple of Running
-        Certificates as they run, with what they say about every unit.
-    """
+    """All observers of a population."""
 
     designs: Mapping[str, Design]
     deployed: str
@@ -214,13 +202,7 @@ def synthesize_all(
     robust: bool = False,
     work: Work | None = None,
 ) -> Designs:
-    """Design all observers that settings ask for, certify them, and choose the one that is deployed.
-
-    Raises
-    ------
-    SynthesisError
-        When none can be made, or not the one that is to be deployed.
-    """
+    """Design all observers that settings ask for, certify them, and choose the one that is deployed."""
     settings, observer, predictor, work = (
         settings or SynthesisSettings(),
         observer or ObserverSettings(),
@@ -296,10 +278,7 @@ def tasks_of(
 
 
 def measurement_noise(identified: IdentifiedModels, models: ModelSet, sensor: Sensors) -> Array:
-    """Return the standard deviation of every measurement's noise: as declared, jitter at the speed of the training episodes, and the rounding.
-
-    The resolution is the coarser of the one that is declared and the one found in the data.
-    """
+    """Return the standard deviation of every measurement's noise."""
     names, steps = [models.lifting.states[i] for i in models.measured], np.zeros(len(models.measured))
     if any(own.jitter_samples for own in sensor.values()):
         steps = TrainingSet.of(identified, models).read().steps(models.measured)
@@ -354,12 +333,7 @@ def certified_problem(task: DesignTask, pairs: Sequence[tuple[DesignTask, Design
 
 
 def choose_deployed(wanted: str | None, made: list[str], running: Sequence[Running]) -> str:
-    """Return the observer that is deployed: the one asked for, else the most accurate one with all certificates that tolerates dropouts.
-
-    Certificates are those as it runs, for the recorded signals of all units and for losses at a declared rate (`Running.certified`). Accuracy is that on
-    training episodes, of the states that are not measured. Where no observer tolerates dropouts, those that are certified compete; where there is none,
-    those that are certified as they run; where there is none either, the best guarantee of the best model decides.
-    """
+    """Return the observer that is deployed: the one asked for, else the most accurate one with all certificates that tolerates dropouts."""
     if wanted is not None:
         if wanted not in made:
             raise SynthesisError(f"observer.deployed = {wanted!r}: there is no such observer, only {', '.join(made)}; name one of them.")

@@ -25,37 +25,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class DesignTask:
-    """One observer to design, in channels divided by their ranges.
-
-    Parameters
-    ----------
-    name : str
-        ``<kind of model>/<method>``.
-    method : str
-    models : ModelSet
-    unit : str
-        The nominal one.
-    problem : ObserverProblem or None
-        None where there is no usable uncertain set; `refusal` says why.
-    refusal : str
-    noise : ndarray, shape (q,)
-        Standard deviation of every measurement's noise.
-    training : TrainingSet
-    covered : tuple of str
-        Units whose differences the set covers.
-    max_order : int
-        Highest order of a weight.
-    settings : SynthesisSettings
-    predictor : PredictorSettings
-    limits : mapping of str to Limit
-        Of recorded states, by name.
-    at_limits : TrainingSet, optional
-        Episodes among which there are some that meet them.
-    pooled : bool
-        Whether the mean of the units' models may be the nominal, where that is free.
-    recordings : TrainingSet, optional
-        All training episodes of all units in all conditions; those of `training` by default.
-    """
+    """One observer to design, in channels divided by their ranges."""
 
     name: str
     method: str
@@ -63,7 +33,7 @@ class DesignTask:
     unit: str
     problem: ObserverProblem | None
     refusal: str
-    noise: Array
+    noise: Array  # (q,)
     training: TrainingSet
     covered: tuple[str, ...] = ()
     max_order: int = 4
@@ -143,20 +113,7 @@ class DesignTask:
 
 @dataclass(frozen=True, eq=False)
 class DesignResult:
-    """One observer in channels divided by their ranges, or the reason why there is none.
-
-    Parameters
-    ----------
-    name : str
-    observer : Observer or None
-    synthesis : Synthesis or None
-    facts : dict
-        For the records.
-    problem : ObserverProblem or None
-        The uncertain set that it was designed for.
-    uncovered : str
-        Why the uncertain set says nothing about this observer, whose model is none of the nominal unit's; empty where it may.
-    """
+    """One observer in channels divided by their ranges, or the reason why there is none."""
 
     name: str
     observer: Observer | None

@@ -41,10 +41,7 @@ class TrainingSet:
 
     @classmethod
     def of(cls, identified: IdentifiedModels, models: ModelSet, sensor: Sensors | None = None) -> TrainingSet:
-        """Take some of the first units, and of each some episodes from the first to the last: those recorded one after the other may be alike.
-
-        Of episodes shorter than `SHORT_S` as many more as make up for it.
-        """
+        """Take some of the first units, and of each some episodes from the first to the last."""
         facts, known = identified.facts, identified.parameters
         units = [u for u in facts.pooled if u in models.unit_ids][:TUNING_UNITS]
         every = [facts.keys("train", u, facts.identify_on) for u in units]
@@ -113,15 +110,7 @@ class TrainingSet:
 
 @dataclass(frozen=True, eq=False)
 class ValidationSet:
-    """Training episodes in memory, as the sensor that was declared shows them.
-
-    Parameters
-    ----------
-    batch : EpisodeBatch
-    sensor : mapping of str to Sensor
-    states : tuple of str
-        Names of the recorded states.
-    """
+    """Training episodes in memory, as the sensor that was declared shows them."""
 
     batch: EpisodeBatch
     sensor: Sensors = field(default_factory=dict)
@@ -207,21 +196,7 @@ def hidden_mean(values: Array, measured: Sequence[int]) -> Array:
 
 
 def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, float]:
-    """Order candidates: first those that are in no state worse than the open loop, by the error of the hidden states relative to it.
-
-    Parameters
-    ----------
-    percent, limit : ndarray, shape (n,)
-        Errors of the candidate and of the open loop, percent of the largest value.
-    measured : sequence of int
-
-    Returns
-    -------
-    bool
-        Whether the candidate is worse than the open loop in some state.
-    float
-        Geometric mean of the hidden states' errors over those of the open loop; of the worst state where the candidate is worse.
-    """
+    """Order candidates: first those that are in no state worse than the open loop, by the error of the hidden states relative to it."""
     ratio = percent / np.maximum(limit, np.finfo(float).tiny)
     worst = float(ratio.max())
     if not worst <= 1:

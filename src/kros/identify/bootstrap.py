@@ -182,29 +182,9 @@ def bootstrap_edmd(R: Array, n_lifted: int, alpha: float, weights: Array, unit_i
 
 
 def one_step_deviations(normal: Array, information: Array, weights: Array) -> Array:
-    """Return where one Gauss-Newton step on resampled episodes leads from the estimate.
+    """Return where one Gauss-Newton step on resampled episodes leads from the estimate, shape (unit, draw, P).
 
-    The estimate is where the search ended, taken as the minimum; with weights w of the episodes the step is
-
-        H_w = information + sum_e (w_e - 1) H_e,     dV = H_w^-1 sum_e (w_e - 1) g_e
-
-    Parameters
-    ----------
-    normal : ndarray, shape (unit, episode, P + 1, P + 1)
-        N of every episode at the estimate, with r data minus model and J the model's derivative.
-    information : ndarray, shape (unit, P, P)
-        Of the whole cost: all episodes, prior, edge of stability.
-    weights : ndarray, shape (unit, draw, episode)
-
-    Returns
-    -------
-    ndarray, shape (unit, draw, P)
-        Zero in directions about which neither the episodes drawn nor the prior say anything.
-
-    Raises
-    ------
-    DimensionError
-        When the shapes do not fit together.
+    H_w = information + sum_e (w_e - 1) H_e,     dV = H_w^-1 sum_e (w_e - 1) g_e,     w the weights of the episodes
     """
     units, episodes, P = normal.shape[0], normal.shape[1], normal.shape[-1] - 1
     if information.shape != (units, P, P) or weights.shape[0] != units or weights.shape[2] != episodes:

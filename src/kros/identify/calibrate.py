@@ -18,13 +18,7 @@ Task = tuple[Population, tuple[EpisodeKey, ...], PhaseSpec]
 
 
 def calibrate(population: Population, facts: RecordingFacts, spec: PhaseSpec, work: Work | None = None) -> PhaseCalibration:
-    """Calibrate all units on training episodes; a unit that cannot be calibrated is left out, with its reason in the log.
-
-    Raises
-    ------
-    IdentificationError
-        When too few units can be calibrated.
-    """
+    """Calibrate all units on training episodes; a unit that cannot be calibrated is left out, with its reason in the log."""
     tasks = [(population.select([u]), calibration_keys(facts, u), spec) for u in facts.groups]
     units: dict[str, UnitPhase] = {}
     marks = [
@@ -47,11 +41,7 @@ def calibrate(population: Population, facts: RecordingFacts, spec: PhaseSpec, wo
 
 
 def segments_of(task: Task) -> list[Segment]:
-    """Find the constant-velocity segments of some episodes.
-
-    Where the measured rate is not recorded, as in the field, the derivative of the angle stands for it. It may lag otherwise than the rate did: the
-    phase is the half sum of both directions, which a lag leaves as it is.
-    """
+    """Find the constant-velocity segments of some episodes."""
     population, keys, spec = task
     names = population.states + population.inputs
     angle, reference = (names.index(n) for n in (spec.angle, spec.reference))

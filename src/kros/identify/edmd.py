@@ -174,19 +174,11 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
 
 @dataclass(frozen=True, eq=False)
 class _Ridge:
-    """Regularised models of units as functions of alpha: with ``R11 = P diag(s) Q^T`` it is ``A^T = Q1 diag(s / (s^2 + alpha)) P^T R12``.
+    """Regularised models as functions of alpha: with ``R11 = P diag(s) Q^T``, ``A^T = Q1 diag(s / (s^2 + alpha)) P^T R12``."""
 
-    Parameters
-    ----------
-    left : ndarray, shape (unit, n_lifted, p)
-        The rows Q1 of Q.
-    values : ndarray, shape (unit, p)
-    right : ndarray, shape (unit, p, n_lifted)
-    """
-
-    left: Array
-    values: Array
-    right: Array
+    left: Array  # (unit, n_lifted, p)
+    values: Array  # (unit, p)
+    right: Array  # (unit, p, n_lifted)
 
     @classmethod
     def of(cls, R: Array, n_lifted: int) -> _Ridge:

@@ -15,28 +15,7 @@ _ROUNDING = 1e-13  # relative: what conversions of units leave of a constant
 
 
 def require_excitation(factor: Factor, inputs: Sequence[str], units: Sequence[str], where: str, alpha: float = 0.0) -> None:
-    """Refuse inputs that are constant over all training episodes of a unit.
-
-    The response to such an input cannot be told from an offset. Without regularisation that is an error. With it the column of B is that of
-    the offset, or zero where the input is, and a warning is logged; an input that is zero for every unit has no range and is always refused.
-
-    Parameters
-    ----------
-    factor : Factor
-        Batch over units, with `input_range`.
-    inputs : sequence of str
-        Recorded inputs.
-    units : sequence of str
-    where : str
-        Condition, for the message.
-    alpha : float
-        Tikhonov coefficient.
-
-    Raises
-    ------
-    IdentificationError
-        Names the first unit and input.
-    """
+    """Refuse inputs that are constant over all training episodes of a unit."""
     if factor.input_range is None:
         return
     low, high = factor.input_range[..., 0, :], factor.input_range[..., 1, :]
@@ -53,23 +32,7 @@ def require_excitation(factor: Factor, inputs: Sequence[str], units: Sequence[st
 
 
 def require_independent(factor: Factor, names: Sequence[str], units: Sequence[str], where: str) -> None:
-    """Refuse lifted data in which one column follows from those before it.
-
-    Parameters
-    ----------
-    factor : Factor
-        Of ``[Psi | Theta_plus]``, batch over units.
-    names : sequence of str
-        Lifted states and inputs, the columns of Psi.
-    units : sequence of str
-    where : str
-        Condition, for the message.
-
-    Raises
-    ------
-    IdentificationError
-        Names unit and function.
-    """
+    """Refuse lifted data in which one column follows from those before it."""
     found = dependent_column(factor.R, len(names))
     if found is not None:
         unit, column = found

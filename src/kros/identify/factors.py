@@ -241,13 +241,7 @@ def _peaks(M: Array, peak: Array) -> Array:
 
 
 def dependent_column(R: Array, n_columns: int) -> tuple[int, int] | None:
-    """Return unit and column of the first of `n_columns` that depends on those before it, or None.
-
-    Parameters
-    ----------
-    R : ndarray, shape (unit, p, p)
-    n_columns : int
-    """
+    """Return unit and column of the first of `n_columns` that depends on those before it, or None; R (unit, p, p)."""
     part = R[..., :n_columns]
     pivots = np.abs(np.diagonal(part, axis1=-2, axis2=-1)) / np.maximum(np.linalg.norm(part, axis=-2), np.finfo(float).tiny)
     found = np.argwhere(pivots < n_columns * np.finfo(float).eps)

@@ -52,15 +52,7 @@ class Stored(Mapping[str, T]):
 
 @dataclass(frozen=True, eq=False)
 class EpisodeFactors:
-    """Triangular factors of every training episode of one condition, free of the lifting's parameters.
-
-    Parameters
-    ----------
-    condition : str
-    rows : tuple of (unit, episode)
-    factor : Factor
-        Batch over `rows`.
-    """
+    """Triangular factors of every training episode of one condition, free of the lifting's parameters."""
 
     condition: str
     rows: tuple[tuple[str, str], ...]

@@ -236,10 +236,7 @@ def fitted(models: ModelSet, factor: Factor) -> ModelSet:
 
 
 def alpha_factor(shared: list[tuple[Array, int]], edge: float, smallest: float) -> float:
-    """Return how many times the smallest stabilising coefficient is taken: doubled until units are near enough for an uncertain set around one of them.
-
-    Where no factor brings them near enough, the smallest one stays.
-    """
+    """Return how many times the smallest stabilising coefficient is taken."""
     limit = 20 * np.log10(LARGEST_RESIDUAL)
     for doubled in range(_DOUBLINGS if edge > 0 else 0):
         factor = smallest * 2.0**doubled
@@ -257,10 +254,7 @@ def begin_refinement(
     starts: list[ModelSet],
     work: Work,
 ) -> Refining:
-    """Begin to refine every kind of model on free-run error, the population first, then each unit with a prior centred on it.
-
-    Beside the models come what the refinement found out: the pooled model, the trade-off, the information matrices.
-    """
+    """Begin to refine every kind of model on free-run error, the population first, then each unit with a prior centred on it."""
     facts = base.facts
     keys = {u: facts.keys("train", u, facts.identify_on) for u in units}
     in_pool = set(facts.pooled)

@@ -32,21 +32,7 @@ _BINS = 1 << 21
 
 @dataclass(frozen=True)
 class PeriodicTerm:
-    """A term of an angle that a linear model lacks.
-
-    Parameters
-    ----------
-    angle : str
-        State.
-    ratio : float
-        The term is ``sin(ratio * angle)`` with some phase.
-    share : float
-        Of the residual of the linear model, that it explains in the state that it shows most in.
-    above : float
-        Peak over the median of the ratios around it; infinite for a ratio of one, which is not compared.
-    odd : bool
-        Whether the sine alone explains nearly as much as sine and cosine, as where the angle is counted from where a pendulum hangs.
-    """
+    """A term of an angle that a linear model lacks."""
 
     angle: str
     ratio: float
@@ -56,16 +42,7 @@ class PeriodicTerm:
 
 
 def periodic_term(population: Population, angles: Sequence[str], keys: Sequence[EpisodeKey] | None = None) -> PeriodicTerm | None:
-    """Return the periodic term that shows most, or None where none does.
-
-    Parameters
-    ----------
-    population : Population
-    angles : sequence of str
-        States that are angles, rad.
-    keys : sequence of EpisodeKey, optional
-        What is looked at; default a few episodes of a few units in the first condition.
-    """
+    """Return the periodic term that shows most, or None where none does."""
     keys = _some_keys(population) if keys is None else keys
     units = [[population.read(k) for k in keys if k.unit == unit] for unit in dict.fromkeys(k.unit for k in keys)]
     names = population.states + population.inputs

@@ -70,10 +70,7 @@ def _sample(population: Population, test: Iterable[str] | None, names: tuple[str
 
 
 def resolve_phase(declared: CalibrationSettings, population: Population, lifting: Lifting) -> PhaseSpec | None:
-    """Return what has to be calibrated for the lifting's parameters: nothing, or the phase of a disturbance that is fixed to an angle.
-
-    What is not declared follows from the plant, else the angle and its ratio from the formula, ``sin(100*position + phase)``.
-    """
+    """Return what has to be calibrated for the lifting's parameters: nothing, or the phase of a disturbance that is fixed to an angle."""
     if not lifting.parameters:
         return None
     if lifting.parameters != (PHASE,):

@@ -25,30 +25,14 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """Ranges of a model's channels.
+    """Ranges of a model's channels."""
 
-    Parameters
-    ----------
-    outputs : ndarray, shape (n_lifted,)
-        Of the lifted states.
-    inputs : ndarray, shape (m,)
-        Of the recorded inputs and the functions of them.
-    """
-
-    outputs: Array
-    inputs: Array
+    outputs: Array  # (n_lifted,)
+    inputs: Array  # (m,)
 
     @classmethod
     def of(cls, factor: Factor, n_lifted: int, rows: Any = slice(None)) -> Ranges:
-        """Return the largest magnitudes in the training episodes of some units; one for a channel that is zero in all of them.
-
-        Parameters
-        ----------
-        factor : Factor
-            Of ``[Psi | Theta_plus]``, batch over units.
-        n_lifted : int
-        rows : index of units, optional
-        """
+        """Return the largest magnitudes in the training episodes of some units; one for a channel that is zero in all of them."""
         peak = factor.peak[rows].max(axis=0)
         peak = np.where(peak > 0, peak, 1.0)
         return cls(peak[:n_lifted], peak[n_lifted:])

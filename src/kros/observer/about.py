@@ -97,13 +97,7 @@ class About(Settings):
 
 
 def checked_about(found: Any, states: Sequence[str], inputs: Sequence[str], parameters: Sequence[str], where: str) -> dict[str, Any]:
-    """Return what a file says, with the channels that it speaks of checked against those of the observer.
-
-    Raises
-    ------
-    DataError
-        A key that is unknown, a value of another kind, or a name that the observer does not have.
-    """
+    """Return what a file says, with the channels that it speaks of checked against those of the observer."""
     if not isinstance(found, Mapping):
         raise DataError(f"{where} should be an object, found {found!r}; correct the file.")
     try:

@@ -74,13 +74,7 @@ def write_observer(observer: ObserverData, path: Path) -> None:
 
 
 def read_observer(path: Path) -> ObserverData:
-    """Read an observer's file.
-
-    Raises
-    ------
-    DataError
-        See `Observer.load`.
-    """
+    """Read an observer's file."""
     content = read_json(path)
     if not isinstance(content, dict) or content.get("kind") != KIND or content.get("schema") not in (_FIRST, SCHEMA):
         raise DataError(
@@ -98,12 +92,7 @@ def read_observer(path: Path) -> ObserverData:
 
 
 def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
-    """Make an observer from the content of a file; messages begin with `where`.
-
-    Raises
-    ------
-    DataError
-    """
+    """Make an observer from the content of a file; messages begin with `where`."""
     _text(content["name"], f"{where}: name")
     for key in ("states", "inputs", "lifting", "lifting_inputs", "input_functions"):
         _names(content.get(key, []) if key.endswith(("lifting_inputs", "functions")) else content[key], f"{where}: {key}")
@@ -156,13 +145,7 @@ def _named_memories(states: Sequence[str]) -> int:
 
 
 def matrix(rows: Any, shape: tuple[int, int], where: str) -> Array:
-    """Return a matrix from lists of lists.
-
-    Raises
-    ------
-    DataError
-        Another shape, or an entry that is not a finite number, with its place.
-    """
+    """Return a matrix from lists of lists."""
     if not isinstance(rows, list) or len(rows) != shape[0]:
         found = f"{len(rows)} rows" if isinstance(rows, list) else shortened(repr(rows), 60)
         raise DataError(f"{where} should have {shape[0]} rows of {shape[1]} numbers, found {found}; correct the file.")

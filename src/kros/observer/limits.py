@@ -48,13 +48,7 @@ Limits = Mapping[str, Limit]
 
 
 def limits_of(declared: Limits, found: Mapping[str, FoundLimit], states: Sequence[str]) -> dict[str, Limit]:
-    """Return limits by state: what is declared, else what was found.
-
-    Raises
-    ------
-    ConfigError
-        When one is declared of what is no state.
-    """
+    """Return limits by state: what is declared, else what was found."""
     if unknown := sorted(set(declared) - set(states)):
         raise ConfigError(f"limits: {', '.join(unknown)} should be among the recorded states, {', '.join(states)}.")
     of = {name: Limit(lower=own.lower, upper=own.upper) for name, own in found.items()} | dict(declared)

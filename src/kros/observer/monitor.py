@@ -249,18 +249,7 @@ def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
 
 
 def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:
-    """Return which samples are judged, shape (n_samples, batch), as a running observer does it.
-
-    Parameters
-    ----------
-    settle : int
-    status : ndarray of int, shape (n_samples, batch)
-        What was wrong with every sample by itself.
-    starts : ndarray of bool, shape (n_samples, batch)
-        Samples at which the observer starts.
-    moving : ndarray of bool, shape (n_samples, batch)
-        Samples that the observer takes: not those that wait for late measurements.
-    """
+    """Return which samples are judged, shape (n_samples, batch), as a running observer does it; status (n_samples, batch)."""
     judged, bad = np.zeros(status.shape, dtype=bool), status != 0
     events = bad | starts | ~moving
     for machine, own in enumerate(judged.T):

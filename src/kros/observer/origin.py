@@ -36,21 +36,11 @@ _MOST = 64  # periods of the first function until all others repeat
 
 @dataclass(frozen=True, eq=False)
 class Shift:
-    """How an observer's signals move with the origin.
+    """How an observer's signals move with the origin."""
 
-    Parameters
-    ----------
-    states : ndarray, shape (n,)
-        Movement of the states for an origin moved by one.
-    whole, rest : ndarray, shape (m,)
-        Movement of the inputs, in whole numbers and what is left: a reference moves by one, and ``u - o`` is exact.
-    period : float
-        The origin moves in multiples of it.
-    """
-
-    states: Array
-    whole: Array
-    rest: Array
+    states: Array  # (n,)
+    whole: Array  # (m,)
+    rest: Array  # (m,)
     period: float
 
 
@@ -118,13 +108,7 @@ def _common(rates: list[Any]) -> float | None:
 
 
 class Origins:
-    """Origins of machines that run side by side in double precision; `at`, shape (batch,), is None while nobody has moved away.
-
-    Parameters
-    ----------
-    observer : ObserverData
-    batch : int
-    """
+    """Origins of machines that run side by side in double precision; `at`, shape (batch,), is None while nobody has moved away."""
 
     def __init__(self, observer: ObserverData, batch: int) -> None:
         self._observer, self._place = observer, observer.measured[0] if len(observer.measured) == 1 else None

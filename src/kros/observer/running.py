@@ -222,10 +222,7 @@ class RunningObserver:
         return self._screen.take(y[None, None], u[None, None], held)
 
     def _take(self, y: Array, u: Array) -> tuple[Array, Array]:
-        """Judge a sample, and start again where that is due; the first sample is the one that the observer started at.
-
-        `_known` is the last input where it was good and nothing is held: then a sample with good inputs takes the short way.
-        """
+        """Judge a sample, and start again where that is due; the first sample is the one that the observer started at."""
         before, self._known = self._known, None
         if before is not None:
             status = self._screen.at_once(y.tolist(), u.tolist())

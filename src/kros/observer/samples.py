@@ -49,21 +49,11 @@ class SampleStatus(IntFlag):
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """Inputs held from sample to sample.
+    """Inputs held from sample to sample."""
 
-    Parameters
-    ----------
-    inputs : ndarray, shape (batch, m)
-        Last good ones; zero before the first.
-    since : ndarray of int, shape (batch, m)
-        Samples since then.
-    stale : ndarray of bool, shape (batch,)
-        Whether the observer starts again at the next sample with a measurement and all inputs.
-    """
-
-    inputs: Array
-    since: Whole
-    stale: Flags
+    inputs: Array  # (batch, m)
+    since: Whole  # (batch, m)
+    stale: Flags  # (batch,)
 
     @classmethod
     def nothing(cls, batch: int, m: int) -> Held:
@@ -78,26 +68,12 @@ class Held:
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """Samples as an observer takes them.
+    """Samples as an observer takes them."""
 
-    Parameters
-    ----------
-    y : ndarray, shape (n_samples, batch, q)
-        NaN where a measurement corrects nothing.
-    u : ndarray, shape (n_samples, batch, m)
-        Finite.
-    status : ndarray of uint8, shape (n_samples, batch)
-        Bits of `SampleStatus`.
-    starts : ndarray of bool, shape (n_samples, batch)
-        Samples at which an observer starts again.
-    held : Held
-        After the last sample.
-    """
-
-    y: Array
-    u: Array
-    status: Bits
-    starts: Flags
+    y: Array  # (n_samples, batch, q)
+    u: Array  # (n_samples, batch, m)
+    status: Bits  # (n_samples, batch)
+    starts: Flags  # (n_samples, batch)
     held: Held
 
     def of(self, members: Sequence[int]) -> Screened:

@@ -50,12 +50,7 @@ Sensors = Mapping[str, Sensor]
 
 
 def require_measured(sensor: Sensors, measured: Sequence[str]) -> None:
-    """Refuse the sensor of what is not measured, and channels that are late by different numbers of samples.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse the sensor of what is not measured, and channels that are late by different numbers of samples."""
     if unknown := sorted(set(sensor) - set(measured)):
         raise ConfigError(f"sensor: {', '.join(unknown)} should be among the states that are measured, {', '.join(measured)}.")
     delays = {name: sensor.get(name, Sensor()).delay_samples for name in measured}

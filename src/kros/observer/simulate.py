@@ -169,11 +169,7 @@ def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters |
 
 
 def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None, wanted: EstimateKind) -> Array:
-    """Run observers on screened samples, shape (observer, n_samples, batch, n).
-
-    With a delay d, states are those of the time of measurement: at k, ``min(k - start, d)`` samples ago. While the first d samples go by, what arrives was
-    measured before the start and says nothing but where to start. In the end all of them are predicted to k.
-    """
+    """Run observers on screened samples, shape (observer, n_samples, batch, n)."""
     observer, d = observers[0], observers[0].runtime.delay
     (n_samples, batch), values = samples.starts.shape, observer.values(parameters, samples.starts.shape[1:])
     steps, pending = Steps(observers, batch, values), _pending(samples.starts, d) if d else None
@@ -198,21 +194,7 @@ def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Param
 def run_innovations(
     observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None, settle: int = 0
 ) -> tuple[Array, Flags]:
-    """Return innovations as an observer meets them, and which samples a monitor judges.
-
-    Parameters
-    ----------
-    observer, y, u, parameters
-        As in `run_observer`.
-    settle : int
-        Samples after a start that are not judged.
-
-    Returns
-    -------
-    innovation : ndarray, shape (n_samples, batch, q)
-        Zero where a measurement is missing.
-    judged : ndarray of bool, shape (n_samples, batch)
-    """
+    """Return innovations as an observer meets them, and which samples a monitor judges."""
     samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
     (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
     steps, innovation = Steps([observer], batch, values), np.zeros(samples.y.shape)

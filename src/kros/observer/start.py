@@ -24,26 +24,11 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Start of an observer in motion.
+    """Start of an observer in motion."""
 
-    Parameters
-    ----------
-    gain : ndarray, shape (n, q + m)
-        G, of the first measurement and the first recorded inputs.
-    corrections : ndarray, shape (count, n, q)
-        S_k, of the first innovations, beside the observer's own correction.
-    rest : ndarray, shape (p, q + m), optional
-        What is at most one in size, all of it, for the first measurement and inputs of a machine at rest; by default nothing tells, and no machine is.
-
-    Raises
-    ------
-    DataError
-        When a number is not finite.
-    """
-
-    gain: Array
-    corrections: Array
-    rest: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    gain: Array  # (n, q + m)
+    corrections: Array  # (count, n, q)
+    rest: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (p, q + m)
 
     def __post_init__(self) -> None:
         for name in ("gain", "corrections", "rest"):
@@ -73,10 +58,7 @@ class Start:
         return np.asarray((np.abs(shown @ self.rest.T) <= 1).all(axis=-1))
 
     def moved(self, y: Array, u: Array, origin: tuple[Array, Array] | None = None) -> Array:
-        """Return what motion adds to the first estimate, shape (..., n): nothing at rest, or where a measurement or an input is not known.
-
-        What is large in y and u alike is better taken off first: `origin`, shape (...), of the measurement, and how inputs move with it, shape (m,).
-        """
+        """Return what motion adds to the first estimate, shape (..., n)."""
         adds = (np.isfinite(y).all(axis=-1) & np.isfinite(u).all(axis=-1) & ~self.at_rest(y, u))[..., None]
         if origin is None:
             return np.asarray(np.where(adds, np.concatenate([y, u], axis=-1), 0.0) @ self.gain.T)

@@ -21,20 +21,7 @@ _PIECE = 256  # samples until the origins of machines that turn on are moved alo
 
 
 class Steps:
-    """Observers of one model, side by side over a batch of machines; `cut` is what limits took from the last estimates.
-
-    The states `near` are relative to origins that follow machines which have moved far away (`origin`); all signals that come and go are not.
-
-    ``[x_hat+; x^c+] = M [theta(x_hat); x^c; u; y]``, one column a machine, so that each quantity of all machines lies together in memory.
-
-    Parameters
-    ----------
-    observers : sequence of ObserverData
-        Of the same lifting, measured states, inputs and limits; more than one only without limits of corrections and without a start in motion.
-    batch : int
-    values : mapping of str to array_like, shape (batch,)
-        Lifting parameters; looked at anew in every step.
-    """
+    """Observers of one model, side by side over a batch of machines, relative to their origins: ``[x_hat+; x^c+] = M [theta(x_hat); x^c; u; y]``."""
 
     def __init__(self, observers: Sequence[ObserverData], batch: int, values: Parameters) -> None:
         observer = observers[0]
@@ -130,16 +117,7 @@ class Steps:
         return np.asarray(y - self.near[..., self._at])
 
     def step(self, y: Array, u: Array, missing: Flags | None = None, moving: Flags | None = None) -> None:
-        """Take measurements, shape (batch, q), and inputs, shape (batch, m).
-
-        Parameters
-        ----------
-        y, u : ndarray
-        missing : ndarray of bool, shape (batch, q), optional
-            Measurements that correct nothing.
-        moving : ndarray of bool, shape (batch,), optional
-            Machines that take the sample; all by default.
-        """
+        """Take measurements, shape (batch, q), and inputs, shape (batch, m); missing (batch, q), moving (batch,)."""
         lifting, following_earlier = self.lifting, None
         y, u = self._origins.take_off(y, u)
         if self._plain:
@@ -184,25 +162,7 @@ class Steps:
         innovation: Array | None = None,
         before: tuple[Array, Whole] | None = None,
     ) -> None:
-        """Take many samples, compiled where there is a compiler.
-
-        Parameters
-        ----------
-        y : ndarray, shape (n_samples, batch, q), optional
-            Not finite where nothing arrived; nothing is corrected where there is none.
-        u : ndarray, shape (n_samples, batch, m)
-        late : int
-            A sample is taken with the inputs of so many samples before.
-        moving, starts : ndarray of bool, shape (n_samples, batch), optional
-            Machines that take a sample, and those that start anew at it, but for the first one.
-        states : ndarray, shape (n_samples, observer, n, batch), optional
-            Filled with the estimates before every sample.
-        innovation : ndarray, shape (n_samples, batch, q), optional
-            Filled with those of the first observer.
-        before : tuple of ndarray, shapes (n_samples, batch, n_earlier) and (n_samples, batch), optional
-            Filled with the first observer's earlier values before every sample, which after a start equal the present ones with the inputs of
-            so many samples before.
-        """
+        """Take many samples, compiled where there is a compiler; y (n_samples, batch, q), u (n_samples, batch, m)."""
         if library() is None:
             self._one_by_one(y, u, late, moving, starts, states, innovation, before)
         elif self._origins.at is None and (y is None or not self._origins.beyond(y)):

@@ -60,23 +60,7 @@ class Tracked:
 
 
 class PhaseLockedLoop:
-    """The loop beside an observer's `Steps`, for a batch of machines.
-
-    Parameters
-    ----------
-    observer : ObserverData
-        Without delays in its lifting and delay of the measurement; with several measurements, it knows their sizes in training.
-    name : str
-        The parameter that is followed.
-    batch : int
-    settle_s : float, s
-        Time tau in which its error decays; long against the vibration that shows it.
-
-    Raises
-    ------
-    ConfigError
-        When the observer is another, or the time is not positive.
-    """
+    """The loop beside an observer's `Steps`, for a batch of machines."""
 
     def __init__(self, observer: ObserverData, name: str, batch: int, settle_s: float = SETTLE_S) -> None:
         lifting = observer.lifting
@@ -118,13 +102,7 @@ class PhaseLockedLoop:
 
 
 def measurement_sizes(observer: ObserverData) -> Array:
-    """Return by what measurements are divided where they count together, shape (q,): sizes seen in training.
-
-    Raises
-    ------
-    ConfigError
-        When there are several measurements and their sizes are not known.
-    """
+    """Return by what measurements are divided where they count together, shape (q,): sizes seen in training."""
     if len(observer.measured) == 1:
         return np.ones(1)
     if observer.seen is None:

@@ -202,13 +202,7 @@ def validate_config(raw: dict[str, Any], base: Path, origin: str = "study", over
 
 
 def stored_config(raw: Any, path: Path) -> StudyConfig:
-    """Return the resolved study of a run folder.
-
-    Raises
-    ------
-    ConfigError
-        Damaged, or of another version of kros.
-    """
+    """Return the resolved study of a run folder."""
     try:
         return StudyConfig.of(raw, f"Run {path.parent}: {path.name}")
     except ConfigError as error:

@@ -46,16 +46,7 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How far generated code is from Python.
-
-    Parameters
-    ----------
-    samples : int
-    difference : float
-        RMS of the differences of estimates, over the estimate's own standard deviation; the largest over the states.
-    loss_percent : mapping of str to float
-        By how much the RMS error of every state's estimate is larger than Python's; not a number where the truth is not known.
-    """
+    """How far generated code is from Python."""
 
     samples: int
     difference: float

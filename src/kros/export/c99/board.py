@@ -21,20 +21,7 @@ _BOARD = ("qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting", "
 
 @dataclass(frozen=True)
 class OnBoard:
-    """What an observer costs on a board.
-
-    Parameters
-    ----------
-    flash : int
-        Bytes of its own code and numbers; sine and cosine come from the C library.
-    state : int
-        Bytes.
-    stack : int
-        Bytes, at most: the frames of all functions together.
-    instructions_a_step : int
-    selftest : int
-        0 where the golden vectors agree.
-    """
+    """What an observer costs on a board."""
 
     flash: int
     state: int
@@ -44,13 +31,7 @@ class OnBoard:
 
     @classmethod
     def of(cls, files: Mapping[str, str], name: str, level: str = "-O2") -> OnBoard:
-        """Compile the files of an export and run them.
-
-        Raises
-        ------
-        ConfigError
-            When a tool is missing or refuses.
-        """
+        """Compile the files of an export and run them."""
         if missing := missing_tools():
             raise ConfigError(
                 f"Measuring on a board: {', '.join(missing)} not found; install gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm."

@@ -16,29 +16,15 @@ SAMPLES = 64
 
 @dataclass(frozen=True, eq=False)
 class Golden:
-    """Samples and what becomes of them.
+    """Samples and what becomes of them."""
 
-    Parameters
-    ----------
-    y, u : ndarray, shape (n_samples, q), (n_samples, m)
-    x_hat : ndarray, shape (n_samples, n_recorded)
-        Estimates after every sample.
-    status : ndarray of int, shape (n_samples,)
-    size : ndarray, shape (n_recorded,)
-        Largest estimates, which differences are compared with.
-    passes : int
-        How often the samples are gone through until a monitor judges them; 1 without one.
-    last_status : ndarray of int, shape (n_samples,)
-        In the last pass.
-    """
-
-    y: Array
-    u: Array
-    x_hat: Array
-    status: npt.NDArray[Any]
-    size: Array
+    y: Array  # (n_samples, q)
+    u: Array  # (n_samples, m)
+    x_hat: Array  # (n_samples, n_recorded)
+    status: npt.NDArray[Any]  # (n_samples,)
+    size: Array  # (n_recorded,)
     passes: int
-    last_status: npt.NDArray[Any]
+    last_status: npt.NDArray[Any]  # (n_samples,)
 
     @classmethod
     def of(cls, observer: Observer, track: str | None = None, count: int = SAMPLES) -> Golden:

@@ -49,20 +49,7 @@ class LoadOutput:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """An observer in the terms of its C source.
-
-    Parameters
-    ----------
-    realised : Realised
-    name : str
-        Prefix of everything that is public, a C identifier.
-    precision : Precision
-    shift : Shift or None
-        Where the origin can move.
-    loop : PhaseLockedLoop or None
-        Of a parameter that follows the machine.
-    load : LoadOutput or None
-    """
+    """An observer in the terms of its C source."""
 
     realised: Realised
     name: str

@@ -29,27 +29,13 @@ _PLAIN = 0.01  # factors as near to one are one: that difference is exact
 
 @dataclass(frozen=True, eq=False)
 class Realised:
-    """An observer as it is computed.
-
-    Parameters
-    ----------
-    observer : Observer
-        In the coordinates in which it is computed.
-    model : ndarray, shape (n, n_lifted + m)
-        From the lifted state and the inputs, of which some are differences, to the next state.
-    less : tuple of (int, int, float)
-        Input, state, factor: of the input the state times the factor is taken off.
-    shift : Shift or None
-        How the signals move with the origin, in these coordinates.
-    start_gain : ndarray, shape (n, q + m), or None
-        Of the start in motion, in these coordinates, from measurements and inputs of which some are differences.
-    """
+    """An observer as it is computed."""
 
     observer: Observer
-    model: Array
+    model: Array  # (n, n_lifted + m)
     less: tuple[tuple[int, int, float], ...]
     shift: Shift | None
-    start_gain: Array | None
+    start_gain: Array | None  # (n, q + m)
 
     @classmethod
     def of(cls, observer: Observer) -> Realised:
@@ -102,10 +88,7 @@ def _start_gain(observer: Observer, less: tuple[tuple[int, int, float], ...]) ->
 
 
 def to_modes(observer: Observer) -> Array | None:
-    """Return the coordinates of the modes of internal states, shape (n_lifted, n_lifted); one for real modes, pairs for complex ones.
-
-    None without such states, or where modes are so alike that rounding would grow.
-    """
+    """Return the coordinates of the modes of internal states, shape (n_lifted, n_lifted); one for real modes, pairs for complex ones."""
     n, first = observer.lifting.n_states, len(observer.recorded)
     if first == n:
         return None

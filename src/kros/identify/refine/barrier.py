@@ -14,10 +14,7 @@ Array = npt.NDArray[np.float64]
 
 
 def stability_barrier(V: Array, T: Array, guard: float, weight: float) -> Array:
-    """Return ``[J r]^T [J r]`` of the cost above, shape (problem, n p + 1, n p + 1), for V (problem, n, p) and T (p, p).
-
-    `guard` is the width of the edge, `weight` the cost of an eigenvalue on the unit circle.
-    """
+    """Return ``[J r]^T [J r]`` of the cost above, shape (problem, n p + 1, n p + 1), for V (problem, n, p) and T (p, p)."""
     problems, n, p = V.shape
     values, right = np.linalg.eig((V @ T.T)[..., :n])
     size = np.abs(values)

@@ -46,26 +46,7 @@ def episode_normals(
     options: RefineOptions,
     pooled: npt.NDArray[np.bool_] | None = None,
 ) -> Array:
-    """Return ``[J r]^T [J r]`` of every episode at the finished models.
-
-    Parameters
-    ----------
-    models : RefinedModels
-    population, keys, lifting, parameters, options, pooled
-        As in the call of `refine_population` that made the models.
-    factors : Factor
-        Of ``[Psi | Theta_plus]`` of every episode, as `episode_factors` makes them.
-
-    Returns
-    -------
-    ndarray, shape (unit, episode, P + 1, P + 1)
-        For parameters V, ``[A B] = V T^T``, as `RefinedModels.information`; zero where there is no episode.
-
-    Raises
-    ------
-    DimensionError
-        When models, episodes and factors do not fit together.
-    """
+    """Return ``[J r]^T [J r]`` of every episode at the finished models, shape (unit, episode, P + 1, P + 1)."""
     n, nl, T = lifting.n_states, lifting.n_lifted, models.whitening
     units, most = len(keys), max(len(episodes) for episodes in keys.values())
     width = len(T) + nl

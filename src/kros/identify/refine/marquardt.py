@@ -16,22 +16,12 @@ _NARROWED = 0.75  # of the problems at work: their data are copied where fewer a
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where the search ended.
+    """Where the search ended."""
 
-    Parameters
-    ----------
-    V : ndarray, shape (problem, rows, columns)
-    matrix : ndarray, shape (problem, P + 1, P + 1)
-        ``[J r]^T [J r]`` there.
-    iterations : int
-    converged : ndarray of bool, shape (problem,)
-        Whether the last accepted step gained less than was asked for, or no damping gave a better point.
-    """
-
-    V: Array
-    matrix: Array
+    V: Array  # (problem, rows, columns)
+    matrix: Array  # (problem, P + 1, P + 1)
     iterations: int
-    converged: npt.NDArray[np.bool_]
+    converged: npt.NDArray[np.bool_]  # (problem,)
 
     @property
     def cost(self) -> Array:
@@ -53,26 +43,7 @@ def minimise(
     least_gain: float,
     narrowed: Callable[[npt.NDArray[np.int64]], Evaluate] | None = None,
 ) -> Solution:
-    """Minimise the squared residuals of every problem.
-
-    Parameters
-    ----------
-    evaluate : callable
-        Returns ``[J r]^T [J r]``, (problem, P + 1, P + 1), at V; r is data minus model and J the model's derivative.
-    admissible : callable
-        Which V may be taken at all, shape (problem,).
-    V : ndarray, shape (problem, rows, columns)
-        Admissible start.
-    iterations : int
-    least_gain : float
-        Relative decrease of the cost at which a problem is done.
-    narrowed : callable, optional
-        Gives `evaluate` of some of the problems, with which those that are not done go on; by default all are evaluated to the end.
-
-    Returns
-    -------
-    Solution
-    """
+    """Minimise the squared residuals of every problem; V (problem, rows, columns)."""
     V, matrix = V.copy(), evaluate(V)
     mu = np.full(len(V), _START)
     done = np.zeros(len(V), dtype=bool)

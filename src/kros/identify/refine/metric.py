@@ -28,26 +28,13 @@ _POINTS = 100
 
 @dataclass(frozen=True, eq=False)
 class ResponsePrior:
-    """Prior that keeps frequency responses near that of the pooled model.
+    """Prior that keeps frequency responses near that of the pooled model."""
 
-    Parameters
-    ----------
-    A : ndarray, shape (n, n)
-        Pooled model, stable.
-    B : ndarray, shape (n, m)
-    T : ndarray, shape (n + m, n + m)
-    output_scale, input_scale : ndarray, shape (n,) and (m,)
-    weight : float
-        Number of residuals times strength.
-    level : float
-    power : int
-    """
-
-    A: Array
-    B: Array
-    T: Array
-    output_scale: Array
-    input_scale: Array
+    A: Array  # (n, n)
+    B: Array  # (n, m)
+    T: Array  # (n + m, n + m)
+    output_scale: Array  # (n,)
+    input_scale: Array  # (m,)
     weight: float = 1.0
     level: float = 0.3
     power: int = 2

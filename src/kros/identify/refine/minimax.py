@@ -28,46 +28,7 @@ def smallest_largest(
     against: Callable[[Array, Array], Array],
     score: Score,
 ) -> tuple[int, Array, Array, Array]:
-    """Return the candidate whose bound has the lowest score.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Numbers of candidates and frequencies.
-    first : int
-        Candidate to begin with.
-    bound_of : callable
-        From a candidate to its largest residual over all units and which unit that is of, both of shape (frequency,).
-    against : callable
-        From candidates, shape (n,), and one unit a frequency to the candidates' residuals with these, shape (n, frequency).
-    score : callable
-        From bounds (..., frequency) to scores (...), non-negative and never falling when a bound rises.
-
-    Returns
-    -------
-    index : int
-        Best candidate; of several equal ones the first.
-    bound : ndarray, shape (frequency,)
-        Its largest residual over the units.
-    scores : ndarray, shape (candidate,)
-        Where a candidate was evaluated its score, elsewhere a lower bound.
-    evaluated : ndarray of bool, shape (candidate,)
-        Which scores are exact.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.identify.refine.minimax import smallest_largest
-    >>> gains = np.array([1.0, 2.0, 2.1, 9.0])
-    >>> def bound_of(row):
-    ...     apart = np.abs(gains - gains[row])
-    ...     return apart.max(keepdims=True), np.array([apart.argmax()])
-    >>> def against(rows, witness):
-    ...     return np.abs(gains[rows][:, None] - gains[witness])
-    >>> index, bound, _, evaluated = smallest_largest((4, 1), 0, bound_of, against, lambda b: b.max(axis=-1))
-    >>> index, bound.round(9).tolist()
-    (2, [6.9])
-    """
+    """Return the candidate whose bound has the lowest score, its bound, all scores (lower bounds where not evaluated), and which are exact."""
     lower, scores, evaluated = np.zeros(shape), np.zeros(shape[0]), np.zeros(shape[0], bool)
     best, row = np.inf, first
     while scores[row] <= best * (1 + TIE):

@@ -19,19 +19,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TradeOff:
-    """What one strength of the prior brings.
-
-    Parameters
-    ----------
-    strength : float
-        Infinite for the pooled model alone.
-    held_out_percent : tuple of float
-        Free-run error of every state on the held-out training episodes, ``100 rms / max|x|``, median over the pooled units.
-    score : float
-        Mean square of the held-out errors in units of `sigma`, over states and pooled units.
-    peak_db : float
-        Peak residual of the inverse input multiplicative form over the pooled units, for the best nominal; nan for one unit.
-    """
+    """What one strength of the prior brings."""
 
     strength: float
     held_out_percent: tuple[float, ...]

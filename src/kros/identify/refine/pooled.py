@@ -55,14 +55,7 @@ def start_pooled(
 
 
 def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, score: Callable[[Array], float], options: RefineOptions) -> Array:
-    """Fit one model to all units, horizons growing; shape (n_lifted, p).
-
-    The free-run error has several minima, so the search is made once for every first horizon and way of weighing the states in
-    `options.starts`, and the end with the best `score` over whole episodes is finished: what is best over a second need not be best over
-    twenty. Growing the horizon from a few samples finds the models of stiff velocity loops best, starting at a long one those of soft
-    loops. On the way a model may be unstable: kept stable from the start, the search runs into the edge of stability and stops there, far
-    from the optimum.
-    """
+    """Fit one model to all units, horizons growing; shape (n_lifted, p)."""
     few = replace(problem, segments=problem.segments.first(max(2, -(-options.pooled_segments // problem.segments.n_units))))
     found: list[tuple[float, float, Array]] = []
     sigma = problem.sigma
@@ -115,11 +108,7 @@ def normalised(problem: Problem, V: Array) -> Problem:
 
 
 def _stabilise(V: Array, problem: Problem, options: RefineOptions) -> Array | None:
-    """Bring a model from outside the edge of stability to the inside; None where that fails.
-
-    The rows of lifted functions, which free runs do not see, are scaled by the largest of a few factors that makes the model stable,
-    off the edge where it can be. Where no factor does, the search goes on from outside with an edge that grows heavier.
-    """
+    """Bring a model from outside the edge of stability to the inside; None where that fails."""
     n = problem.lifting.n_states
     shortened = []
     for factor in np.linspace(1.0, 0.0, 21):

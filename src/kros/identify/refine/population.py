@@ -185,10 +185,7 @@ def _strengthen(problem: Problem, strength: float) -> Problem:
 
 
 def _path(problem: Problem, common: Array, validation: ValidationSet, options: RefineOptions) -> tuple[list[Array], list[TradeOff]]:
-    """Fit all units at falling strengths, each from the one before, until weaker ones bring nothing or too much uncertainty.
-
-    Returns models of shape (unit, n_lifted, p) and what they are worth, at every strength.
-    """
+    """Fit all units at falling strengths, each from the one before, until weaker ones bring nothing or too much uncertainty."""
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
     path: list[Array] = []
     rows: list[TradeOff] = []
@@ -234,10 +231,7 @@ def _keep_bounded(
     unbounded: Callable[[Array, npt.NDArray[np.int64]], dict[int, str]],
     options: RefineOptions,
 ) -> tuple[Solution, Array]:
-    """Fit units whose free runs leave their bound again, from the pooled model and with a prior ten times as strong, until none does.
-
-    Returns the strength for every unit beside the solution.
-    """
+    """Fit units whose free runs leave their bound again, from the pooled model and with a prior ten times as strong, until none does."""
     rows = np.arange(len(solution.V))
     strengths = np.full(len(rows), strength)
     for _ in range(_ROUNDS):

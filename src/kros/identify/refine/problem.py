@@ -32,24 +32,12 @@ _LEAST_VARIANCE = 1e-10  # of the one-step error, relative to the mean square of
 
 @dataclass(frozen=True, eq=False)
 class OneStep:
-    """Normal equations of the lifted functions' rows.
+    """Normal equations of the lifted functions' rows."""
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (unit, p + f, p + f)
-        ``[psi sigma+]^T [psi sigma+]`` per sample, psi whitened.
-    least : ndarray, shape (unit, f)
-        Mean square of every unit's own least-squares error; costs count from there.
-    variance : ndarray, shape (f,)
-        Of the one-step error of the pooled least-squares rows.
-    rows : ndarray, shape (f, p)
-        Those rows, as a part of V.
-    """
-
-    matrix: Array
-    least: Array
-    variance: Array
-    rows: Array
+    matrix: Array  # (unit, p + f, p + f)
+    least: Array  # (unit, f)
+    variance: Array  # (f,)
+    rows: Array  # (f, p)
 
     @classmethod
     def of(
@@ -79,31 +67,13 @@ class OneStep:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Least squares of all units at one horizon.
-
-    Parameters
-    ----------
-    lifting : Lifting
-    parameters : mapping of str to ndarray, shape (unit,)
-    segments : Segments
-    T : ndarray, shape (p, p)
-    sigma : ndarray, shape (n,)
-    one_step : OneStep
-    margin : float
-    pooled : bool
-        One model for all units.
-    guard : float, optional
-        Width of the soft edge of stability; none by default.
-    prior : ResponsePrior, optional
-    counted : float, optional
-        Residuals that a unit of a whole population contributes on average, of which these units are some.
-    """
+    """Least squares of all units at one horizon."""
 
     lifting: Lifting
-    parameters: Mapping[str, Array]
+    parameters: Mapping[str, Array]  # (unit,)
     segments: Segments
-    T: Array
-    sigma: Array
+    T: Array  # (p, p)
+    sigma: Array  # (n,)
     one_step: OneStep
     margin: float
     pooled: bool = False

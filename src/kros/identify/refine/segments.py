@@ -17,21 +17,11 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Stretches of recordings, the same number for every unit.
+    """Stretches of recordings, the same number for every unit."""
 
-    Parameters
-    ----------
-    states : ndarray, shape (n_samples, n, unit, segment)
-    inputs : ndarray, shape (n_samples, m, unit, segment)
-    valid : ndarray of bool, shape (n_samples, unit, segment)
-        False behind the end of an episode shorter than the others.
-    history : int
-        Samples before the one that a free run starts from; a lifting with delays reads them.
-    """
-
-    states: Array
-    inputs: Array
-    valid: npt.NDArray[np.bool_]
+    states: Array  # (n_samples, n, unit, segment)
+    inputs: Array  # (n_samples, m, unit, segment)
+    valid: npt.NDArray[np.bool_]  # (n_samples, unit, segment)
     history: int = 0
 
     @property
@@ -68,10 +58,7 @@ class Segments:
         )
 
     def cut(self, horizon: int) -> Segments:
-        """Return pieces of `horizon` steps, as many as there are segments, spread evenly over them.
-
-        Pieces of one segment share the history that they read, and no sample that they are compared with.
-        """
+        """Return pieces of `horizon` steps, as many as there are segments, spread evenly over them."""
         length = min(horizon, self.horizon) + 1
         pieces, n_segments = (len(self.valid) - self.history) // length, self.valid.shape[2]
         keep = np.unique(np.linspace(0, pieces * n_segments - 1, n_segments).round().astype(int))
@@ -87,30 +74,7 @@ class Segments:
 def read_segments(
     population: Population, keys: Mapping[str, Sequence[EpisodeKey]], horizon: int, count: int, seed: int, history: int = 0
 ) -> Segments:
-    """Draw segments of every unit, those of its last episode at the end.
-
-    Parameters
-    ----------
-    population : Population
-    keys : mapping of str to sequence of EpisodeKey
-        Training episodes of every unit.
-    horizon : int
-        Steps of a segment; an episode that is shorter gives one segment, which is all of it.
-    count : int
-        Segments of every unit; the first ``count - held_segments(count, keys)`` are from all episodes but the last.
-    seed : int
-    history : int
-        Samples before the first of the `horizon` steps.
-
-    Returns
-    -------
-    Segments
-
-    Raises
-    ------
-    DataError
-        When a unit has no episode, or an episode drawn from is too short for the history and one step.
-    """
+    """Draw segments of every unit, those of its last episode at the end."""
     held = held_segments(count, keys)
     n, width = len(population.states), len(population.channels)
     length = history + horizon + 1

@@ -35,21 +35,11 @@ _AT_ONCE = 500_000  # numbers in memory: residuals and how they move
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations of every unit.
+    """Normal equations of every unit."""
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (unit, n p + 1, n p + 1)
-        ``[J r]^T [J r]``; infinite where a run diverged.
-    squares : ndarray, shape (unit, n)
-        Sum of squared errors of every state, not scaled.
-    counts : ndarray, shape (unit,)
-        Number of residuals of one state.
-    """
-
-    matrix: Array
-    squares: Array
-    counts: Array
+    matrix: Array  # (unit, n p + 1, n p + 1)
+    squares: Array  # (unit, n)
+    counts: Array  # (unit,)
 
     @property
     def cost(self) -> Array:

@@ -17,23 +17,7 @@ _DECADES_BELOW_NYQUIST = 6
 
 
 def peak_residual_db(A: Array, B: Array, output_scale: Array, input_scale: Array, points: int = _POINTS) -> float:
-    """Return the peak of the inverse input multiplicative residual ``G^+ (G_nominal - G)`` for the nominal unit that makes it smallest.
-
-    Parameters
-    ----------
-    A : ndarray, shape (unit, n, n)
-        Stable.
-    B : ndarray, shape (unit, n, m)
-    output_scale : ndarray, shape (n,)
-    input_scale : ndarray, shape (m,)
-    points : int
-        Frequencies.
-
-    Returns
-    -------
-    float, dB
-        NaN for fewer than two units.
-    """
+    """Return the peak of the inverse input multiplicative residual ``G^+ (G_nominal - G)`` for the nominal unit that makes it smallest."""
     if len(A) < 2:
         return float("nan")
     z = np.exp(1j * np.pi * np.logspace(-_DECADES_BELOW_NYQUIST, 0, points))

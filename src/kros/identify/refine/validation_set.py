@@ -29,11 +29,7 @@ def free_run_errors(
     population: Population,
     keys: Sequence[EpisodeKey],
 ) -> tuple[Array, Array, Array]:
-    """Return what the free runs of several models, A (model, unit, n_lifted, n_lifted), differ by from one episode of every unit.
-
-    That is the RMS of the error (model, unit, n), infinite where a run diverged, the largest magnitude recorded (unit, n), and that of the run
-    (model, unit, n).
-    """
+    """Return what the free runs of several models, differ by from one episode of every unit: RMS, largest recorded, reached."""
     n, models = lifting.n_states, len(A)
     rms, reached, top = np.full((models, len(keys), n), np.inf), np.full((models, len(keys), n), np.inf), np.zeros((len(keys), n))
     for start in range(0, len(keys), _TOGETHER):

@@ -105,20 +105,7 @@ class FilteredDifference:
 
 
 def rates(channels: Iterable[Channel], measured: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """Return which states are rates of measured ones, found by their units, such as rad and rad/s.
-
-    Parameters
-    ----------
-    channels : iterable of Channel
-        The states, in order.
-    measured : sequence of str
-        Names of the measured states, in the order of the measurements.
-
-    Returns
-    -------
-    tuple of (int, int)
-        Index of the measurement and of the state; a unit that two measurements or two rates share names no pair.
-    """
+    """Return which states are rates of measured ones, found by their units, such as rad and rad/s."""
     states = list(channels)
     unit = {c.name: c.unit for c in states}
     pairs = []
@@ -132,22 +119,7 @@ def rates(channels: Iterable[Channel], measured: Sequence[str]) -> tuple[tuple[i
 
 
 def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    """Return which states recordings show to be rates of measured ones, whatever the units of measure.
-
-    Of all states that are not measured the one counts that a difference of the measurement, at its best cut-off, explains best, and by more than half
-    of its variance.
-
-    Parameters
-    ----------
-    batch : EpisodeBatch
-    measured : sequence of int
-        Indices of the measured states.
-
-    Returns
-    -------
-    tuple of (int, int)
-        As `rates`.
-    """
+    """Return which states recordings show to be rates of measured ones, whatever the units of measure."""
     states, y, sample_period_s = batch.states, batch.measurements(measured, arrived=False), batch.sample_period_s
     hidden = [j for j in range(states.shape[-1]) if j not in measured]
     inside = np.arange(len(y))[:, None] < batch.lengths

@@ -17,25 +17,7 @@ _DECADES_APART = 2
 
 
 def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:
-    """Sweep the size of white process noise over sixteen decades; the covariance as it is, the textbook's choice, is among them.
-
-    Sizes for which there is no stable filter are left out.
-
-    Parameters
-    ----------
-    A : ndarray, shape (n, n)
-    C : ndarray, shape (q, n)
-    shape : ndarray, shape (n, n) or (n,)
-        Covariance of the process noise; or the range of every state, for noise of equal relative size.
-    R : ndarray, shape (q, q)
-    dt : float, s
-
-    Yields
-    ------
-    float
-        Process noise, as variance of the measured combinations relative to the measurement noise, on average over them.
-    Synthesis
-    """
+    """Sweep the size of white process noise over sixteen decades; the covariance as it is, the textbook's choice, is among them."""
     shape = np.diag(shape**2) if shape.ndim == 1 else shape
     base = like_measurement_noise(C @ shape @ C.T, R)
     start, stop = _SWEEP_DECADES

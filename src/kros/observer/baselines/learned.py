@@ -29,21 +29,11 @@ _EXPLAINED = 0.5  # share of a measurement's variance
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """The channels that the estimator looks at.
-
-    Parameters
-    ----------
-    lifting : Lifting
-    measured : tuple of int
-    taps : int
-        Samples of the past, at most.
-    static : ndarray, shape (q, 1 + m)
-        Offset c and matrix M of the measurement that the inputs explain.
-    """
+    """The channels that the estimator looks at."""
 
     lifting: Lifting
     measured: tuple[int, ...]
-    static: Array
+    static: Array  # (q, 1 + m)
     taps: int = TAPS
 
     @classmethod
@@ -87,28 +77,15 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """The trained estimator.
-
-    Parameters
-    ----------
-    features : Features
-    estimated : tuple of int
-        Indices of the estimated states.
-    constant : ndarray, shape (h,)
-    response : ndarray, shape (channels, taps, h)
-        Weights of the samples at k - 1, k - 2, ...
-    """
+    """The trained estimator."""
 
     features: Features
     estimated: tuple[int, ...]
-    constant: Array
-    response: Array
+    constant: Array  # (h,)
+    response: Array  # (channels, taps, h)
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n); parameters of shape (batch,).
-
-        Row k from data up to k - 1, what came before the first sample taken to equal it; NaN for states that are not estimated.
-        """
+        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n)."""
         from scipy.fft import irfft, next_fast_len, rfft
 
         z = self.features.channels(y, u, parameters)

@@ -30,17 +30,7 @@ _BLOCKS = 3 * _FOLDS
 
 @dataclass(frozen=True)
 class Choice:
-    """How one state is estimated.
-
-    Parameters
-    ----------
-    taps : int
-        Samples of the past.
-    ridge : float
-        Penalty of weights relative to the regressors' mean squares.
-    condition : str or None
-        That is trained on; None for all.
-    """
+    """How one state is estimated."""
 
     taps: int
     ridge: float
@@ -49,48 +39,18 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """What every unit leaves of its training episodes in every condition: means of products of regressors and estimated states.
-
-    Regressors are a constant and, for every channel, its sample at k - 1 and the differences of those before it. For every estimated state, episodes are
-    divided by its largest value in them, as errors are.
-
-    Parameters
-    ----------
-    features : Features
-    estimated : tuple of int
-        Indices of the estimated states.
-    groups : tuple of (str, str)
-        Unit and condition.
-    gram : ndarray, shape (group, h, 1 + f, 1 + f)
-        Of the regressors, ``f = channels * taps``, for every estimated state.
-    cross : ndarray, shape (group, h, 1 + f)
-    power : ndarray, shape (group, h)
-        Mean squares of the estimated states.
-    """
+    """What every unit leaves of its training episodes in every condition: means of products of regressors and estimated states."""
 
     features: Features
     estimated: tuple[int, ...]
     groups: tuple[tuple[str, str], ...]
-    gram: Array
-    cross: Array
-    power: Array
+    gram: Array  # (group, h, 1 + f, 1 + f)
+    cross: Array  # (group, h, 1 + f)
+    power: Array  # (group, h)
 
     @classmethod
     def of(cls, features: Features, batches: Iterable[EpisodeBatch], least: Array | None = None) -> Moments:
-        """Collect the moments of training episodes, every sample from the first on; all episodes of a unit and condition count the same.
-
-        Parameters
-        ----------
-        features : Features
-        batches : iterable of EpisodeBatch
-        least : ndarray, shape (n,), optional
-            Smallest values that the states' errors are divided by, so that episodes at rest do not count for more than all others.
-
-        Raises
-        ------
-        DataError
-            When every state is measured.
-        """
+        """Collect the moments of training episodes, every sample from the first on; all episodes of a unit and condition count the same."""
         n = features.lifting.n_states
         estimated = [i for i in range(n) if i not in features.measured]
         if not estimated:
@@ -151,19 +111,7 @@ class Moments:
         return np.asarray(np.sqrt(np.maximum(missed, np.finfo(float).tiny)))
 
     def estimator(self, without: Collection[str] = (), choices: Sequence[Choice] | None = None) -> Learned:
-        """Train on all units but some; names of units that took no part are ignored.
-
-        Parameters
-        ----------
-        without : collection of str
-        choices : sequence of Choice, optional
-            For every estimated state; all samples and a small penalty by default.
-
-        Raises
-        ------
-        DataError
-            When no unit is left.
-        """
+        """Train on all units but some; names of units that took no part are ignored."""
         if not set(self.units) - set(without):
             raise DataError(f"Learned estimator: no unit is left to train on without {', '.join(sorted(without))}; record more units.")
         taps, h = self.features.taps, len(self.estimated)
@@ -190,11 +138,7 @@ class Moments:
         return [(own, _sum(self.gram, own), _sum(self.cross, own)) for own in rows.values()]
 
     def _means(self, state: int, without: Collection[str], condition: str | None) -> tuple[Array, Array]:
-        """Return the mean moments of all other units in one condition or all, shapes (1 + f, 1 + f) and (1 + f,).
-
-        Where the other units were not recorded in the condition that was chosen, all conditions are trained on. Sums of blocks in which none is left out
-        are there already; nothing is taken off again, so that a unit that is left out leaves no trace.
-        """
+        """Return the mean moments of all other units in one condition or all, shapes (1 + f, 1 + f) and (1 + f,)."""
         others = [i for i, (unit, _) in enumerate(self.groups) if unit not in without]
         rows = [i for i in others if condition in (None, self.groups[i][1])] or others
         wanted, gram, cross = set(rows), np.zeros(self.gram.shape[2:]), np.zeros(self.cross.shape[2:])
@@ -234,23 +178,7 @@ def solved(gram: Array, cross: Array, ridges: Sequence[float]) -> Array:
 
 
 def episode_moments(z: Array, truth: Array, taps: int) -> tuple[Array, Array, Array]:
-    """Return the moments of one episode, every sample from the first on.
-
-    Regressors of row k are 1, ``z[k-1]`` and ``z[k-1-j] - z[k-j]`` for j = 1, ..., taps - 1, with z[0] before the start. Products of two differences
-    depend on their lags' difference but for the ends, so that few products of long signals are all it takes.
-
-    Parameters
-    ----------
-    z : ndarray, shape (n_samples, channels)
-    truth : ndarray, shape (n_samples, h)
-    taps : int
-
-    Returns
-    -------
-    gram : ndarray, shape (1 + channels * taps, 1 + channels * taps)
-    cross : ndarray, shape (1 + channels * taps, h)
-    power : ndarray, shape (h,)
-    """
+    """Return the moments of one episode; regressors of row k are 1, ``z[k-1]`` and ``z[k-1-j] - z[k-j]`` for j = 1, ..., taps - 1."""
     (n_samples, c), h, behind = z.shape, truth.shape[1], taps - 1
     step = np.zeros((c, behind + n_samples))
     step[:, behind + 1 :] = (z[:-1] - z[1:]).T
@@ -282,17 +210,7 @@ def episode_moments(z: Array, truth: Array, taps: int) -> tuple[Array, Array, Ar
 
 
 def products_with_lags(signals: Array, step: Array, behind: int) -> Array:
-    """Return ``sum_k signals[:, k] step[:, behind - j + k]`` for lags j = 1, ..., behind, shape (behind, s, c): by transforms of short pieces.
-
-    Lags at which a channel has not moved yet are exactly zero, so that rounding gives them no weight.
-
-    Parameters
-    ----------
-    signals : ndarray, shape (s, n_samples)
-    step : ndarray, shape (c, behind + n_samples)
-    behind : int
-        Lags.
-    """
+    """Return ``sum_k signals[:, k] step[:, behind - j + k]`` for lags j = 1, ..., behind, shape (behind, s, c); signals (s, n_samples)."""
     if not behind:
         return np.zeros((0, len(signals), len(step)))
     size = 1 << (8 * behind).bit_length()

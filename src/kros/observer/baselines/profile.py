@@ -15,23 +15,12 @@ SAME = 0.01  # of the largest input: RMS difference of inputs that are the same 
 
 @dataclass(frozen=True, eq=False)
 class MeanProfile:
-    """Mean states of motions that are known by their inputs.
-
-    Parameters
-    ----------
-    n_states : int
-    estimated : tuple of int
-        Indices of the estimated states.
-    inputs : sequence of ndarray, shape (n_samples, m)
-        Of every motion.
-    states : sequence of ndarray, shape (n_samples, h)
-        Mean of the estimated states, sample by sample.
-    """
+    """Mean states of motions that are known by their inputs."""
 
     n_states: int
     estimated: tuple[int, ...]
-    inputs: Sequence[Array]
-    states: Sequence[Array]
+    inputs: Sequence[Array]  # (n_samples, m)
+    states: Sequence[Array]  # (n_samples, h)
 
     @cached_property
     def sizes(self) -> Array:
@@ -39,10 +28,7 @@ class MeanProfile:
         return sizes_of(self.inputs)
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Estimate a batch from its first sample on, each member by the motion whose inputs are nearest to its own; shape (n_samples, batch, n).
-
-        NaN for states that are not estimated. A motion that goes on for longer than it was recorded is held. Measurements and parameters play no part.
-        """
+        """Estimate a batch from its first sample on, each member by the motion whose inputs are nearest to its own."""
         del parameters
         estimate = np.full((*y.shape[:2], self.n_states), np.nan)
         for i in range(y.shape[1]):

@@ -14,10 +14,7 @@ Array = npt.NDArray[np.float64]
 
 
 def restarted(run: Callable[[Array, Array, Mapping[str, Any]], Array], samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
-    """Run a batch, and every member once more from each sample at which it starts again to the next; shape (n_samples, batch, n).
-
-    `run` takes measurements, inputs and parameters, shape (batch,), to estimates whose row 0 is the start.
-    """
+    """Run a batch, and every member once more from each sample at which it starts again to the next; shape (n_samples, batch, n)."""
     n_samples, batch = samples.starts.shape
     found = run(samples.y, samples.u, parameters)
     for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:

@@ -34,48 +34,18 @@ _THIN = 3
 
 @dataclass(frozen=True, eq=False)
 class ResidualModel:
-    """A model for a residual-shaped observer, with what its synthesis needs.
-
-    Parameters
-    ----------
-    refitted : tuple of int
-        Rows that were fitted to single steps; none for the model as identified.
-    A : ndarray, shape (n_lifted, n_lifted)
-    B : ndarray, shape (n_lifted, m)
-    dynamics : ndarray, shape (n, n)
-        Mean error dynamics of the original states.
-    spectra : ndarray, shape (unit, f, n, n), complex
-        Of every unit's one-step residual.
-    promised : ndarray, shape (n,)
-        Root mean square error of every state that the Kalman predictor for these spectra promises, as a share of the largest value.
-    """
+    """A model for a residual-shaped observer, with what its synthesis needs."""
 
     refitted: tuple[int, ...]
-    A: Array
-    B: Array
-    dynamics: Array
-    spectra: npt.NDArray[Any]
-    promised: Array
+    A: Array  # (n_lifted, n_lifted)
+    B: Array  # (n_lifted, m)
+    dynamics: Array  # (n, n)
+    spectra: npt.NDArray[Any]  # (unit, f, n, n)
+    promised: Array  # (n,)
 
 
 def one_step_rows(lifting: Lifting, batch: EpisodeBatch) -> tuple[Array, Array]:
-    """Fit the original states' rows of the model to single steps of all recordings by least squares.
-
-    Parameters
-    ----------
-    lifting : Lifting
-    batch : EpisodeBatch
-
-    Returns
-    -------
-    A : ndarray, shape (n, n_lifted)
-    B : ndarray, shape (n, m)
-
-    Raises
-    ------
-    DataError
-        When there are fewer steps than coefficients.
-    """
+    """Fit the original states' rows of the model to single steps of all recordings by least squares."""
     h, lengths = lifting.history, batch.lengths
     x, u = np.swapaxes(batch.states, 0, 1), np.swapaxes(batch.inputs, 0, 1)
     values = {name: value[..., None] for name, value in batch.parameters.items()}
@@ -92,33 +62,16 @@ def one_step_rows(lifting: Lifting, batch: EpisodeBatch) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Refitted:
-    """A model of which some rows were fitted to single steps.
-
-    Parameters
-    ----------
-    rows : tuple of int
-        None for the model as identified.
-    A : ndarray, shape (n_lifted, n_lifted)
-    B : ndarray, shape (n_lifted, m)
-    columns : tuple of int
-        Which residuals, of those of all rows as identified and of all rows fitted, are this model's.
-    """
+    """A model of which some rows were fitted to single steps."""
 
     rows: tuple[int, ...]
-    A: Array
-    B: Array
+    A: Array  # (n_lifted, n_lifted)
+    B: Array  # (n_lifted, m)
     columns: tuple[int, ...]
 
 
 def refitted_models(lifting: Lifting, A: Array, B: Array, measured: Sequence[int], batch: EpisodeBatch) -> tuple[list[Refitted], Array]:
-    """Return the model as identified and with rows fitted to single steps; measured rows with every choice of hidden ones.
-
-    Returns
-    -------
-    list of Refitted
-    ndarray, shape (n_samples - 1 - history, batch, 2 n)
-        One-step residuals of all rows as identified, and of all fitted ones.
-    """
+    """Return the model as identified and with rows fitted to single steps; measured rows with every choice of hidden ones."""
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(range(n))
     fitted, x, u, values = one_step_rows(lifting, batch), batch.states, batch.inputs, batch.parameters

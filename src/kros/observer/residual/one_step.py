@@ -29,24 +29,7 @@ _FEWEST = 64  # samples of a segment
 def one_step_residual(
     lifting: Lifting, A: Array, B: Array, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
 ) -> Array:
-    """Run the one-step model along recordings and return what it misses.
-
-    Parameters
-    ----------
-    lifting : Lifting
-    A : ndarray, shape (n_lifted, n_lifted)
-    B : ndarray, shape (n_lifted, m)
-    states : ndarray, shape (n_samples, batch, n)
-    inputs : ndarray, shape (n_samples, batch, m)
-        Recorded inputs.
-    parameters : mapping of str to array_like, shape (batch,)
-        Lifting parameters of the machine behind each episode.
-
-    Returns
-    -------
-    ndarray, shape (n_samples - 1 - history, batch, n)
-        Rows of the original states.
-    """
+    """Run the one-step model along recordings and return what it misses; A (n_lifted, n_lifted), B (n_lifted, m)."""
     if states.ndim != 3 or inputs.ndim != 3 or states.shape[:2] != inputs.shape[:2]:
         raise DimensionError(f"One-step residual: states {states.shape} and inputs {inputs.shape} should agree in (n_samples, batch).")
     n, h = lifting.n_states, lifting.history
@@ -59,10 +42,7 @@ def one_step_residual(
 
 
 def mean_slopes(lifting: Lifting, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-    """Return the lifted functions' slopes by the states at their mean over recordings, shape (p, n).
-
-    Parameters as in `one_step_residual`; slopes by earlier values, and of input functions, count as residual.
-    """
+    """Return the lifted functions' slopes by the states at their mean over recordings, shape (p, n)."""
     n = lifting.n_states
     if not lifting.functions:
         return np.zeros((0, n))
@@ -78,41 +58,13 @@ def mean_error_dynamics(A: Array, slopes: Array) -> Array:
 
 
 def one_step_covariance(residual: Array, lengths: npt.ArrayLike) -> Array:
-    """Return the mean product of residuals over all episodes, shape (n, n): what white process noise of the same size would have, means included.
-
-    Parameters
-    ----------
-    residual : ndarray, shape (n_samples, batch, n)
-    lengths : array_like of int, shape (batch,)
-        Samples of every episode that count.
-    """
+    """Return the mean product of residuals over all episodes, shape (n, n); residual (n_samples, batch, n), lengths (batch,)."""
     counted = residual[np.arange(len(residual))[:, None] < np.asarray(lengths)]
     return np.asarray(counted.T @ counted / len(counted))
 
 
 def residual_spectra(residual: Array, lengths: npt.ArrayLike, units: Sequence[str], segment: int = SEGMENT) -> Array:
-    """Return every unit's cross spectral density of the residual by Welch's method; means are kept, since a bias is an error too.
-
-    Parameters
-    ----------
-    residual : ndarray, shape (n_samples, batch, n)
-    lengths : array_like of int, shape (batch,)
-        Samples of every episode that count.
-    units : sequence of str, length batch
-        The unit of every episode.
-    segment : int
-        Samples of a segment, Hann window, half overlapping; the shortest episode where it is shorter.
-
-    Returns
-    -------
-    ndarray, shape (unit, segment // 2 + 1, n, n), complex
-        From zero to Nyquist, units in order of appearance. The mean over the unit circle is the covariance.
-
-    Raises
-    ------
-    DataError
-        When an episode is shorter than 64 samples, or the residual is not finite.
-    """
+    """Return every unit's cross spectral density of the residual by Welch's method; means are kept, since a bias is an error too."""
     lengths = np.asarray(lengths, dtype=int)
     if residual.ndim != 3 or lengths.shape != (residual.shape[1],) or len(units) != residual.shape[1]:
         raise DimensionError(

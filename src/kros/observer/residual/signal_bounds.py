@@ -38,18 +38,7 @@ _BASES = (Basis(4, (0.8, 0.95, 0.98)), Basis(8, (0.95, 0.98)), Basis(8, (0.9, 0.
 
 
 def signal_lower_bounds(A: Array, C: Array, noise: Array, signals: SignalSet, dt: float) -> Array:
-    """Return root mean squares of every state's error that no correction of a model beats over the set; NaN where none is proven.
-
-    Parameters
-    ----------
-    A : ndarray, shape (n, n)
-        Mean error dynamics.
-    C : ndarray, shape (q, n)
-    noise : ndarray, shape (q,)
-        Deviations of the measurement noise.
-    signals : SignalSet
-    dt : float, s
-    """
+    """Return root mean squares of every state's error that no correction of a model beats over the set; NaN where none is proven."""
     n, q = len(A), len(C)
     size = 2.0 ** np.round(np.log2(np.sqrt(np.maximum(signals.energies.mean_square.mean(axis=0), np.finfo(float).tiny))))
     A, C, signals = A * size / size[:, None], C * size, replace(signals, energies=signals.energies.scaled(size))

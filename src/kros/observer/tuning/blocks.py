@@ -58,21 +58,7 @@ class Block:
 
 
 def states_along(blocks: Sequence[Block], z: Array, rest: Array, every: int = 1) -> tuple[Array, Array]:
-    """Return the states of a model along channels, at every so many samples, and at rest.
-
-    Parameters
-    ----------
-    blocks : sequence of Block
-    z : ndarray, shape (channels, batch, n_samples)
-    rest : ndarray, shape (channels, batch)
-        What z was before.
-    every : int
-
-    Returns
-    -------
-    h : ndarray, shape (n, batch, n_samples / every)
-    held : ndarray, shape (n, batch)
-    """
+    """Return the states of a model along channels, at every so many samples, and at rest; z (channels, batch, n_samples)."""
     F, G, H = _in_pairs(blocks)
     held, n = _held(F, G, rest), sum(len(b.F) for b in blocks)
     return blocks_along(F, G, H, z, rest, held, every)[:n], held.reshape(-1, rest.shape[1])[:n]
@@ -112,10 +98,7 @@ def moved(blocks: Sequence[Block], signals: Array, every: int, first: int) -> Ar
 
 
 def blocks_of(F: Array, G: Array, H: Array) -> list[Block]:
-    """Split a model into blocks: pairs of conjugate eigenvalues, and real ones two by two.
-
-    Where eigenvectors are nearly parallel, as those of delays, F is moved by a millionth first.
-    """
+    """Split a model into blocks: pairs of conjugate eigenvalues, and real ones two by two."""
     turn = _modes(F)
     if not np.linalg.cond(turn) < _PARALLEL:
         F = F + _NUDGE * np.random.default_rng(0).normal(size=F.shape)

@@ -43,20 +43,7 @@ def search(
     least_gain: float,
     patience: int = 1,
 ) -> tuple[P, tuple[float, ...]]:
-    """Return the best point, and the criterion before the search and after every step.
-
-    Parameters
-    ----------
-    point : Point
-    steps : callable
-        From a point to what makes a trial point of a damping.
-    damping : Damping
-    iterations : int
-        Most steps.
-    least_gain : float
-        Decrease of the criterion in the last `patience` steps below which the search ends.
-    patience : int
-    """
+    """Return the best point, and the criterion before the search and after every step."""
     criterion, level = [point.criterion], damping.first
     for _ in range(iterations):
         trial_at = steps(point)

@@ -28,18 +28,7 @@ from .recordings import check_channels, hidden_states, identify_on, load_calibra
 
 
 def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]:
-    """Identify the units of some recordings as the study did, and score each against the study's population.
-
-    A unit that took part in the study, by its name or by its recordings, is left out of what it is compared with. Where hidden channels were not
-    recorded, the deployed observer's monitor judges instead, and ``score`` is None (`monitored`).
-
-    Returns
-    -------
-    list of dict
-        One row a unit and condition that the study knows: ``unit, condition, score, threshold, outlier, status, detectable, freq_hz`` and more
-        (see `kros.uncertainty.outliers.population.score_row`), ``left_out``, units of the study that it was not compared with, and where the deployed
-        observer has a monitor its ``level_db`` and ``bands_db``, which flags nothing where there is a score.
-    """
+    """Identify the units of some recordings as the study did, and score each against the study's population."""
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (config, store):
         return scored(config, store, data, workers)
 

@@ -27,13 +27,7 @@ _STAGE, _RECORDINGS = "simulate", "simulated"
 def simulate_to(
     out: Path, plant: str, units: int, episodes: int, seconds: float, seed: int, spread: float, loop: str, outlier: bool, format_: str
 ) -> dict[str, Any]:
-    """Simulate a population into a new folder, with the truth beside it in ``truth.json``.
-
-    Returns
-    -------
-    dict
-        The truth that was written.
-    """
+    """Simulate a population into a new folder, with the truth beside it in ``truth.json``."""
     from ...plants import PLANTS
 
     for name, value, allowed in (("--plant", plant, tuple(PLANTS)), ("--format", format_, FORMATS), ("--loop", loop, ("stiff", "soft"))):
@@ -66,15 +60,7 @@ def simulate_to(
 def run_demo(
     out: Path, units: int, episodes: int, seconds: float, seed: int, workers: int, progress: Progress, overrides: Sequence[str] = ()
 ) -> RunResult:
-    """Simulate a population with one badly assembled drive and run the study on it, all below one folder.
-
-    An earlier demo there is continued, or changed to what is asked now. Predictors are made with little effort unless `overrides` say otherwise.
-
-    Raises
-    ------
-    ConfigError
-        When the folder holds anything but an earlier demo.
-    """
+    """Simulate a population with one badly assembled drive and run the study on it, all below one folder."""
     out = Path(out).absolute()
     raw = {"name": "demo", "data": {"source": str(out / _RECORDINGS), "reader": "parquet"}, "predictor": {"effort": "quick"}}
     config = validate_config(raw, out, overrides=overrides)

@@ -44,30 +44,7 @@ class Estimated:
 
 
 def estimate_recordings(run: Path, data: Path, out: Path, given: Collection[str] = (), track: str | None = None) -> Estimated:
-    """Write ``unit, condition, episode, k, <channel>_hat`` for every sample; where a parameter is followed, it stands behind them.
-
-    Units of measure and where every unit's parameters came from are in the metadata of a Parquet file's schema, and beside a CSV file in
-    ``<out>-metadata.json``.
-
-    Parameters
-    ----------
-    run, data : Path
-    out : Path
-        Ends in ``.parquet`` or ``.csv``.
-    given : collection of str
-        Parameters of units, ``UNIT.NAME=VALUE``.
-    track : str, optional
-        Parameter that a phase-locked loop follows, for all units; it starts at what is given or found.
-
-    Raises
-    ------
-    ConfigError
-        When the file exists or has another ending, or a parameter is none of the observer's.
-    DataError
-        When measured channels or inputs are missing.
-    IdentificationError
-        When a parameter is neither given, nor to be found, nor to be followed.
-    """
+    """Write ``unit, condition, episode, k, <channel>_hat`` for every sample; where a parameter is followed, it stands behind them."""
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         if out.exists() or out.suffix not in ENDINGS:
             raise ConfigError(f"Output {out}: should be a new file that ends in {' or '.join(ENDINGS)}.")

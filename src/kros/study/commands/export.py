@@ -39,15 +39,7 @@ def export_run(
     precision: str = "double",
     track: str | None = None,
 ) -> Path:
-    """Write one of a run's observers as C source, or as an FMU of a version; `name` is the study's by default.
-
-    The parameter `track` is followed by a phase-locked loop; observers of a load torque, ``koopman/load``, give its level too.
-
-    Raises
-    ------
-    ConfigError
-        When there is no such observer, or no such run.
-    """
+    """Write one of a run's observers as C source, or as an FMU of a version; `name` is the study's by default."""
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         names = (DEPLOYED, *load_artifact(store.path("observers"), "observers")[0]["names"])
         loads = {f"{kind}/{LOAD}": f"{kind}.json" for kind in ("koopman", "linear") if store.holds(LOAD, f"{kind}.json")}

@@ -28,21 +28,7 @@ _BATCH, _PHASES, _SEEN_S = 64, 24, 20.0
 
 @dataclass(frozen=True)
 class FieldRecordings:
-    """Recordings that need no hidden channels, with all that the observer needs to run on them.
-
-    Parameters
-    ----------
-    observer : Observer
-    population : Population
-    values : mapping of unit to mapping of str to float
-        Lifting parameters, or where a loop starts that follows one.
-    sources : mapping of unit to str
-        Where they come from, in words; empty where the lifting has none.
-    followed : frozenset of str
-        Units for which `name` is followed.
-    name : str, optional
-        The parameter that a phase-locked loop follows.
-    """
+    """Recordings that need no hidden channels, with all that the observer needs to run on them."""
 
     observer: Observer
     population: Population
@@ -53,20 +39,7 @@ class FieldRecordings:
 
     @classmethod
     def open(cls, config: StudyConfig, store: Store, data: Path, given: Collection[str] = (), track: str | None = None) -> FieldRecordings:
-        """Open what `data` names, and settle the parameters of every unit.
-
-        What is given comes first, then what the unit's own recordings show by the study's calibration, then what the run found. Where none of these
-        is there, a phase-locked loop follows the parameter, and starts where the observer's innovation is smallest.
-
-        Raises
-        ------
-        ConfigError
-            When a parameter is none of the observer's.
-        DataError
-            When measured channels or inputs are missing, or in another unit of measure.
-        IdentificationError
-            When a parameter is neither given, nor to be found, nor to be followed.
-        """
+        """Open what `data` names, and settle the parameters of every unit."""
         if not store.holds("observers", "deployed.json"):
             raise ConfigError(f"Run {store.folder}: has no deployed observer; run the study at least until synthesize.")
         observer = Observer.load(store.path("observers", "deployed.json"))
@@ -87,14 +60,7 @@ class FieldRecordings:
             yield arriving(self.observer, self.population, keys[start : start + _BATCH], values)
 
     def estimates(self, found: Arriving) -> tuple[Array, Array | None]:
-        """Run the observer.
-
-        Returns
-        -------
-        estimates : ndarray, shape (n_samples, batch, n_recorded)
-        followed : ndarray, shape (n_samples, batch), optional
-            The parameter that was used, where some unit's is followed.
-        """
+        """Run the observer."""
         observer, units, n = self.observer, found.batch.units, len(self.observer.recorded)
         estimates = np.empty((*found.y.shape[:2], n))
         others, rows = ([i for i, unit in enumerate(units) if (unit in self.followed) is wanted] for wanted in (False, True))

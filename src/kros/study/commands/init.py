@@ -33,16 +33,7 @@ NO_LOAD = ("unloaded", "noload", "leerlauf", "ohnelast", "unbelastet", "leer", "
 
 @dataclass(frozen=True)
 class Initialised:
-    """What `kros init` wrote, and what it says.
-
-    Parameters
-    ----------
-    study : Path
-    lines : tuple of str
-        For people.
-    findings : tuple of str
-        What looks wrong in the recordings.
-    """
+    """What `kros init` wrote, and what it says."""
 
     study: Path
     lines: tuple[str, ...]
@@ -59,26 +50,7 @@ class LiftingProposal:
 
 
 def init_study(source: Path, out: Path, wanted: Wanted, ask: Ask | None, progress: Progress) -> Initialised:
-    """Write a study for a folder of recordings.
-
-    Parameters
-    ----------
-    source : Path
-        Folder of CSV or Parquet files, of recordings in kros's own format, or in the raw layout.
-    out : Path
-        New file.
-    wanted : Wanted
-    ask : callable or None
-        Who corrects the proposed parts of the columns; nobody without a terminal.
-    progress : Progress
-
-    Raises
-    ------
-    ConfigError
-        When the file exists, or what is measured cannot be told.
-    DataError
-        When there are no recordings that can be used.
-    """
+    """Write a study for a folder of recordings."""
     if out.exists():
         raise ConfigError(f"Output {out}: exists; name another file, --out FILE, or remove it.")
     if not source.is_dir():

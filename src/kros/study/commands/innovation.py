@@ -20,13 +20,7 @@ FEWEST = 8  # units behind a bound that calls one an outlier: of studies of five
 
 
 def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
-    """Return a row for every unit and condition, as `kros check` does, with what needs hidden channels left unknown.
-
-    ``level_db`` is the highest level of the innovation over the monitor's bound, that of the condition where the monitor knows it. The bound is set for a
-    share ``level_rate`` of good units, from ``level_units``; above it a unit is an outlier where these are at least `FEWEST`. The level is None where the
-    deployed observer has no monitor, or nothing could be judged.
-    ``bands_db`` says by measured channel and centre frequency in Hz where the highest residual power is, dB over the limit of the band.
-    """
+    """Return a row for every unit and condition, as `kros check` does, with what needs hidden channels left unknown."""
     population, observer = recordings.population, recordings.observer
     monitor, rows = observer.monitor, []
     for unit, condition, keys in population.groups():

@@ -12,13 +12,7 @@ from .summary import summary_lines
 
 
 def list_run(run: Path) -> list[str]:
-    """Return what was studied, which stages are done, which observers there are by name, and how well they do.
-
-    Raises
-    ------
-    ConfigError
-        When the folder is no run, or another process is at work in it.
-    """
+    """Return what was studied, which stages are done, which observers there are by name, and how well they do."""
     with open_finished(run) as (config, store):
         records = {stage.value: store.record(stage) for stage in Stage}
         done = [f"{name} {record.seconds:.3g} s" for name, record in records.items() if record is not None]

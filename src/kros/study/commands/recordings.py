@@ -84,16 +84,7 @@ def load_calibration(store: Store) -> PhaseCalibration | None:
 
 @dataclass(frozen=True)
 class UnitValues:
-    """Lifting parameters of every unit, and where each came from.
-
-    Parameters
-    ----------
-    values : mapping of unit to mapping of str to float
-    sources : mapping of unit to str
-        ``given``, ``calibrated``, ``calibrated on the derivative of ...``, ``of the run`` or ``unknown``; empty where the lifting has no parameters.
-    reasons : mapping of unit to str
-        Why a value is unknown.
-    """
+    """Lifting parameters of every unit, and where each came from."""
 
     values: dict[str, dict[str, float]]
     sources: dict[str, str] = field(default_factory=dict)
@@ -103,18 +94,7 @@ class UnitValues:
 def unit_values(
     population: Population, calibration: PhaseCalibration | None, prefer: str, given: Mapping[str, Mapping[str, float]] | None = None
 ) -> UnitValues:
-    """Return every unit's lifting parameters: those that are given, else calibrated on the unit's own training episodes, else the run's own.
-
-    A new unit is put on the branch of the run's population.
-
-    Parameters
-    ----------
-    population : Population
-    calibration : PhaseCalibration or None
-    prefer : str
-        Condition to calibrate on, where a unit has it.
-    given : mapping of unit to mapping of str to float, optional
-    """
+    """Return every unit's lifting parameters."""
     given = given or {}
     found = UnitValues({unit: dict(given.get(unit, {})) for unit in population.unit_ids})
     if calibration is None:
@@ -140,13 +120,7 @@ def unit_values(
 
 
 def unit_parameters(population: Population, calibration: PhaseCalibration | None, prefer: str) -> dict[str, dict[str, float]]:
-    """Return every unit's lifting parameters, as `unit_values` finds them.
-
-    Raises
-    ------
-    IdentificationError
-        When a unit can be calibrated neither way.
-    """
+    """Return every unit's lifting parameters, as `unit_values` finds them."""
     found = unit_values(population, calibration, prefer)
     for reason in found.reasons.values():
         raise IdentificationError(reason)
@@ -154,13 +128,7 @@ def unit_parameters(population: Population, calibration: PhaseCalibration | None
 
 
 def parse_given(texts: Collection[str], units: Collection[str], known: Collection[str]) -> dict[str, dict[str, float]]:
-    """Return parameters given as ``UNIT.NAME=VALUE``.
-
-    Raises
-    ------
-    ConfigError
-        When one is written differently, or names what is not there.
-    """
+    """Return parameters given as ``UNIT.NAME=VALUE``."""
     given: dict[str, dict[str, float]] = {}
     for text in texts:
         place, _, number = text.partition("=")

@@ -34,13 +34,7 @@ class DaskExecutor:
         self._client, self._address = client, address
 
     def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
-        """Yield results in the order of the tasks, which run again elsewhere where a worker ends.
-
-        Raises
-        ------
-        KrosError
-            When the scheduler is lost, when workers die of a task, or have another version of kros.
-        """
+        """Yield results in the order of the tasks, which run again elsewhere where a worker ends."""
         from distributed.client import ClosedClientError
 
         tasks = list(tasks)
@@ -82,15 +76,7 @@ class DaskExecutor:
 
 
 def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> list[T]:
-    """In a worker: run a batch of tasks, while no other one runs in this process.
-
-    Workers of several threads would share warning filters and caches between tasks.
-
-    Raises
-    ------
-    KrosError
-        When kros is another one than that of the client, by `key`, or files of the study are not here.
-    """
+    """In a worker: run a batch of tasks, while no other one runs in this process."""
     from threadpoolctl import threadpool_limits
 
     if code_key() != key:
@@ -109,15 +95,7 @@ def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> l
 
 @contextmanager
 def open_dask(address: str) -> Iterator[DaskExecutor]:
-    """Connect to a Dask scheduler.
-
-    Raises
-    ------
-    MissingDependencyError
-        Without Dask.
-    ConfigError
-        When no scheduler answers.
-    """
+    """Connect to a Dask scheduler."""
     try:
         import threadpoolctl  # noqa: F401  # workers have what is installed here
         from distributed import Client

@@ -27,13 +27,7 @@ class ProcessExecutor:
         self._pool = pool
 
     def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
-        """Yield results in the order of the tasks.
-
-        Raises
-        ------
-        KrosError
-            When a worker process was ended from outside.
-        """
+        """Yield results in the order of the tasks."""
         tasks = list(tasks)
         return _results(self._pool.map(function, tasks, chunksize=max(1, len(tasks) // _CHUNKS)))
 
@@ -53,15 +47,7 @@ def _results(found: Iterator[T]) -> Iterator[T]:
 
 @contextmanager
 def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
-    """Open the executor that fits: Dask for a scheduler's address, processes for more than one worker.
-
-    Parameters
-    ----------
-    workers : int
-        Number of processes.
-    scheduler : str, optional
-        Address of a Dask scheduler.
-    """
+    """Open the executor that fits: Dask for a scheduler's address, processes for more than one worker."""
     if scheduler is not None:
         with open_dask(scheduler) as executor:
             yield executor

@@ -17,13 +17,7 @@ STUDY = "study.json"
 
 
 def require_own(out: Path, config: StudyConfig) -> bool:
-    """Refuse a folder that is not this study's: one with the same name and recordings; tell whether it is new or empty.
-
-    Raises
-    ------
-    ConfigError
-        When the folder is a file, holds another study, or something else.
-    """
+    """Refuse a folder that is not this study's: one with the same name and recordings; tell whether it is new or empty."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Output {out}: is a file; name a folder.")
     if not out.exists() or not {p.name for p in out.iterdir()} - BOOKKEEPING:
@@ -57,15 +51,7 @@ def _read_study(folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
-    """Open a study's run folder for this process alone; what an interrupted run left half done goes.
-
-    Where bad input ends a run that has read no recordings yet, nothing stays of it.
-
-    Raises
-    ------
-    ConfigError
-        When the folder is not this study's, or another run is at work in it.
-    """
+    """Open a study's run folder for this process alone; what an interrupted run left half done goes."""
     above = [p for p in (out, *out.absolute().parents) if not p.exists()]
     out.mkdir(parents=True, exist_ok=True)
     try:
@@ -90,23 +76,7 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
 
 @contextmanager
 def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator[tuple[StudyConfig, Store]]:
-    """Open a run for reading while no other process writes there, and make sure that some stages' files are as they left them.
-
-    Parameters
-    ----------
-    folder : Path
-    *stages : Stage
-        Stages that are read.
-    alone : bool
-        Whether to write as well.
-
-    Raises
-    ------
-    ConfigError
-        When the folder is no run, or another process is at work in it.
-    DataError
-        When a file is missing or was changed.
-    """
+    """Open a run for reading while no other process writes there, and make sure that some stages' files are as they left them."""
     folder = Path(folder)
     load_run(folder)
     with locked(folder, shared=not alone):
@@ -116,13 +86,7 @@ def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator
 
 
 def load_run(folder: Path) -> tuple[StudyConfig, Store]:
-    """Read the study of a run folder.
-
-    Raises
-    ------
-    ConfigError
-        When the folder is not a run, or one of another version of kros.
-    """
+    """Read the study of a run folder."""
     folder = Path(folder)
     if not (folder / STUDY).exists():
         raise ConfigError(f"Run {folder}: there is no {STUDY} in it; name the folder that kros run or kros demo wrote.")

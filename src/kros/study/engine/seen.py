@@ -34,31 +34,7 @@ _LEVEL = 1  # of compression
 
 @dataclass(frozen=True)
 class Seen:
-    """What was computed earlier.
-
-    Parameters
-    ----------
-    folder : Path
-        One file a map; it need not exist.
-    key : str
-        Of the code; results of another one are not known.
-    changed : callable or None
-        Told the path of every file that was written; None where nothing is written.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from tempfile import TemporaryDirectory
-    >>> from kros.core.work import Work
-    >>> from kros.study.engine.seen import Seen
-    >>> with TemporaryDirectory() as folder:
-    ...     work = Work(seen=Seen(Path(folder), "1", changed=lambda path: None))
-    ...     squares = list(work.recall("square", lambda x: x**2, [2, 3], ["two", "three"]))
-    ...     more = list(work.recall("square", lambda x: print(x) or x**2, [2, 3, 4], ["two", "three", "four"]))
-    4
-    >>> squares, more
-    ([4, 9], [4, 9, 16])
-    """
+    """What was computed earlier."""
 
     folder: Path
     key: str

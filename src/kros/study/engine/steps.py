@@ -55,10 +55,7 @@ def run_steps(context: Context, steps: Sequence[Step], until: Stage) -> None:
 
 
 def _run_step(context: Context, steps: Sequence[Step], upstream: str) -> str:
-    """Run the first of some steps, or find it done; return what the next one depends on.
-
-    Its earlier result, and all that follows from it, stay until the new one is there: a stage that fails or is killed leaves a run as it was.
-    """
+    """Run the first of some steps, or find it done; return what the next one depends on."""
     stage = steps[0].stage
     key = _key(context, steps[0], upstream)
     if context.store.is_current(stage, key):

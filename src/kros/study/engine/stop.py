@@ -21,10 +21,7 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """Raise `Stopped` where the process is told to stop, so that what is half done goes as it does after an error; a second signal kills.
-
-    Signals that somebody handles, or ignores as nohup does, are left alone.
-    """
+    """Raise `Stopped` where the process is told to stop, so that what is half done goes as it does after an error."""
     if current_thread() is not main_thread():
         yield
         return

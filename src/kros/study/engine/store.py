@@ -36,14 +36,7 @@ BOOKKEEPING = frozenset({PARTIAL, LOCK})
 
 @dataclass(frozen=True)
 class Store:
-    """A run folder and the records of its stages.
-
-    Parameters
-    ----------
-    folder : Path
-    place : Path, optional
-        Where the running stage writes; without a stage, into the folder itself.
-    """
+    """A run folder and the records of its stages."""
 
     folder: Path
     place: Path | None = None
@@ -113,13 +106,7 @@ class Store:
         return any(f == name or f.startswith(f"{name}/") for f in self.files())
 
     def verify(self, *stages: str) -> None:
-        """Make sure that what finished stages wrote is as they left it, and the study and its metrics too; all stages where none is named.
-
-        Raises
-        ------
-        DataError
-            When a record cannot be believed, or a file is gone or has changed, by name.
-        """
+        """Make sure that what finished stages wrote is as they left it, and the study and its metrics too."""
         for stage in (*map(_name, stages), OWN) if stages else [r.stage for r in records.records(self.folder) if r.stage != SEEN]:
             record = records.read_record(self.folder, stage)
             for name in record.all if record is not None else ():
@@ -128,13 +115,7 @@ class Store:
                     raise DataError(f"Run {self.folder}: {name}, which stage {stage} wrote, {found}; run the study again.")
 
     def commit(self, stage: str, key: str, seconds: float) -> None:
-        """Record what the running stage wrote, then move it into place.
-
-        Raises
-        ------
-        ConfigError, DataError
-            When something else is in the place of a result: a folder, or a link out of the run folder.
-        """
+        """Record what the running stage wrote, then move it into place."""
         draft = self.draft()
         written = sorted(f.relative_to(draft).as_posix() for f in draft.rglob("*") if records.is_file(f))
         for name in written:

@@ -35,23 +35,7 @@ _FEWEST_DRAWS = 2
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Disturbed runs of a study.
-
-    Parameters
-    ----------
-    population : Population
-    keys : tuple of EpisodeKey
-    samples : int
-        So many of every episode.
-    units : dict
-        Lifting parameters by unit.
-    measured : tuple of int
-    disturbances : tuple of Disturbance
-    names : tuple of str
-        Observers that take part; baselines without a model all do.
-    sensor : mapping of str to Sensor
-        What is declared; disturbances come on top of it.
-    """
+    """Disturbed runs of a study."""
 
     population: Population
     keys: tuple[EpisodeKey, ...]
@@ -89,11 +73,7 @@ class Trial:
 
 
 def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, dict[str, float]], roles: Mapping[str, str]) -> Trial | None:
-    """Return what is run on disturbed measurements; None where the study asks for nothing of it.
-
-    By default the observers of the deployed kind of model, on the first seconds of one held-out episode of few units; with
-    ``robustness = "all"`` all observers, units and conditions.
-    """
+    """Return what is run on disturbed measurements; None where the study asks for nothing of it."""
     config = context.config.evaluate
     if not (config.robustness or config.monte_carlo):
         return None
@@ -128,10 +108,7 @@ def noise_draws(context: Context, keys: Sequence[EpisodeKey], measured: Sequence
 def run_disturbed(
     context: Context, trial: Trial | None, observers: Mapping[str, Observer], baselines: Mapping[str, tuple[Array, Sequence[int] | None]]
 ) -> None:
-    """Run the observers of a trial on disturbed measurements and on random members of their set, and save what comes out.
-
-    `baselines` have been run already; beside their errors stand the channels that they estimate.
-    """
+    """Run the observers of a trial on disturbed measurements and on random members of their set, and save what comes out."""
     if trial is None:
         return
     config, folder = context.config.evaluate, context.store.draft("disturbed")

@@ -42,11 +42,7 @@ _NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that s
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one model or observer did on the test episodes: errors, and trajectories of the episodes that are shown.
-
-    A baseline that is made here leaves its `facts`, and its errors on disturbed measurements where these are asked for; `estimated` are the states
-    that it estimates, all where it is None, and `true` its errors against what states really were, where the recordings say so.
-    """
+    """What one model or observer did on the test episodes: errors, and trajectories of the episodes that are shown."""
 
     summary: ErrorSummary
     shown: list[Array]
@@ -92,10 +88,7 @@ def evaluate_baseline(
     trial: Trial | None = None,
     limits: tuple[Array, Array] | None = None,
 ) -> Outcome | str:
-    """Make a baseline and run it on test episodes as the sensor shows them, and on disturbed ones; the reason where it cannot be made.
-
-    `limits` of the states, lower and upper, cut off its estimates.
-    """
+    """Make a baseline and run it on test episodes as the sensor shows them, and on disturbed ones; the reason where it cannot be made."""
     try:
         baseline = replace(make(), limits=limits)
     except KrosError as error:
@@ -130,10 +123,7 @@ def _outcomes(
     sensor: Sensors,
     truths: bool = True,
 ) -> list[Outcome]:
-    """Return the outcomes of estimates, shape (estimate, n_samples, batch, n or more), a few at a time, some episodes after others.
-
-    That many episodes are side by side in the compiled loops at once, and their estimates are put where those of others were.
-    """
+    """Return the outcomes of estimates, shape (estimate, n_samples, batch, n or more), a few at a time, some episodes after others."""
     found = []
     for start in range(0, len(keys) or 1, _EPISODES):  # none at all are refused where they are read
         batch = EpisodeBatch.read(population, keys[start : start + _EPISODES], parameters=units, truths=truths)
@@ -239,10 +229,7 @@ def outcomes(context: Context, work: Sequence[Piece]) -> dict[str, Outcome | str
 
 
 def baseline_makers(context: Context, population: Population, keys: tuple[EpisodeKey, ...]) -> dict[str, Callable[[], Baseline]]:
-    """Return what makes every baseline that is no correction of a model: the extended filter of the first lifted model, and those without a model.
-
-    `keys` are the episodes of a population that will be estimated: the mean profile has to know their motions.
-    """
+    """Return what makes every baseline that is no correction of a model."""
     models = {name: context.identified.models(name) for name in context.identified.kinds}
     asked, first = context.config.observer.baselines, next(iter(models.values()))
     nominal, training = context.uncertain.nominal, TrainingSet.of(context.identified, first, context.config.sensor)

@@ -56,13 +56,7 @@ def check_folds(config: StudyConfig, population: Population) -> None:
 
 
 def parted(units: Sequence[str], folds: int) -> list[list[str]]:
-    """Return the units of every fold.
-
-    Raises
-    ------
-    ConfigError
-        When a fold would be empty, or leave fewer than two units to learn from.
-    """
+    """Return the units of every fold."""
     if folds > len(units):
         raise ConfigError(f"evaluate.folds = {folds}: there are {len(units)} units to leave out; ask for at most that many folds.")
     parts = [list(units[fold::folds]) for fold in range(folds)]
@@ -208,10 +202,7 @@ def of_condition(rows: Rows, condition: str) -> Rows:
 
 
 def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float) -> dict[str, Any]:
-    """Bound the next unit's errors in some channels, in percent and in RMS, all together.
-
-    Errors are compared relative to the mean over the units that the observer was made from (`known`), which knows nothing of those in `rows`.
-    """
+    """Bound the next unit's errors in some channels, in percent and in RMS, all together."""
     own = {(c, m): np.array([r[m] for r in known if r["channel"] == c], float) for c in channels for m in _MEASURES}
     scale = {place: float(values.mean()) if values.size else np.nan for place, values in own.items()}
     usable = [place for place, size in scale.items() if np.isfinite(size) and size > 0]
@@ -229,11 +220,7 @@ def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: floa
 
 
 def facts_of_folds(found: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
-    """Return what all folds together say about every observer.
-
-    ``made`` and the certificates count folds: ``relift_certified`` as it runs, ``robust`` for the uncertain set. Both are None for what has no
-    model and so can have none. Reasons are those that were given, without repetition.
-    """
+    """Return what all folds together say about every observer."""
     facts = {}
     for name in dict.fromkeys(name for fold in found for name in fold):
         entries = [fold[name] for fold in found if name in fold]

@@ -38,13 +38,7 @@ def open_source(config: StudyConfig, given: Population | None = None) -> Populat
 
 
 def draw(config: StudyConfig, population: Population) -> tuple[str, ...]:
-    """Return the units in reserve: drawn from those of the population that the study does not name, by their places alone.
-
-    Raises
-    ------
-    ConfigError
-        When fewer than two units are left to learn from.
-    """
+    """Return the units in reserve: drawn from those of the population that the study does not name, by their places alone."""
     n, named = config.evaluate.reserve, {config.uncertainty.nominal, *config.load.units}
     pooled = [u.id for u in population.units if u.group != OUTLIERS]
     free = [u for u in pooled if u not in named]

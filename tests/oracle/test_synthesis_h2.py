@@ -110,7 +110,7 @@ def test_optimum_is_found_by_blind_search_too():
     assert min(results) <= found.h2_norm * 1.02
 
 
-def test_fir_youla_program_reaches_the_same_optimum():
+def test_an_impulse_response_of_forty_taps_reaches_the_same_optimum():
     # A stable plant: T(Q) = P11 + P12 Q P21 is affine in a FIR Q, so least squares over its taps tends to the optimum from above.
     rng = np.random.default_rng(5)
     plant = random_plant(rng, 3, 1.0, d22=False)

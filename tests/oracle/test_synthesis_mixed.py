@@ -4,20 +4,19 @@ import re
 import time
 from dataclasses import replace
 
+import cvxpy as cp
 import numpy as np
 import pytest
 from paper_plant import paper_plant, reduced_plant
 from scipy.linalg import expm
-from youla import youla_bound
 
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, h2, mixed
 from kros.synthesis.mixed_norms.balance import balance
+from kros.synthesis.mixed_norms.barrier import minimise
 from kros.synthesis.mixed_norms.candidates import by_inequalities
 from kros.synthesis.mixed_norms.channels import part, scaled, verify
 from kros.synthesis.mixed_norms.inequalities import MixedInequalities
-from kros.synthesis.mixed_norms.lower_bounds import hinf_lower_bound
-from kros.synthesis.mixed_norms.solvers import Program, solve
 from kros.synthesis.problem.plants import mixed_plant
 from kros.synthesis.reduction.truncation import truncate
 from kros.synthesis.worst_case.certificate import certify
@@ -92,7 +91,7 @@ def free_optimum(plant):
 
 def candidates(plant, gamma, scalings):
     reasons = []
-    found = by_inequalities(plant, gamma, scalings, 8, time.perf_counter() + 60, reasons, [], ("BARRIER",))
+    found = by_inequalities(plant, gamma, scalings, 8, time.perf_counter() + 60, reasons, [])
     return found, reasons
 
 
@@ -115,12 +114,22 @@ def test_inequalities_bound_the_norms_and_agree_with_another_solver():
     gamma = 0.9 * peak
     balanced = balance(scaled(plant, 16.0))
     inequalities = MixedInequalities(balanced, gamma)
-    program = Program(inequalities.objective(), inequalities.blocks(), inequalities.start())
-    own, other = solve(program, "BARRIER", 20.0, 1e-6), solve(program, "CLARABEL", 20.0, 1e-7)
-    assert own.value == pytest.approx(other.value, rel=1e-4)
+    own = minimise(inequalities.objective(), inequalities.blocks(), inequalities.start(), rtol=1e-6)
+    assert own.value == pytest.approx(by_clarabel(inequalities), rel=1e-4)
     checked = verify(plant, inequalities.controller(own.x), gamma, "inequalities")
     assert free.h2_norm <= checked.h2 <= balanced.size * np.sqrt(own.value)
     assert checked.hinf < gamma
+
+
+def by_clarabel(inequalities):
+    """Optimum of the inequalities by a conic solver."""
+    x = cp.Variable(inequalities.size)
+    constraints = []
+    for block in inequalities.blocks():
+        for constant, basis in zip(block.constant, block.basis.swapaxes(0, 1), strict=True):
+            value = cp.reshape(basis.reshape(len(basis), -1).T @ x, constant.shape, order="C") + constant
+            constraints.append((value + value.T) / 2 >> 0)
+    return cp.Problem(cp.Minimize(inequalities.objective() @ x), constraints).solve(solver="CLARABEL")
 
 
 def test_scaling_of_the_channel_helps():
@@ -136,24 +145,30 @@ def test_scaling_of_the_channel_helps():
         assert all(v.hinf < 0.95 * peak for v in found)
 
 
-SMALL = [(0, 2, 0.3), (1, 3, 0.3), (2, 4, 0.3), (3, 2, 0.3), (11, 4, 0.7), (13, 3, 0.3)]
+# Seed, states, gamma, and the norm that a free filter Q of up to 32 taps attains around the H2 optimum (Youla program, computed once).
+SMALL = [
+    (0, 2, 0.0822, 1.636558),
+    (1, 3, 0.076, 0.1355849),
+    (2, 4, 0.329, 2.113431),
+    (3, 2, 0.087, 0.4080596),
+    (11, 4, 0.262, 2.216258),
+    (13, 3, 0.658, 3.157932),
+]
 
 
-@pytest.mark.parametrize(("seed", "n", "share"), SMALL)
-def test_between_a_lower_bound_and_a_long_filter(seed, n, share):
-    """The gap to the Youla program is below five percent, and no controller is below the dual bound."""
+@pytest.mark.parametrize(("seed", "n", "gamma", "upper"), SMALL)
+def test_between_a_lower_bound_and_a_long_filter(seed, n, gamma, upper):
+    """The gap to a long filter is below five percent, and no controller is below the dual bound."""
     plant = two_channel(np.random.default_rng(seed), n=n)
-    free, peak = free_optimum(plant)
-    least = hinf_lower_bound(plant)
-    gamma = least + share * (peak - least)
-    found, upper = mixed(plant, gamma=gamma), youla_bound(plant, 16, "mixed", gamma, max_taps=32)
+    free, _ = free_optimum(plant)
+    found = mixed(plant, gamma=gamma)
     closed = plant.close(found.controller)
     assert found.hinf_norm == pytest.approx(hinf_norm(part(plant, closed, 2)))
     assert found.h2_norm == pytest.approx(h2_norm(part(plant, closed, 1)))
     assert found.hinf_norm < gamma
     assert found.controller.n_states == n
-    assert found.h2_norm <= 1.05 * upper.value
-    assert free.h2_norm * (1 - 1e-9) <= found.lower_bound <= min(found.h2_norm, upper.value)
+    assert found.h2_norm <= 1.05 * upper
+    assert free.h2_norm * (1 - 1e-9) <= found.lower_bound <= min(found.h2_norm, upper)
     assert found.gap_percent == pytest.approx(100 * (found.h2_norm / found.lower_bound - 1))
 
 
@@ -198,7 +213,7 @@ def test_drive_like_observers_are_solved_and_certified(seed, order, injection):
 
 
 def test_the_published_plant_itself():
-    """18 states, singular and degenerate: T11 vanishes for every controller, T22 does not contain it; what is returned stabilises and says so."""
+    """18 states, singular and degenerate: T11 vanishes for every controller, T22 does not contain it; what is returned stabilises."""
     case = drive_problem(0, Injection.INPUT, 5)
     A, B, C, W_p = case.scaled
     nominal = StateSpace(A, B, np.eye(4), np.zeros((4, 2)), DT)
@@ -208,7 +223,8 @@ def test_the_published_plant_itself():
     assert found.h2_norm < 1e-4 * h2_norm(part(plant, replace(plant, C2=0 * plant.C2).close(gain(np.zeros((2, 1)), DT)), 2))
     assert found.hinf_norm == pytest.approx(hinf_norm(case.W_L), rel=1e-6)
     assert plant.close(found.controller).is_stable()
-    assert any("T11 is the same for every controller" in note for note in found.notes)
+    assert any("small ones were added for the search" in note for note in found.notes)
+    assert found.lower_bound is None
 
 
 def test_splitting_the_weight_differently_changes_nothing():
@@ -218,14 +234,6 @@ def test_splitting_the_weight_differently_changes_nothing():
     other = replace(case, W_L=StateSpace(W.A, W.B, W.C / 20, W.D / 20, DT), W_R=gain(20 * np.eye(2), DT))
     one, two = mixed(case, max_states=6), mixed(other, max_states=6)
     assert two.worst_case_h2 == pytest.approx(one.worst_case_h2, rel=1e-2)
-
-
-def test_shrinking_the_channel_of_an_observer_only_undoes_the_correction():
-    case = drive_problem(0, Injection.INPUT, 1)
-    plain, shrunk = mixed(case, max_states=6), mixed(case, scalings=(1e-2,), max_states=6)
-    nothing = certify(case, gain(np.zeros((2, 1)), DT))[0]
-    assert plain.worst_case_h2 < shrunk.worst_case_h2 <= nothing * 1.01
-    assert shrunk.h2_norm < plain.h2_norm  # T11 holds the noise alone: no correction is its optimum
 
 
 def test_mixed_plant_is_the_published_one_with_noise_and_penalty():
@@ -271,48 +279,21 @@ def test_truncation_error_is_within_its_bound():
     assert hinf_norm(difference) <= 2 * tail * hinf_norm(full) * 1.01 + 1e-9 * hinf_norm(full)
 
 
-@pytest.mark.parametrize(("seed", "speed"), [(0, 1e-2), (1, 1e2)])
-def test_continuous_plants_are_mapped_exactly(seed, speed):
-    """Without a constraint the value is that of the continuous Riccati equations; with one, everything holds for the continuous loop."""
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((3, 3))
-    A = speed * (A - (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(3))
-    B1 = np.hstack([speed * rng.standard_normal((3, 1)), np.zeros((3, 1)), 0.3 * speed * np.ones((3, 1))])
-    C1 = np.vstack([rng.standard_normal((1, 3)), np.zeros((1, 3)), 0.3 * np.ones((1, 3))])
-    zero, B2, C2 = np.zeros((3, 3)), speed * rng.standard_normal((3, 1)), rng.standard_normal((1, 3))
-    plant = GeneralizedPlant(A, B1, B2, C1, C2, zero, [[0.0], [1.0], [0.1]], [[0.0, 1.0, 0.1]], [[0.2]], 0.0, 2, 2)
-    free = h2(plant.channel(plant.rows(1), plant.columns(1)))
-    found = mixed(plant, gamma=1e3)
-    assert found.status is Status.OPTIMAL
-    assert found.h2_norm == pytest.approx(free.h2_norm, rel=1e-9)
-    gamma = 0.8 * hinf_norm(part(plant, plant.close(free.controller), 2))
-    found = mixed(plant, gamma=gamma)
-    closed = plant.close(found.controller)
-    assert hinf_norm(part(plant, closed, 2)) == pytest.approx(found.hinf_norm, rel=1e-5)
-    assert found.hinf_norm < gamma
-    assert h2_norm(part(plant, closed, 1)) == pytest.approx(found.h2_norm, rel=1e-9)
-    assert free.h2_norm * (1 - 1e-9) <= found.lower_bound <= found.h2_norm
-    assert found.gap_percent < 2
-
-
-def fixed_at(c, share, dt):
+def fixed_at(c, share):
     """T22 = c + share theta K with theta an all-pass with a zero outside the stable region: no controller brings it below c."""
     b = 0.5
-    pole, out, direct = (b, -b * (b - 1 / b), -b) if dt > 0 else (-b, -2 * b, 1.0)
-    A = np.diag([0.9 if dt > 0 else -0.1, pole])
-    B1, C1 = np.zeros((2, 3)), np.zeros((3, 2))
+    A, B1, C1 = np.diag([0.9, b]), np.zeros((2, 3)), np.zeros((3, 2))
     B1[0, 0] = C1[0, 0] = 1.0
-    C1[2, 1] = share * out
-    D12, D21 = [[0.0], [0.3], [share * direct]], [[0.0, 0.3, 1.0]]
-    return GeneralizedPlant(A, B1, [[1.0], [1.0]], C1, [[1.0, 0.0]], np.diag([0.0, 0.0, c]), D12, D21, [[0.0]], dt, 2, 2)
+    C1[2, 1] = -share * b * (b - 1 / b)
+    D12, D21 = [[0.0], [0.3], [-share * b]], [[0.0, 0.3, 1.0]]
+    return GeneralizedPlant(A, B1, [[1.0], [1.0]], C1, [[1.0, 0.0]], np.diag([0.0, 0.0, c]), D12, D21, [[0.0]], 1.0, 2, 2)
 
 
-@pytest.mark.parametrize("dt", [0.0, 1.0])
 @pytest.mark.parametrize("share", [0.0, 1e-6, 1e-2, 1.0])
-def test_a_constraint_out_of_reach_is_refused_with_what_is_within(share, dt):
+def test_a_constraint_out_of_reach_is_refused_with_what_is_within(share):
     with pytest.raises(SynthesisError, match=r"gamma = 0\.5 is infeasible, no controller has \|\|T22\|\| below 0\.(8|79999)"):
-        mixed(fixed_at(0.8, share, dt), gamma=0.5, time_limit_s=1e4)
-    assert mixed(fixed_at(0.8, share, dt), gamma=0.9).hinf_norm < 0.9
+        mixed(fixed_at(0.8, share), gamma=0.5, time_limit_s=1e4)
+    assert mixed(fixed_at(0.8, share), gamma=0.9).hinf_norm < 0.9
 
 
 def test_an_observer_whose_constraint_cannot_be_met_is_told_so():

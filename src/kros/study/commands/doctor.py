@@ -1,4 +1,4 @@
-"""What is installed, which solvers there are, and what is missing for which purpose."""
+"""What is installed, and what is missing for which purpose."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ _OPTIONAL = {
     "pandas": "reading long data frames",
     "scikit-learn": "the estimator protocol",
     "control": "exchange with python-control",
-    "sdpa-python": "another semidefinite solver",
-    "mosek": "another semidefinite solver, commercial",
     "fmpy": "checking exported FMUs",
 }
 
@@ -26,16 +24,8 @@ def diagnose() -> list[str]:
     lines += [f"  {name:<16} {_version(name) or 'MISSING: install kros again'}" for name in _REQUIRED]
     lines.append("optional")
     lines += [f"  {name:<16} {_version(name) or 'not installed'}   {purpose}" for name, purpose in _OPTIONAL.items()]
-    lines.append(f"solvers           {', '.join(installed_solvers())}")
     lines.append(f"C compiler        {shutil.which('cc') or shutil.which('gcc') or 'none'}   for checking exported C code")
     return lines
-
-
-def installed_solvers() -> list[str]:
-    """Return the semidefinite solvers that cvxpy finds."""
-    import cvxpy as cp
-
-    return [name for name in cp.installed_solvers() if name in ("CLARABEL", "MOSEK")]
 
 
 def _version(name: str) -> str | None:

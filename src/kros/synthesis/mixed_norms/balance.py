@@ -13,7 +13,6 @@ T : coordinates in which X = E^-1 = diag(s)
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,6 +29,7 @@ from ..riccati.h2_optimal import h2
 Array = npt.NDArray[Any]
 
 _KNOWN = 1e-28  # share of a state's variance below which rounding alone keeps it from being known exactly
+_LITTLE = 1e-3  # disturbance of such a state, in its standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,35 +45,19 @@ class Balanced:
     controls: Array
     measurements: Array
 
+    def inside(self, K: StateSpace) -> StateSpace:
+        """Return the controller of the balanced plant for one of the original."""
+        c, m = self.controls[:, None], self.measurements
+        return StateSpace(K.A, K.B * m, K.C / c, K.D * m / c, K.dt)
+
     def controller(self, K: StateSpace) -> StateSpace:
         """Return the controller of the original plant."""
         c, m = self.controls[:, None], self.measurements
         return StateSpace(K.A, K.B / m, c * K.C, c * K.D / m, K.dt)
 
 
-def in_balance(
-    plant: GeneralizedPlant, controller: StateSpace, improve: Callable[[GeneralizedPlant, StateSpace], StateSpace]
-) -> StateSpace:
-    """Improve a controller on the balanced plant, where a search does not depend on units of measure; on the plant itself where there is none."""
-    if np.any(plant.D22):
-        return improve(plant, controller)
-    try:
-        balanced = balance(plant)
-    except SynthesisError:
-        return improve(plant, controller)
-    c, m = balanced.controls[:, None], balanced.measurements
-    inside = StateSpace(controller.A, controller.B * m, controller.C / c, controller.D * m / c, controller.dt)
-    return balanced.controller(improve(balanced.plant, inside))
-
-
 def balance(plant: GeneralizedPlant) -> Balanced:
-    """Balance a plant for the mixed inequalities.
-
-    Raises
-    ------
-    SynthesisError
-        When the plant is not regular, or has states that no disturbance reaches.
-    """
+    """Balance a plant for the mixed inequalities; a `SynthesisError` where it is not regular or has states that no disturbance reaches."""
     plant = replace(plant, D22=np.zeros_like(plant.D22))
     rows = plant.rows(1)
     performance = plant.channel(rows, slice(None))
@@ -109,29 +93,16 @@ def balance(plant: GeneralizedPlant) -> Balanced:
     return Balanced(balanced, size, s, controls, measurements)
 
 
-def reached(plant: GeneralizedPlant, share: float = 1e-3) -> GeneralizedPlant:
-    """Return a plant in which no state is known exactly, such as that of an actuator: every state gets a little disturbance in w1 where one is.
-
-    Parameters
-    ----------
-    plant : GeneralizedPlant
-    share : float
-        Of a state's standard deviation.
-    """
+def reached(plant: GeneralizedPlant) -> GeneralizedPlant:
+    """Give every state a little disturbance in w1 where one is known exactly, such as that of a weight on the control; else the plant itself."""
     bare = replace(plant, D22=np.zeros_like(plant.D22))
-    try:
-        E, F, W = covariances(bare, h2(bare.channel(bare.rows(1), slice(None))).controller)
-        sizes = np.sqrt(np.diag(E + F + F.T + W))
-        np.linalg.cholesky(E)
-        if (np.diag(E) > _KNOWN * sizes**2).all():
-            return plant
-    except LinAlgError:
-        pass
-    except SynthesisError:
-        return plant  # not regular: `balance` says so
+    E, F, W = covariances(bare, h2(bare.channel(bare.rows(1), slice(None))).controller)
+    sizes = np.sqrt(np.diag(E + F + F.T + W))
+    if (np.diag(E) > _KNOWN * sizes**2).all():
+        return plant
     n, _, _, n_z, n_y = plant.sizes
     w1 = plant.columns(1).stop if plant.n_w1 is not None else plant.sizes[1]
-    noise = np.diag(share * np.where(sizes > 0, sizes, sizes.max(initial=0.0)))
+    noise = np.diag(_LITTLE * np.where(sizes > 0, sizes, sizes.max(initial=0.0)))
     return replace(
         plant,
         B1=np.insert(plant.B1, [w1] * n, noise, axis=1),

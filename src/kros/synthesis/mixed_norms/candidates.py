@@ -1,4 +1,4 @@
-"""Candidates of mixed synthesis: controllers from matrix inequalities and from H-infinity synthesis, each verified on the full plant."""
+"""Candidates of mixed synthesis: controllers from matrix inequalities, each verified on the full plant."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from ...core.errors import KrosError, SynthesisError
+from ...core.lti import StateSpace
 from ..generalized_plant import GeneralizedPlant
 from ..reduction.truncation import truncate
 from ..riccati.h2_optimal import absorb_feedthrough
-from ..riccati.hinf_optimal import hinf
-from .balance import balance
+from .balance import balance, reached
+from .barrier import Ending, minimise
 from .channels import Verified, scaled, verify
 from .inequalities import MixedInequalities
-from .solvers import Answer, Program, solve_with_fallback
+
+_ACCURACY = 1e-4
 
 
 def by_inequalities(
@@ -28,7 +30,6 @@ def by_inequalities(
     end: float,
     reasons: list[str],
     notes: list[str],
-    solvers: Sequence[str] | None = None,
 ) -> list[Verified]:
     """Candidates from the matrix inequalities, one for each scaling that works."""
     small, done = reduced(plant, max_states)
@@ -39,61 +40,31 @@ def by_inequalities(
         if left <= 0:
             reasons.append("the time limit was reached")
             break
-        try:
-            balanced = balance(scaled(small, a))
-            inequalities = MixedInequalities(balanced, gamma)
-            program = Program(inequalities.objective(), inequalities.blocks(), inequalities.start())
-        except (SynthesisError, LinAlgError, ValueError) as error:
-            reasons.append(f"scaling {a:g}: {error}")
-            continue
-        label = f"inequalities, scaling {a:g}"
-
-        def check(answer: Answer, inequalities: MixedInequalities = inequalities, label: str = label) -> Verified | str:
-            assert answer.x is not None
-            try:
-                K = absorb_feedthrough(inequalities.controller(answer.x), plant.D22)
-            except (LinAlgError, KrosError) as error:
-                return f"{answer.solver}: the controller cannot be recovered ({error})"
-            value = inequalities.balanced.size * np.sqrt(max(answer.value, 0.0))
-            return verify(
-                plant, K, gamma, f"{answer.solver} ({answer.word}), {label}, their value {value:.6g}", answer.solver.lower(), answer.optimal
-            )
-
-        result = solve_with_fallback(program, check, time_limit_s=left, solvers=solvers)
-        reasons += [f"{label}, {note}" for note in result.notes]
-        if result.accepted is not None:
-            found.append(result.accepted)
-    return found
-
-
-def by_hinf(plant: GeneralizedPlant, gamma: float, end: float, reasons: list[str]) -> list[Verified]:
-    """Candidates from H-infinity synthesis of both channels together, channel 1 with less and less weight."""
-    found: list[Verified] = []
-    one_z, one_w = plant.rows(1), plant.columns(1)
-    for share in (0.3, 0.1, 0.03, 0.01, 1e-3):
-        if time.perf_counter() > end:
-            break
-        left, right = np.ones(plant.sizes[3]), np.ones(plant.sizes[1])
-        left[one_z], right[one_w] = share, share
-        weighted = replace(
-            plant,
-            B1=plant.B1 * right,
-            D21=plant.D21 * right,
-            C1=plant.C1 * left[:, None],
-            D12=plant.D12 * left[:, None],
-            D11=plant.D11 * left[:, None] * right,
-        )
-        try:
-            K = hinf(weighted, gamma=gamma * (1 - 1e-3)).controller
-        except KrosError as error:
-            reasons.append(f"H-infinity synthesis, channel 1 times {share:g}: {error}")
-            continue
-        verdict = verify(plant, K, gamma, f"H-infinity synthesis, channel 1 times {share:g}", "riccati")
+        verdict = _candidate(plant, scaled(small, a), gamma, f"inequalities, scaling {a:g}", left)
         if isinstance(verdict, Verified):
             found.append(verdict)
-            if len(found) == 2:
-                break
+        else:
+            reasons.append(verdict)
     return found
+
+
+def _candidate(plant: GeneralizedPlant, small: GeneralizedPlant, gamma: float, label: str, time_limit_s: float) -> Verified | str:
+    """Solve the inequalities of the small plant and verify the controller on the whole one; a text says why there is none."""
+    try:
+        inequalities = MixedInequalities(balance(reached(small)), gamma)
+        blocks, start = inequalities.blocks(), inequalities.start()
+    except (SynthesisError, LinAlgError, ValueError) as error:
+        return f"{label}: {error}"
+    solved = minimise(inequalities.objective(), blocks, start, rtol=_ACCURACY, time_limit_s=time_limit_s)
+    if solved.x is None or not np.isfinite(solved.value):
+        return f"{label}: {solved.ending.value}"
+    try:
+        K: StateSpace = absorb_feedthrough(inequalities.controller(solved.x), plant.D22)
+    except (LinAlgError, KrosError) as error:
+        return f"{label}: the controller cannot be recovered ({error})"
+    value = inequalities.balanced.size * np.sqrt(max(solved.value, 0.0))
+    origin = f"{label} ({solved.ending.value}), their value {value:.6g}"
+    return verify(plant, K, gamma, origin, solved.ending is Ending.SOLVED)
 
 
 def reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant, list[str]]:

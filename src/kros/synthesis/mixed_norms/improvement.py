@@ -23,10 +23,11 @@ from ...core.lti import StateSpace
 from ...core.norms import h2_norm, hinf_norm
 from ..generalized_plant import GeneralizedPlant
 from ..reduction.affine_loop import AffineLoop
+from .channels import part
 
 Array = npt.NDArray[Any]
 
-_GRID, _ROUNDS = 60, 8
+_GRID, _ROUNDS, _ITERATIONS = 60, 8, 60
 _BACK_OFF = 1e-4
 _UNSTABLE = 1e3
 
@@ -59,7 +60,7 @@ class _Problem:
         rows, columns = p.rows(2), p.columns(2)
         (B_u, D_u), (C_y, D_y) = self.loop.into, self.loop.out_of
         n = loop.n_states
-        z = np.exp(2j * np.pi * freqs_hz * loop.dt) if loop.dt > 0 else 2j * np.pi * freqs_hz
+        z = np.exp(2j * np.pi * freqs_hz * loop.dt)
         resolvent = np.linalg.inv(z[:, None, None] * np.eye(n) - loop.A)
         B, C = loop.B[:, columns], loop.C[rows]
         U, s, Vh = np.linalg.svd(C @ resolvent @ B + loop.D[rows, columns], full_matrices=False)
@@ -70,21 +71,8 @@ class _Problem:
         return np.log(size / self.gamma), slope.reshape(len(z), -1) / size[:, None]
 
 
-def polish(plant: GeneralizedPlant, controller: StateSpace, gamma: float, time_limit_s: float = 5.0, iterations: int = 60) -> StateSpace:
-    """Return a controller of the same order that is at least as good; the one given where nothing better is found.
-
-    Parameters
-    ----------
-    plant : GeneralizedPlant
-        With its partition.
-    controller : StateSpace
-        Stabilises the plant with ``||T22||_inf < gamma``.
-    gamma : float
-    time_limit_s : float
-        Looked at in every evaluation.
-    iterations : int
-        Of the quadratic programming, for each set of frequencies.
-    """
+def improved(plant: GeneralizedPlant, controller: StateSpace, gamma: float, time_limit_s: float) -> StateSpace:
+    """Return a controller of the same order that is at least as good, for one that stabilises with ``||T22||_inf < gamma``."""
     loop = AffineLoop(plant, controller.n_states)
     start = loop.theta(controller)
     units = loop.typical(start)
@@ -93,7 +81,7 @@ def polish(plant: GeneralizedPlant, controller: StateSpace, gamma: float, time_l
     freqs_hz, level = _frequencies(loop.close(start)), 1 - _BACK_OFF
     for _ in range(_ROUNDS):
         try:
-            x_new = _programme(problem, x, freqs_hz, level, iterations)
+            x_new = _programme(problem, x, freqs_hz, level)
         except (TimeoutError, np.linalg.LinAlgError, ValueError):
             break
         candidate = loop.controller(problem.theta(x_new))
@@ -117,7 +105,8 @@ def polish(plant: GeneralizedPlant, controller: StateSpace, gamma: float, time_l
     return best
 
 
-def _programme(problem: _Problem, x: Array, freqs_hz: Array, level: float, iterations: int) -> Array:
+def _programme(problem: _Problem, x: Array, freqs_hz: Array, level: float) -> Array:
+    """Run sequential quadratic programming with the constraint at some frequencies."""
     from scipy.optimize import minimize
 
     remembered: dict[bytes, tuple[Array, Array]] = {}
@@ -133,23 +122,22 @@ def _programme(problem: _Problem, x: Array, freqs_hz: Array, level: float, itera
     cost: Callable[[Array], tuple[float, Array]] = problem.cost
     p = problem.loop.plant
     rooms = [room] if p.D11[p.rows(2), p.columns(2)].size else []
-    found = minimize(cost, x, jac=True, method="SLSQP", constraints=rooms, options={"maxiter": iterations, "ftol": 1e-7})
+    found = minimize(cost, x, jac=True, method="SLSQP", constraints=rooms, options={"maxiter": _ITERATIONS, "ftol": 1e-7})
     return np.asarray(found.x)
 
 
 def _norms(plant: GeneralizedPlant, controller: StateSpace) -> tuple[float, float]:
+    """Norms of T11 and T22."""
     closed = plant.close(controller)
-    rows, columns = (plant.rows(1), plant.rows(2)), (plant.columns(1), plant.columns(2))
-    one, two = (StateSpace(closed.A, closed.B[:, c], closed.C[r], closed.D[r][:, c], closed.dt) for r, c in zip(rows, columns, strict=True))
-    return h2_norm(one), hinf_norm(two)
+    return h2_norm(part(plant, closed, 1)), hinf_norm(part(plant, closed, 2))
 
 
 def _frequencies(closed: StateSpace, count: int = _GRID) -> Array:
     """Frequencies in Hz: of the poles, and logarithmically between far below the slowest and the highest."""
     poles = closed.poles().astype(complex)
-    poles = np.log(poles[np.abs(poles) > 1e-9]) / closed.dt if closed.dt > 0 else poles
+    poles = np.log(poles[np.abs(poles) > 1e-9]) / closed.dt
     sizes = np.abs(poles)[np.abs(poles) > 0] / (2 * np.pi)
-    top = 0.5 / closed.dt if closed.dt > 0 else 100 * sizes.max(initial=1.0)
+    top = 0.5 / closed.dt
     bottom = min(sizes.min(initial=top) / 10, top / 100)
     resonances = np.abs(poles.imag) / (2 * np.pi)
     grid = np.geomspace(bottom, top, count)

@@ -13,8 +13,8 @@ its gain is one at all frequencies.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -26,20 +26,16 @@ from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import mixed_plant
 from ..result import Status, Synthesis
 from ..worst_case.certificate import certify
-from .attainable import require_reachable
 from .candidates import by_inequalities
-from .channels import Verified
-from .solvers import QUICK
+from .channels import Verified, require_reachable
 
-# Least measurement noise in the inequalities, as a fraction of the measured channel's range, tenfold where the solver fails: they do not resolve an
-# encoder's 1e-7. The certificate uses the true noise.
+# Least measurement noise in the inequalities, as a fraction of the measured channel's range, tenfold where the result is no
+# better than nothing: they do not resolve an encoder's 1e-7. The certificate uses the true noise.
 _NOISE_FLOOR = 1e-3
 _NOTHING = 1e-3  # an observer this much worse than no correction may be owed to the reduction of the plant
 
 
-def for_observer(
-    problem: ObserverProblem, gamma: float, scalings: Sequence[float] | None, max_states: int, time_limit_s: float
-) -> Synthesis:
+def for_observer(problem: ObserverProblem, gamma: float, max_states: int, time_limit_s: float) -> Synthesis:
     """Solve the reduced observer problem on noise that the inequalities resolve; certify the filter on the set, in physical units."""
     problem.require_sound()
     start = time.perf_counter()
@@ -50,18 +46,14 @@ def for_observer(
         return _without_correction(problem, nothing, start)
     best: Synthesis | None = None
     reasons: list[str] = []
-    # What the quick solver cannot do on any of the problems is asked of all the others on the first.
-    rows: list[tuple[float, int, Sequence[str] | None]] = [
-        (floor, states, QUICK) for floor in (_NOISE_FLOOR, 10 * _NOISE_FLOOR) for states in _around(max_states)
-    ]
-    for floor, states, solvers in [*rows, (_NOISE_FLOOR, max_states, None)]:
+    for floor, states in product((_NOISE_FLOOR, 10 * _NOISE_FLOOR), _around(max_states)):
         noisy = replace(problem, noise=np.maximum(problem.noise, floor * (np.abs(problem.C) @ problem.output_scale)))
         plant = mixed_plant(noisy, noise_floor=0.0)
         require_reachable(plant, gamma)  # K does not enter T22, so that this is all there is to say about the constraint
-        for tried in canonical_scalings(plant) if scalings is None else [tuple(scalings)]:
+        for scaling in canonical_scalings(plant):
             failed: list[str] = []
             notes: list[str] = []
-            found = by_inequalities(plant, gamma, tried, states, end, failed, notes, solvers)
+            found = by_inequalities(plant, gamma, (scaling,), states, end, failed, notes)
             if found:
                 made = _certified(problem, noisy, min(found, key=lambda v: v.h2), notes, start)
                 best = made if best is None or _worst(made) < _worst(best) else best
@@ -85,14 +77,14 @@ def _worst(found: Synthesis) -> float:
     return np.inf if found.worst_case_h2 is None else found.worst_case_h2
 
 
-def canonical_scalings(plant: GeneralizedPlant) -> list[tuple[float]]:
+def canonical_scalings(plant: GeneralizedPlant) -> list[float]:
     """Scalings of channel 2 in which the disturbances w1 reach z2 with unit energy, or with unit gain."""
     rows, columns = plant.rows(2), plant.columns(1)
     B, C, D = plant.B1[:, columns], plant.C1[rows], plant.D11[rows][:, columns]
     energy = B.T @ gramian(plant.A.T, C.T, plant.dt) @ B + D.T @ D
     size = float(np.sqrt(np.linalg.norm(energy, 2))) if energy.size else 0.0
     peak = hinf_norm(StateSpace(plant.A, B, C, D, plant.dt))
-    return [(size,), (peak,)] if size > 0 else [(1.0,)]
+    return [size, peak] if size > 0 else [1.0]
 
 
 def _without_correction(problem: ObserverProblem, nothing: StateSpace, start: float) -> Synthesis:
@@ -128,7 +120,7 @@ def _certified(problem: ObserverProblem, noisy: ObserverProblem, best: Verified,
         quadrature_error=error,
         spectral_radius=float(problem.error_system(controller).spectral_radius()),
         solve_s=elapsed,
-        solver=best.solver,
+        solver="barrier",
         notes=(
             *notes,
             f"Found by: {best.origin}.",

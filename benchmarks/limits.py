@@ -14,10 +14,11 @@ import numpy as np
 from kros.data import EpisodeBatch
 from kros.data.survey import survey
 from kros.lifting import Lifting
-from kros.observer import conditioned, driven_coordinates, identify_predictor, relift_certificate, run_observer
+from kros.observer import identify_predictor, relift_certificate, run_observer
 from kros.observer.baselines.learned import Features
 from kros.observer.baselines.learned_moments import Moments
-from kros.observer.predictor.limited import with_limits
+from kros.observer.predictor.driven import driven_coordinates
+from kros.observer.predictor.limited import conditioned, with_limits
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
 FOLDS, HELD = 3, "3"

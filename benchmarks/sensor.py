@@ -26,7 +26,8 @@ from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent
 from kros.evaluate.sensor import as_shown
 from kros.identify.calibrate import segments_of
-from kros.observer import Sensor, in_sizes, run_observer
+from kros.observer import Sensor, run_observer
+from kros.observer.units import in_sizes
 from kros.study.commands.demo import simulate_to
 from kros.uncertainty.quantify import UncertainModels
 

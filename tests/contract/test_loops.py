@@ -70,7 +70,7 @@ def test_observers_of_all_kinds_run_alike(kind, both):
 
     def run():
         nu, judged = run_innovations(observer, y, u, own)
-        return run_observer(observer, y, u, own), run_observer(observer, y, u, own, "filter"), nu, judged
+        return run_observer(observer, y, u, own), nu, judged
 
     assert_same(*both(run))
 

@@ -9,8 +9,9 @@ from kros.data import EpisodeBatch
 from kros.design.methods.gains import design_kalman_tuned
 from kros.design.settings import PredictorSettings, SynthesisSettings
 from kros.design.synthesize import tasks_of
-from kros.observer import in_sizes, run_observer
+from kros.observer import run_observer
 from kros.observer.residual.one_step import one_step_covariance
+from kros.observer.units import in_sizes
 from kros.plants import DcMotorPopulation
 
 

@@ -9,9 +9,10 @@ from batches import batch_of
 
 from kros.core.errors import DimensionError
 from kros.lifting import Lifting
-from kros.observer import Observer, PastMoments, ReliftScales, driven_coordinates, relift_certificate, run_observer, with_internal
+from kros.observer import Observer, PastMoments, ReliftScales, relift_certificate, run_observer
 from kros.observer.certificate.report import relift_report
 from kros.observer.predictor.build import embedded
+from kros.observer.predictor.driven import driven_coordinates, with_internal
 from kros.observer.residual.one_step import one_step_residual
 from kros.synthesis.residual_shaped.shaping_filter import Basis
 

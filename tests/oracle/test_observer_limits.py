@@ -10,12 +10,13 @@ from kros.core.lti import gain
 from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
-from kros.observer import Observer, Runtime, conditioned, driven_coordinates, relift_certificate, run_observer, signal_bound, with_internal
+from kros.observer import Observer, Runtime, relift_certificate, run_observer, signal_bound
 from kros.observer.certificate.error import ReliftScales, error_system
 from kros.observer.certificate.report import course, frozen_response
 from kros.observer.limits import Limit, limits_of
 from kros.observer.predictor.choice import filled_in
-from kros.observer.predictor.limited import with_limits
+from kros.observer.predictor.driven import driven_coordinates, with_internal
+from kros.observer.predictor.limited import conditioned, with_limits
 from kros.observer.predictor.moments import PastMoments
 from kros.synthesis import Injection
 from kros.synthesis.residual_shaped.shaping_filter import Basis

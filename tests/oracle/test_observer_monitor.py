@@ -11,9 +11,10 @@ from kros.core.lti import gain
 from kros.design.monitor import bound_of_peaks, fit_monitor, monitor_facts, steady, weighted
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
-from kros.observer import Monitor, Observer, SampleStatus, in_sizes
+from kros.observer import Monitor, Observer, SampleStatus
 from kros.observer.monitor import RECOVERY, WEIGHT, Watch, octaves, poisson_interval
 from kros.observer.simulate import run_innovations
+from kros.observer.units import in_sizes
 from kros.plants import HarmonicDrivePopulation
 from kros.synthesis import Injection
 from kros.uncertainty.outliers.tail import prediction_bound

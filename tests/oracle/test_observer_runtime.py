@@ -49,28 +49,31 @@ def test_filtered_estimate_of_a_kalman_predictor_is_the_kalman_filter():
         P = F @ (P - gain_now @ C @ P) @ F.T + Q
     np.testing.assert_allclose(o.filter_gain, gain_now, atol=1e-9)
     y, u = recordings(m=1)
-    filtered, x = run_observer(o, y, u, estimate="filter"), run_observer(o, y, u)
-    np.testing.assert_allclose(filtered, x + (y - x[..., :1]) @ gain_now.T, atol=1e-9)
+    x = run_observer(o, y, u)
+    filtered = x + (y - x[..., :1]) @ gain_now.T
+    running = o.start(y[0, 0])
+    for k in range(len(y)):
+        np.testing.assert_allclose(running.filter(y[k, 0]), filtered[k, 0], atol=1e-9)
+        running.step(y[k, 0], u[k, 0])
     np.testing.assert_allclose(x[1:], filtered[:-1] @ F.T + u[:-1] @ G.T, atol=1e-9)  # predicting from the filtered state is the prediction
 
 
-@pytest.mark.parametrize("estimate", ["predict", "filter"])
 @pytest.mark.parametrize("delay", [0, 1, 4, 50])
 @pytest.mark.parametrize("lifting", [LIFTING, LATE], ids=["drive", "delays"])
-def test_batched_and_single_runs_agree_with_gaps_delays_and_limits(lifting, delay, estimate):
+def test_batched_and_single_runs_agree_with_gaps_delays_and_limits(lifting, delay):
     n, m = lifting.n_states, 2 if lifting is LIFTING else 1
     limits = {"lower": np.full(n, -0.8), "upper": np.array([np.inf, 0.5, 0.7][:n]), "correction": np.full(lifting.n_lifted, 0.2)}
     o = observer(lifting, Runtime(delay, **limits), m=m)
     y, u = recordings(m)
     y[[5, 6, 20]] = np.nan
     y[30, 0] = np.inf
-    found = run_observer(o, y, u, estimate=estimate)
+    found = run_observer(o, y, u)
     assert np.isfinite(found).all()
     assert found[1:, :, 1].max() <= 0.5
     for i in range(y.shape[1]):
         running, single = o.start(y[0, i]), []
         for k in range(len(y)):
-            single.append(running.estimate if estimate == "predict" else running.filter(y[k, i]))
+            single.append(running.estimate)
             running.step(y[k, i], u[k, i])
         np.testing.assert_allclose(found[:, i], single, rtol=1e-10, atol=1e-10)
 
@@ -99,12 +102,12 @@ def test_a_missing_measurement_corrects_nothing():
 
 
 def test_the_file_holds_the_runtime_and_older_files_are_read(tmp_path):
-    runtime = Runtime(3, lower=[-1, -np.inf, -2], upper=[1, 2, np.inf], correction=[1, 2, 3, 4], filter_gain=np.ones((3, 1)))
+    runtime = Runtime(3, lower=[-1, -np.inf, -2], upper=[1, 2, np.inf], correction=[1, 2, 3, 4])
     o = observer(runtime=runtime)
     o.save(tmp_path / "o.json")
     again = Observer.load(tmp_path / "o.json").runtime
     assert again.delay == 3
-    for name in ("lower", "upper", "correction", "filter_gain"):
+    for name in ("lower", "upper", "correction"):
         np.testing.assert_array_equal(getattr(again, name), getattr(runtime, name))
     observer().save(tmp_path / "plain.json")
     assert "runtime" not in json.loads((tmp_path / "plain.json").read_text())

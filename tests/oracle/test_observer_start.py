@@ -10,10 +10,11 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from kros.core.lti import gain
 from kros.lifting import Lifting
-from kros.observer import Observer, in_sizes, run_observer
+from kros.observer import Observer, run_observer
 from kros.observer.predictor.free_start import FreeStart, in_motion
 from kros.observer.predictor.start import with_start
 from kros.observer.simulate import started
+from kros.observer.units import in_sizes
 from kros.synthesis import Injection
 
 DT = 0.01

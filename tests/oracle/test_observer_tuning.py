@@ -8,8 +8,9 @@ from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
 from kros.evaluate import unit_interval
 from kros.lifting import Lifting
-from kros.observer import Observer, residual_models, run_observer, tune_observer
-from kros.observer.residual.models import one_step_rows
+from kros.observer import Observer, run_observer
+from kros.observer.residual.models import one_step_rows, residual_models
+from kros.observer.tuning.observer_rows import tune_observer
 from kros.synthesis import Injection, ResidualProblem, kalman, residual_h2
 
 DT = 0.01

@@ -11,10 +11,11 @@ from batches import batch_of
 from kros.core.linalg import least_squares, solve_balanced
 from kros.core.lti import StateSpace, gain
 from kros.lifting import Lifting
-from kros.observer import FilteredDifference, Observer, ReliftScales, Runtime, in_sizes, relift_certificate, run_observer
+from kros.observer import FilteredDifference, Observer, ReliftScales, Runtime, relift_certificate, run_observer
 from kros.observer.baselines.difference import followed
 from kros.observer.baselines.kalman import kalman_candidates, like_measurement_noise
 from kros.observer.baselines.learned import Features
+from kros.observer.units import in_sizes
 from kros.synthesis import Injection
 
 DT = 0.01
@@ -33,20 +34,18 @@ def observer(injection=Injection.STATE, runtime=None):
 RUNTIMES = [
     Runtime(),
     Runtime(lower=np.array([-0.2, -0.5]), upper=np.array([0.3, np.inf]), delay=2),
-    Runtime(filter_gain=np.array([[0.3], [0.1]])),
 ]
 
 
 @pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
-@pytest.mark.parametrize("runtime", RUNTIMES, ids=["plain", "limits", "filter"])
-@pytest.mark.parametrize("estimate", ["predict", "filter"])
-def test_estimates_in_other_sizes_are_the_same(injection, runtime, estimate):
+@pytest.mark.parametrize("runtime", RUNTIMES, ids=["plain", "limits"])
+def test_estimates_in_other_sizes_are_the_same(injection, runtime):
     one, rng = observer(injection, runtime), np.random.default_rng(0)
     other = in_sizes(one, SIZES)
     y, u = rng.normal(size=(200, 3, 1)), rng.normal(size=(200, 3, 1))
     y[50:60] = np.nan
-    found = run_observer(other, y / 1e9, u / 2e5, estimate=estimate)
-    np.testing.assert_allclose(found * [1e9, 3e-9], run_observer(one, y, u, estimate=estimate), rtol=1e-6, atol=1e-9)
+    found = run_observer(other, y / 1e9, u / 2e5)
+    np.testing.assert_allclose(found * [1e9, 3e-9], run_observer(one, y, u), rtol=1e-6, atol=1e-9)
     back = in_sizes(other, {})
     assert back.lifting == one.lifting
     for name in "AB":

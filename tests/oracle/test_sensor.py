@@ -13,8 +13,9 @@ from kros.design.synthesize import measurement_noise
 from kros.design.validation import ValidationSet
 from kros.evaluate.sensor import as_arriving, as_shown
 from kros.lifting import Lifting
-from kros.observer import Observer, Runtime, Sensor, in_sizes, run_observers
+from kros.observer import Observer, Runtime, Sensor, run_observers
 from kros.observer.sensor import require_measured
+from kros.observer.units import in_sizes
 from kros.study.config import validate_config
 from kros.synthesis.result import Injection
 

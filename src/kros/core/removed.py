@@ -49,6 +49,21 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
         ("calibrate.settle_s",),
     ),
     (
+        "Steps of the design of predictors and residual-shaped observers are no longer public; use synthesize with method memory or residual_h2.",
+        (
+            "kros.observer.conditioned",
+            "kros.observer.driven_coordinates",
+            "kros.observer.with_internal",
+            "kros.observer.residual_models",
+            "kros.observer.tune_observer",
+            "kros.observer.in_sizes",
+        ),
+    ),
+    (
+        "Filtered estimates are those of a running observer, whose gain follows from the correction; use running.filter.",
+        ("kros.observer.EstimateKind",),
+    ),
+    (
         "The observers kalman_white and luenberger are no longer part of kros; use kalman_tuned.",
         ("observer.baselines=kalman_white", "observer.baselines=luenberger"),
     ),

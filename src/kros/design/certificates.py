@@ -25,9 +25,9 @@ from ..observer import (
     relift_certificate,
     run_observers,
     signal_bound,
-    with_internal,
 )
 from ..observer.certificate.report import ReliftRow, course, relift_report
+from ..observer.predictor.driven import with_internal
 from ..observer.residual.one_step import one_step_residual
 from ..observer.units import factors
 from ..uncertainty.coprime.bands import BandEnergies

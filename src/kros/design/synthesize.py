@@ -25,9 +25,10 @@ from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..identify.kinds import kind_of
 from ..lifting import Lifting
-from ..observer import Observer, ReliftCertificate, Sensor, in_sizes
+from ..observer import Observer, ReliftCertificate, Sensor
 from ..observer.limits import Limit, Limits, limits_of
 from ..observer.sensor import Sensors, require_measured
+from ..observer.units import in_sizes
 from ..synthesis import ObserverProblem, Synthesis
 from ..uncertainty.quantify import UncertainModels
 from .about import about

@@ -11,6 +11,7 @@ Examples
 [0.5, 0.25]
 """
 
+from ..core.removed import refusing
 from .baselines.difference import FilteredDifference
 from .baselines.extended_kalman import ExtendedKalman
 from .certificate.certificate import ReliftCertificate, relift_certificate
@@ -21,25 +22,19 @@ from .certificate.status import Dropped, ReliftStatus
 from .monitor import Monitor
 from .observer import Observer
 from .predictor.build import identify_predictor
-from .predictor.driven import driven_coordinates, with_internal
-from .predictor.limited import conditioned
 from .predictor.moments import PastMoments
-from .residual.models import residual_models
 from .running import Estimate, RunningObserver
 from .runtime import Runtime, Seen
 from .samples import SampleStatus
 from .screen import sample_status
 from .sensor import Sensor
-from .simulate import EstimateKind, run_observer, run_observers
+from .simulate import run_observer, run_observers
 from .tracking import Tracked, track_parameter
-from .tuning.observer_rows import tune_observer
-from .units import in_sizes
 
 __all__ = [
     "DropoutBound",
     "Dropped",
     "Estimate",
-    "EstimateKind",
     "ExtendedKalman",
     "FilteredDifference",
     "Monitor",
@@ -55,18 +50,14 @@ __all__ = [
     "Sensor",
     "SignalBound",
     "Tracked",
-    "conditioned",
-    "driven_coordinates",
     "dropout_bound",
     "identify_predictor",
-    "in_sizes",
     "relift_certificate",
-    "residual_models",
     "run_observer",
     "run_observers",
     "sample_status",
     "signal_bound",
     "track_parameter",
-    "tune_observer",
-    "with_internal",
 ]
+
+__getattr__ = refusing(__name__)

@@ -113,7 +113,7 @@ class ObserverData:
                 f"Observer {self.name}: the controller should map {len(self.measured)} innovations to {width} corrections ({self.injection.value} injection), "
                 f"found {K.n_inputs} to {K.n_outputs}."
             )
-        self.runtime.require_fit(self.name, n, len(self.measured), width, len(self.inputs))
+        self.runtime.require_fit(self.name, n, width, len(self.inputs))
         if self.seen is not None and (len(self.seen.measured), len(self.seen.inputs)) != (len(self.measured), len(self.inputs)):
             raise DimensionError(
                 f"Observer {self.name}: {len(self.measured)} measurements and {len(self.inputs)} inputs need as many sizes seen in training, found "
@@ -151,12 +151,10 @@ class ObserverData:
     def filter_gain(self) -> Array:
         """Gain from the innovation to the filtered estimate, ``x_hat(k|k) = x_hat(k) + L_f (y - C x_hat(k))``; shape (n, q).
 
-        As declared in `runtime`; else as it follows from the correction. The direct correction of the next estimate is that of this one, carried
+        It follows from the correction: the direct correction of the next estimate is that of this one, carried
         through the model: ``A_s L_f = (into D^c)_s`` by least squares. For a Kalman predictor of a linear model this is its filter, exactly;
         states of the correction and slopes of lifted functions are left out.
         """
-        if self.runtime.filter_gain is not None:
-            return self.runtime.filter_gain
         n = self.lifting.n_states
         return solve_balanced(self.A[:n, :n], (self.into @ self.controller.D)[:n], rcond=1e-9)
 

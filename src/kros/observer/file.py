@@ -211,7 +211,7 @@ def _runtime(content: Mapping[str, Any], where: str) -> Runtime:
         while any(isinstance(entry, list) for entry in entries):
             entries = [e for entry in entries for e in (entry if isinstance(entry, list) else [entry])]
         for entry in entries:
-            free = entry is None and key not in ("delay", "filter_gain")  # a limit that is null is infinite
+            free = entry is None and key != "delay"  # a limit that is null is infinite
             _require(free or _is_finite(entry), f"{where}: runtime.{key} should hold finite numbers", entry)
     return Runtime.from_content(content)
 

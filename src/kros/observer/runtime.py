@@ -69,8 +69,6 @@ class Runtime:
         control need not be stable with a state that is stuck: what is cut off is safe for every observer, the other for one that was made for it.
     correction : ndarray, shape (width,), optional
         Largest size of every correction.
-    filter_gain : ndarray, shape (n, q), optional
-        Gain of filtered estimates, in place of the one that follows from the correction.
     input_lower, input_upper : ndarray, shape (m,), optional
         Limits of the recorded inputs. What is beyond them is taken at the limit, as measurements are beyond the limits of their states.
 
@@ -92,7 +90,6 @@ class Runtime:
     lower: Array | None = None
     upper: Array | None = None
     correction: Array | None = None
-    filter_gain: Array | None = None
     input_lower: Array | None = None
     input_upper: Array | None = None
     relift: bool = True
@@ -177,9 +174,9 @@ class Runtime:
         """Return inputs within their limits, shape (..., m)."""
         return u if self.input_lower is None and self.input_upper is None else np.asarray(np.clip(u, self.input_lower, self.input_upper))
 
-    def require_fit(self, name: str, n: int, q: int, width: int, m: int) -> None:
+    def require_fit(self, name: str, n: int, width: int, m: int) -> None:
         """Refuse limits of another size than the observer's."""
-        wanted = {"lower": (n,), "upper": (n,), "correction": (width,), "filter_gain": (n, q), "input_lower": (m,), "input_upper": (m,)}
+        wanted = {"lower": (n,), "upper": (n,), "correction": (width,), "input_lower": (m,), "input_upper": (m,)}
         for key, shape in wanted.items():
             value = getattr(self, key)
             if value is not None and value.shape != shape:
@@ -204,7 +201,7 @@ class Runtime:
         return cls(**found)
 
 
-_ARRAYS = ("lower", "upper", "correction", "filter_gain", "input_lower", "input_upper")
+_ARRAYS = ("lower", "upper", "correction", "input_lower", "input_upper")
 
 
 def _finite(value: Array) -> list[Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
@@ -19,31 +18,11 @@ Array = npt.NDArray[np.float64]
 _ROWS = 512  # samples predicted forward at a time
 
 
-class EstimateKind(str, Enum):
-    """Which estimate is wanted.
-
-    PREDICT
-        Of the state at k from what arrived up to k - 1, as in the paper.
-    FILTER
-        Of the state at k from what arrived up to k.
-
-    Examples
-    --------
-    >>> from kros.observer import EstimateKind
-    >>> EstimateKind("filter") is EstimateKind.FILTER
-    True
-    """
-
-    PREDICT = "predict"
-    FILTER = "filter"
-
-
 def run_observer(
     observer: ObserverData,
     y: Array,
     u: Array,
     parameters: Mapping[str, npt.ArrayLike] | None = None,
-    estimate: EstimateKind | str = EstimateKind.PREDICT,
 ) -> Array:
     """Run an observer over a batch of episodes.
 
@@ -56,13 +35,11 @@ def run_observer(
         Not finite where an input is not known: the last good value stands for it. What is implausible, and where a run starts: see `screen`.
     parameters : mapping of str to array_like, shape (batch,)
         Lifting parameters of the machine behind each episode; the observer's own where absent.
-    estimate : EstimateKind or "predict" or "filter"
-        Row k of a prediction is the estimate of the state at k from what arrived up to k - 1; of a filtered estimate, up to k.
 
     Returns
     -------
     ndarray, shape (n_samples, batch, n)
-        Row 0 of a prediction is the start.
+        Row k is the estimate of the state at k from what arrived up to k - 1; row 0 is the start.
 
     Raises
     ------
@@ -83,7 +60,7 @@ def run_observer(
     >>> run_observer(observer, y, np.zeros((4, 1, 1))).ravel().tolist()
     [4.0, 2.0, 4.0, 2.0]
     """
-    return _run([observer], screened(observer, y, u), parameters, EstimateKind(estimate))[0]
+    return _run([observer], screened(observer, y, u), parameters)[0]
 
 
 def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
@@ -139,10 +116,10 @@ def run_some_at_a_time(
     for start in range(0, len(observers), count):
         some = observers[start : start + count]
         if samples is None:
-            each = [_run([o], screened(o, y, u), parameters, EstimateKind.PREDICT)[0] for o in some]
+            each = [_run([o], screened(o, y, u), parameters)[0] for o in some]
             yield np.stack(each) if len(each) > 1 else each[0][None]
         else:
-            yield _run(some, samples, parameters, EstimateKind.PREDICT)
+            yield _run(some, samples, parameters)
 
 
 def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None, *, cut: bool = False) -> tuple[Array, Array]:
@@ -168,7 +145,7 @@ def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters |
     return first, added
 
 
-def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None, wanted: EstimateKind) -> Array:
+def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None) -> Array:
     """Run observers on screened samples, shape (observer, n_samples, batch, n)."""
     observer, d = observers[0], observers[0].runtime.delay
     (n_samples, batch), values = samples.starts.shape, observer.values(parameters, samples.starts.shape[1:])
@@ -181,8 +158,6 @@ def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Param
     steps.through(samples.y, samples.u, d, moving, samples.starts, estimates, before=before)
     found = estimates.transpose(1, 0, 3, 2)
     with np.errstate(over="ignore", invalid="ignore"):
-        if wanted is EstimateKind.FILTER:
-            _filter(observer, found[0], samples.y, pending, d)
         if before is not None:
             for own, of_one in zip(observers, found, strict=True):
                 _predict(own, of_one, *before, samples, values)
@@ -213,13 +188,6 @@ def _pending(starts: Flags, delay: int) -> Whole:
     begun = np.maximum.accumulate(np.where(starts, row, 0), axis=0)
     since = row - np.concatenate([begun[:1] * 0, begun[:-1]])
     return np.minimum(since, delay)
-
-
-def _filter(observer: ObserverData, x: Array, y: Array, pending: Whole | None, delay: int) -> None:
-    """Correct predictions, shape (n_samples, batch, n), by what has arrived."""
-    nu = np.where(np.isfinite(y), y - x[..., list(observer.measured)], 0.0)
-    filtered = observer.runtime.relifted(x + nu @ observer.filter_gain.T)
-    np.copyto(x, filtered, where=True if pending is None else (pending == delay)[..., None])
 
 
 def _predict(observer: ObserverData, x: Array, earlier: Array, pending: Whole, samples: Screened, values: Parameters) -> None:

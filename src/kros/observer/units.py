@@ -33,7 +33,8 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
     --------
     >>> import numpy as np
     >>> from kros.lifting import Lifting
-    >>> from kros.observer import Observer, in_sizes
+    >>> from kros.observer import Observer
+    >>> from kros.observer.units import in_sizes
     >>> observer = Observer.open_loop("lag", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), 0.01)
     >>> in_sizes(observer, {"x": 2.0, "u": 10.0}).B.tolist()
     [[5.0]]
@@ -66,6 +67,6 @@ def factors(observer: ObserverData, sizes: Mapping[str, float]) -> tuple[Array, 
 
 
 def _runtime(runtime: Runtime, x: Array, y: Array, into: Array, u: Array) -> Runtime:
-    by = {"lower": x, "upper": x, "correction": into, "filter_gain": x[:, None] / y}
+    by = {"lower": x, "upper": x, "correction": into}
     by |= {name: u[: len(limit)] for name in ("input_lower", "input_upper") if (limit := getattr(runtime, name)) is not None}
     return replace(runtime, **{name: getattr(runtime, name) * by[name] for name in by if getattr(runtime, name) is not None})

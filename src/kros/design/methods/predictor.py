@@ -16,13 +16,14 @@ from ...core.errors import KrosError, SynthesisError
 from ...data import EpisodeBatch
 from ...evaluate import error_rms
 from ...lifting import Lifting
-from ...observer import Observer, PastMoments, Runtime, conditioned, driven_coordinates, run_observer
+from ...observer import Observer, PastMoments, Runtime, run_observer
 from ...observer.certificate.error import error_system
 from ...observer.certificate.search import quick_gain
 from ...observer.limits import sides
 from ...observer.predictor.build import embedded_with
 from ...observer.predictor.choice import AT_LIMITS, Recipe, at_limits, choose, filled_in
-from ...observer.predictor.limited import with_limits
+from ...observer.predictor.driven import driven_coordinates
+from ...observer.predictor.limited import conditioned, with_limits
 from ...observer.predictor.moments import limited
 from ...observer.predictor.start import with_start
 from ...observer.predictor.tuning import tune_predictor

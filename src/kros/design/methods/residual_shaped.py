@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import SynthesisError
-from ...observer import Observer, Runtime, residual_models, tune_observer
-from ...observer.residual.models import ResidualModel
+from ...observer import Observer, Runtime
+from ...observer.residual.models import ResidualModel, residual_models
+from ...observer.tuning.observer_rows import tune_observer
 from ...synthesis import ResidualProblem, Synthesis, residual_h2
 from ..task import DesignResult, DesignTask, first_of
 from ..validation import ValidationSet

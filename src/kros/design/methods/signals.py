@@ -18,11 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import KrosError, SynthesisError
-from ...observer import Observer, Runtime, relift_certificate, tune_observer
+from ...observer import Observer, Runtime, relift_certificate
 from ...observer.certificate.signals import SignalBound, signal_bound
 from ...observer.residual.models import refitted_models
 from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_residual, residual_spectra
 from ...observer.residual.signal_bounds import signal_lower_bounds
+from ...observer.tuning.observer_rows import tune_observer
 from ...synthesis import ResidualProblem, Status, Synthesis, residual_h2
 from ...uncertainty.coprime.bands import BandEnergies
 from ...uncertainty.coprime.signals import SignalSet

@@ -72,7 +72,8 @@ def with_internal(
     >>> import kros
     >>> from kros.data import EpisodeBatch
     >>> from kros.lifting import Lifting
-    >>> from kros.observer import driven_coordinates, identify_predictor, with_internal
+    >>> from kros.observer import identify_predictor
+    >>> from kros.observer.predictor.driven import driven_coordinates, with_internal
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
     >>> batch = EpisodeBatch.read(motors, motors.keys())
     >>> predictor = identify_predictor("motor", Lifting(motors.states), (0,), motors.inputs, batch, internal=2, iterations=0)
@@ -124,7 +125,8 @@ def driven_coordinates(observer: Observer, batch: EpisodeBatch, sizes: npt.Array
     >>> import kros
     >>> from kros.data import EpisodeBatch
     >>> from kros.lifting import Lifting
-    >>> from kros.observer import driven_coordinates, identify_predictor
+    >>> from kros.observer import identify_predictor
+    >>> from kros.observer.predictor.driven import driven_coordinates
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
     >>> batch = EpisodeBatch.read(motors, motors.keys())
     >>> predictor = identify_predictor("motor", Lifting(motors.states), (0,), motors.inputs, batch, internal=2, iterations=0)

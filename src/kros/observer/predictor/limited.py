@@ -87,7 +87,8 @@ def conditioned(observer: Observer, batch: EpisodeBatch, importance: npt.ArrayLi
     >>> import kros
     >>> from kros.data import EpisodeBatch
     >>> from kros.lifting import Lifting
-    >>> from kros.observer import conditioned, identify_predictor
+    >>> from kros.observer import identify_predictor
+    >>> from kros.observer.predictor.limited import conditioned
     >>> from kros.observer.predictor.limited import with_limits
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
     >>> batch = EpisodeBatch.read(motors, motors.keys())

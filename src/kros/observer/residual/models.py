@@ -116,7 +116,7 @@ def residual_models(
     >>> import numpy as np
     >>> import kros
     >>> from kros.data import EpisodeBatch
-    >>> from kros.observer import residual_models
+    >>> from kros.observer.residual.models import residual_models
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     >>> models = kros.identify(motors, refine=False).sets["linear_edmd"]
     >>> batch = EpisodeBatch.read(motors, motors.keys())

@@ -68,7 +68,7 @@ def tune_observer(observer: O, batch: EpisodeBatch, iterations: int = 25) -> tup
     --------
     >>> import kros
     >>> from kros.data import EpisodeBatch
-    >>> from kros.observer import tune_observer
+    >>> from kros.observer.tuning.observer_rows import tune_observer
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=2.0, seed=3).simulate().population
     >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1)
     >>> observer = kros.synthesize(uncertain, "kalman_tuned", methods=()).observer

@@ -33,7 +33,7 @@ import numpy.typing as npt
 
 from kros.data import Channel, EpisodeKey, Population, Role, TrueChannel, Unit, write_parquet
 from kros.plants.harmonic_drive.reference import episode_reference
-from kros.plants.recordings import Recordings
+from kros.plants.simulated import SimulatedEpisodes
 
 Array = npt.NDArray[np.float64]
 
@@ -238,7 +238,7 @@ def simulate(
     signals[2] += CURRENT_NOISE * rng.standard_normal(signals[2].shape)
     parts = {key: (signals[:3, i], targets[:, i, REST_SAMPLES:], signals[3:, i]) for i, key in enumerate(keys)}
     metadata = {"plant": "compliant-drive", "gear_ratio": GEAR_RATIO}
-    population = Population(CHANNELS, PERIOD_S, tuple(Unit(u) for u in units), tuple(keys), Recordings(parts), metadata, TRUTHS)
+    population = Population(CHANNELS, PERIOD_S, tuple(Unit(u) for u in units), tuple(keys), SimulatedEpisodes(parts), metadata, TRUTHS)
     return population, {"limit": limit, "units": {u: {n: float(v[i]) for n, v in parameters.items()} for i, u in enumerate(units)}}
 
 

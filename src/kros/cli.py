@@ -94,13 +94,13 @@ def _on_terminal() -> bool:
 def _ask_parts(columns: Any) -> Any:
     """Ask which columns are measured and which are inputs; Return takes what is proposed."""
     from .data.discovery.discover import assign
-    from .data.discovery.roles import Part
+    from .data.discovery.roles import ColumnPart
     from .study.commands.init import column_lines
 
     for line in column_lines(columns):
         typer.echo(line)
     answers = []
-    for part, what in ((Part.MEASURED, "Measured states"), (Part.INPUT, "Inputs")):
+    for part, what in ((ColumnPart.MEASURED, "Measured states"), (ColumnPart.INPUT, "Inputs")):
         proposed = ", ".join(c.name for c in columns if c.part is part)
         answers.append([n for n in typer.prompt(what, default=proposed).replace(",", " ").split() if n])
     return assign(columns, *answers)

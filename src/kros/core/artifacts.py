@@ -31,7 +31,7 @@ SCHEMA = 1
 CHECKSUM = "checksum"
 
 
-class Record(dict[Any, Any]):
+class LoadedContent(dict[Any, Any]):
     """A JSON object or a set of arrays as read from a file; asking for a key that is not there says so, with the file."""
 
     def __init__(self, content: Mapping[Any, Any], path: Path) -> None:
@@ -45,7 +45,7 @@ class Record(dict[Any, Any]):
 
 
 _AS_IT_IS = frozenset({str, int, bool, type(None)})
-_OBJECTS, _LISTS = frozenset({dict, Record}), frozenset({list, tuple})
+_OBJECTS, _LISTS = frozenset({dict, LoadedContent}), frozenset({list, tuple})
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -129,13 +129,13 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file, or say which file is missing or broken; its objects are `Record`."""
+    """Read a JSON file, or say which file is missing or broken; its objects are `LoadedContent`."""
     path = Path(path)
     if not path.exists():
         raise DataError(f"Reading {path.name}: there is no file {path}; is this the folder that an earlier step wrote?")
     try:
         text = read_bytes(path, limits.MAX_JSON_BYTES).decode("utf-8")
-        return json.loads(text, object_hook=lambda found: Record(found, path), parse_constant=_refuse, parse_float=_finite)
+        return json.loads(text, object_hook=lambda found: LoadedContent(found, path), parse_constant=_refuse, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         if isinstance(error, DataError):
             raise
@@ -151,11 +151,6 @@ def _finite(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{text} is too large")
     return value
-
-
-def checksum_of(content: Mapping[str, Any]) -> str:
-    """Return the checksum of an artifact's JSON content, whatever its layout, without the key that holds it."""
-    return _digest(plain(content))
 
 
 def _digest(content: Mapping[str, Any]) -> str:
@@ -181,15 +176,10 @@ def check_checksum(content: Mapping[str, Any], path: Path) -> bool:
     return True
 
 
-def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays to an .npz whose bytes depend on the content alone."""
-    write_bytes(path, pack_arrays(arrays))
-
-
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read all arrays of an .npz; pickled objects and packed archives are refused."""
     path = Path(path)
-    return Record(unpack_arrays(_read_archive(path), path), path)
+    return LoadedContent(unpack_arrays(_read_archive(path), path), path)
 
 
 def _read_archive(path: Path) -> bytes:
@@ -223,10 +213,10 @@ def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np
     content.pop(CHECKSUM, None)
     digest = content.pop("arrays", None)
     if digest is None and not archive.exists():
-        return content, Record({}, archive)
+        return content, LoadedContent({}, archive)
     packed = _read_archive(archive)
     if digest is not None and hashlib.sha256(packed).hexdigest() != digest:
         raise DataError(
             f"Reading {archive}: it is not the file that {path.name} was written with; write both again with the step that made them."
         )
-    return content, Record(unpack_arrays(packed, archive), archive)
+    return content, LoadedContent(unpack_arrays(packed, archive), archive)

@@ -7,8 +7,6 @@ import math
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
-from enum import Enum
 from numbers import Real
 from typing import Any
 
@@ -24,27 +22,13 @@ from .recording import title
 logger = logging.getLogger(__name__)
 Look = Callable[[EpisodeKey, npt.NDArray[np.float64]], None]
 
+ON_NAN = ("error", "drop_episode")
 MIN_SAMPLES = 3  # two consecutive states and one more
 _ROUNDING = 1e-12  # of the largest value: what filters and scales make of a constant
 
 
-class OnNan(str, Enum):
-    """What to do with an episode that holds NaN or infinity."""
-
-    ERROR = "error"
-    DROP_EPISODE = "drop_episode"
-
-
 class NonFiniteError(DataError):
     """An episode holds NaN or infinity."""
-
-
-def parse_on_nan(value: OnNan | str) -> OnNan:
-    """Return the policy named by `data.on_nan`."""
-    try:
-        return OnNan(value)
-    except ValueError as error:
-        raise ConfigError(f"data.on_nan should be one of {[p.value for p in OnNan]}, found {value!r}; correct it.") from error
 
 
 def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False) -> None:
@@ -68,7 +52,7 @@ def _check_moving(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
     still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
     if not still:
         return
-    moving = [c.name for i, c in enumerate(channels) if i not in still and c.role is not Role.COVARIATE and not is_constant(values[:, i])]
+    moving = [c.name for i, c in enumerate(channels) if i not in still and not is_constant(values[:, i])]
     if moving:
         raise DataError(
             f"{title(key)}: state {channels[still[0]].name!r} stays at {values[0, still[0]]:g} in all {len(values)} samples while "
@@ -232,25 +216,20 @@ def check_population(population: Population, allow_single: bool = False) -> None
             )
 
 
-def scan_population(population: Population, on_nan: OnNan | str = OnNan.ERROR) -> Population:
-    """Read every episode once and check it."""
-    kept = [key for key, _ in scan_prints(population, on_nan)]
-    left = {key.unit for key in kept}
-    return replace(population, episodes=tuple(kept), units=tuple(u for u in population.units if u.id in left))
-
-
-def scan_prints(population: Population, on_nan: OnNan | str = OnNan.ERROR, look: Look | None = None) -> list[tuple[EpisodeKey, Print]]:
-    """Do the same, and return the episodes that are left with what they are recognised by; `look` is shown the samples of each."""
+def scan_prints(population: Population, on_nan: str = "error", look: Look | None = None) -> list[tuple[EpisodeKey, Print]]:
+    """Read and check every episode, and return those that are left with what they are recognised by; `look` is shown the samples of each."""
     kept = [(key, mark) for _, _, keys in population.groups() for key, _, mark in usable_episodes(population, keys, on_nan, look)]
     refuse_copies(kept)
     return kept
 
 
 def usable_episodes(
-    population: Population, keys: Iterable[EpisodeKey], on_nan: OnNan | str, look: Look | None = None
+    population: Population, keys: Iterable[EpisodeKey], on_nan: str, look: Look | None = None
 ) -> Iterator[tuple[EpisodeKey, npt.NDArray[np.float64], Print]]:
     """Yield the episodes of one unit and condition that pass all checks, all columns of their samples and what they are recognised by."""
-    policy, columns = parse_on_nan(on_nan), population.columns
+    if on_nan not in ON_NAN:
+        raise ConfigError(f"data.on_nan should be one of {list(ON_NAN)}, found {on_nan!r}; correct it.")
+    columns = population.columns
     watch = RestWatch(columns)
     key = None
     for key in keys:
@@ -258,7 +237,7 @@ def usable_episodes(
             values = population.source(key)
             check_episode(values, key, columns)
         except NonFiniteError as error:
-            if policy is OnNan.ERROR:
+            if on_nan == "error":
                 raise
             logger.warning("Dropped, as data.on_nan asks: %s", error)
             continue

@@ -40,7 +40,6 @@ class Role(str, Enum):
     STATE = "state"
     INPUT = "input"
     TRUTH = "truth"  # what a state really was: for judging only
-    COVARIATE = "covariate"  # recorded beside, such as a temperature: for judging units only
 
 
 class HasRole(Protocol):
@@ -144,17 +143,15 @@ def restrict(source: Source, keys: Iterable[EpisodeKey]) -> Source:
 
 
 def columns_in_order(channels: Iterable[AnyChannel]) -> tuple[AnyChannel, ...]:
-    """Return channels, or what describes them, in the order of a source's columns: states, inputs, truths, covariates."""
+    """Return channels, or what describes them, in the order of a source's columns: states, inputs, truths."""
     roles = list(Role)
     return tuple(sorted(channels, key=lambda c: roles.index(c.role)))
 
 
 def part_columns(columns: Iterable[Channel]) -> dict[str, Any]:
-    """Return the columns of a source as the ``channels``, the ``truths`` and the ``covariates`` of a population."""
+    """Return the columns of a source as the ``channels`` and the ``truths`` of a population."""
     columns = tuple(columns)
-    beside = {"truths": Role.TRUTH, "covariates": Role.COVARIATE}
-    found = {name: tuple(c for c in columns if c.role is role) for name, role in beside.items()}
-    return {"channels": tuple(c for c in columns if c.role not in beside.values()), **found}
+    return {"channels": tuple(c for c in columns if c.role is not Role.TRUTH), "truths": tuple(c for c in columns if c.role is Role.TRUTH)}
 
 
 @dataclass(frozen=True)
@@ -186,16 +183,13 @@ class Population:
     episodes : tuple of EpisodeKey
         In natural order of unit, condition and episode.
     source : callable
-        Returns an episode's samples, float64, shape (n_samples, n_channels + n_truths + n_covariates).
+        Returns an episode's samples, float64, shape (n_samples, n_channels + n_truths).
     metadata : mapping
         Facts about the batch, for example ``{"plant": "harmonic-drive", "gear_ratio": 100}``.
     truths : tuple of TrueChannel
         Further columns of the source, behind the inputs: what some states really were. No model and no observer sees them.
     scaling : mapping of str to Scaling
         The columns that channels were read from, and how; a channel that is not named is the column of its name, as it is.
-    covariates : tuple of Channel
-        Further columns of the source, behind the truths: what was recorded beside, such as a load, a supply voltage or a temperature. No model and no
-        observer sees them; `kros check` takes off what they explain.
 
     Examples
     --------
@@ -217,7 +211,6 @@ class Population:
     metadata: Mapping[str, Any] = field(default_factory=dict)
     truths: tuple[TrueChannel, ...] = ()
     scaling: Mapping[str, Scaling] = field(default_factory=dict)
-    covariates: tuple[Channel, ...] = ()
 
     def __repr__(self) -> str:
         """Say how much was recorded of what."""
@@ -225,13 +218,12 @@ class Population:
         sizes = ", ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items())
         states = ", ".join(f"{s} (measured)" if s in self.measured else s for s in self.states)
         true = f"; true {', '.join(t.of for t in self.truths)}" if self.truths else ""
-        true += f"; covariates {', '.join(c.name for c in self.covariates)}" if self.covariates else ""
         return f"Population({sizes} every {self.sample_period_s:g} s; states {states}; inputs {', '.join(self.inputs) or 'none'}{true})"
 
     @property
     def columns(self) -> tuple[Channel, ...]:
-        """All columns of the source: channels, then truths, then covariates."""
-        return self.channels + self.truths + self.covariates
+        """All columns of the source: channels, then truths."""
+        return self.channels + self.truths
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -285,10 +277,6 @@ class Population:
         """Read one episode, shape (n_samples, n_channels), and what its states really were, shape (n_samples, n_truths)."""
         values, n = self.source(key), len(self.channels)
         return np.ascontiguousarray(values[:, :n]) if values.shape[1] > n else values, values[:, n : n + len(self.truths)]
-
-    def read_covariates(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
-        """Read what was recorded beside one episode, shape (n_samples, n_covariates)."""
-        return self.source(key)[:, len(self.channels) + len(self.truths) :]
 
     def read_parts(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Read one episode as states (n_samples, n) and inputs (n_samples, m)."""

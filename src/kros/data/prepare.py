@@ -37,7 +37,7 @@ class PreparedSource:
     """Read a recording, check its time, apply the steps, check the result."""
 
     recordings: Recordings | EvenRecordings  # returns a `Recording` for an `EpisodeKey`
-    channels: tuple[Channel, ...]  # as recorded: states, inputs, truths, covariates
+    channels: tuple[Channel, ...]  # as recorded: states, inputs, truths
     period_s: float  # as recorded, found in the episode `reference`
     reference: EpisodeKey
     steps: tuple[Step, ...] = ()
@@ -81,7 +81,7 @@ def assemble(
     check_structure(channels, list(recordings.places))
     if channels != columns_in_order(channels):
         raise DataError(
-            f"Channels should list states before inputs, and truths and covariates last, found {[(c.name, c.role.value) for c in channels]}; reorder them."
+            f"Channels should list states before inputs, and truths last, found {[(c.name, c.role.value) for c in channels]}; reorder them."
         )
     episodes = tuple(sorted(recordings.places, key=episode_order))
     facts = {unit.id: unit for unit in units}

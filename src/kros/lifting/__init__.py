@@ -8,24 +8,19 @@ Examples
 [[0.0, 3.0, 0.0]]
 """
 
-from .centres import grid_centres, kmeans_centres, latin_hypercube_centres, random_centres
-from .families import concatenate, delays, formulas, harmonics, polynomials, products
-from .kernels import Kernel, fourier_features, radial
+from ..core.removed import refusing
+from .families import concatenate, delays, harmonics, polynomials
+from .kernels import fourier_features, kmeans_centres, radial
 from .lifting import Lifting
 
 __all__ = [
-    "Kernel",
     "Lifting",
     "concatenate",
     "delays",
-    "formulas",
     "fourier_features",
-    "grid_centres",
     "harmonics",
     "kmeans_centres",
-    "latin_hypercube_centres",
     "polynomials",
-    "products",
     "radial",
-    "random_centres",
 ]
+__getattr__ = refusing(__name__)

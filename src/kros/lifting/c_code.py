@@ -35,12 +35,12 @@ def c_code(expression: Any, name: Callable[[str], str], precision: Precision | N
     """Return a SymPy tree as a C expression."""
     numbers: list[float] = []
     shape = shape_of(expression, numbers)
-    text = _Writer(name, precision or Precision(), iter(numbers)).write(shape)
+    text = _CWriter(name, precision or Precision(), iter(numbers)).write(shape)
     return text[1:-1] if shape[0] in ("add", "multiply") else text
 
 
 @dataclass(frozen=True)
-class _Writer:
+class _CWriter:
     name: Callable[[str], str]
     precision: Precision
     numbers: Any

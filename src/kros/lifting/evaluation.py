@@ -44,14 +44,14 @@ _POWERS: dict[float, Callable[[Any], Any]] = {
 
 
 @dataclass(frozen=True)
-class Columns:
+class ColumnEvaluator:
     """Expressions evaluated together, one column each."""
 
     singles: tuple[tuple[int, Evaluator], ...]  # columns whose shape no other has
     blocks: tuple[tuple[Any, Evaluator], ...]  # columns of one shape; the evaluator wants values with a trailing axis of length one
 
     @classmethod
-    def of(cls, expressions: Sequence[Any], first: int = 0) -> Columns:
+    def of(cls, expressions: Sequence[Any], first: int = 0) -> ColumnEvaluator:
         """Group expressions by shape; they go to the columns from `first` on."""
         groups: dict[Shape, list[tuple[int, list[float]]]] = {}
         for column, expression in enumerate(expressions, first):
@@ -182,6 +182,6 @@ def _fold(combine: Callable[[Any, Any], Any], children: list[Evaluator]) -> Eval
 
 
 def _as_slice(columns: list[int]) -> Any:
-    """Columns as a slice where they follow each other, for a write without a gather."""
+    """ColumnEvaluator as a slice where they follow each other, for a write without a gather."""
     start, stop = columns[0], columns[-1] + 1
     return slice(start, stop) if stop - start == len(columns) else np.array(columns)

@@ -52,20 +52,17 @@ def harmonics(angle: str, ratio: float = 1.0, orders: Sequence[int] = (1,), phas
     return tuple(f"{function}({text})" for text in texts for function in ("sin", "cos"))
 
 
-def polynomials(names: Sequence[str], degree: int, lowest: int = 2, cross: bool = True) -> Formulas:
-    """Return the monomials of total degree `lowest` to `degree`, with products of different quantities where `cross` is true.
-
-    Without delays among them, the states themselves are lifted already: `lowest` is 2. Of formulas, start at 1.
+def polynomials(names: Sequence[str], degree: int) -> Formulas:
+    """Return the monomials of total degree two to `degree`.
 
     >>> polynomials(["position", "velocity"], 2)
     ('position**2', 'position*velocity', 'velocity**2')
     """
     names = require_names("polynomials", names)
-    _require_whole("polynomials", "lowest", [lowest], 1)
-    _require_whole("polynomials", "degree", [degree], lowest)
+    _require_whole("polynomials", "degree", [degree], 2)
     require_count("polynomials", math.comb(len(names) + degree, degree) if degree <= MAX_FORMULAS else math.inf)
-    chosen = (combo for d in range(lowest, degree + 1) for combo in combinations_with_replacement(names, d))
-    return tuple(_monomial(combo) for combo in chosen if cross or len(set(combo)) == 1)
+    chosen = (combo for d in range(2, degree + 1) for combo in combinations_with_replacement(names, d))
+    return tuple(_monomial(combo) for combo in chosen)
 
 
 def delays(names: Sequence[str], depth: int) -> Formulas:
@@ -83,29 +80,6 @@ def delays(names: Sequence[str], depth: int) -> Formulas:
         raise ConfigError(f"delays: depth = {depth} is too deep; at most {MAX_DELAY} samples are kept.")
     require_count("delays", depth * len(names))
     return tuple(delayed_name(name, d) for d in range(1, depth + 1) for name in names)
-
-
-def products(names: Sequence[str], others: Sequence[str]) -> Formulas:
-    """Return every product of one of `names` and one of `others`: of states and inputs they are the input functions of a bilinear model.
-
-    >>> products(["position", "current"], ["voltage"])
-    ('position*voltage', 'current*voltage')
-    """
-    names, others = require_names("products", names), require_names("products", others)
-    require_count("products", len(names) * len(others))
-    return tuple(f"{wrapped(a)}*{wrapped(b)}" for b in others for a in names)
-
-
-def formulas(functions: Sequence[str]) -> Formulas:
-    """Return formulas as they are written, for a place among families.
-
-    Examples
-    --------
-    >>> from kros.lifting import formulas
-    >>> formulas(["sin(angle)", "rate*abs(rate)"])
-    ('sin(angle)', 'rate*abs(rate)')
-    """
-    return require_names("formulas", functions)
 
 
 def concatenate(*families: Sequence[str]) -> Formulas:

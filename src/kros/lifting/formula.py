@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from ..core.files import did_you_mean
-from .c_code import c_code
 from .evaluation import FUNCTIONS, Evaluator, compile_expression
 from .limits import MAX_EXPONENT, MAX_LENGTH, TooCostlyError, finite, require_size, settled
 
@@ -75,10 +74,6 @@ class Formula:
         magnitude, jump = _real_magnitude()
         real = self.expression.replace(sp.Abs, magnitude).replace(sp.sign, jump)
         return sp.diff(real, sp.Symbol(name, real=True)).replace(magnitude, sp.Abs).replace(jump, sp.sign)
-
-    def c_expression(self, pointers: Sequence[str] = ()) -> str:
-        """Return the formula as a C expression in double precision."""
-        return c_code(self.expression, lambda name: f"{name}[0]" if name in pointers else name)
 
 
 def delayed_name(name: str, delay: int) -> str:

@@ -1,17 +1,8 @@
-"""Radial basis functions and random Fourier features, as formulas.
-
-With the scaled distance ``s**2 = sum_i ((q_i - c_i)/length_i)**2`` from a centre c:
-
-    gaussian               exp(-s**2/2)
-    multiquadric           sqrt(1 + s**2)
-    inverse_multiquadric   1/sqrt(1 + s**2)
-    thin_plate             s**2 log(s)
-"""
+"""Gaussian radial basis functions, their centres, and random Fourier features, as formulas."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
@@ -20,54 +11,21 @@ from ..core.errors import ConfigError
 from .families import Formulas, is_whole, number, require_count, require_names, wrapped
 
 Array = npt.NDArray[np.float64]
-_GUARD = 1e-30  # keeps the logarithm of the thin plate finite at the centre; changes no value by more than 1e-30
+_ROUNDS = 100
+_STARTS = 8
 
 
-class Radial(str, Enum):
-    """Kinds of radial basis functions."""
-
-    GAUSSIAN = "gaussian"
-    MULTIQUADRIC = "multiquadric"
-    INVERSE_MULTIQUADRIC = "inverse_multiquadric"
-    THIN_PLATE = "thin_plate"
-
-
-class Kernel(str, Enum):
-    """Kernels that random Fourier features approximate.
-
-    Examples
-    --------
-    >>> from kros.lifting import Kernel
-    >>> [kernel.value for kernel in Kernel]
-    ['gaussian', 'laplacian']
-    """
-
-    GAUSSIAN = "gaussian"
-    LAPLACIAN = "laplacian"
-
-
-_TEXTS = {
-    Radial.GAUSSIAN: "exp(-({s2})/2)",
-    Radial.MULTIQUADRIC: "sqrt(1 + {s2})",
-    Radial.INVERSE_MULTIQUADRIC: "1/sqrt(1 + {s2})",
-    Radial.THIN_PLATE: "({s2})*log({s2} + " + repr(_GUARD) + ")/2",
-}
-
-
-def radial(
-    names: Sequence[str], centres: npt.ArrayLike, length: float | Sequence[float], function: Radial | str = Radial.GAUSSIAN
-) -> Formulas:
-    """Return one radial basis function for every centre.
+def radial(names: Sequence[str], centres: npt.ArrayLike, length: float | Sequence[float]) -> Formulas:
+    """Return ``exp(-s**2/2)`` for every centre c, of the scaled distance ``s**2 = sum_i ((q_i - c_i)/length_i)**2``.
 
     Parameters
     ----------
     names : sequence of str
         Quantities, or formulas, that span the space; d of them.
     centres : array_like, shape (n_centres, d)
-        In the units of the quantities; see `grid_centres`, `latin_hypercube_centres`, `random_centres`, `kmeans_centres`.
+        In the units of the quantities; see `kmeans_centres`.
     length : float or sequence of float, shape (d,)
         Length scale of every quantity, in its unit.
-    function : Radial or str
 
     Returns
     -------
@@ -79,25 +37,19 @@ def radial(
     ('exp(-(((position - 0.5)/0.1)**2 + (velocity/2)**2)/2)',)
     """
     names = require_names("radial", names)
-    try:
-        text = _TEXTS[Radial(function)]
-    except ValueError as error:
-        raise ConfigError(f"radial: function = {function!r} is unknown; known are {', '.join(r.value for r in Radial)}.") from error
     lengths = length_scales("radial", length, len(names))
     centres = np.asarray(centres, dtype=float)
     if centres.ndim != 2 or centres.shape[1] != len(names) or not len(centres) or not np.isfinite(centres).all():
         raise ConfigError(
             f"radial: centres for {list(names)} should be finite and have the shape (n, {len(names)}), found shape {centres.shape}."
         )
-    return tuple(text.format(s2=_squared_distance(names, centre, lengths)) for centre in centres)
+    return tuple(f"exp(-({_squared_distance(names, centre, lengths)})/2)" for centre in centres)
 
 
-def fourier_features(
-    names: Sequence[str], n: int, length: float | Sequence[float], seed: int, kernel: Kernel | str = Kernel.GAUSSIAN
-) -> Formulas:
-    """Return random Fourier features ``sqrt(2/n)*cos(w*q + b)``, whose inner product tends to a kernel as n grows.
+def fourier_features(names: Sequence[str], n: int, length: float | Sequence[float], seed: int) -> Formulas:
+    """Return random Fourier features ``sqrt(2/n)*cos(w*q + b)``, whose inner product tends to the Gaussian kernel as n grows.
 
-    The Gaussian kernel is ``exp(-s**2/2)`` with the scaled distance s, the Laplacian kernel ``exp(-sum_i |q_i - p_i|/length_i)``.
+    The kernel is ``exp(-s**2/2)`` with the scaled distance s, as in `radial`.
 
     Parameters
     ----------
@@ -106,7 +58,6 @@ def fourier_features(
     n : int
     length : float or sequence of float, shape (d,)
     seed : int
-    kernel : Kernel or str
 
     References
     ----------
@@ -124,11 +75,7 @@ def fourier_features(
         raise ConfigError(f"fourier: n = {n!r} should be a whole number of at least 1.")
     require_count("fourier", n)
     rng = np.random.default_rng(seed)
-    try:
-        draw = {Kernel.GAUSSIAN: rng.standard_normal, Kernel.LAPLACIAN: rng.standard_cauchy}[Kernel(kernel)]
-    except ValueError as error:
-        raise ConfigError(f"fourier: kernel = {kernel!r} is unknown; known are {', '.join(k.value for k in Kernel)}.") from error
-    frequencies = draw(size=(int(n), len(names))) / lengths
+    frequencies = rng.standard_normal(size=(int(n), len(names))) / lengths
     shifts = rng.uniform(0, 2 * np.pi, size=int(n))
     size = number(np.sqrt(2 / n))
     return tuple(
@@ -151,3 +98,50 @@ def _squared_distance(names: Sequence[str], centre: Array, lengths: Array) -> st
         offset = wrapped(name) if c == 0 else f"({wrapped(name)} {'-' if c > 0 else '+'} {number(abs(c))})"
         terms.append(f"({offset}/{number(scale)})**2" if scale != 1 else f"{offset}**2")
     return " + ".join(terms)
+
+
+def kmeans_centres(data: npt.ArrayLike, n: int, seed: int) -> Array:
+    """Return the means of n clusters of data, shape (n, d), the best of eight starts; dimensions count in units of their standard deviation.
+
+    Parameters
+    ----------
+    data : array_like, shape (n_samples, d)
+    n : int
+    seed : int
+
+    Examples
+    --------
+    >>> from kros.lifting import kmeans_centres
+    >>> sorted(kmeans_centres([[0.0], [0.2], [9.0], [9.2]], n=2, seed=0).round(9).ravel().tolist())
+    [0.1, 9.1]
+    """
+    from scipy.cluster.vq import ClusterError, kmeans2
+
+    data = np.asarray(data, dtype=float)
+    if data.ndim != 2 or not np.isfinite(data).all():
+        raise ConfigError(f"Centres by k-means: need finite data of shape (n_samples, d), found shape {data.shape}.")
+    distinct = np.unique(data, axis=0)
+    if len(distinct) < _count(n):
+        raise ConfigError(f"Centres by k-means: {n} clusters need as many different samples, found {len(distinct)}; ask for fewer.")
+    spread = data.std(axis=0)
+    spread[spread == 0] = 1.0
+    rng, scaled = np.random.default_rng(seed), data / spread
+    best: tuple[float, Array] | None = None
+    for _ in range(_STARTS):
+        try:
+            means, label = kmeans2(scaled, n, iter=_ROUNDS, minit="++", missing="raise", rng=rng)
+        except ClusterError:
+            continue
+        error = float(np.sum((scaled - means[label]) ** 2))
+        if best is None or error < best[0]:
+            best = error, np.asarray(means * spread)
+    if best is None:
+        raise ConfigError(f"Centres by k-means: in {_STARTS} starts one of {n} clusters was empty; ask for fewer.")
+    return best[1]
+
+
+def _count(n: int) -> int:
+    if not is_whole(n, 1):
+        raise ConfigError(f"Centres: n = {n!r} should be a whole number of at least 1.")
+    require_count("centres", n)
+    return int(n)

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
 from .continuity import slope_bounds_of
-from .evaluation import Columns
+from .evaluation import ColumnEvaluator
 from .formula import Formula, base_and_delay, require_text
 from .intervals import Box
 from .separation import Separation
@@ -308,18 +308,6 @@ class Lifting:
         given = {**(box or {}), **(parameters or {})}
         return slope_bounds_of(self.formulas, self.window.names, given)
 
-    def c_expressions(self) -> tuple[str, ...]:
-        """Return every lifted function as a C expression.
-
-        Quantities with delays are pointers to the present value in an array of values: ``position[0]``, ``position[-1]``; all others are
-        numbers.
-        """
-        return tuple(formula.c_expression([q for q, _ in self.window.depths]) for formula in self.formulas)
-
-    def c_input_expressions(self) -> tuple[str, ...]:
-        """Return every input function as a C expression, with the same pointers as `c_expressions`."""
-        return tuple(formula.c_expression([q for q, _ in self.window.depths]) for formula in self.input_formulas)
-
     @cached_property
     def separation(self) -> Separation:
         """The functions as parameter-dependent combinations of parameter-free ones."""
@@ -331,24 +319,24 @@ class Lifting:
         return Separation.of(self.input_formulas, self.window, self.parameters)
 
     @cached_property
-    def _columns(self) -> Columns:
-        return Columns.of([formula.expression for formula in self.formulas], first=self.n_states)
+    def _columns(self) -> ColumnEvaluator:
+        return ColumnEvaluator.of([formula.expression for formula in self.formulas], first=self.n_states)
 
     @cached_property
-    def _input_columns(self) -> Columns:
-        return Columns.of([formula.expression for formula in self.input_formulas], first=len(self.inputs))
+    def _input_columns(self) -> ColumnEvaluator:
+        return ColumnEvaluator.of([formula.expression for formula in self.input_formulas], first=len(self.inputs))
 
     @cached_property
-    def _derivatives(self) -> Columns:
-        return Columns.of([formula.derivative(name) for formula in self.formulas for name in self.window.names])
+    def _derivatives(self) -> ColumnEvaluator:
+        return ColumnEvaluator.of([formula.derivative(name) for formula in self.formulas for name in self.window.names])
 
     @cached_property
-    def _parameter_derivatives(self) -> dict[str, Columns]:
-        return {name: Columns.of([formula.derivative(name) for formula in self.formulas]) for name in self.parameters}
+    def _parameter_derivatives(self) -> dict[str, ColumnEvaluator]:
+        return {name: ColumnEvaluator.of([formula.derivative(name) for formula in self.formulas]) for name in self.parameters}
 
     @cached_property
-    def _input_derivatives(self) -> Columns:
-        return Columns.of([formula.derivative(name) for formula in self.input_formulas for name in self.window.names])
+    def _input_derivatives(self) -> ColumnEvaluator:
+        return ColumnEvaluator.of([formula.derivative(name) for formula in self.input_formulas for name in self.window.names])
 
     @cached_property
     def _read_states(self) -> tuple[tuple[int, str], ...]:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
-from .evaluation import Columns, compile_expression
+from .evaluation import ColumnEvaluator, compile_expression
 from .formula import Formula
 from .limits import MAX_TERMS, count_terms
 from .window import Window
@@ -44,8 +44,8 @@ class Separation:
         return cls(window, parameters, tuple(basis), tuple(rows))
 
     @cached_property
-    def _columns(self) -> Columns:
-        return Columns.of(self.basis)
+    def _columns(self) -> ColumnEvaluator:
+        return ColumnEvaluator.of(self.basis)
 
     def evaluate(self, window: Array, u: Array | None = None) -> Array:
         """Return the parameter-free functions at windows (..., n_window), with the present inputs for input functions; shape (..., n_basis)."""

@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
-from .centres import grid_centres, kmeans_centres, latin_hypercube_centres, random_centres
-from .families import MAX_FORMULAS, Formulas, delays, formulas, harmonics, is_whole, polynomials, products, require_names
-from .kernels import fourier_features, radial
+from .families import MAX_FORMULAS, Formulas, delays, harmonics, is_whole, polynomials, require_names
+from .kernels import fourier_features, kmeans_centres, radial
 
 Array = npt.NDArray[np.float64]
 Table = Mapping[str, Any]
@@ -24,15 +23,8 @@ KINDS: dict[str, Callable[..., Formulas]] = {
     "radial": radial,
     "fourier": fourier_features,
     "delays": delays,
-    "products": products,
-    "formulas": formulas,
 }
-CENTRES: dict[str, Callable[..., Array]] = {
-    "grid": grid_centres,
-    "random": random_centres,
-    "latin_hypercube": latin_hypercube_centres,
-    "kmeans": kmeans_centres,
-}
+CENTRES: dict[str, Callable[..., Array]] = {"kmeans": kmeans_centres}
 
 
 def family(table: Table, sample: Sample | None = None) -> Formulas:

@@ -67,7 +67,7 @@ def tape_of(lifting: Lifting, m: int, entries: tuple[int, ...] = (), of_inputs: 
     """
     window, n_lifted = lifting.window.names, lifting.n_lifted
     inputs = lifting.inputs or tuple(f"input {i}" for i in range(m))  # which no formula can read
-    writer = _Writer([*window, *inputs, *lifting.parameters])
+    writer = _TapeWriter([*window, *inputs, *lifting.parameters])
     functions = [writer.write(formula.expression) for formula in lifting.formulas]
     of = [writer.write(formula.expression) for formula in lifting.input_formulas]
     states = list(range(lifting.n_states))
@@ -80,7 +80,7 @@ def tape_of(lifting: Lifting, m: int, entries: tuple[int, ...] = (), of_inputs: 
 
 
 @dataclass
-class _Writer:
+class _TapeWriter:
     """Values are numbered as they come: quantities, then whatever is new; constants have negative numbers until all are known."""
 
     names: list[str]

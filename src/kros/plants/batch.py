@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, TrueChannel, Unit
-from .recordings import Recordings
-from .simulated import SimulatedPopulation, T
+from .simulated import SimulatedEpisodes, SimulatedPopulation, T
 
 Array = npt.NDArray[np.float64]
 
@@ -96,7 +95,7 @@ class Batch(ABC, Generic[T]):
                 states[1 : 1 + len(noise), u, e] += np.array(self.noise)[:, None] * noise
         states[0] = np.rint(states[0] / COUNT_RAD) * COUNT_RAD
         keys = tuple(EpisodeKey(unit.id, DEFAULT_CONDITION, str(e)) for unit in units for e in range(self.n_episodes))
-        source = Recordings(
+        source = SimulatedEpisodes(
             {
                 key: (states[:, u, e], inputs[e, None], true[:, u, e])
                 for key, (u, e) in zip(keys, np.ndindex(len(units), self.n_episodes), strict=True)

@@ -58,11 +58,6 @@ class DcMotorTruth:
         start = np.zeros((3, len(self.unit_ids), len(voltage)))
         return runge_kutta(self._rates, start, voltage, SAMPLE_PERIOD_S, _limited)
 
-    def steady_velocity(self, voltage: float) -> Array:
-        """Velocity at which a constant positive voltage turns the motors, far above `SLIP_RAD_S`; rad/s, shape (n_units,)."""
-        k, R = self.torque_constant, self.resistance
-        return (k * voltage - R * self.coulomb) / (k**2 + R * self.viscous)
-
     def as_dict(self) -> dict[str, Any]:
         """Return all parameters, ready for JSON: one entry per unit."""
         names = [f.name for f in fields(self) if f.name != "unit_ids"]

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
-from ..data.population import Population
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError
+from ..data.population import EpisodeKey, Population
+
+Array = npt.NDArray[Any]
 
 
 class HasTruth(Protocol):
@@ -41,3 +48,23 @@ class SimulatedPopulation(Generic[T]):
     population: Population
     raw: Population
     truth: T
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedEpisodes:
+    """Source of raw episodes in memory, which can be pickled."""
+
+    parts: Mapping[EpisodeKey, tuple[Array, ...]]
+
+    def __call__(self, key: EpisodeKey) -> Array:
+        """Return the samples of an episode, shape (n_samples, n_states + n_inputs + n_truths)."""
+        if key not in self.parts:
+            first = next(iter(self.parts), None)
+            raise DataError(
+                f"Asked for {key}; the simulation has {len(self.parts)} episodes, first {first}; take keys from population.episodes."
+            )
+        return np.ascontiguousarray(np.concatenate(self.parts[key]).T)
+
+    def restricted(self, keys: Iterable[EpisodeKey]) -> SimulatedEpisodes:
+        """Return the same for fewer episodes, cheaper to send to another process."""
+        return SimulatedEpisodes({key: self.parts[key] for key in keys})

@@ -26,10 +26,10 @@ from .dialect import TableHead, look_at
 from .examine import Examined, examine
 from .filenames import infer_names, quoted
 from .measures import SECONDS
-from .roles import UNKNOWN, Column, Part, describe, propose, time_columns, time_scale
+from .roles import UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
 Array = npt.NDArray[np.float64]
-Ask = Callable[[Sequence[Column]], Sequence[Column]]
+Ask = Callable[[Sequence[TableColumn]], Sequence[TableColumn]]
 LOOKED_AT, SAMPLED = 15, 6  # files whose first lines, and whose numbers, say what columns are
 PIECES, SHORTEST_PIECE = 5, 200  # episodes that a single long recording is cut into, and the samples that each needs
 
@@ -50,7 +50,7 @@ class Discovery:
 
     mapping: dict[str, Any]  # table ``[data.csv]``, with the keys that are not default
     prepare: tuple[dict[str, Any], ...]  # steps of preparation that the recordings need
-    columns: tuple[Column, ...]  # all of them, with their parts
+    columns: tuple[TableColumn, ...]  # all of them, with their parts
     population: Population  # as the mapping reads it, before preparation
     notes: dict[str, str] = field(default_factory=dict)  # what a key of the mapping rests on
     findings: tuple[str, ...] = ()  # what looks wrong
@@ -82,7 +82,7 @@ def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None,
     mapping |= timing[0]
     notes |= timing[1]
     columns = _decided(columns, wanted, ask)
-    mapping["channel"] = [_channel(c) for c in columns if c.part in (Part.MEASURED, Part.STATE, Part.INPUT)]
+    mapping["channel"] = [_channel(c) for c in columns if c.part in (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)]
     excluded = {
         relative: f"its columns are others than those of {next(iter(own))}" for relative in strange if re.search(mapping["files"], relative)
     }
@@ -146,9 +146,9 @@ def _dialect_keys(dialect: Dialect) -> dict[str, Any]:
 
 def _columns(
     source: Path, head: TableHead, own: dict[str, Path], wanted: Wanted
-) -> tuple[list[Column], tuple[dict[str, Any], dict[str, str]]]:
+) -> tuple[list[TableColumn], tuple[dict[str, Any], dict[str, str]]]:
     """Return the columns with the parts that are proposed, and the keys that say what time is, with what they rest on."""
-    described: list[Column] = []
+    described: list[TableColumn] = []
     for i, (header, unit) in enumerate(zip(head.fields, head.units, strict=True)):
         column = describe(header or f"column {i + 1}", unit, [c.name for c in described])
         if not head.dialect.header:
@@ -178,10 +178,10 @@ def _columns(
         if scale != 1:
             keys["time_scale"] = scale
             notes["time_scale"] = why
-        chosen[at] = replace(chosen[at], part=Part.TIME)
+        chosen[at] = replace(chosen[at], part=ColumnPart.TIME)
     elif texts:
         keys |= {"time": described[texts[-1]].reference, "timestamp": head.timestamp(texts[-1])}
-        described[texts[-1]] = replace(described[texts[-1]], part=Part.TIME)
+        described[texts[-1]] = replace(described[texts[-1]], part=ColumnPart.TIME)
     else:
         found = ", ".join(repr(c.header) for c in described)
         called = next((c.header for c in described if c.kind == "time"), None)
@@ -192,7 +192,7 @@ def _columns(
     proposed = propose(chosen, samples)
     for place, column in zip(numeric, proposed, strict=True):
         described[place] = column
-    rest = {i for i in range(len(described)) if i not in numeric and described[i].part is not Part.TIME}
+    rest = {i for i in range(len(described)) if i not in numeric and described[i].part is not ColumnPart.TIME}
     return [replace(c, why="no numbers") if i in rest else c for i, c in enumerate(described) if head.fields[i]], (keys, notes)
 
 
@@ -211,12 +211,12 @@ def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
     return read_columns(path, names, [names[i] for i in columns], head.dialect)
 
 
-def _channel(column: Column) -> dict[str, Any]:
+def _channel(column: TableColumn) -> dict[str, Any]:
     table: dict[str, Any] = {"name": column.name}
     if column.reference != column.name:
         table["column"] = column.reference
-    table["role"] = "input" if column.part is Part.INPUT else "state"
-    if column.part is Part.MEASURED:
+    table["role"] = "input" if column.part is ColumnPart.INPUT else "state"
+    if column.part is ColumnPart.MEASURED:
         table["measured"] = True
     if column.unit:
         table["unit"] = column.unit
@@ -225,24 +225,26 @@ def _channel(column: Column) -> dict[str, Any]:
     return table
 
 
-def _decided(columns: Sequence[Column], wanted: Wanted, ask: Ask | None) -> list[Column]:
+def _decided(columns: Sequence[TableColumn], wanted: Wanted, ask: Ask | None) -> list[TableColumn]:
     """Return the columns with the parts that were asked for, else proposed."""
     decided = assign(columns, wanted.measured, wanted.inputs)
     if ask is not None and not (wanted.measured and wanted.inputs):
         decided = list(ask(decided))
-    for part, option, what in ((Part.MEASURED, "--measured", "a measured state"), (Part.INPUT, "--input", "an input")):
+    for part, option, what in ((ColumnPart.MEASURED, "--measured", "a measured state"), (ColumnPart.INPUT, "--input", "an input")):
         if not any(c.part is part for c in decided):
-            names = ", ".join(c.name if c.name == c.header else f"{c.name} ({c.header!r})" for c in decided if c.part is not Part.TIME)
+            names = ", ".join(
+                c.name if c.name == c.header else f"{c.name} ({c.header!r})" for c in decided if c.part is not ColumnPart.TIME
+            )
             raise ConfigError(f"Roles: no column is {what} by its name; name it, {option} NAME. The columns are {names}.")
-    if any(c.part is Part.STATE for c in decided):
+    if any(c.part is ColumnPart.STATE for c in decided):
         return decided
-    return [replace(c, part=Part.STATE) if c.why == UNKNOWN else c for c in decided]  # an observer is for what is not measured
+    return [replace(c, part=ColumnPart.STATE) if c.why == UNKNOWN else c for c in decided]  # an observer is for what is not measured
 
 
-def assign(columns: Sequence[Column], measured: Sequence[str], inputs: Sequence[str]) -> list[Column]:
+def assign(columns: Sequence[TableColumn], measured: Sequence[str], inputs: Sequence[str]) -> list[TableColumn]:
     """Return the columns with measured states and inputs as named, where any are named."""
     decided = list(columns)
-    for part, names in ((Part.MEASURED, measured), (Part.INPUT, inputs)):
+    for part, names in ((ColumnPart.MEASURED, measured), (ColumnPart.INPUT, inputs)):
         places = [_place(decided, name) for name in names]
         if not places:
             continue
@@ -250,11 +252,11 @@ def assign(columns: Sequence[Column], measured: Sequence[str], inputs: Sequence[
             if i in places:
                 decided[i] = replace(column, part=part, why="as you said")
             elif column.part is part:
-                decided[i] = replace(column, part=Part.STATE if part is Part.MEASURED else Part.LEFT_OUT)
+                decided[i] = replace(column, part=ColumnPart.STATE if part is ColumnPart.MEASURED else ColumnPart.LEFT_OUT)
     return decided
 
 
-def _place(columns: Sequence[Column], name: str) -> int:
+def _place(columns: Sequence[TableColumn], name: str) -> int:
     for attribute in ("name", "header"):
         for i, column in enumerate(columns):
             if getattr(column, attribute) == name:
@@ -267,7 +269,7 @@ def _examined(
     source: Path,
     mapping: dict[str, Any],
     notes: dict[str, str],
-    columns: Sequence[Column],
+    columns: Sequence[TableColumn],
     excluded: dict[str, str],
     strange: Sequence[str],
     work: Work | None,

@@ -27,7 +27,7 @@ _SLOWER = 1.5
 
 
 @dataclass(frozen=True)
-class Seen:
+class EpisodeLook:
     """What one episode looks like.
 
     Parameters
@@ -102,7 +102,7 @@ def examine(population: Population, work: Work | None = None) -> Examined:
     return Examined(wrong, tuple(doubts), resample, tuple(s.key for s in good if s.nan), counts, shortest, max_gap)
 
 
-def _look(population: Population) -> list[Seen]:
+def _look(population: Population) -> list[EpisodeLook]:
     """Look at the episodes of one unit and condition, in a worker."""
     source: Any = population.source
     recordings = source.recordings if isinstance(source, PreparedSource) else None
@@ -115,21 +115,21 @@ def _look(population: Population) -> list[Seen]:
                 recording = recordings(key)
                 found.append(_looked(key, recording.values, recording.time_s, population.columns, population.sample_period_s, i == 0))
         except DataError as error:
-            found.append(Seen(key, str(error)))
+            found.append(EpisodeLook(key, str(error)))
     return found
 
 
-def _looked(key: EpisodeKey, values: Array, time: Array | None, channels: Sequence[Channel], period_s: float, first: bool) -> Seen:
+def _looked(key: EpisodeKey, values: Array, time: Array | None, channels: Sequence[Channel], period_s: float, first: bool) -> EpisodeLook:
     n = len(values)
     if n < MIN_SAMPLES:
-        return Seen(key, f"has {n} samples", n_samples=n)
+        return EpisodeLook(key, f"has {n} samples", n_samples=n)
     period, uneven, gap = period_s, False, None
     if time is not None:
         steps = np.diff(time)
         backwards = np.flatnonzero(~(steps > 0))
         if backwards.size:
             k = int(backwards[0])
-            return Seen(
+            return EpisodeLook(
                 key,
                 f"time stands still or runs back at sample {k} ({time[k]:g} s, then {time[k + 1]:g} s), {backwards.size} times",
                 n_samples=n,
@@ -141,13 +141,15 @@ def _looked(key: EpisodeKey, values: Array, time: Array | None, channels: Sequen
     if not np.isfinite(values).all():
         bad = np.count_nonzero(~np.isfinite(values), axis=0)
         names = ", ".join(f"{c.name!r} ({count})" for c, count in zip(channels, bad, strict=True) if count)
-        return Seen(key, "", (f"{title(key)}: no number in some samples of {names}",), n, period, uneven, True, gap)
+        return EpisodeLook(key, "", (f"{title(key)}: no number in some samples of {names}",), n, period, uneven, True, gap)
     still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
     if still and len(still) < sum(not is_constant(values[:, i]) or i in still for i in range(len(channels))):
         stuck = channels[still[0]].name
-        return Seen(key, f"state {stuck!r} stays at {values[0, still[0]]:g} in all samples while others move: a stuck sensor", n_samples=n)
+        return EpisodeLook(
+            key, f"state {stuck!r} stays at {values[0, still[0]]:g} in all samples while others move: a stuck sensor", n_samples=n
+        )
     alerts = period_alerts(values, channels, period) if first else ()
-    return Seen(key, "", tuple(_rests(key, values, channels)), n, period, uneven, False, gap, print_of(values, channels), alerts)
+    return EpisodeLook(key, "", tuple(_rests(key, values, channels)), n, period, uneven, False, gap, print_of(values, channels), alerts)
 
 
 def _rests(key: EpisodeKey, values: Array, channels: Sequence[Channel]) -> list[str]:

@@ -16,7 +16,7 @@ from .measures import SECONDS, clean_unit, identifier, kind_of_unit, split_heade
 Array = npt.NDArray[np.float64]
 
 
-class Part(str, Enum):
+class ColumnPart(str, Enum):
     """What a column is taken for."""
 
     TIME = "time"
@@ -50,7 +50,7 @@ _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("curren
 
 
 @dataclass(frozen=True)
-class Column:
+class TableColumn:
     """A column of the recordings."""
 
     header: str  # as in the files; the number of the column where there is no header
@@ -58,7 +58,7 @@ class Column:
     unit: str = ""  # unit of measure of the channel, after scaling
     scale: float = 1.0  # to the channel
     kind: str = ""  # kind of quantity, or nothing
-    part: Part = Part.LEFT_OUT
+    part: ColumnPart = ColumnPart.LEFT_OUT
     why: str = ""  # what the proposal rests on
     number: int | None = None  # of the column, from 1, where its header does not name it alone
 
@@ -68,7 +68,7 @@ class Column:
         return self.header if self.number is None else self.number
 
 
-def describe(header: str, unit: str, taken: Collection[str]) -> Column:
+def describe(header: str, unit: str, taken: Collection[str]) -> TableColumn:
     """Return a column by its header and the unit in a row of units, without a part."""
     split = split_header(header)
     unit = clean_unit(unit) or clean_unit(split.unit)
@@ -76,7 +76,7 @@ def describe(header: str, unit: str, taken: Collection[str]) -> Column:
     name = identifier(f"column_{name}" if name.isdigit() else name, list(taken))
     kind = kind_of(split.name, unit)
     scale, unit = (to_radians(unit) or (1.0, unit)) if kind in ("angle", "velocity", "position") else (1.0, unit)
-    return Column(header, name, unit, scale, kind)
+    return TableColumn(header, name, unit, scale, kind)
 
 
 def _words_of(name: str) -> list[str]:
@@ -100,7 +100,7 @@ def is_commanded(name: str) -> bool:
     return any(_OF_WORD.get(w) == "input" for w in _words_of(name)) or any(w.startswith("soll") for w in _words_of(name))
 
 
-def time_columns(columns: Sequence[Column], samples: Sequence[Array]) -> list[int]:
+def time_columns(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[int]:
     """Return the columns that may be time, the likeliest first: called so, or increasing evenly."""
     rising = [i for i in range(len(columns)) if all(_rises(s[i]) for s in samples)]
     called = [i for i in rising if columns[i].kind == "time"]
@@ -133,20 +133,20 @@ def time_scale(unit: str, step: float) -> tuple[float, str]:
     return 1.0, f"a step of {step:g} fits no unit of time: correct time_scale"
 
 
-def propose(columns: Sequence[Column], samples: Sequence[Array]) -> list[Column]:
+def propose(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[TableColumn]:
     """Return the columns with the part that each is likely to have; time is known already."""
-    found: list[Column] = []
+    found: list[TableColumn] = []
     for i, column in enumerate(columns):
-        spare = column.part is not Part.TIME and _spare(i, column, found, samples)
-        found.append(replace(column, part=Part.LEFT_OUT, why=spare) if spare else _by_name(column))
-    free = [c for c in found if c.part is Part.STATE]
+        spare = column.part is not ColumnPart.TIME and _spare(i, column, found, samples)
+        found.append(replace(column, part=ColumnPart.LEFT_OUT, why=spare) if spare else _by_name(column))
+    free = [c for c in found if c.part is ColumnPart.STATE]
     for kinds in _FIRST_MEASURED:
         if any(c.kind in kinds for c in free):
-            return [replace(c, part=Part.MEASURED) if c in free and c.kind in kinds else c for c in found]
+            return [replace(c, part=ColumnPart.MEASURED) if c in free and c.kind in kinds else c for c in found]
     return found
 
 
-def _spare(i: int, column: Column, before: Sequence[Column], samples: Sequence[Array]) -> str:
+def _spare(i: int, column: TableColumn, before: Sequence[TableColumn], samples: Sequence[Array]) -> str:
     """Return why a column is not needed, or nothing."""
     own = [s[i] for s in samples]
     if all(np.isnan(s).mean() > 0.1 for s in own):
@@ -158,16 +158,16 @@ def _spare(i: int, column: Column, before: Sequence[Column], samples: Sequence[A
     if any(_OF_WORD.get(w) == "spare" for w in _words_of(column.name)):
         return "by its name"
     for j, other in enumerate(before):
-        if other.part is not Part.LEFT_OUT and all(np.array_equal(s[i], s[j]) for s in samples):
+        if other.part is not ColumnPart.LEFT_OUT and all(np.array_equal(s[i], s[j]) for s in samples):
             return f"the same as {other.header!r}"
     return ""
 
 
-def _by_name(column: Column) -> Column:
-    if column.part is Part.TIME:
+def _by_name(column: TableColumn) -> TableColumn:
+    if column.part is ColumnPart.TIME:
         return column
     if is_commanded(split_header(column.header).name) or column.kind == "voltage":
-        return replace(column, part=Part.INPUT, why="a command or a voltage, by name and unit")
+        return replace(column, part=ColumnPart.INPUT, why="a command or a voltage, by name and unit")
     if column.kind in ("angle", "position", *_HIDDEN):
-        return replace(column, part=Part.STATE, why=f"{column.kind}, by name or unit")
-    return replace(column, part=Part.LEFT_OUT, why="a second column of time" if column.kind == "time" else UNKNOWN)
+        return replace(column, part=ColumnPart.STATE, why=f"{column.kind}, by name or unit")
+    return replace(column, part=ColumnPart.LEFT_OUT, why="a second column of time" if column.kind == "time" else UNKNOWN)

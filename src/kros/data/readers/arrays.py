@@ -74,8 +74,8 @@ def from_arrays(
         (n_samples, n_channels) with states, then inputs, as columns; a pair (states, inputs); or a mapping from the name of a channel to its
         samples, shape (n_samples,).
     channels : sequence of Channel, optional
-        In place of `states`, `inputs` and `measured`, with units of measure, in the order of the columns; states are moved before inputs, truths and
-        covariates behind both.
+        In place of `states`, `inputs` and `measured`, with units of measure, in the order of the columns; states are moved before inputs, truths behind
+        both.
     sample_period_s : float, s
     states, inputs : sequence of str
         Names of the columns.

@@ -21,7 +21,6 @@ from ..prepare import assemble
 from ..recording import Recording, Recordings
 from .csv_mapping import Column, CsvMapping, UnitMapping, load_mapping
 from .csvfile import Dialect, first_fields, read_columns
-from .lookup import read_lookup
 from .parquet_table import parquet_columns, parquet_fields
 
 ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz", ".parquet")
@@ -122,14 +121,14 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
     ('left', 'right')
     """
     chosen, source = load_mapping(mapping), Path(source)
-    dialect, table = chosen.dialect, None if chosen.lookup is None else read_lookup(source, chosen.lookup, chosen)
+    dialect = chosen.dialect
     places: dict[EpisodeKey, FilePlace] = {}
     groups: dict[str, str] = {}
-    for path, relative, match in _matches(source, chosen):
+    for path, match in _matches(source, chosen):
         fields = parquet_fields(path) if path.suffix == ".parquet" else first_fields(path, dialect)
         if optional and not places:
             chosen = chosen.without(_absent(chosen, fields, optional))
-        found = match.groupdict() if table is None else table.completed(relative, match.groupdict())
+        found = match.groupdict()
         for unit in chosen.units:
             place, group = _place(path, fields, chosen, unit), found.get("group") or ""
             for i in range(chosen.pieces):
@@ -157,8 +156,8 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
 
 
 def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:
-    """Return the channels that are not there and need not be: those that are optional, truths and covariates."""
-    spared = [c for c in mapping.channel if c.name in optional or c.role in (Role.TRUTH, Role.COVARIATE)]
+    """Return the channels that are not there and need not be: those that are optional, and truths."""
+    spared = [c for c in mapping.channel if c.name in optional or c.role is Role.TRUTH]
     columns = {(c.name, mapping.column(c, unit)) for c in spared for unit in mapping.units}
     absent = {name for name, column in columns if (column > len(fields) if isinstance(column, int) else column not in fields)}
     return absent | {c.name for c in mapping.channel if c.of in absent}
@@ -174,11 +173,11 @@ def csv_files(source: Path) -> Iterator[tuple[Path, str]]:
                 yield path, path.relative_to(source).as_posix()
 
 
-def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, str, re.Match[str]]]:
+def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match[str]]]:
     for path, relative in csv_files(source):
         match = re.search(mapping.files, relative)
-        if match and relative != mapping.lookup and not (mapping.exclude and re.search(mapping.exclude, relative)):
-            yield path, relative, match
+        if match and not (mapping.exclude and re.search(mapping.exclude, relative)):
+            yield path, match
 
 
 def _sample(source: Path) -> str:

@@ -32,7 +32,7 @@ class ChannelMapping:
     name : str
         Of the channel, in everything that follows.
     role : Role
-        What it is to the observer; a truth serves evaluation alone, a covariate `kros check`.
+        What it is to the observer; a truth serves evaluation alone.
     column : str or int, optional
         Name in the header or number from 1; default: the channel's name.
     measured : bool
@@ -116,8 +116,6 @@ class CsvMapping:
         Where time is a timestamp such as ``2024-05-31 12:00:00.010``: the order of its date. A time of day alone takes any of them.
     pieces : int
         Every file is cut into so many episodes of equal length, named ``<episode>.1`` and so on.
-    lookup : str, optional
-        A CSV file in the folder that says more about the files: see `kros.data.readers.lookup`.
     prepare : tuple of mapping
         Preparation steps of this mapping.
     metadata : mapping
@@ -140,7 +138,6 @@ class CsvMapping:
     encoding: str = "utf-8"
     timestamp: Literal["ymd", "dmy", "mdy"] | None = None
     pieces: int = 1
-    lookup: str | None = None
     prepare: tuple[Mapping[str, Any] | Step, ...] = ()
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
@@ -211,7 +208,7 @@ class CsvMapping:
 
     @property
     def ordered(self) -> tuple[ChannelMapping, ...]:
-        """Channels, states before inputs, truths and covariates behind them."""
+        """Channels, states before inputs, truths behind them."""
         return columns_in_order(self.channel)
 
     @property

@@ -53,7 +53,7 @@ class Dialect:
 COMMA = Dialect()
 
 
-class Bounded:
+class LimitedFile:
     """An open file that refuses to give more than is ever read; text that was packed too tightly to be recordings is refused early."""
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
@@ -98,13 +98,13 @@ class Bounded:
 
 
 @contextmanager
-def opened(path: Path, encoding: str = "utf-8") -> Iterator[Bounded]:
+def opened(path: Path, encoding: str = "utf-8") -> Iterator[LimitedFile]:
     """Open a regular text file, unpacked where it ends in ``.gz``; what has two bytes a character is given in UTF-8."""
     require_regular(path, limits.MAX_TEXT_BYTES)
     opener: Any = gzip.open if path.suffix == ".gz" else open
     try:
         with opener(path, "rb") as file:
-            yield Bounded(file if _has_ascii(encoding) else codecs.EncodedFile(file, "utf-8", encoding), path)
+            yield LimitedFile(file if _has_ascii(encoding) else codecs.EncodedFile(file, "utf-8", encoding), path)
     except (OSError, EOFError, zlib.error, UnicodeError) as error:
         raise DataError(f"Reading {path}: cannot be read ({error}); check the file, or restore it.") from error
 
@@ -177,7 +177,7 @@ def read_columns(
     return values
 
 
-def _skip(file: Bounded, lines: int, path: Path) -> None:
+def _skip(file: LimitedFile, lines: int, path: Path) -> None:
     for line in range(lines):
         if not file.readline():
             raise DataError(

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import ConfigError, DataError
-from ..checks import OnNan, parse_on_nan, scan_population
 from ..population import Population
 from ..prepare import prepare as prepared
 from ..steps import Step, parse_steps
@@ -40,7 +39,6 @@ def read(
     mapping: CsvMapping | Mapping[str, Any] | Path | str | None = None,
     prepare: Iterable[Step | Mapping[str, Any]] = (),
     *,
-    on_nan: str = "error",
     optional: Collection[str] = (),
 ) -> Population:
     """Open a folder of recordings; episodes are read on demand.
@@ -54,9 +52,6 @@ def read(
         How CSV files map to a population: a TOML file or the table ``[data.csv]``.
     prepare : iterable of Step or mapping
         Further steps, as in ``[[data.prepare]]``, after those of the mapping.
-    on_nan : {"error", "drop_episode"}
-        With ``drop_episode`` every episode is read once here, and those with NaN or infinity are left out and logged. To save that pass
-        keep ``error`` here and give the option to `write_parquet`.
     optional : collection of str
         Channels that recordings may lack, such as states that only a test bench measures; steps that need them are left out with them.
 
@@ -81,7 +76,7 @@ def read(
     ...     kros.read(folder).unit_ids
     ('001', '002')
     """
-    steps, policy = parse_steps(prepare), parse_on_nan(on_nan)
+    steps = parse_steps(prepare)
     if reader is not None and reader not in READERS:
         raise ConfigError(f"data.reader should be one of {', '.join(READERS)}, found {reader!r}; correct it.")
     chosen = _fitting(reader, Path(source), mapping is not None)
@@ -99,8 +94,7 @@ def read(
     else:
         population = read_parquet(source) if chosen == "parquet" else read_motor_drive_raw(source)
     absent = set(optional) - set(population.states) - set(population.inputs)
-    population = prepared(population, [step for s in steps if (step := s.without(absent)) is not None] if absent else steps)
-    return population if policy is OnNan.ERROR else scan_population(population, on_nan=policy)
+    return prepared(population, [step for s in steps if (step := s.without(absent)) is not None] if absent else steps)
 
 
 def _fitting(reader: str | None, source: Path, with_mapping: bool) -> str:

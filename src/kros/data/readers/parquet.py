@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,6 @@ from ...core.errors import DataError
 from ...core.files import require_regular, shortened
 from ..arrow import fill
 from ..checks import check_period
-from ..kept import Kept
 from ..population import Channel, EpisodeKey, Population, Role, TrueChannel, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings
@@ -28,6 +29,33 @@ from ..tables import build
 INDEX = "population"  # kind of the artifact, hence population.json
 KEYS = ("unit", "condition", "episode")
 Version = tuple[int, int, int]
+
+
+class Kept:
+    """Arrays by key, those that were asked for last, at most so many bytes in all; they cannot be written to."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit, self.size = limit, 0
+        self.arrays: OrderedDict[Hashable, npt.NDArray[np.float64]] = OrderedDict()
+        self._lock = Lock()
+
+    def take(self, key: Hashable, make: Callable[[], npt.NDArray[np.float64]]) -> npt.NDArray[np.float64]:
+        """Return the array of a key, made where it is not there."""
+        with self._lock:
+            if key in self.arrays:
+                self.arrays.move_to_end(key)
+                return self.arrays[key]
+        made = make()
+        made.flags.writeable = False
+        with self._lock:
+            if made.nbytes <= self.limit and key not in self.arrays:
+                self.arrays[key] = made
+                self.size += made.nbytes
+            while self.size > self.limit:
+                self.size -= self.arrays.popitem(last=False)[1].nbytes
+        return made
+
+
 _KEPT = Kept(limit=2**28)  # the demo's recordings fit, those of a factory do not have to
 
 
@@ -142,8 +170,7 @@ def read_parquet(folder: Path | str) -> Population:
     """
     content, _ = load_artifact(Path(folder), INDEX)
     try:
-        listed = *content["channels"], *content.get("covariates", ())
-        channels = tuple(Channel(c["name"], Role(c["role"]), _text(c["unit"]), c["measured"] is True) for c in listed)
+        channels = tuple(Channel(c["name"], Role(c["role"]), _text(c["unit"]), c["measured"] is True) for c in content["channels"])
         channels += tuple(TrueChannel(t["name"], Role.TRUTH, _text(t["unit"]), of=_text(t["of"])) for t in content.get("truths", ()))
         channels = columns_in_order(channels)
         units = [Unit(_text(u["id"]), _text(u["group"]), dict(u["metadata"])) for u in content["units"]]

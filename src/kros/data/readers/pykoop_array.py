@@ -23,8 +23,6 @@ def from_pykoop(
     sample_period_s: float,
     *,
     channels: Sequence[Channel] | None = None,
-    episode_feature: bool = True,
-    condition: str = DEFAULT_CONDITION,
 ) -> Population:
     """Make a population from pykoop's `X`.
 
@@ -39,9 +37,6 @@ def from_pykoop(
     sample_period_s : float
     channels : sequence of Channel, optional
         Default: states ``x0, x1, ...``, all measured, inputs ``u0, u1, ...``.
-    episode_feature : bool
-        False where `X` has no episode column, so each array is one episode.
-    condition : str
 
     Returns
     -------
@@ -70,37 +65,27 @@ def from_pykoop(
     if isinstance(n_inputs, bool) or not isinstance(n_inputs, (int, np.integer)):
         raise DataError(f"from_pykoop: n_inputs should be a whole number, found {n_inputs!r}; correct it.")
     widths = sorted({x.shape[-1] if x.ndim == 2 else -1 for x in arrays.values()})
-    n_columns = widths[0] - int(episode_feature)
+    n_columns = widths[0] - 1
     if len(widths) > 1 or n_columns < 1 or not 0 <= n_inputs < n_columns:
         shapes = [x.shape for x in arrays.values()]
-        raise DataError(
-            f"from_pykoop: needs arrays (n_samples, {int(episode_feature)} + states + {n_inputs}) of one width, found "
-            f"{shapes[:5]}; check n_inputs."
-        )
+        raise DataError(f"from_pykoop: needs arrays (n_samples, 1 + states + {n_inputs}) of one width, found {shapes[:5]}; check n_inputs.")
     states, inputs = ([f"{letter}{i}" for i in range(count)] for letter, count in (("x", n_columns - n_inputs), ("u", n_inputs)))
     named = channels if channels is not None else declare_channels(None, states, inputs, states, "from_pykoop")
-    episodes = {EpisodeKey(u, condition, name): part for u, x in arrays.items() for name, part in _split(u, x, episode_feature)}
+    episodes = {EpisodeKey(u, DEFAULT_CONDITION, name): part for u, x in arrays.items() for name, part in _split(u, x)}
     return from_arrays(episodes, named, sample_period_s)
 
 
-def to_pykoop(population: Population, unit: str | None = None, condition: str | None = None) -> npt.NDArray[np.float64]:
-    """Return episodes as pykoop's `X`.
+def to_pykoop(population: Population) -> npt.NDArray[np.float64]:
+    """Return a population as pykoop's `X`, with episodes numbered through in the order of ``population.episodes``.
 
     Parameters
     ----------
     population : Population
-    unit, condition : str, optional
-        Default: all, with episodes numbered through in the order of ``population.keys(unit, condition)``.
 
     Returns
     -------
     ndarray, shape (n_samples, 1 + n_states + n_inputs)
         Pass ``n_inputs=len(population.inputs), episode_feature=True`` to pykoop's `fit`.
-
-    Raises
-    ------
-    DataError
-        When there is no such episode.
 
     Examples
     --------
@@ -110,22 +95,13 @@ def to_pykoop(population: Population, unit: str | None = None, condition: str | 
     >>> kros.data.to_pykoop(population).tolist()
     [[0.0, 1.0, 1.0], [0.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
     """
-    keys = population.keys(unit, condition)
-    if not keys:
-        raise DataError(
-            f"to_pykoop: no episode of unit {unit!r}, condition {condition!r}; units are "
-            f"{list(population.unit_ids[:10])}, conditions {list(population.conditions)}."
-        )
-    parts = [population.read(key) for key in keys]
+    parts = [population.read(key) for key in population.episodes]
     return np.concatenate([np.column_stack([np.full(len(part), float(i)), part]) for i, part in enumerate(parts)])
 
 
-def _split(unit: str, x: npt.NDArray[Any], episode_feature: bool) -> Iterable[tuple[str, npt.NDArray[np.float64]]]:
+def _split(unit: str, x: npt.NDArray[Any]) -> Iterable[tuple[str, npt.NDArray[np.float64]]]:
     """Yield (episode, samples) in the order in which episodes appear."""
-    values = _numbers(unit, x[:, 1:] if episode_feature else x)
-    if not episode_feature:
-        yield "0", values
-        return
+    values = _numbers(unit, x[:, 1:])
     ids = _episodes(unit, x[:, 0])
     starts = [name for i, name in enumerate(ids) if i == 0 or name != ids[i - 1]]
     if len(starts) > len(set(starts)):
@@ -149,7 +125,7 @@ def _episodes(unit: str, column: npt.NDArray[Any]) -> list[str]:
         found = column[row : row + 1].tolist()[0]
         raise DataError(
             f"from_pykoop: the first column should number the episodes (as floating-point numbers below 2**53), found {found!r} in row "
-            f"{row} of unit {unit}; use an integer or object array, or pass episode_feature=False without the column."
+            f"{row} of unit {unit}; use an integer or object array."
         )
     return [str(int(v)) for v in column] if column.dtype.kind == "f" else [str(v) for v in column]
 

@@ -14,10 +14,9 @@ Examples
 4
 """
 
-from .events import ByDirection, Cut
 from .filtered import Differentiate, Resample
 from .parsing import parse_steps
-from .pointwise import Offset, Scale, Shift, Tare, Trim
+from .pointwise import Offset, Scale, Shift, Trim
 from .step import Step
 
-__all__ = ["ByDirection", "Cut", "Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Tare", "Trim", "parse_steps"]
+__all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim", "parse_steps"]

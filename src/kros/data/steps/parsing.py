@@ -7,12 +7,11 @@ from typing import Any
 
 from ...core.errors import ConfigError
 from ..tables import build
-from .events import ByDirection, Cut
 from .filtered import Differentiate, Resample
-from .pointwise import Offset, Scale, Shift, Tare, Trim
+from .pointwise import Offset, Scale, Shift, Trim
 from .step import Step
 
-STEPS: dict[str, type[Step]] = {kind.step: kind for kind in (Scale, Shift, Offset, Tare, ByDirection, Cut, Trim, Resample, Differentiate)}
+STEPS: dict[str, type[Step]] = {kind.step: kind for kind in (Scale, Shift, Offset, Trim, Resample, Differentiate)}
 
 
 def parse_steps(tables: Iterable[Step | Mapping[str, Any]], where: str = "data.prepare") -> tuple[Step, ...]:

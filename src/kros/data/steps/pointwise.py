@@ -1,4 +1,4 @@
-"""Preparation steps that scale, shift, tare and cut."""
+"""Preparation steps that scale, shift, remove an offset and cut."""
 
 from __future__ import annotations
 
@@ -151,48 +151,6 @@ class Offset(Step):
         check_finite(window, recording.key, channels, first=self.start, columns=(column, reference))
         values = recording.values.copy()
         values[:, column] += np.mean(window[:, reference] - window[:, column])
-        return replace(recording, values=values)
-
-
-@dataclass(frozen=True)
-class Tare(Step):
-    """Set channels to zero in the mean over samples ``[start, stop)`` of each episode; all of it by default.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import kros
-    >>> from kros.data.steps import Tare
-    >>> population = kros.from_arrays({"a": [np.array([[5.0], [5.0], [7.0]])]}, states=["force"], measured=["force"], sample_period_s=0.01)
-    >>> tared = kros.data.prepare(population, [Tare(("force",), stop=2)])
-    >>> tared.read(tared.keys()[0]).ravel().tolist()
-    [0.0, 0.0, 2.0]
-    """
-
-    channels: tuple[str, ...]
-    start: int = 0
-    stop: int | None = None
-    step: ClassVar[str] = "tare"
-
-    def channels_after(self, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
-        """Return the channels, unchanged."""
-        self.columns(self.channels, channels)
-        if self.start < 0 or (self.stop is not None and self.stop <= self.start):
-            raise ConfigError(f"Step 'tare' needs 0 <= start < stop, found start = {self.start}, stop = {self.stop}; correct the window.")
-        return channels
-
-    def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
-        """Return the recording with the means taken off."""
-        n, columns = len(recording.values), self.columns(self.channels, channels)
-        if n <= self.start or (self.stop is not None and n < self.stop):
-            raise DataError(
-                f"{title(recording.key)}: the tare is taken over samples {self.start} to {'the end' if self.stop is None else self.stop - 1}, the episode "
-                f"has {n}; leave the episode out."
-            )
-        window = recording.values[self.start : self.stop]
-        check_finite(window, recording.key, channels, first=self.start, columns=columns)
-        values = recording.values.copy()
-        values[:, columns] -= window[:, columns].mean(axis=0)
         return replace(recording, values=values)
 
 

@@ -35,7 +35,7 @@ def same_file(path: Path, target: Path) -> None:
 
 
 @contextmanager
-def whole_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
+def whole_folder(out: Path) -> Iterator[Path]:
     """Give a folder beside `out` to fill; it is moved there at the end, or removed when anything fails."""
     out = out.absolute()
     work = out.with_name(f".{out.name}.kros")
@@ -44,8 +44,7 @@ def whole_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
         with locked(work):
             filled, aside = work / "new", work / "old"
             _tidy(out, filled, aside)
-            occupied = out.exists() and not (out.is_dir() and not any(out.iterdir()))
-            if occupied and not (overwrite and out.is_dir()):
+            if out.exists() and not (out.is_dir() and not any(out.iterdir())):
                 raise DataError(f"Writing {out}: it exists and is not empty; choose another name or remove it first.")
             try:
                 filled.mkdir()

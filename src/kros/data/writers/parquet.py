@@ -1,7 +1,7 @@
 """Write a population in kros's native format.
 
     <out>/population.json                    channels, period, units, episodes with their lengths
-    <out>/<unit>@<condition>.parquet         one row group an episode: unit, condition, episode, k, then the channels, truths, covariates
+    <out>/<unit>@<condition>.parquet         one row group an episode: unit, condition, episode, k, then the channels and truths
 
 Names of files are percent-encoded, so any id works. A study writes groups from several processes (`write_group`), then the index.
 """
@@ -97,14 +97,13 @@ def write_index(population: Population, records: Iterable[GroupRecord], folder: 
         "units": [u for u in population.units if u.id in written],
         "metadata": population.metadata,
         **({"truths": population.truths} if population.truths else {}),
-        **({"covariates": population.covariates} if population.covariates else {}),
         **({"scaling": population.scaling} if population.scaling else {}),
         "groups": [{name: getattr(g, name) for name in _INDEXED} for g in groups],
     }
     save_artifact(Path(folder), INDEX, content)
 
 
-def write_parquet(population: Population, out: Path | str, *, on_nan: str = "error", overwrite: bool = False) -> None:
+def write_parquet(population: Population, out: Path | str) -> None:
     """Write a population as a folder of Parquet files; it appears whole or not at all.
 
     Parameters
@@ -112,9 +111,6 @@ def write_parquet(population: Population, out: Path | str, *, on_nan: str = "err
     population : Population
     out : Path
         Folder to make.
-    on_nan : {"error", "drop_episode"}
-    overwrite : bool
-        Replace what is at `out`.
 
     Raises
     ------
@@ -134,8 +130,8 @@ def write_parquet(population: Population, out: Path | str, *, on_nan: str = "err
     ['a@default.parquet', 'population.json']
     """
     groups = [(unit, condition) for unit, condition, _ in population.groups()]
-    with whole_folder(Path(out), overwrite) as folder:
-        records = in_threads([partial(write_group, population, *group, folder, on_nan) for group in groups])
+    with whole_folder(Path(out)) as folder:
+        records = in_threads([partial(write_group, population, *group, folder) for group in groups])
         write_index(population, records, folder)
 
 

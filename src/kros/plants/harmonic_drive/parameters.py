@@ -82,10 +82,6 @@ class DriveParameters:
         sign = velocity / np.sqrt(velocity**2 + SMOOTHING_VELOCITY**2)
         return sign * (self.coulomb_torque + self.breakaway_torque / fade)
 
-    def friction_torque(self, velocity: Array) -> Array:
-        """Dry and viscous friction of each unit at its own velocity, shape (n_units,), N m."""
-        return self.dry_friction(velocity) + self.viscous_friction * velocity
-
     def gearbox_current(self, position: Array) -> Array:
         """Disturbance (34) of each unit at its own output angle, shape (n_units,), fraction of full scale."""
         order = np.arange(1, self.ripple.shape[1] + 1)

@@ -12,8 +12,7 @@ from ...core.errors import ConfigError
 from ...data import prepare
 from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, TrueChannel, Unit
 from ...data.steps import Offset, Trim
-from ..recordings import Recordings
-from ..simulated import SimulatedPopulation
+from ..simulated import SimulatedEpisodes, SimulatedPopulation
 from .control import CURRENT_NOISE, GAINS, SAMPLE_PERIOD_S, Loop
 from .parameters import GEAR_RATIO, DriveParameters, concatenate, draw_outlier, draw_parameters
 from .reference import episode_reference
@@ -121,7 +120,7 @@ class HarmonicDrivePopulation:
         signals = simulate(parameters.take(rows), loaded, episode, (targets[0], targets[1]), GAINS[loop])
         self._disturb(signals.states, keys)
         inputs = [np.ascontiguousarray(targets[:, e]) for e in range(self.n_episodes)]
-        recordings = Recordings({key: (signals.states[i], inputs[episode[i]], signals.velocity[i]) for i, key in enumerate(keys)})
+        recordings = SimulatedEpisodes({key: (signals.states[i], inputs[episode[i]], signals.velocity[i]) for i, key in enumerate(keys)})
         raw = Population(CHANNELS, SAMPLE_PERIOD_S, units, keys, recordings, {"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO}, TRUTHS)
         load_rows = {key: i for i, key in enumerate(k for k in keys if k.condition == "load")}
         truth = Truth(tuple(u.id for u in units), parameters, loop, GAINS[loop], load_rows, signals.load_torque[:, REST_SAMPLES:-1])

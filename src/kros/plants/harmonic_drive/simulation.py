@@ -1,6 +1,6 @@
 """Run the drives: sampled control around the physics, many trajectories at once.
 
-Time is the outer loop; every step is vectorised over trajectories. Signals are kept time-major in small blocks and turned
+Time is the outer loop; every step is vectorised over trajectories. SimulatedSignals are kept time-major in small blocks and turned
 over into one row per trajectory as each block is full.
 
 Symbols
@@ -30,7 +30,7 @@ _DIFFERENCE = np.array((1.0 - VELOCITY_POLE) / SAMPLE_PERIOD_S)
 
 
 @dataclass(frozen=True, eq=False)
-class Signals:
+class SimulatedSignals:
     """What a simulation leaves behind, one row per trajectory."""
 
     states: Array  # shape (n, 3, n_samples): quantised position, rad, its filtered difference, rad/s, and current without noise
@@ -38,12 +38,14 @@ class Signals:
     load_torque: Array  # shape (n_loaded, n_samples), float32, fraction of full-scale current: what the load takes from the flange
 
 
-def simulate(p: DriveParameters, loaded: Array, reference: Array, targets: tuple[Array, Array], gains: Gains) -> Signals:
+def simulate(p: DriveParameters, loaded: Array, reference: Array, targets: tuple[Array, Array], gains: Gains) -> SimulatedSignals:
     """Simulate all trajectories; `targets` hold position (rad) and velocity (rad/s), shape (n_references, n_samples)."""
     n, n_samples = len(p), targets[0].shape[1]
     n_loaded = int(np.count_nonzero(loaded))
     rows = np.cumsum(loaded > 0) - 1
-    out = Signals(np.empty((n, len(_SIGNALS), n_samples)), np.empty((n, 1, n_samples)), np.empty((n_loaded, n_samples), np.float32))
+    out = SimulatedSignals(
+        np.empty((n, len(_SIGNALS), n_samples)), np.empty((n, 1, n_samples)), np.empty((n_loaded, n_samples), np.float32)
+    )
     for start in range(0, n, CHUNK_TRAJECTORIES):
         part = slice(start, start + CHUNK_TRAJECTORIES)
         _simulate_chunk(p.take(part), loaded[part], reference[part], targets, gains, out, part, rows[part])
@@ -51,7 +53,14 @@ def simulate(p: DriveParameters, loaded: Array, reference: Array, targets: tuple
 
 
 def _simulate_chunk(
-    p: DriveParameters, loaded: Array, reference: Array, targets: tuple[Array, Array], gains: Gains, out: Signals, part: slice, rows: Array
+    p: DriveParameters,
+    loaded: Array,
+    reference: Array,
+    targets: tuple[Array, Array],
+    gains: Gains,
+    out: SimulatedSignals,
+    part: slice,
+    rows: Array,
 ) -> None:
     n, n_samples = len(p), targets[0].shape[1]
     physics = Physics(p, loaded, targets[0][reference, 0])

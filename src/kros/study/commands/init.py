@@ -15,7 +15,7 @@ from ...core.files import parse_toml
 from ...core.work import Progress, Work
 from ...data import Population, Role, check_population
 from ...data.discovery.discover import Ask, Discovery, Wanted, discover
-from ...data.discovery.roles import Column, Part, is_commanded, kind_of
+from ...data.discovery.roles import ColumnPart, TableColumn, is_commanded, kind_of
 from ...data.readers.opening import LOOKS, detect_reader
 from ...data.survey import UNLOADED, RecordingFacts, survey
 from ...identify import PhaseSpec
@@ -179,15 +179,15 @@ def _lines(population: Population, found: Discovery | None, proposal: LiftingPro
     return [*lines, f"study: {out}; look through it, then: kros run {out}{until}"]
 
 
-def column_lines(columns: Sequence[Column]) -> list[str]:
+def column_lines(columns: Sequence[TableColumn]) -> list[str]:
     """Return one line a column: what it is taken for, its channel and its unit of measure."""
     names = {c: f"{c.name}{f' [{c.unit}]' if c.unit else ''}" for c in columns}
     width = max(len(n) for n in names.values())
     lines = []
-    for part in Part:
+    for part in ColumnPart:
         for column in (c for c in columns if c.part is part):
             came = f"column {column.reference!r}" if column.reference != column.name else ""
-            why = f"({column.why})" if part is Part.LEFT_OUT else ""
+            why = f"({column.why})" if part is ColumnPart.LEFT_OUT else ""
             lines.append(f"  {part.value:<9} {names[column]:<{width}}  {came}  {why}".rstrip())
     return lines
 

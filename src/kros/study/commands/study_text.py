@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ...data.discovery.discover import Discovery
-from ...data.discovery.roles import Column, Part
+from ...data.discovery.roles import ColumnPart, TableColumn
 
 COMMENTS = {
     "files": "what a file is: a regular expression on its path, whose groups unit, condition, episode and group are read",
@@ -71,7 +71,7 @@ def _mapping(found: Discovery) -> Iterator[str]:
     by_name = {c.name: c for c in found.columns}
     for channel in found.mapping["channel"]:
         yield from ("", "[[data.csv.channel]]", *_channel(channel, by_name[channel["name"]]))
-    spare = [c for c in found.columns if c.part is Part.LEFT_OUT and c.why != "no numbers"]
+    spare = [c for c in found.columns if c.part is ColumnPart.LEFT_OUT and c.why != "no numbers"]
     if spare:
         yield from (
             "",
@@ -82,7 +82,7 @@ def _mapping(found: Discovery) -> Iterator[str]:
         yield from ("", *(f"# {line}" for line in ("[[data.csv.channel]]", *_channel(table, column))))
 
 
-def _channel(table: Mapping[str, Any], column: Column) -> Iterator[str]:
+def _channel(table: Mapping[str, Any], column: TableColumn) -> Iterator[str]:
     for key, value in table.items():
         note = {"role": column.why, "measured": "available at run time", "scale": "to " + column.unit}.get(key, "")
         yield f"{key} = {_value(value)}{f'  # {_one_line(note)}' if note else ''}"

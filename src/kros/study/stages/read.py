@@ -77,6 +77,6 @@ def run(context: Context) -> None:
         population, config.split.test, data.identify_on, data.on_nan, folder, context.work, reserve, earlier, context.store.told
     )
     if in_place and facts.dropped:
-        raise DataError("Dropping episodes needs a copy of the recordings; convert them first with on_nan = 'drop_episode'.")
+        raise DataError("Dropping episodes needs a copy of the recordings; convert them again without these episodes.")
     content = {"recordings": config.data.source if in_place else "recordings", **facts.content()}
     save_artifact(context.store.draft("population"), "facts", content)

@@ -22,6 +22,7 @@ from campaign import LONGEST_S, Tally, main
 
 from kros.core.errors import ConfigError
 from kros.lifting import Lifting
+from kros.lifting.c_code import c_code
 from kros.lifting.tables import check_family
 
 DIGITS, NAMES = 60, ("x", "y", "p")
@@ -194,7 +195,7 @@ def one(text: Any, tally: Tally, rng: np.random.Generator) -> None:
             lifting = Lifting(("x", "y"), (text,), ("p",))
             outcome = "accepted, in agreement"
             if not lifting.history:
-                lifting.c_expressions()
+                [c_code(formula.expression, str) for formula in lifting.formulas]
                 with suppress(ConfigError):  # a parameter that does not separate
                     _ = lifting.separation
                 wrong = judge_slopes(lifting, rng)
@@ -236,22 +237,18 @@ def random_table(rng: np.random.Generator) -> dict[str, Any]:
         [[0, 1]],
         {},
     ]
-    kinds = ["harmonics", "polynomials", "radial", "fourier", "delays", "products", "formulas", "other"]
+    kinds = ["harmonics", "polynomials", "radial", "fourier", "delays", "other"]
     keys = [
         "names",
         "degree",
-        "lowest",
-        "cross",
         "angle",
         "ratio",
         "orders",
         "phase",
         "length",
-        "function",
         "centres",
         "n",
         "seed",
-        "kernel",
         "depth",
     ]
     table: dict[str, Any] = {"kind": str(rng.choice(kinds)), "names": ["x", "y"]}
@@ -259,21 +256,19 @@ def random_table(rng: np.random.Generator) -> dict[str, Any]:
         "harmonics": {"angle": "x"},
         "polynomials": {"degree": 3},
         "radial": {
-            "centres": {"kind": str(rng.choice(["grid", "random", "kmeans"])), "n": 5, "seed": 0, "ranges": [[0, 1]] * 2},
+            "centres": {"kind": "kmeans", "n": 5, "seed": 0},
             "length": 1,
         },
         "fourier": {"n": 4, "length": 1, "seed": 0},
         "delays": {"depth": 2},
-        "products": {"others": ["y"]},
-        "formulas": {"functions": ["x*y"]},
     }
     table |= needed.get(table["kind"], {})
-    if table["kind"] in ("harmonics", "formulas"):
+    if table["kind"] == "harmonics":
         del table["names"]
     for key in rng.choice([*table, *keys], rng.integers(0, 3)):
         table[str(key)] = odd[int(rng.integers(len(odd)))]
     if isinstance(table.get("centres"), dict) and rng.random() < 0.5:
-        table["centres"] = {**table["centres"], str(rng.choice(["n", "seed", "ranges", "counts"])): odd[int(rng.integers(len(odd)))]}
+        table["centres"] = {**table["centres"], str(rng.choice(["n", "seed"])): odd[int(rng.integers(len(odd)))]}
     return table
 
 

@@ -1,6 +1,7 @@
 """Every reader gives the same population: raw layout, Parquet, CSV with a mapping, arrays, a long frame, pykoop's array."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -93,9 +94,9 @@ def by_pykoop(folder: Path) -> Population:
     source = from_arrays(ALIGNED, CHANNELS, PERIOD)
     episodes = {}
     for condition in source.conditions:
-        X = {unit: to_pykoop(source, unit, condition) for unit in source.unit_ids}
-        part = from_pykoop(X, 2, PERIOD, channels=CHANNELS, condition=condition)
-        episodes.update({key: part.read(key) for key in part.episodes})
+        X = {unit: to_pykoop(source.select([unit], [condition])) for unit in source.unit_ids}
+        part = from_pykoop(X, 2, PERIOD, channels=CHANNELS)
+        episodes.update({replace(key, condition=condition): part.read(key) for key in part.episodes})
     return prepare(from_arrays(episodes, CHANNELS, PERIOD), PREPARATION)
 
 

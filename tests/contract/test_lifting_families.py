@@ -9,6 +9,7 @@ from families import FAMILIES, INPUT_FUNCTIONS, INPUTS, STATES
 
 from kros.core.errors import ConfigError
 from kros.lifting import Lifting, radial
+from kros.lifting.c_code import c_code
 from kros.lifting.intervals import bounds_of
 
 BOX = {"position": (-1.5, 1.2), "velocity": (0.1, 2.0), "voltage": (-3.0, 3.0)}
@@ -47,7 +48,9 @@ def test_c_computes_what_numpy_does(lifting, tmp_path):
             )
         else:
             lines.append(f"const double {name}={slot};(void){name};")
-    lines += [f'printf("%.17g\\n",(double)({expression}));' for expression in lifting.c_expressions() + lifting.c_input_expressions()]
+    expressions = [formula.expression for formula in lifting.formulas + lifting.input_formulas]
+    written = [c_code(tree, lambda name: f"{name}[0]" if name in pointers else name) for tree in expressions]
+    lines += [f'printf("%.17g\\n",(double)({expression}));' for expression in written]
     width = windows.shape[1] + 2
     source = (
         f"#include <math.h>\n#include <stdio.h>\nint main(void){{double row[{width}];for(;;){{for(int i=0;i<{width};i++)"

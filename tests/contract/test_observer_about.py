@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import kros
-from kros.core.artifacts import checksum_of
+from kros.core.artifacts import check_checksum
 from kros.observer import Observer
 from kros.observer.about import About
 from kros.plants import PLANTS
@@ -54,7 +54,7 @@ def found(tmp_path_factory) -> tuple[Any, dict[str, Any]]:
 def test_the_file_is_complete(found) -> None:
     study, content = found
     about = content["about"]
-    assert content["checksum"] == checksum_of(content)
+    assert check_checksum(content, study.folder)
     assert content["states"] == ["current", "angle"]
     assert about["units_of_measure"] == {"current": "A", "angle": "rad", "voltage": "V"}
     assert (about["kros"], about["study"]) == (version("kros"), "run")

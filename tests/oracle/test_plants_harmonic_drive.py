@@ -174,7 +174,7 @@ def test_at_constant_speed_current_is_friction_and_the_position_error_vanishes(l
     position = np.cumsum(velocity) * PERIOD
     signals = simulate(p, np.zeros(5), np.zeros(5, int), (position[None], velocity[None]), GAINS[loop])
     tail = slice(n - 2000, n)  # 80 motor revolutions
-    friction = p.friction_torque(np.full(5, speed)) / p.torque_constant
+    friction = (p.dry_friction(np.full(5, speed)) + p.viscous_friction * speed) / p.torque_constant
     np.testing.assert_allclose(signals.states[:, 2, tail].mean(axis=1), friction, atol=2e-3)
     np.testing.assert_allclose(signals.states[:, 0, tail].mean(axis=1), position[tail].mean(), atol=5e-6)
     np.testing.assert_allclose(signals.states[:, 1, tail].mean(axis=1), speed, atol=1e-4)

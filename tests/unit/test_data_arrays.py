@@ -175,7 +175,7 @@ def test_pykoop_both_ways() -> None:
     assert (population.states, population.inputs, population.measured) == (("x0", "x1"), ("u0",), ("x0", "x1"))
     assert [k.episode for k in population.keys("a")] == ["0", "3", "7"]
     np.testing.assert_array_equal(population.read(EpisodeKey("b", "default", "7")), values(7))
-    back = to_pykoop(population, "a")
+    back = to_pykoop(population.select(["a"]))
     np.testing.assert_array_equal(back[:, 1:], X[:, 1:])
     np.testing.assert_array_equal(back[:, 0], np.repeat([0, 1, 2], 12))
     assert to_pykoop(population).shape == (72, 4)
@@ -205,11 +205,6 @@ def test_pykoop_episodes_that_are_text_or_huge_are_told_apart() -> None:
         from_pykoop(np.full((12, 4), "a"), 1, 0.1)
 
 
-def test_pykoop_without_episode_column() -> None:
-    population = from_pykoop(values(0), 1, 0.1, episode_feature=False, channels=CHANNELS, condition="hot")
-    np.testing.assert_array_equal(population.read(EpisodeKey("0", "hot", "0")), values(0))
-
-
 def test_pykoop_agrees_with_pykoop() -> None:
     pykoop = pytest.importorskip("pykoop", exc_type=ImportError)
     population = from_pykoop(koopman_array(), 1, 0.1)
@@ -230,5 +225,3 @@ def test_pykoop_refuses() -> None:
         from_pykoop({"a": koopman_array(), "b": koopman_array()[:, :3]}, 1, 0.1)
     with pytest.raises(DataError, match="mapping is empty"):
         from_pykoop({}, 1, 0.1)
-    with pytest.raises(DataError, match="no episode of unit 'z'"):
-        to_pykoop(from_pykoop(koopman_array(), 1, 0.1), "z")

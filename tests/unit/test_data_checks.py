@@ -9,7 +9,7 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, check_population, from_arrays
-from kros.data.checks import OnNan, check_episode, parse_on_nan, scan_population
+from kros.data.checks import check_episode, scan_prints
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 KEY = EpisodeKey("001011", "load", "7")
@@ -116,10 +116,10 @@ def test_channel_names_differ() -> None:
 def test_scan_refuses_an_input_that_never_moves() -> None:
     resting = [values(i) for i in range(4)]
     resting[0][:, 2] = 0.0
-    scan_population(population({"a": resting[:2], "b": resting[2:]}))
+    scan_prints(population({"a": resting[:2], "b": resting[2:]}))
     resting[1][:, 2] = 0.0
     with pytest.raises(DataError, match=r"Unit a \(default\): input 'u' stays at 0 in all 2 episodes"):
-        scan_population(population({"a": resting[:2], "b": resting[2:]}))
+        scan_prints(population({"a": resting[:2], "b": resting[2:]}))
 
 
 @pytest.mark.parametrize("later", [2.5, -1.0], ids=["same level", "another level"])
@@ -128,14 +128,14 @@ def test_scan_refuses_a_state_that_rests_in_every_episode(later: float) -> None:
     with pytest.raises(
         DataError, match=r"Unit a \(default\): state 'x' stays where it is in each of 2 episodes, in the first at 0; check the sensor"
     ):
-        scan_population(population({"a": stuck}))
+        scan_prints(population({"a": stuck}))
 
 
 def test_scan_accepts_an_input_held_at_different_levels() -> None:
     levels = [values(i) for i in range(2)]
     for level, episode in enumerate(levels):
         episode[:, 2] = level
-    scan_population(population({"a": levels}))
+    scan_prints(population({"a": levels}))
 
 
 def test_scan_drops_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
@@ -144,25 +144,17 @@ def test_scan_drops_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
     episodes["b"][0][4, 1] = np.nan
     bad = population(episodes)
     with pytest.raises(DataError, match="channel 'x' has 1 NaN at sample 3"):
-        scan_population(bad)
+        scan_prints(bad)
     with caplog.at_level(logging.WARNING):
-        kept = scan_population(bad, on_nan="drop_episode")
-    assert kept.episodes == (EpisodeKey("a", "default", "0"),)
-    assert kept.unit_ids == ("a",)
+        kept = scan_prints(bad, on_nan="drop_episode")
+    assert [key for key, _ in kept] == [EpisodeKey("a", "default", "0")]
     assert [r.message.split(":")[1] for r in caplog.records] == [" Episode 1 of unit a (default)", " Episode 0 of unit b (default)"]
 
 
 def test_scan_takes_the_policy_by_name() -> None:
     samples = values(0)
     samples[3, 0] = np.nan
-    for policy in ("error", OnNan.ERROR):
-        with pytest.raises(DataError, match="1 NaN at sample 3"):
-            scan_population(population({"a": [samples]}), on_nan=policy)
+    with pytest.raises(DataError, match="1 NaN at sample 3"):
+        scan_prints(population({"a": [samples]}), on_nan="error")
     with pytest.raises(ConfigError, match=r"data\.on_nan should be"):
-        scan_population(population(), on_nan="ignore")
-
-
-def test_on_nan_by_name() -> None:
-    assert parse_on_nan("drop_episode") is OnNan.DROP_EPISODE
-    with pytest.raises(ConfigError, match=r"data\.on_nan should be one of \['error', 'drop_episode'\], found 'ignore'"):
-        parse_on_nan("ignore")
+        scan_prints(population(), on_nan="ignore")

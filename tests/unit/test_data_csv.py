@@ -216,7 +216,7 @@ def test_another_rate(folder: Path) -> None:
         ({"channel": [{"name": "x", "role": "state", "column": "pos", "measurd": True}]}, r"channel\[0\]: unknown key 'measurd'"),
         (
             {"channel": [{"name": "x", "role": "output", "column": "pos"}]},
-            r"role: should be one of \['state', 'input', 'truth', 'covariate'\], found 'output'",
+            r"role: should be one of \['state', 'input', 'truth'\], found 'output'",
         ),
         ({"channel": []}, r"there is no \[\[channel\]\]"),
         ({"files": "("}, r"files = '\(' is not a regular expression"),
@@ -287,32 +287,6 @@ def test_restricted_to_one_unit(folder: Path) -> None:
     one = population.select(units=["a"])
     assert len(one.source.recordings.places) == 2  # type: ignore[attr-defined]
     np.testing.assert_array_equal(one.read(one.episodes[0]), population.read(one.episodes[0]))
-
-
-def test_a_list_of_recordings_says_condition_and_group(tmp_path: Path) -> None:
-    for i in range(4):
-        write(tmp_path / f"rec_{i}.csv", samples(i))
-    (tmp_path / "protocol.csv").write_text(
-        "file,unit,condition,group,tester\nrec_0,a,cold,,me\nrec_1,a,warm,,me\nrec_2.csv,b,cold,outliers,you\nrec_3,b,warm,outliers,you\n"
-    )
-    table = mapping(files=r"^rec_(?P<episode>\d)\.csv", lookup="protocol.csv")
-    population = read_csv_folder(tmp_path, table)
-    assert [(k.unit, k.condition, k.episode) for k in population.episodes] == [
-        ("a", "cold", "0"),
-        ("a", "warm", "1"),
-        ("b", "cold", "2"),
-        ("b", "warm", "3"),
-    ]
-    assert [(u.id, u.group) for u in population.units] == [("a", ""), ("b", "outliers")]
-    write(tmp_path / "rec_4.csv", samples(4))
-    with pytest.raises(DataError, match=r"protocol\.csv: there is no row for the file 'rec_4\.csv'"):
-        read_csv_folder(tmp_path, table)
-
-
-def test_a_list_of_recordings_by_what_paths_say(folder: Path) -> None:
-    (folder / "units.csv").write_text("unit;condition;group\na;cold;\nb;cold;outliers\nb;warm;outliers\n")
-    population = read_csv_folder(folder, mapping(lookup="units.csv"))
-    assert [(u.id, u.group) for u in population.units] == [("a", ""), ("b", "outliers")]
 
 
 def test_pieces_are_the_recording_in_parts(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from kros.core import limits
 from kros.core.errors import ConfigError, DataError
 from kros.data import Channel, EpisodeKey, Role, from_arrays, from_frame, from_pykoop, prepare, read, read_parquet, steps, write_parquet
 from kros.data.alerts import period_alerts
-from kros.data.checks import scan_population
+from kros.data.checks import scan_prints
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 MAPPING: dict[str, Any] = {
@@ -34,7 +34,9 @@ def samples(seed: int, n: int = 80) -> np.ndarray:
 
 
 def scan(folder: Path, **mapping: Any) -> Any:
-    return scan_population(read(folder, "csv", mapping={**MAPPING, **mapping}))
+    found = read(folder, "csv", mapping={**MAPPING, **mapping})
+    scan_prints(found)
+    return found
 
 
 # ------------------------------------------------------------------------------------------------------------------------- files of text
@@ -244,7 +246,7 @@ def test_columns_of_another_type(stored: Path, kind: Any) -> None:
 
     rewrite(stored / "a@default.parquet", change)
     with pytest.raises(DataError, match=r"a@default\.parquet: column 'v' should hold numbers of type double"):
-        scan_population(read_parquet(stored))
+        scan_prints(read_parquet(stored))
 
 
 @pytest.mark.parametrize("label", ["unit", "condition", "episode"])
@@ -255,16 +257,16 @@ def test_labels_that_disagree_with_the_index(stored: Path, label: str) -> None:
 
     rewrite(stored / "a@default.parquet", change)
     with pytest.raises(DataError, match=rf"the index says {label} '(a|default|0)', the samples say .*other"):
-        scan_population(read_parquet(stored))
+        scan_prints(read_parquet(stored))
 
 
 def test_files_that_were_exchanged_or_lack_labels(stored: Path) -> None:
     shutil.copy(stored / "b@default.parquet", stored / "a@default.parquet")
     with pytest.raises(DataError, match=r"index says unit 'a', the samples say \['b'\]"):
-        scan_population(read_parquet(stored))
+        scan_prints(read_parquet(stored))
     rewrite(stored / "a@default.parquet", lambda table: table.drop(["unit"]))
     with pytest.raises(DataError, match=r"a@default\.parquet.*unit"):
-        scan_population(read_parquet(stored))
+        scan_prints(read_parquet(stored))
 
 
 @given(st.data())
@@ -314,7 +316,7 @@ def test_copies_are_refused_and_named(tmp_path: Path, copied: Any, part: slice) 
     data = {u: {c: {e: episode(seed) for e, seed in es.items()} for c, es in cs.items()} for u, cs in copied.items()}
     population = from_arrays(data, CHANNELS, 0.01)
     with pytest.raises(DataError, match=r"[Ee]pisode \d of unit \w .* episode 1 of unit a \(c\)"):
-        scan_population(population)
+        scan_prints(population)
     with pytest.raises(DataError, match=r"[Ee]pisode \d of unit \w .* episode 1 of unit a \(c\)"):
         write_parquet(population, tmp_path / "p")
     assert not (tmp_path / "p").exists()
@@ -324,7 +326,7 @@ def test_what_is_alike_is_no_copy() -> None:
     rest = np.zeros((200, 3))
     one, other = (np.concatenate([rest, samples(seed, 100)]) for seed in (0, 1))
     other[:, 2] = one[:, 2]  # the same input, another answer
-    scan_population(from_arrays({"a": [one, other], "b": [1.001 * one]}, CHANNELS, 0.01))
+    scan_prints(from_arrays({"a": [one, other], "b": [1.001 * one]}, CHANNELS, 0.01))
 
 
 @pytest.mark.parametrize("period", [1.0, 0.5, 60.0, 1e-6])

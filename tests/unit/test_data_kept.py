@@ -5,7 +5,7 @@ import pytest
 
 import kros
 from kros.data import read_parquet, write_parquet
-from kros.data.kept import Kept
+from kros.data.readers.parquet import Kept
 
 RAMP = np.arange(40.0).reshape(20, 2)
 

@@ -91,8 +91,6 @@ def test_unknown_reader_and_options(folders: Path) -> None:
         read(folders / "csv", "csv")
     with pytest.raises(ConfigError, match="a CSV mapping is given"):
         read(folders / "parquet", "parquet", mapping=MAPPING)
-    with pytest.raises(ConfigError, match=r"data\.on_nan"):
-        read(folders / "parquet", "parquet", on_nan="")
     with pytest.raises(ConfigError, match=r"data\.prepare\[0\] \(step 'trim'\): unknown key"):
         read(folders / "parquet", "parquet", prepare=[{"step": "trim", "from": 3}])
 
@@ -103,14 +101,6 @@ def test_declared_steps_come_after_the_readers_own(folders: Path, name: str) -> 
     whole = read(folders / name, name, mapping=mapping)
     trimmed = read(folders / name, name, mapping=mapping, prepare=[{"step": "trim", "start": 2}])
     np.testing.assert_array_equal(trimmed.read(whole.episodes[0]), whole.read(whole.episodes[0])[2:])
-
-
-def test_dropping_episodes_at_opening(folders: Path, tmp_path: Path) -> None:
-    for path in (folders / "csv").iterdir():
-        (tmp_path / path.name).write_text(path.read_text())
-    (tmp_path / "a_2.csv").write_text("t,x\n0,1\n0.1,\n0.2,3\n")
-    assert len(read(tmp_path, "csv", mapping=MAPPING).episodes) == 3
-    assert len(read(tmp_path, "csv", mapping=MAPPING, on_nan="drop_episode").episodes) == 2
 
 
 def test_paths_may_be_text(folders: Path) -> None:

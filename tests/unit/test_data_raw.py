@@ -9,7 +9,7 @@ import pytest
 
 from kros.core.errors import DataError
 from kros.data import EpisodeKey, Unit, from_arrays, read_motor_drive_raw, write_raw
-from kros.data.checks import scan_population
+from kros.data.checks import scan_prints
 from kros.data.readers.motor_drive_raw import CHANNELS, STEPS
 
 HEADER = "t,theta,omega,tau,theta_ref,omega_ref"
@@ -206,7 +206,7 @@ def test_constant_state(raw: Path) -> None:
     write_file(folder(raw, "001011") / "cycle_001.csv", samples)
     population = read_motor_drive_raw(raw).select(["001011"], ["noload"])
     with pytest.raises(DataError, match=r"Episode 1 of unit 001011 \(noload\): state 'current' stays at 0\.005 in all 99 samples"):
-        scan_population(population)
+        scan_prints(population)
 
 
 def test_too_short_for_the_offset_or_the_rest(raw: Path) -> None:

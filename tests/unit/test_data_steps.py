@@ -208,53 +208,6 @@ def test_steps_from_toml_refuse(table: dict[str, Any], message: str) -> None:
         steps.parse_steps([table])
 
 
-def test_tare_takes_off_the_mean_of_its_window() -> None:
-    found = prepare(population(counting()), [steps.Tare(("x", "u"), 0, 3)]).read(KEY)
-    np.testing.assert_allclose(found, counting() - [1, 0, 201])
-    np.testing.assert_allclose(prepare(population(counting()), [steps.Tare(("y",))]).read(KEY)[:, 1].mean(), 0, atol=1e-12)
-    with pytest.raises(DataError, match="the tare is taken over samples 2 to 19, the episode has 10"):
-        prepare(population(counting()), [steps.Tare(("x",), 2, 20)]).read(KEY)
-
-
-def test_cut_keeps_what_is_between_two_crossings() -> None:
-    values = counting(12)
-    values[:, 2] = [0, 5, 0, 0, 3, 4, 4, 1, 0, 5, 5, 0]
-    raw = population(values)
-
-    def kept(**events: Any) -> list[float]:
-        return prepare(raw, [steps.Cut("u", 2.5, **events)]).read(KEY)[:, 0].tolist()
-
-    assert kept(start="rising") == list(range(1, 12))
-    assert kept(start="falling", stop="falling") == [2, 3, 4, 5, 6]
-    assert kept(start="falling", stop="falling", before=1, after=2) == [1, 2, 3, 4, 5, 6, 7, 8]
-    assert kept(stop="falling", after=100) == list(range(12))
-    with pytest.raises(DataError, match=r"'u' never crosses 9 rising behind sample 0, found values from 0 to 5"):
-        prepare(raw, [steps.Cut("u", 9, start="rising")]).read(KEY)
-    with pytest.raises(ConfigError, match="needs start or stop"):
-        prepare(raw, [steps.Cut("u", 9)])
-
-
-def test_direction_turns_signs_and_sides_where_the_machine_runs_backwards() -> None:
-    channels = (
-        Channel("v", Role.STATE, measured=True),
-        Channel("force", Role.STATE),
-        Channel("a", Role.INPUT, "bar"),
-        Channel("b", Role.INPUT, "bar"),
-    )
-    values = np.array([[1.0, 7, 1, 2], [-1, 8, 3, 4], [2, 9, 5, 6], [0, 9, 7, 8]])
-    raw = from_arrays({KEY: values}, channels, 0.1)
-    table = [{"step": "by_direction", "channel": "v", "negate": ["force"], "swap": [["a", "b"]]}]
-    np.testing.assert_array_equal(
-        prepare(raw, steps.parse_steps(table)).read(KEY), [[1, 7, 1, 2], [-1, -8, 4, 3], [2, 9, 5, 6], [0, 9, 7, 8]]
-    )
-    whole = prepare(raw, [steps.ByDirection("v", negate=("force",), each="episode")]).read(KEY)
-    np.testing.assert_array_equal(whole, values)
-    backwards = from_arrays({KEY: values * [-1, 1, 1, 1]}, channels, 0.1)
-    np.testing.assert_array_equal(prepare(backwards, [steps.ByDirection("v", ("force",), each="episode")]).read(KEY)[:, 1], -values[:, 1])
-    with pytest.raises(ConfigError, match=r"swap needs pairs of channels with one role and unit, found \['a', 'v'\]"):
-        prepare(raw, [steps.ByDirection("v", swap=(("a", "v"),))])
-
-
 @pytest.mark.parametrize("jitter", [0.0, 1e-12, 1e-5, 0.3])
 def test_the_period_is_the_median_step_in_six_digits(jitter):
     steps = 1e-3 * (1 + jitter * np.random.default_rng(0).uniform(-1, 1, 501))

@@ -132,25 +132,7 @@ def test_a_failed_group_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="NaN"):
         write_group(broken(), "b", "warm", tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_dropping_episodes_while_writing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    write_parquet(broken(), tmp_path / "out", on_nan="drop_episode")
-    assert [k.episode for k in read_parquet(tmp_path / "out").keys("b", "warm")] == ["0", "2"]
-    assert "Episode 1 of unit b (warm)" in caplog.text
-    with pytest.raises(ConfigError, match=r"data\.on_nan should be one of"):
-        write_parquet(broken(), tmp_path / "other", on_nan="skip")
-
-
-def test_dropping_all_episodes_of_a_unit(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    samples = {"a": [values(0)], "b": [values(1)]}
-    samples["b"][0][0, 0] = np.inf
-    write_parquet(from_arrays(samples, CHANNELS, 0.01), tmp_path / "out", on_nan="drop_episode")
-    assert read_parquet(tmp_path / "out").unit_ids == ("a",)
-    assert "Unit b (default) is left out" in caplog.text
-    with pytest.raises(DataError, match="population is empty"):
-        write_parquet(from_arrays({"b": samples["b"]}, CHANNELS, 0.01), tmp_path / "none", on_nan="drop_episode")
-    assert not (tmp_path / "none").exists()
+    assert write_group(broken(), "b", "warm", tmp_path, "drop_episode").episodes == ("0", "2")
 
 
 def test_resting_input(tmp_path: Path) -> None:
@@ -160,7 +142,7 @@ def test_resting_input(tmp_path: Path) -> None:
         write_parquet(from_arrays({"a": [samples]}, CHANNELS, 0.01), tmp_path / "out")
 
 
-def test_existing_folders_are_kept_unless_told(tmp_path: Path) -> None:
+def test_existing_folders_are_kept(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     write_parquet(population(), out)
@@ -168,32 +150,9 @@ def test_existing_folders_are_kept_unless_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="exists and is not empty"):
         write_parquet(population(("c",)), out)
     assert (out / "mine.txt").exists()
-    with pytest.raises(DataError, match="NaN"):
-        write_parquet(broken(), out, overwrite=True)
-    assert_same(read_parquet(out), population())
-    write_parquet(population(("c",)), out, overwrite=True)
-    assert read_parquet(out).unit_ids == ("c",)
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="exists and is not empty"):
-        write_parquet(population(), tmp_path / "file", overwrite=True)
-
-
-def test_what_was_there_comes_back_when_the_move_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "out"
-    write_parquet(population(), out)
-    original = Path.rename
-
-    def full_disk(self: Path, target: Path) -> Path:
-        if self.name == "new":
-            raise OSError("no space left")
-        return original(self, target)
-
-    monkeypatch.setattr(Path, "rename", full_disk)
-    with pytest.raises(OSError, match="no space left"):
-        write_parquet(population(("c",)), out, overwrite=True)
-    monkeypatch.undo()
-    assert_same(read_parquet(out), population())
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+        write_parquet(population(), tmp_path / "file")
 
 
 def test_channel_named_like_a_key_column(tmp_path: Path) -> None:
@@ -245,7 +204,6 @@ def test_what_a_killed_writer_left_goes_and_what_it_moved_aside_comes_back(tmp_p
         write_parquet(population(), out)
     assert (out / "half").exists()
     assert not left.exists()
-    write_parquet(population(), out, overwrite=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["population"]
 
 

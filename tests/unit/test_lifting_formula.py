@@ -10,6 +10,7 @@ import pytest
 
 from kros.core.errors import ConfigError, DimensionError
 from kros.lifting import Lifting
+from kros.lifting.c_code import c_code
 from kros.lifting.formula import Formula, parse
 
 NAMES = ("position", "velocity", "phase")
@@ -88,7 +89,7 @@ def test_c_expression_computes_the_same(tmp_path):
     if compiler is None:
         pytest.skip("no C compiler on this machine")
     formula = Formula("sin(100*position + phase)*velocity**3 - abs(position)/3", NAMES)
-    body = f'double position=0.7,velocity=-1.3,phase=2.1;printf("%.17g",{formula.c_expression()});return 0;'
+    body = f'double position=0.7,velocity=-1.3,phase=2.1;printf("%.17g",{c_code(formula.expression, str)});return 0;'
     source = f"#include <math.h>\n#include <stdio.h>\nint main(void){{{body}}}"
     (tmp_path / "f.c").write_text(source)
     subprocess.run([compiler, str(tmp_path / "f.c"), "-o", str(tmp_path / "f"), "-lm"], check=True)

@@ -5,8 +5,7 @@ import pytest
 
 from kros.core.errors import ConfigError
 from kros.core.lti import gain
-from kros.lifting import Lifting, fourier_features, polynomials, random_centres
-from kros.lifting.centres import grid_centres
+from kros.lifting import Lifting, fourier_features, polynomials
 from kros.lifting.formula import Formula
 from kros.lifting.tables import check_family
 from kros.observer import Observer, ReliftStatus, relift_certificate
@@ -76,9 +75,6 @@ def test_multiplying_out_has_an_end():
         lambda: polynomials(["x", "y", "z"], 10**6),
         lambda: polynomials(["x"], 10**400),
         lambda: fourier_features(["x"], 10**12, 1.0, 0),
-        lambda: random_centres([[0, 1]], 10**12, 0),
-        lambda: grid_centres([[0, 1]] * 3, [10**5] * 3),
-        lambda: grid_centres([[0, 1]], [np.inf]),
         lambda: check_family({"kind": "radial", "names": ["x"], "length": 1, "centres": {"kind": "kmeans", "n": 10**12, "seed": 0}}),
         lambda: check_family({"kind": "harmonics", "angle": 5}),
         lambda: check_family({"kind": "harmonics", "angle": "x", "ratio": 10**400}),

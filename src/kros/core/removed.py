@@ -77,6 +77,33 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
         ),
     ),
     ("Pairs of rows are no longer part of kros; use y of KoopmanRegressor.fit, or GroupKFold.", ("kros.interop.one_step_pairs",)),
+    (
+        "Preparation steps that follow events are no longer part of kros; use offset and trim, or a class of your own that derives from Step.",
+        (
+            "kros.data.steps.ByDirection",
+            "kros.data.steps.Cut",
+            "kros.data.steps.Tare",
+        ),
+    ),
+    (
+        "Centres other than those of k-means are no longer part of kros; use kmeans_centres, or a list of points.",
+        (
+            "kros.lifting.grid_centres",
+            "kros.lifting.latin_hypercube_centres",
+            "kros.lifting.random_centres",
+        ),
+    ),
+    (
+        "Families that only join texts are no longer part of kros; write the formulas under functions or input_functions.",
+        (
+            "kros.lifting.formulas",
+            "kros.lifting.products",
+        ),
+    ),
+    (
+        "Kernels of random Fourier features are no longer a choice; fourier_features approximates the Gaussian kernel.",
+        ("kros.lifting.Kernel",),
+    ),
 )
 
 

@@ -14,9 +14,11 @@ Examples
 4
 """
 
+from ...core.removed import refusing
 from .filtered import Differentiate, Resample
 from .parsing import parse_steps
 from .pointwise import Offset, Scale, Shift, Trim
 from .step import Step
 
 __all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim", "parse_steps"]
+__getattr__ = refusing(__name__)

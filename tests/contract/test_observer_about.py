@@ -10,7 +10,6 @@ import pytest
 import kros
 from kros.core.artifacts import check_checksum
 from kros.observer import Observer
-from kros.observer.about import About
 from kros.plants import PLANTS
 
 MAPPING: dict[str, Any] = {
@@ -81,6 +80,6 @@ def test_what_was_written_is_read(found, tmp_path) -> None:
     study, content = found
     observer = Observer.load(study.folder / "observers" / "deployed.json")
     assert observer.about == content["about"]
-    assert About.of(observer.about, "about").as_it_runs.operating_box == {}
+    assert observer.about["as_it_runs"]["operating_box"] in ({}, None)
     observer.save(tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == (study.folder / "observers" / "deployed.json").read_bytes()

@@ -7,13 +7,11 @@ import pytest
 from batches import batch_of
 from scipy.signal import butter, lfilter
 
-from kros.core.errors import ConfigError, DataError, DimensionError
+from kros.core.errors import DataError, DimensionError
 from kros.core.lti import StateSpace, gain
-from kros.data import Channel, Role
 from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
 from kros.observer import ExtendedKalman, FilteredDifference, Observer, run_observer, run_observers
-from kros.observer.baselines.difference import cutoffs_hz, rates
 from kros.observer.baselines.extended_kalman import start_covariance
 from kros.observer.baselines.learned import Features
 from kros.observer.baselines.learned_moments import Choice, Moments
@@ -111,17 +109,6 @@ def test_filtered_difference_is_that_of_a_butterworth_filter(cutoff_hz):
     rate[2:] = np.diff(y[:-1, :, 0], axis=0) / 1e-3
     wanted = lfilter(*butter(2, cutoff_hz, fs=1e3), rate, axis=0)
     np.testing.assert_allclose(found, wanted, atol=1e-10 * np.abs(wanted).max())
-
-
-def test_rates_follow_from_units_of_measure():
-    states = [Channel(n, Role.STATE, u) for n, u in (("angle", "rad"), ("speed", "rad/s"), ("current", "A"), ("flow", "m/s"))]
-    assert rates(states, ["angle"]) == ((0, 1),)
-    assert rates(states, ["current", "angle"]) == ((1, 1),)
-    assert rates(states, ["current"]) == ()
-    assert rates([*states, Channel("other", Role.STATE, "rad/s")], ["angle"]) == ()
-    with pytest.raises(ConfigError, match="half the sampling"):
-        FilteredDifference(2, ((0, 1),), 600.0, DT)
-    assert 1.0 <= cutoffs_hz(DT).min() < cutoffs_hz(DT).max() < 500
 
 
 def linear_in_the_past(seed=3, units=3, n_samples=900):

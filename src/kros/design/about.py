@@ -25,7 +25,7 @@ _LOSSES = {
 def about(
     task: DesignTask, identified: IdentifiedModels, observer: Observer, certificate: ReliftCertificate, facts: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what `kros.observer.about.About` describes, in the recordings' units."""
+    """Return the object ``about`` of an observer's file, in the recordings' units."""
     population, known, calibration = identified.population, identified.facts, identified.calibration
     as_it_runs = {"certified": certificate.certified, "reason": certificate.reason, "gain": certificate.gain}
     found: dict[str, Any] = {

@@ -18,7 +18,7 @@ from ..evaluate.disturb import hold_missing
 from ..identify import ModelSet
 from ..lifting import Lifting
 from ..observer import ExtendedKalman, FilteredDifference, Seen
-from ..observer.baselines.difference import cutoffs_hz, followed, rates
+from ..observer.baselines.difference import cutoffs_hz, followed
 from ..observer.baselines.extended_kalman import start_covariance
 from ..observer.baselines.kalman import like_measurement_noise
 from ..observer.baselines.learned import Features, Learned
@@ -128,20 +128,16 @@ def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baselin
     """Choose the cut-off of the filtered difference and find its scale."""
     population, data = training.population, training.read()
     states, y, lengths = data.batch.states, data.measurements(measured), data.batch.lengths
-    channels = [c for c in population.channels if c.name in population.states]
     pairs = followed(data.batch, measured)
-    pairs = pairs or rates(channels, [population.states[i] for i in measured])
     if not pairs:
-        units = ", ".join(f"{c.name} ({c.unit or 'no unit'})" for c in channels)
         raise ConfigError(
-            f"Filtered difference: no state follows the rate of a measured one, nor is one named by its unit of measure, found {units}; "
-            "record the rate, or declare units such as rad and rad/s."
+            f"Filtered difference: no state of {', '.join(population.states)} follows the rate of a measured one; record the rate."
         )
     estimated = [state for _, state in pairs]
     truth = states[..., estimated]
     best: tuple[float, FilteredDifference] | None = None
     for cutoff in cutoffs_hz(population.sample_period_s):
-        trial = FilteredDifference(len(channels), pairs, float(cutoff), population.sample_period_s).scaled_to(data.batch, measured)
+        trial = FilteredDifference(len(population.states), pairs, float(cutoff), population.sample_period_s).scaled_to(data.batch, measured)
         error = float(error_percent(trial.run(y, data.batch.inputs)[..., estimated], truth, lengths).mean())
         if best is None or error < best[0]:
             best = (error, trial)

@@ -1,6 +1,6 @@
 """The file of an observer: JSON that a person can read and write, checked in every part when it is read.
 
-A file that kros wrote carries a checksum of its content. One without, from an earlier version or edited by hand, is read all the same, with a
+A file that kros wrote carries a checksum of its content. One without, edited by hand, is read all the same, with a
 warning: everything below is checked either way.
 """
 
@@ -23,8 +23,7 @@ from ..core.loading import as_written
 from ..core.lti import StateSpace
 from ..lifting import Lifting
 from ..synthesis.result import Injection
-from .about import checked_about
-from .data import ObserverData, measurement_replaces
+from .data import ObserverData
 from .monitor import Monitor
 from .runtime import Runtime, Seen
 from .sensor import Sensor
@@ -33,7 +32,6 @@ from .start import Start
 Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
 SCHEMA, KIND = 2, "observer"
-_FIRST = 1  # schema of kros 0.1: matrices and names of states said what `replaces` and `internal` say
 
 
 def observer_content(observer: ObserverData) -> dict[str, Any]:
@@ -76,12 +74,12 @@ def write_observer(observer: ObserverData, path: Path) -> None:
 def read_observer(path: Path) -> ObserverData:
     """Read an observer's file."""
     content = read_json(path)
-    if not isinstance(content, dict) or content.get("kind") != KIND or content.get("schema") not in (_FIRST, SCHEMA):
+    if not isinstance(content, dict) or content.get("kind") != KIND or content.get("schema") != SCHEMA:
         raise DataError(
-            f"Loading an observer from {path}: not an observer file of schema {_FIRST} or {SCHEMA}; write it again with this version of kros."
+            f"Loading an observer from {path}: not an observer file of schema {SCHEMA}; write it again with this version of kros."
         )
     if not check_checksum(content, path):
-        log.warning("The observer of %s carries no checksum: it was edited, or written by an earlier version of kros.", path)
+        log.warning("The observer of %s carries no checksum: it was edited.", path)
     try:
         with as_written("Observer", path):
             return observer_from(content, f"Loading an observer from {path}")
@@ -129,19 +127,12 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
     )
     optional = ("runtime", "sensor", "start_in_motion", "lifting_inputs", "input_functions", "about", CHECKSUM)
     _known(content, [*observer_content(observer), *optional], where)
-    about = checked_about(content.get("about", {}), lifting.states, observer.inputs, lifting.parameters, f"{where}: about")
-    observer = replace(observer, about=about)
-    if content["schema"] == _FIRST:
-        return replace(observer, replaces=measurement_replaces(observer), internal=_named_memories(lifting.states))
+    about = content.get("about", {})
+    _require(isinstance(about, dict), f"{where}: about should be an object", about)
     replaces, internal = content["measurement_replaces_estimate"], content["internal_states"]
     _require(type(replaces) is bool, f"{where}: measurement_replaces_estimate should be true or false", replaces)
     _require(type(internal) is int, f"{where}: internal_states should be a whole number", internal)
-    return replace(observer, replaces=replaces, internal=internal)
-
-
-def _named_memories(states: Sequence[str]) -> int:
-    """The number of states ``memory_1, ...`` at the end, which schema 1 knew by their names."""
-    return next((k for k in range(len(states), 0, -1) if tuple(states[-k:]) == tuple(f"memory_{i + 1}" for i in range(k))), 0)
+    return replace(observer, replaces=replaces, internal=internal, about=about)
 
 
 def matrix(rows: Any, shape: tuple[int, int], where: str) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from ...core.errors import ConfigError, DimensionError
 from ...data import EpisodeBatch
-from ...data.population import Channel
 from ...loops import all_pole
 
 Array = npt.NDArray[np.float64]
@@ -102,20 +101,6 @@ class FilteredDifference:
             power = float(np.sum((rate / largest) ** 2))
             slopes.append(float(np.sum(rate / largest * truth)) / power / largest if power else 1.0)
         return replace(self, scales=tuple(slopes))
-
-
-def rates(channels: Iterable[Channel], measured: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """Return which states are rates of measured ones, found by their units, such as rad and rad/s."""
-    states = list(channels)
-    unit = {c.name: c.unit for c in states}
-    pairs = []
-    for i, name in enumerate(measured):
-        wanted = f"{unit[name]}/s"
-        found = [j for j, c in enumerate(states) if c.unit == wanted and c.name not in measured]
-        alone = sum(unit[other] == unit[name] for other in measured) == 1
-        if unit[name] and alone and len(found) == 1:
-            pairs.append((i, found[0]))
-    return tuple(pairs)
 
 
 def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, int], ...]:

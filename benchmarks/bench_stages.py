@@ -27,7 +27,7 @@ from kros.core.frequency import log_grid
 from kros.data import read, write_raw
 from kros.identify import edmd, free_run, reduce_episode
 from kros.observer import run_observer
-from kros.synthesis import Block, h2, hinf, mixed, mu_upper
+from kros.synthesis import h2, hinf, mixed
 from kros.uncertainty import bounds, choose_nominal, fit_magnitude
 from kros.uncertainty.bilinear import BilinearAxis
 from kros.uncertainty.weights.cover import optimal_cover
@@ -275,28 +275,6 @@ def norms_h2() -> Stage:
     return Stage("30 states, discrete", {"kros": lambda: Entry(lambda: h2_norm(system)), "python-control": control}, float)
 
 
-def structured_values() -> Stage:
-    rng = np.random.default_rng(0)
-    M = rng.normal(size=(60, 6, 6)) + 1j * rng.normal(size=(60, 6, 6))
-
-    def slycot() -> Entry:
-        from slycot import ab13md
-
-        return Entry(lambda: [ab13md(m, np.array([2, 2, 2]), np.array([2, 2, 2]))[0] for m in M], within=1e-4)
-
-    def dkpy() -> Entry:
-        import dkpy
-
-        blocks = [dkpy.ComplexFullBlock(2, 2)] * 3
-        few = np.moveaxis(M[:1], 0, -1)
-        return Entry(lambda: dkpy.SsvLmiBisection(n_jobs=None).compute_ssv(few, blocks)[0], share=1 / 60, within=1e-3)
-
-    return Stage(
-        "60 matrices, 6 × 6, three full blocks",
-        {"kros": lambda: Entry(lambda: mu_upper(M, [Block.full(2)] * 3)), "slycot": slycot, "dkpy": dkpy},
-    )
-
-
 def mixed_norms() -> Stage:
     plant = problems.two_channels()
     note = "one Lyapunov matrix for both norms: its bound of the H2 norm"
@@ -329,7 +307,6 @@ STAGES: dict[str, tuple[Callable[[], Stage], tuple[str, ...]]] = {
     "synthesize: mixed H2/H-infinity controller": (mixed_norms, ("plain",)),
     "certify: H-infinity norm": (norms_hinf, ("python-control, slycot",)),
     "certify: H2 norm": (norms_h2, ("python-control",)),
-    "certify: structured singular values": (structured_values, ("slycot", "dkpy")),
     "evaluate: an observer on all episodes": (observers, ("plain",)),
 }
 MODULES = {"python-control": "control"}

@@ -97,7 +97,7 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
     study.write_text(
         f'[data]\nsource = "recordings"\nreader = "parquet"\n[synthesis]\nmethods = {methods}\n'
         "[predictor]\nsteps = 25\nepisodes = 2\nimportance = {velocity = 16}\n"
-        f"[evaluate]\nfolds = {options.folds}\nrobustness = false\nmonte_carlo = 0\n"
+        f"[evaluate]\nfolds = {options.folds}\nrobustness = false\n"
     )
     config = load_config(study, options.set)
     result = run_study(config, folder / "run", until=Stage.LEFT_OUT, workers=options.workers, progress=Lines())

@@ -22,7 +22,7 @@ from typing import Any
 
 KROS = [sys.executable, "-c", "from kros.cli import app; app()"]
 STUDIES = {
-    "drives": ("harmonic-drive", '[data]\nsource = "drives"\nreader = "parquet"\n[evaluate]\nmonte_carlo = 20\n'),
+    "drives": ("harmonic-drive", '[data]\nsource = "drives"\nreader = "parquet"\n'),
     "pendulums": ("pendulum", '[data]\nsource = "pendulums"\nreader = "parquet"\n[lifting]\nfunctions = ["sin(position)"]\n'),
     "motors": ("dc-motor", '[data]\nsource = "motors-csv"\nreader = "csv"\n[lifting]\nfunctions = ["tanh(velocity)"]\n'),
 }

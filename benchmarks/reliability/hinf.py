@@ -20,7 +20,7 @@ import numpy as np
 from campaign import Tally, main
 
 from kros.core import KrosError, StateSpace
-from kros.synthesis import Block, GeneralizedPlant, hinf, mixed, mu_bounds, mu_lower, mu_upper
+from kros.synthesis import GeneralizedPlant, hinf, mixed
 
 SLYCOT = importlib.util.find_spec("slycot") is not None
 LEVELS = (0.3, 0.7, 0.9, 0.98, 0.999, 1.0001, 1.002, 1.05, 2.0)
@@ -187,33 +187,6 @@ def optimum(rng: np.random.Generator, dt: float, family: str) -> Callable[[], tu
     return tried
 
 
-def structured(rng: np.random.Generator, dt: float) -> Callable[[], tuple[str, bool]]:
-    """One case of `mu_bounds`: a lightly damped system, by default or on a coarse grid of the user's."""
-    n = int(rng.integers(2, 9))
-    A = random_dynamics(rng, n, dt, 10 ** rng.uniform(-7, -1))
-    D = rng.standard_normal((4, 4)) * rng.integers(0, 2)
-    system = StateSpace(A, rng.standard_normal((n, 4)), rng.standard_normal((4, n)), D, dt)
-    scalar, full = Block.scalar(), Block.full(2)
-    blocks = [[scalar] * 4, [full, full], [Block.scalar(2), full], [Block.full(4)]][int(rng.integers(4))]
-    freqs = dense(A, dt)
-    given = np.geomspace(freqs[1], freqs[-1], 40) if rng.random() < 0.3 else None
-
-    def tried() -> tuple[str, bool]:
-        found = mu_bounds(system, blocks, given)
-        response = system.frequency_response(freqs)
-        truth, below = mu_upper(response, blocks).max(), mu_lower(response, blocks)[0].max()
-        if found.everywhere is None or below > found.everywhere * (1 + FALSE) or found.peak_lower > found.everywhere * (1 + FALSE):
-            return "false bound", True
-        if given is None and found.peak < truth * 0.99:
-            return "missed peak", True
-        return (
-            f"bounded everywhere within {'2 %' if found.everywhere <= 1.02 * max(found.peak, truth) else 'more than 2 %'} of the peak",
-            False,
-        )
-
-    return tried
-
-
 def constrained(rng: np.random.Generator, dt: float) -> Callable[[], tuple[str, bool]]:
     """One case of `mixed`: T22 = c + share theta K, theta an all-pass with a zero outside, so that nothing below c is within reach."""
     c, a, share = rng.uniform(0.3, 3), rng.uniform(1.2, 5), (0.0, 1e-6, 1e-3, 1e-1)[int(rng.integers(4))]
@@ -269,8 +242,6 @@ def run(count: int, seed: int) -> list[Tally]:
     for dt in (0.0, 1.0):
         time_axis = "discrete" if dt else "continuous"
         rng = np.random.default_rng([seed, len(tallies)])
-        mu = Tally(f"Structured singular value, lightly damped, {time_axis}", "bounds on dense grids within every pole's width")
-        tallies.append(_tried(mu, structured, dt, count // 20, rng))
         least = Tally(f"Mixed synthesis, constraint within reach or not, {time_axis}", "the least norm by interpolation at a zero")
         tallies.append(_tried(least, constrained, dt, count // 20, rng))
     return tallies
@@ -284,4 +255,4 @@ def _tried(tally: Tally, make: Callable[..., Callable[[], tuple[str, bool]]], dt
 
 if __name__ == "__main__":
     warnings.simplefilter("error", RuntimeWarning)
-    main("hinf", "H-infinity bounds, structured singular values, infeasible mixed problems", run, 1000)
+    main("hinf", "H-infinity bounds, infeasible mixed problems", run, 1000)

@@ -42,7 +42,6 @@ methods = ["residual_h2"]
 baselines = ["open_loop", "kalman_tuned"]
 [evaluate]
 robustness = false
-monte_carlo = 0
 """
 TIMES = {"seconds", "solve_s", "timing_s", "checksum"}  # a checksum is of the times too
 STAGES = ("simulate", "read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report")

@@ -82,7 +82,7 @@ def study(plant: str, population: Population, factors: Factors, folder: Path, *,
             "noise": {"position": NOISE[plant] * factors.get("position", 1.0)},
         },
         "predictor": {"states": 3, "steps": 2},
-        "evaluate": {"robustness": False, "monte_carlo": 0},
+        "evaluate": {"robustness": False},
     }
     if plant == "harmonic-drive":
         raw["calibrate"] = {"ratio": RATIO / factors.get("position", 1.0)}

@@ -11,7 +11,6 @@ FAST = (
     "synthesis.input_weight=3.0",
     'synthesis.methods=["residual_h2"]',
     'observer.baselines=["open_loop", "learned"]',
-    "evaluate.monte_carlo=0",
     "evaluate.robustness=false",
 )
 

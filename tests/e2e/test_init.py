@@ -109,7 +109,7 @@ def test_european_csv_to_a_report_with_two_commands(kros, tmp_path, motors):
     assert result.exit_code == 0, result.output
     assert "winkel_abtrieb [rad]" in result.output
     quick = ["uncertainty.n_freqs=60", "synthesis.input_weight=3.0", 'synthesis.methods=["worst_case_h2"]', "identify.refine=false"]
-    quick += ["evaluate.robustness=false", "evaluate.monte_carlo=0", 'observer.baselines=["open_loop"]', "predictor.effort=quick"]
+    quick += ["evaluate.robustness=false", 'observer.baselines=["open_loop"]', "predictor.effort=quick"]
     result = kros("run", tmp_path / "study.toml", "--out", tmp_path / "run", "--workers", 1, *(a for q in quick for a in ("--set", q)))
     assert result.exit_code == 0, result.output
     assert (tmp_path / "run" / "report.html").stat().st_size > 10_000

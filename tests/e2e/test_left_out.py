@@ -29,7 +29,7 @@ FAST = (
     "[uncertainty]\nn_freqs = 60\nmax_order = 1\n"
     '[synthesis]\ninput_weight = 3.0\nmethods = ["residual_h2"]\n'
     '[observer]\nbaselines = ["open_loop", "kalman_tuned", "filtered_difference", "learned"]\n'
-    "[evaluate]\nfolds = {folds}\nrobustness = false\nmonte_carlo = 0\n"
+    "[evaluate]\nfolds = {folds}\nrobustness = false\n"
 )
 
 

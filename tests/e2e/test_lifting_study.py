@@ -35,7 +35,6 @@ max_order = 1
 
 [evaluate]
 robustness = false
-monte_carlo = 0
 [synthesis]
 input_weight = 3.0
 methods = ["worst_case_h2"]

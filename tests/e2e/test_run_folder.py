@@ -26,7 +26,7 @@ FAST = (
     "[uncertainty]\nn_freqs = 60\nmax_order = 1\n"
     '[synthesis]\ninput_weight = 3.0\nmethods = ["residual_h2"]\n'
     '[observer]\nbaselines = ["open_loop", "kalman_tuned"]\n'
-    "[evaluate]\nrobustness = false\nmonte_carlo = 0\n"
+    "[evaluate]\nrobustness = false\n"
 )
 TIMES = {"seconds", "solve_s", "timing_s", "checksum"}  # a checksum is of the times too
 

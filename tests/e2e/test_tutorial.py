@@ -13,7 +13,7 @@ import pytest
 PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
 # the study of the page takes a minute; what it does is the same
 QUICKER = ["identify.refine=false", 'synthesis.methods=["worst_case_h2"]', 'observer.baselines=["open_loop"]', "synthesis.input_weight=3.0"]
-QUICKER += ["evaluate.robustness=false", "evaluate.monte_carlo=0", "predictor.effort=quick", "uncertainty.n_freqs=60"]
+QUICKER += ["evaluate.robustness=false", "predictor.effort=quick", "uncertainty.n_freqs=60"]
 
 
 def steps() -> list[tuple[str, str]]:

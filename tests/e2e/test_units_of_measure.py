@@ -51,7 +51,7 @@ def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
         "synthesis": {"input_weight": 3.0, "methods": ["worst_case_h2", "residual_h2", "memory"]},
         "sensor": {"position": {"noise": 4e-4 * factors[0]}},
         "predictor": {"states": 2, "steps": 1},
-        "evaluate": {"robustness": False, "monte_carlo": 0},
+        "evaluate": {"robustness": False},
     }
     metrics = run_study(validate_config(raw, folder), folder / "run", until=until).metrics
     return json.loads(json.dumps(metrics)), folder / "run"

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from scipy.signal import place_poles
 
-from kros.core import StateSpace, SynthesisError, gain, h2_norm
+from kros.core import StateSpace, gain, h2_norm
 from kros.synthesis import GeneralizedPlant, h2, kalman
-from kros.synthesis.riccati.constant_gain import luenberger
 
 
 def random_plant(rng, n, dt, d22=True):
@@ -156,23 +154,6 @@ def test_kalman_beats_every_constant_gain():
         L = found.controller.D * (1 + 0.2 * rng.standard_normal((2, 1)))
         other = StateSpace(A - L @ C, np.hstack([np.sqrt(Q), -L * np.sqrt(0.5)]), np.eye(2), np.zeros((2, 3)), 1.0)
         assert h2_norm(other) >= found.h2_norm * (1 - 1e-12)
-
-
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("poles", [[0.3, 0.5, 0.6, 0.9], [0.2, 0.7, 0.5 + 0.3j, 0.5 - 0.3j]])
-def test_the_gain_of_one_measurement_is_that_of_scipy(seed, poles):
-    rng = np.random.default_rng(seed)
-    A, C = np.eye(4) + 0.2 * rng.normal(size=(4, 4)), rng.normal(size=(1, 4))
-    expected = place_poles(A.T, C.T, poles).gain_matrix.T
-    np.testing.assert_allclose(luenberger(A, C, poles).controller.D, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
-
-
-def test_luenberger_places_the_poles():
-    A, C = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[1.0, 0.0]])
-    found = luenberger(A, C, [0.5, 0.6])
-    assert np.sort(np.linalg.eigvals(A - found.controller.D @ C)) == pytest.approx([0.5, 0.6])
-    with pytest.raises(SynthesisError, match=r"0\.5.*|poles"):
-        luenberger(np.diag([1.0, 0.9]), [[0.0, 1.0]], [0.5, 0.6])
 
 
 def test_continuous_lqg_against_scipy_formula():

@@ -9,15 +9,13 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain
-from kros.synthesis import Injection, ObserverProblem, Status, Synthesis, reduce_controller, worst_case_h2, worst_case_hinf
+from kros.synthesis import Injection, ObserverProblem, Status, Synthesis, reduce_controller, worst_case_h2
 from kros.synthesis.result import enclosed
 from kros.synthesis.riccati.filter_bound import predictor_bound
 from kros.synthesis.worst_case.arcs import Enclosure, least_ratio
 from kros.synthesis.worst_case.certificate import certify
 from kros.synthesis.worst_case.disturbance import Channels, Shaping, design_grid
 from kros.synthesis.worst_case.everywhere import Everywhere
-from kros.synthesis.worst_case.robust_gain import RobustGain, robust_gain
-from kros.synthesis.worst_case.worst_case_hinf import lower_bound
 
 DT = 1.0
 FULL = StateSpace([[0.6]], [[1.0, 0.3]], [[0.1], [0.05]], [[0.2, 0.1], [0.0, 0.2]], DT)
@@ -75,7 +73,7 @@ def test_a_lightly_damped_population():
     case = stored("lightly_damped_population")
     nothing = certify(case, gain(np.zeros((4, 1)), case.nominal.dt))[0]
     assert nothing == pytest.approx(24.81, abs=0.005)
-    found = worst_case_h2(case, refinements=0, causal=False)
+    found = worst_case_h2(case, refinements=0)
     assert found.worst_case_h2 <= nothing
     assert 0.7 * nothing < found.lower_bound < found.worst_case_h2
     assert found.gap_percent == pytest.approx(100 * (found.worst_case_h2 / found.lower_bound - 1))
@@ -84,7 +82,7 @@ def test_a_lightly_damped_population():
 def test_the_best_over_orders_is_kept_and_a_bound_belongs_to_all():
     case = replace(stored("lightly_damped_population"), remainder_left=None, remainder_right=None)
     nothing = certify(case, gain(np.zeros((4, 1)), case.nominal.dt))[0]
-    found = [worst_case_h2(case, refinements=0, causal=False, order=order) for order in (1, 4)]
+    found = [worst_case_h2(case, refinements=0, order=order) for order in (1, 4)]
     assert max(f.lower_bound for f in found) < min(f.worst_case_h2 for f in found)
     assert max(f.worst_case_h2 for f in found) <= nothing
 
@@ -236,12 +234,12 @@ def test_no_bound_without_states_or_performance():
 )  # fmt: skip
 def test_no_observer_is_below_the_bound(changes):
     case = small_problem(**changes)
-    found = worst_case_h2(case, refinements=0, causal=False, max_order=1)
+    found = worst_case_h2(case, refinements=0, max_order=1)
     assert 0.4 * found.worst_case_h2 < found.lower_bound <= found.worst_case_h2
     rng = np.random.default_rng(0)
     for injection in (Injection.STATE, Injection.INPUT):
         same = small_problem(**{**changes, "injection": injection})
-        mine = worst_case_h2(same, refinements=0, causal=False, max_order=1)
+        mine = worst_case_h2(same, refinements=0, max_order=1)
         assert mine.lower_bound <= found.worst_case_h2
         for K in others(same, mine, rng):
             assert certify(same, K)[0] >= max(found.lower_bound, mine.lower_bound)
@@ -252,81 +250,9 @@ def test_bound_of_a_white_set_is_the_kalman_optimum():
     case = small_problem()
     A, B, C, W_p = case.scaled
     P = solve_discrete_are(A.T, C.T, (0.3 / 0.7) ** 2 * B @ B.T, np.eye(1))
-    found = worst_case_h2(case, refinements=0, causal=False)
+    found = worst_case_h2(case, refinements=0)
     assert found.lower_bound == pytest.approx(np.sqrt(np.trace(W_p @ P @ W_p.T)), rel=1e-2)
     assert found.lower_bound <= np.sqrt(np.trace(W_p @ P @ W_p.T)) <= found.worst_case_h2
-
-
-def test_bound_in_the_other_norm():
-    case = small_problem(W_L=resonance(0.99, 1.3, 0.4, 0.1))
-    found = worst_case_hinf(case, max_order=2, refinements=0)
-    assert found.lower_bound is not None
-    for K in others(case, found, np.random.default_rng(1)):
-        assert robust_gain(case, K).value >= found.lower_bound
-
-
-def prediction_level(F, G, H, L):
-    """Least H-infinity norm of one-step predictions of ``L x`` from ``y = H x + n``, by iterating the filter's Riccati recursion.
-
-    B. Hassibi, A. H. Sayed and T. Kailath, Indefinite-Quadratic Estimation and Control, SIAM 1999, theorem 4.3.1 (a priori filters).
-    """
-
-    def exists(level):
-        P, both = G @ G.T, np.vstack([H, L])
-        weights = np.diag(np.r_[np.ones(len(H)), -np.full(len(L), level**2)])
-        for _ in range(3000):
-            if np.linalg.eigvalsh(L @ P @ L.T).max() >= level**2:
-                return False
-            step = F @ P @ F.T + G @ G.T - F @ P @ both.T @ np.linalg.solve(weights + both @ P @ both.T, both @ P @ F.T)
-            if np.abs(step - P).max() < 1e-12 * np.abs(P).max():
-                return True
-            P = (step + step.T) / 2
-        return False
-
-    low, high = 0.0, 100.0
-    while high - low > 1e-4 * high:
-        low, high = ((low + high) / 2, high) if not exists((low + high) / 2) else (low, (low + high) / 2)
-    return high
-
-
-@pytest.mark.parametrize("form", ["inverse_input_multiplicative", "additive"])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_bound_in_the_other_norm_is_that_of_prediction(form, seed):
-    """Constant filters: nothing is lost, so the bound is what the filter's own recursion says; two measurements, one state without process noise."""
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((3, 3))
-    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
-    B, level, outer = rng.standard_normal((3, 2)), np.array([0.3, 0.0, 0.2]), form == "additive"
-    case = ObserverProblem(
-        StateSpace(A, B, np.eye(3), np.zeros((3, 2)), DT),
-        rng.standard_normal((2, 3)),
-        gain(0.1 * np.eye(3 if outer else 2), DT),
-        gain(0.1 * np.eye(2), DT),
-        np.ones(2),
-        np.ones(3),
-        np.array([0.5, 0.8]),
-        form=form,
-        process_noise=level,
-    )
-    size = np.diag(rng.uniform(0.2, 0.6, 3 if outer else 2))
-    _, _, C, W = case.scaled
-    V = np.diag(level)
-    if outer:  # e = x + size w with a w of its own at every sample, which is a state here
-        F, G = np.block([[A, np.zeros((3, 3))], [np.zeros((3, 6))]]), np.block([[V, np.zeros((3, 3))], [np.zeros((3, 3)), np.eye(3)]])
-        truth = prediction_level(F, G, C @ np.hstack([np.eye(3), size]), W @ np.hstack([np.eye(3), size]))
-    else:
-        truth = prediction_level(A, np.hstack([B @ size, V]), C, W)
-    found = lower_bound(case, Shaping(gain(size, DT), None, None), 1e-3)
-    assert 0.997 * truth <= found <= 1.0002 * truth
-
-
-def test_a_set_of_one_model_without_noise_has_no_error():
-    """Nothing disturbs the error of the open loop: both bounds are zero, and no gap is told."""
-    found = worst_case_hinf(small_problem(W_L=gain([[0.0]], DT)))
-    assert (found.worst_case_hinf, found.lower_bound, found.gap_percent) == (0.0, 0.0, None)
-    assert found.status is Status.CERTIFIED
-    assert not found.controller.D.any()
-    assert robust_gain(small_problem(W_L=gain([[0.0]], DT)), found.controller) == RobustGain(0.0, 0.0, 0.0)
 
 
 # --- what is handed on
@@ -348,7 +274,7 @@ def test_a_bound_above_what_is_attained_is_never_a_result():
 def test_no_correction_is_kept_where_nothing_is_better():
     """Measurements far worse than the disturbance: what is handed over is not worse than no correction, and reducing it changes nothing."""
     case = small_problem(noise=[1e6], W_L=resonance(0.999, 1.3, 0.4, 0.1))
-    found = worst_case_h2(case, refinements=0, causal=False, max_order=2)
+    found = worst_case_h2(case, refinements=0, max_order=2)
     nothing = certify(case, gain(np.zeros((2, 1)), DT))[0]
     assert found.worst_case_h2 <= nothing
     bare = Synthesis("worst_case_h2", gain(np.zeros((2, 1)), DT), Status.CERTIFIED, Injection.STATE, worst_case_h2=nothing)

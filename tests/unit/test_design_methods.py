@@ -24,7 +24,7 @@ def test_what_does_not_suit_refined_models_is_left_out_with_the_reason(caplog):
 
 
 def test_the_slowest_start_first_and_the_best_guarantee_is_deployed():
-    assert slowest_first(["open_loop", "worst_case_hinf", "residual_h2", "kalman_tuned"]) == [1, 2, 3, 0]
+    assert slowest_first(["open_loop", "worst_case_h2", "residual_h2", "kalman_tuned"]) == [1, 2, 3, 0]
     made = ["koopman/open_loop", "koopman/residual_h2", "koopman_edmd/worst_case_h2", "linear/worst_case_h2"]
     assert preferred(made) == "koopman_edmd/worst_case_h2"
     assert preferred(["koopman/ekf"]) is None

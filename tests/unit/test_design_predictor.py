@@ -11,10 +11,9 @@ from kros.data.population import EpisodeKey
 from kros.design.certificates import certify_running, other_conditions
 from kros.design.methods.design import design
 from kros.design.methods.predictor import EFFORTS, Plan, on_the_circle, recordings
-from kros.design.methods.residual_shaped import TUNED, tuned
 from kros.design.methods.tuned import held_out, tuned_where_better
 from kros.design.settings import PredictorSettings, SynthesisSettings
-from kros.design.task import DesignResult, DesignTask
+from kros.design.task import DesignTask
 from kros.design.uncertain_set import certificate
 from kros.design.validation import TrainingSet, hidden_mean
 from kros.lifting import Lifting
@@ -23,7 +22,6 @@ from kros.observer.limits import Limit
 from kros.observer.predictor.choice import _held_out
 from kros.plants import PLANTS
 from kros.report.verdict import verdict
-from kros.synthesis import kalman
 
 STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "target_velocity")
 DRIVE = Lifting(STATES, ("sin(100*position + phase)",), ("phase",))
@@ -202,24 +200,6 @@ def test_what_is_tuned_is_judged_by_what_counts(tuning, made):
     logs = np.log(np.sqrt(np.mean(error**2, axis=0)))
     cold, warm = (logs[[key.condition == c for key in keys]].mean(axis=0) for c in ("cold", "warm"))
     assert found == pytest.approx(100 * np.exp((cold @ [2.0, 1.0] + warm[0]) / 4.0))
-
-
-def test_a_correction_filter_is_tuned_the_same_way(tuning):
-    own = task(tuning, name="linear/residual_h2", method="residual_h2", lifting=Lifting(STATES))
-    judge = tuning.read()
-    x, u = judge.batch.states, judge.batch.inputs
-    seen, following = np.concatenate([x, u], axis=-1)[:-1].reshape(-1, 5), x[1:].reshape(-1, 3)
-    rows = np.linalg.lstsq(seen, following, rcond=None)[0].T
-    covariance = np.cov((following - seen @ rows.T).T)
-    own.models.A[0], own.models.B[0] = 0.999 * rows[:, :3], rows[:, 3:]
-    start = kalman(own.models.A[0], np.eye(1, 3), covariance, np.array([[1e-10]]), 0.001)
-    kept = tuned(own, DesignResult(own.name, own.observer(start), start, {}))
-    facts = kept.facts
-    assert facts["tuned"]
-    assert facts["held_out_percent"]["after"] < 0.9 * facts["held_out_percent"]["before"]
-    assert kept.uncovered == TUNED
-    assert kept.synthesis.controller.n_states == start.controller.n_states
-    assert "tuned on training episodes" in certificate(own, kept, None)["reason"]
 
 
 def test_the_verdict_claims_no_set_for_it():

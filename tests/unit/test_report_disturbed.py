@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from kros.core.errors import DataError, DimensionError
+from kros.core.errors import DimensionError
 from kros.evaluate import Kind, unit_interval
-from kros.evaluate.intervals import draw_interval, interval_rows, mean_intervals
+from kros.evaluate.intervals import interval_rows, mean_intervals
 from kros.evaluate.robustness import severity_of_growth
 from kros.report.disturbances import Curve, curves, needed, shown_observers
 from kros.report.error_tables import error_table
@@ -85,15 +85,3 @@ def test_no_interval_where_an_estimate_diverged_or_units_are_few():
     rows[1]["error_percent"] = None
     assert ("a", "noload", "v") not in mean_intervals(rows)
     assert mean_intervals(evaluation(units=3)) == {}
-
-
-def test_an_interval_over_noise_and_units_has_the_spread_of_both():
-    """Means of n units of one noisy run each: variances of units and noise add, over n."""
-    rng = np.random.default_rng(3)
-    units, noise, n = 1.0, 0.7, 30
-    values = 5 + units * rng.standard_normal((1, n)) + noise * rng.standard_normal((60, n))
-    lower, upper = draw_interval(values)
-    expected = 2 * 1.96 * np.sqrt((values.mean(axis=0).var() + values.var(axis=0).mean()) / n)
-    assert upper - lower == pytest.approx(expected, rel=0.05)
-    with pytest.raises(DataError, match="2 realisations"):
-        draw_interval(values[:1])

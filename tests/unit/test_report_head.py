@@ -75,7 +75,6 @@ FLAGGED = {"unit": "b", "condition": "default", "score": 9.0, "outlier": True}
         ),
         ({"observers": {"learned": {}}}, Level.LOOK, "synthesis", "No robust observer"),
         ({"left_out": {"rows": [row(NAME, None)], "failed": {}}}, Level.STOP, "left-out", "diverges on some units"),
-        ({"monte_carlo": {"sets": [{"observer": NAME, "exceeded": True}]}}, Level.STOP, "robustness", "the certificate is wrong"),
         ({"study": {"deployed": None}}, Level.STOP, "making", "stopped before an observer was made"),
     ],
 )

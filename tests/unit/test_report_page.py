@@ -296,14 +296,8 @@ def write_disturbed(run: Path, names: list[str]) -> dict[str, Any]:
         for kind, severity in told
         for c in STATES
     ]
-    members = np.random.default_rng(6).uniform(0.1, 0.9, 50)
-    row = {"observer": "koopman_edmd/worst_case_h2", "members": 50, "bound": 1.0, "largest": 0.9, "exceeded": False, "noise": 0.05}
-    row |= {"quantiles": {"0.05": 0.1, "0.5": 0.5, "0.95": 0.8}, "unit_median": 0.3, "unit_worst": 0.4}
-    noise = [{"observer": n, "condition": "noload", "channel": c, "units": 1, "error_percent": 1.0} for n in names for c in STATES]
-    noise = [{**r, "over_noise": [0.9, 1.1], "over_units": None, "over_both": None} for r in noise]
-    content = {"robustness": robustness, "monte_carlo": {"members": 50, "sets": [row], "noise": noise}}
-    arrays = {f"{what}/{row['observer']}": values for what, values in (("members", members), ("units", members[:4]))}
-    save_artifact(run / "disturbed", "disturbed", {**content, "units": ["001"], "seconds": 3.0}, arrays)
+    content = {"robustness": robustness}
+    save_artifact(run / "disturbed", "disturbed", {**content, "units": ["001"], "seconds": 3.0})
     return content
 
 

@@ -125,13 +125,13 @@ def test_verdict_compares_with_the_best_baseline_of_every_channel_by_name() -> N
 
 def test_results_tell_what_baselines_are_not() -> None:
     facts = {
-        "linear/ekf": {"status": "optimal", "correction_off": True},
-        "linear/kalman_tuned": {"status": "optimal", "correction_off": False},
+        "linear/kalman_tuned": {"status": "optimal", "correction_off": True},
+        "koopman/kalman_tuned": {"status": "optimal", "correction_off": False},
         "learned": {"episodes": 30, "episodes_recorded": 47},
         "mean_profile": {"status": "failed", "reason": "Mean profile: no motion is repeated."},
     }
     off, learned, missing = baseline_notes(facts)
-    assert off.endswith("training episodes: linear, extended Kalman.")
+    assert off.endswith("training episodes: linear, tuned Kalman.")
     assert learned == "The learned estimator was trained on 30 of 47 training episodes, from their first sample on."
     assert missing == "Mean profile: no motion is repeated."
     assert baseline_notes({"learned": {"episodes": 47, "episodes_recorded": 47}})[0].startswith(

@@ -20,9 +20,7 @@ from kros.synthesis import (
     kalman,
     mixed,
     worst_case_h2,
-    worst_case_hinf,
 )
-from kros.synthesis.riccati.constant_gain import luenberger
 from kros.synthesis.worst_case.certificate import certify
 
 DT = 1e-3
@@ -245,13 +243,6 @@ def test_kalman_refusals(arguments, error, message):
         kalman(*arguments)
 
 
-def test_luenberger_refusals():
-    with pytest.raises(SynthesisError, match="inside the unit circle"):
-        luenberger([[1.0]], [[1.0]], [1.0])
-    with pytest.raises(DimensionError, match="needs 1 poles"):
-        luenberger([[1.0]], [[1.0]], [0.5, 0.6])
-
-
 def test_published_plant_checks_its_weights():
     nominal, one = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], DT), gain([[1.0]], DT)
     with pytest.raises(DimensionError, match="W_u should be 1 x 1, found 2 x 2"):
@@ -313,7 +304,7 @@ def test_public_names():
         _ = kros.synthesis.nothing
 
 
-@pytest.mark.parametrize("method", [worst_case_h2, worst_case_hinf, mixed])
+@pytest.mark.parametrize("method", [worst_case_h2, mixed])
 def test_where_all_units_are_alike_nothing_is_corrected(method):
     found = method(problem(W_L=gain([[0.0]], DT)))
     assert found.worst_case_h2 == 0

@@ -86,9 +86,9 @@ class SynthesisError(KrosError):
     --------
     >>> import numpy as np
     >>> from kros.core import SynthesisError
-    >>> from kros.synthesis import luenberger
+    >>> from kros.synthesis import kalman
     >>> try:
-    ...     luenberger(np.diag([0.5, 1.0]), [[1.0, 0.0]], [0.1, 0.2])  # the second state is not observed
+    ...     kalman(np.diag([0.5, 1.0]), [[1.0, 0.0]], np.eye(2), [[1.0]])  # the second state is not observed
     ... except SynthesisError as error:
     ...     print(type(error).__name__)
     SynthesisError

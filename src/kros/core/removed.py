@@ -104,6 +104,33 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
         "Kernels of random Fourier features are no longer a choice; fourier_features approximates the Gaussian kernel.",
         ("kros.lifting.Kernel",),
     ),
+    (
+        "Bounds of the structured singular value and D-K iteration are no longer part of kros; hand the uncertain model to dkpy, as "
+        "examples/output_feedback does.",
+        tuple(f"kros.synthesis.{name}" for name in ("Block", "MuBounds", "dk_iteration", "mu_bounds", "mu_lower", "mu_upper")),
+    ),
+    (
+        "Worst-case H-infinity observers and gains are no longer part of kros; use worst_case_h2, which bounds the error of every member too.",
+        (
+            "kros.synthesis.worst_case_hinf",
+            "kros.synthesis.robust_gain",
+            "kros.synthesis.RobustGain",
+            "synthesis.methods=worst_case_hinf",
+        ),
+    ),
+    (
+        "Controllers are no longer polished by descent; use reduce_controller, which truncates in balanced coordinates and certifies the result.",
+        ("kros.synthesis.polish", "synthesis.max_states", "synthesis.tune"),
+    ),
+    (
+        "Placed poles are no longer part of kros; use kalman.",
+        ("kros.synthesis.luenberger",),
+    ),
+    (
+        "Random members of the uncertain set are no longer drawn in a study; the certificate bounds all of them, and the report shows "
+        "disturbed measurements.",
+        ("kros.evaluate.MonteCarlo", "kros.evaluate.sample_errors", "evaluate.monte_carlo"),
+    ),
 )
 
 

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator
 from ..core.errors import ConfigError
 from ..core.settings import Settings
 
-METHODS = Literal["mixed", "paper", "worst_case_h2", "worst_case_hinf", "residual_h2", "memory"]
+METHODS = Literal["mixed", "paper", "worst_case_h2", "residual_h2", "memory"]
 BASELINES = Literal["open_loop", "kalman_tuned", "ekf", "filtered_difference", "learned", "mean_profile"]
 
 
@@ -25,11 +25,7 @@ class SynthesisSettings(Settings):
     )
     input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
     penalty: float = Field(1e-3, gt=0, description="on the correction, relative to the error")
-    max_states: int | None = Field(
-        None, ge=0, description="most states of the filter of worst_case_h2; reduced and polished where it has more"
-    )
     time_limit_s: float = Field(60.0, gt=0, description="for the optimisation of mixed")
-    tune: bool = Field(False, description="whether residual_h2 is tuned on training episodes, which takes some seconds a kind of model")
 
 
 class PredictorSettings(Settings):

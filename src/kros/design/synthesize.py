@@ -84,7 +84,7 @@ class Design:
     @property
     def lower_bound(self) -> float | None:
         """No observer of this kind has a smaller worst-case norm; None where nothing is proven."""
-        return self.synthesis.lower_bound if self.synthesis.bounded_in_h2 else None
+        return self.synthesis.lower_bound if self.synthesis.worst_case_h2 is not None else None
 
     def save(self, folder: Path | str) -> None:
         """Write the observer, its synthesis and its certificate."""
@@ -151,7 +151,7 @@ def synthesize(
     work : Work, optional
         Where it runs.
     **settings
-        Of `SynthesisSettings`: ``methods``, ``injection``, ``input_weight``, ``penalty``, ``max_states``, ``tune``, ``time_limit_s``.
+        Of `SynthesisSettings`: ``methods``, ``injection``, ``input_weight``, ``penalty``, ``time_limit_s``.
 
     Returns
     -------

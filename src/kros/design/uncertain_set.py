@@ -19,7 +19,6 @@ from .task import DesignResult, DesignTask
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-WORST_CASE = ("worst_case_h2", "worst_case_hinf")
 
 
 def usable_problem(
@@ -53,18 +52,17 @@ def certificate(task: DesignTask, found: DesignResult, problem: ObserverProblem 
     facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
     try:
         facts["worst_case_h2"] = certify(problem, synthesis.controller)[0]
-        return facts | (of_units(task, found, problem) if task.method in WORST_CASE else {})
+        return facts | (of_units(task, found, problem) if task.method == "worst_case_h2" else {})
     except SynthesisError as error:
         log.warning("%s: no certificate, %s", task.name, error)
         return facts | {"reason": str(error)}
 
 
 def of_units(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> dict[str, Any]:
-    """Return the bound in the other norm, and whether both hold for the models of all units."""
+    """Return whether the bound holds for the models of all units."""
     assert found.synthesis is not None
     units = check_units(problem, found.synthesis.controller, task.models.systems(task.covered), task.covered)
     if not units.holds:
         log.warning("%s: the error of a unit's model is %.3g times its certified bound", task.name, units.largest_ratio)
-    gain = units.worst_case_hinf if np.isfinite(units.worst_case_hinf) else None
-    facts = {"worst_case_hinf": gain, "causal_h2": found.synthesis.causal_h2, "bound_holds": units.holds}
-    return facts | {"unit_to_bound_max": units.largest_ratio, "unit_to_density_max": float(units.density_ratio.max(initial=0.0))}
+    ratios = {"unit_to_bound_max": units.largest_ratio, "unit_to_density_max": float(units.density_ratio.max(initial=0.0))}
+    return {"bound_holds": units.holds} | ratios

@@ -1,4 +1,4 @@
-"""Evaluation: errors and spectra of estimates and free runs against recordings, also of disturbed ones; Monte Carlo over uncertain sets.
+"""Evaluation: errors and spectra of estimates and free runs against recordings, also of disturbed ones.
 
 Examples
 --------
@@ -10,10 +10,10 @@ Examples
 ([[0.1]], [[2.5]])
 """
 
+from ..core.removed import refusing
 from .disturb import Disturbance, Kind, standard_disturbances
 from .errors import error_percent, error_rms, error_spectrum
 from .intervals import unit_interval
-from .monte_carlo import MonteCarlo, sample_errors
 from .next_unit import next_unit_bound
 from .robustness import DisturbedEpisodes, robustness_rows
 from .truth import TrueErrors, true_errors
@@ -22,15 +22,15 @@ __all__ = [
     "Disturbance",
     "DisturbedEpisodes",
     "Kind",
-    "MonteCarlo",
     "TrueErrors",
     "error_percent",
     "error_rms",
     "error_spectrum",
     "next_unit_bound",
     "robustness_rows",
-    "sample_errors",
     "standard_disturbances",
     "true_errors",
     "unit_interval",
 ]
+
+__getattr__ = refusing(__name__)

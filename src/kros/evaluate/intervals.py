@@ -54,32 +54,6 @@ def unit_interval(values: npt.ArrayLike, draws: int = 4000, seed: int = 0) -> tu
     return _interval(np.tensordot(counts, values, 1))
 
 
-def draw_interval(values: npt.ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[Array, Array]:
-    """Return the 95 % interval of the mean over resampled units, each with one of its noise realisations.
-
-    Parameters
-    ----------
-    values : array_like, shape (realisation, unit, ...)
-    draws, seed : int
-
-    Returns
-    -------
-    lower, upper : ndarray, shape (...)
-        Wider than `unit_interval` of the means over realisations by what realisations differ.
-
-    Raises
-    ------
-    DataError
-        With fewer than two units or realisations.
-    """
-    values = np.asarray(values, dtype=float)
-    if values.ndim < 2 or min(values.shape[:2]) < 2:
-        raise DataError(f"Bootstrap over units and noise: needs at least 2 realisations of 2 units, found values of shape {values.shape}.")
-    rng = np.random.default_rng(seed)
-    n_draws, n_units = values.shape[:2]
-    return _interval(values[rng.integers(n_draws, size=(draws, n_units)), rng.integers(n_units, size=(draws, n_units))].mean(axis=1))
-
-
 def _interval(means: Array) -> tuple[Array, Array]:
     lower, upper = np.quantile(means, _ENDS, axis=0)
     return np.asarray(lower), np.asarray(upper)

@@ -37,7 +37,6 @@ AXES = {
 }
 _LOOKS = {
     "worst_case_h2": Look(Tone.BLUE.light),
-    "worst_case_hinf": Look(Tone.BLUE.light, "--"),
     "residual_h2": Look(Tone.INK.light),
     "memory": Look(Tone.SKY.light),
     "mixed": Look(Tone.ORANGE.light),

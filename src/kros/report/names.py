@@ -19,7 +19,6 @@ _METHODS = {
     "h2": "H2",
     "hinf": "H∞",
     "worst_case_h2": "worst-case H2",
-    "worst_case_hinf": "worst-case H∞",
     "residual_h2": "residual-shaped H2",
     "memory": "subspace predictor",
     "filtered_difference": "filtered difference",

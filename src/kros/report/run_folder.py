@@ -239,13 +239,8 @@ class RunFolder:
 
     @cached_property
     def disturbed(self) -> dict[str, Any]:
-        """What was found on disturbed measurements and on random members of the set; empty where the study asks for neither."""
+        """What was found on disturbed measurements; empty where the study does not ask for it."""
         return load_artifact(self.folder / "disturbed", "disturbed")[0] if self.has("disturbed/disturbed.json") else {}
-
-    @cached_property
-    def members(self) -> dict[str, Array]:
-        """Norms of the errors over random members of the set, ``members/<observer>`` and ``units/<observer>``."""
-        return self._arrays("disturbed", "no member of an uncertain set was drawn")
 
     @cached_property
     def left_out(self) -> dict[str, Any]:

@@ -106,14 +106,6 @@ def _stops(metrics: Metrics, measured: Sequence[str]) -> list[Alert]:
         texts.append(
             ("Designed without the unit it runs on, this kind of observer diverges on some units: do not use it on new ones.", "left-out")
         )
-    wrong = [observer_label(r["observer"]) for r in metrics.get("monte_carlo", {}).get("sets", []) if r["exceeded"]]
-    if wrong:
-        texts.append(
-            (
-                f"A member of the set exceeds the certified bound of {joined(wrong)}: the certificate is wrong; please report it.",
-                "robustness",
-            )
-        )
     return [Alert(Level.STOP, *text) for text in texts]
 
 

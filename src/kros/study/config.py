@@ -70,12 +70,12 @@ class SplitConfig(Settings):
 
 
 class EvaluateConfig(Settings):
-    """Evaluation on units that took no part, on disturbed measurements, and on machines that might be.
+    """Evaluation on units that took no part, and on disturbed measurements.
 
     With `folds` the pooled units are parted into so many folds, and for each the study is made once more on all other units; 0 leaves that out.
     With `reserve` so many units take part in nothing, and their errors bound those of the next unit with this `confidence`.
     With `robustness` observers of the deployed kind of model run on disturbed measurements of a few units, with "all" every observer on all
-    units in all conditions. `monte_carlo` is the number of random members of the certified set that observers are computed for; 0 leaves that out.
+    units in all conditions.
     """
 
     folds: int = Field(
@@ -87,7 +87,6 @@ class EvaluateConfig(Settings):
         True,
         description="disturbed measurements: of the deployed kind of model on a few units, or all observers on all units in all conditions",
     )
-    monte_carlo: int = Field(100, ge=0, description="random members of the certified set that observers are computed for; 0 for none")
 
     @field_validator("folds")
     @classmethod

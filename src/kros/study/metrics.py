@@ -151,7 +151,7 @@ def _observers(context: Context) -> dict[str, Any]:
             synthesis = Synthesis.load(context.store.path("synthesis", name))
             entry |= {"status": synthesis.status, "solve_s": synthesis.solve_s}
             entry |= {key: getattr(synthesis, key) for key in ("h2_norm", "hinf_norm")}
-            if synthesis.bounded_in_h2:  # a Kalman filter's own optimum bounds nothing in the worst case
+            if synthesis.worst_case_h2 is not None:  # a Kalman filter's own optimum bounds nothing in the worst case
                 entry |= {key: getattr(synthesis, key) for key in ("lower_bound", "gap_percent")}
         entries[name] = entry
     return entries
@@ -171,11 +171,11 @@ def _intervals(context: Context) -> list[dict[str, Any]]:
 
 
 def _disturbed(context: Context) -> dict[str, Any]:
-    """Errors against severity, and over noise and random members of the set; only what the study asks for."""
+    """Errors against severity, where the study asks for them."""
     if not context.store.holds("disturbed", "disturbed.json"):
         return {}
     content = load_artifact(context.store.path("disturbed"), "disturbed")[0]
-    return {key: content[key] for key in ("robustness", "monte_carlo") if key in content}
+    return {key: content[key] for key in ("robustness",) if key in content}
 
 
 def _recorded(context: Context) -> dict[str, Any]:

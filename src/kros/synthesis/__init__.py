@@ -1,6 +1,6 @@
 """Synthesis: from an uncertain model to a verified correction filter.
 
-    UncertainModel --> ObserverProblem --> h2 | hinf | mixed | worst_case_h2 | worst_case_hinf | kalman --> Synthesis
+    UncertainModel --> ObserverProblem --> h2 | hinf | mixed | worst_case_h2 | kalman --> Synthesis
 
 Nothing leaves this layer unverified: norms and stability are recomputed by `kros.core`, failure is a `SynthesisError` that says why.
 
@@ -21,77 +21,49 @@ if TYPE_CHECKING:
     from .generalized_plant import GeneralizedPlant
     from .mixed_norms.optimal import mixed
     from .problem.observer_problem import ObserverProblem
-    from .reduction.polishing import polish
     from .reduction.truncation import reduce_controller
     from .residual_shaped.residual_h2 import ResidualProblem, residual_h2
     from .result import Injection, Status, Synthesis
-    from .riccati.constant_gain import kalman, luenberger
+    from .riccati.constant_gain import kalman
     from .riccati.h2_optimal import h2
     from .riccati.hinf_optimal import hinf
-    from .structured.blocks import Block
-    from .structured.bounds import MuBounds, mu_bounds, mu_lower, mu_upper
-    from .structured.dk import dk_iteration
-    from .worst_case.robust_gain import RobustGain, robust_gain
     from .worst_case.unit_check import UnitCheck, check_units
     from .worst_case.worst_case_h2 import worst_case_h2
-    from .worst_case.worst_case_hinf import worst_case_hinf
 
 _HOME = {
-    "Block": "structured.blocks",
     "GeneralizedPlant": "generalized_plant",
     "Injection": "result",
-    "MuBounds": "structured.bounds",
     "ObserverProblem": "problem.observer_problem",
     "ResidualProblem": "residual_shaped.residual_h2",
-    "RobustGain": "worst_case.robust_gain",
     "Status": "result",
     "Synthesis": "result",
     "UnitCheck": "worst_case.unit_check",
     "check_units": "worst_case.unit_check",
-    "dk_iteration": "structured.dk",
     "h2": "riccati.h2_optimal",
     "hinf": "riccati.hinf_optimal",
     "kalman": "riccati.constant_gain",
-    "luenberger": "riccati.constant_gain",
     "mixed": "mixed_norms.optimal",
-    "mu_bounds": "structured.bounds",
-    "mu_lower": "structured.bounds",
-    "mu_upper": "structured.bounds",
-    "polish": "reduction.polishing",
     "reduce_controller": "reduction.truncation",
     "residual_h2": "residual_shaped.residual_h2",
-    "robust_gain": "worst_case.robust_gain",
     "worst_case_h2": "worst_case.worst_case_h2",
-    "worst_case_hinf": "worst_case.worst_case_hinf",
 }
 
 __all__ = [
-    "Block",
     "GeneralizedPlant",
     "Injection",
-    "MuBounds",
     "ObserverProblem",
     "ResidualProblem",
-    "RobustGain",
     "Status",
     "Synthesis",
     "UnitCheck",
     "check_units",
-    "dk_iteration",
     "h2",
     "hinf",
     "kalman",
-    "luenberger",
     "mixed",
-    "mu_bounds",
-    "mu_lower",
-    "mu_upper",
-    "polish",
     "reduce_controller",
     "residual_h2",
-    "robust_gain",
     "worst_case_h2",
-    "worst_case_hinf",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)

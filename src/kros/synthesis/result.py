@@ -80,10 +80,6 @@ class Synthesis:
         H-infinity norm of the closed loop from w (or w2) to z (or z2), recomputed.
     worst_case_h2 : float or None
         Certified H2 norm for every member of the uncertain set.
-    causal_h2 : float or None
-        Largest H2 norm that was found for a causal perturbation: a lower estimate beside `worst_case_h2`, which allows any.
-    worst_case_hinf : float or None
-        Certified H-infinity norm for every member of the uncertain set.
     lower_bound : float or None
         No controller of this kind does better.
     gap_percent : float or None
@@ -112,8 +108,6 @@ class Synthesis:
     h2_norm: float | None = None
     hinf_norm: float | None = None
     worst_case_h2: float | None = None
-    causal_h2: float | None = None
-    worst_case_hinf: float | None = None
     lower_bound: float | None = None
     gap_percent: float | None = None
     quadrature_error: float | None = None
@@ -128,11 +122,6 @@ class Synthesis:
                 f"Synthesis {self.method}: a lower bound of {self.lower_bound} lies above what is attained ({self.gap_percent:.6g} %); "
                 "no result claims that. Please report the problem that led here."
             )
-
-    @property
-    def bounded_in_h2(self) -> bool:
-        """Whether `lower_bound` is about `worst_case_h2`; a worst-case H-infinity observer has both norms and a bound of the other."""
-        return self.worst_case_h2 is not None and self.worst_case_hinf is None
 
     def save(self, folder: Path) -> None:
         """Write `synthesis.json` and `arrays.npz`."""

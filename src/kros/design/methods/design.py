@@ -10,7 +10,7 @@ from .gains import design_kalman_tuned, design_open_loop
 from .predictor import design_predictor
 from .published import design_published
 from .residual_shaped import design_residual_h2
-from .robust import design_mixed, design_worst_case_hinf
+from .robust import design_mixed
 from .sets import design_worst_case
 
 DESIGNS: dict[str, Callable[[DesignTask], DesignResult]] = {
@@ -19,7 +19,6 @@ DESIGNS: dict[str, Callable[[DesignTask], DesignResult]] = {
     "mixed": design_mixed,
     "paper": design_published,
     "worst_case_h2": design_worst_case,
-    "worst_case_hinf": design_worst_case_hinf,
     "residual_h2": design_residual_h2,
     "memory": design_predictor,
 }

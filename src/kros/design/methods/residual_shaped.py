@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import SynthesisError
-from ...observer import Observer, Runtime
 from ...observer.residual.models import ResidualModel, residual_models
-from ...observer.tuning.observer_rows import tune_observer
 from ...synthesis import ResidualProblem, Synthesis, residual_h2
 from ..task import DesignResult, DesignTask, first_of
-from ..validation import ValidationSet
-from .tuned import tuned_where_better
 
 Array = npt.NDArray[np.float64]
 MAX_ORDER = 12
 FITTED = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
-TUNED = "the observer runs rows that were tuned on training episodes"
 _COMPARED = 3
-_TUNE_S, _STEPS = 5.0, 8
 
 
 def design_residual_h2(task: DesignTask) -> DesignResult:
@@ -45,25 +38,7 @@ def design_residual_h2(task: DesignTask) -> DesignResult:
         "rows_fitted_to_single_steps": [task.models.lifting.states[i] for i in models[best].refitted],
     }
     uncovered = FITTED if models[best].refitted else ""
-    found = DesignResult(task.name, observers[best], syntheses[best], facts, task.problem, uncovered)
-    return tuned(task, found) if task.settings.tune else found
-
-
-def tuned(task: DesignTask, found: DesignResult) -> DesignResult:
-    """Return an observer with gains and rows tuned on training episodes, where that is better on those that were held out."""
-    assert found.observer is not None
-    assert found.synthesis is not None
-    data = task.training.read().first(_TUNE_S / task.models.sample_period_s)
-    kept, facts = tuned_where_better(task, data, found.observer, _steps)
-    if kept is found.observer:
-        return replace(found, facts=found.facts | facts)
-    synthesis = replace(found.synthesis, controller=kept.controller)
-    return replace(found, observer=kept, synthesis=synthesis, facts=found.facts | facts, uncovered=TUNED)
-
-
-def _steps(data: ValidationSet, start: Observer) -> Observer:
-    found = tune_observer(replace(start, runtime=Runtime()), data.on_time.batch, _STEPS)[0]
-    return replace(found, runtime=start.runtime)
+    return DesignResult(task.name, observers[best], syntheses[best], facts, task.problem, uncovered)
 
 
 def promising(task: DesignTask) -> list[ResidualModel]:

@@ -1,4 +1,4 @@
-"""Methods for the uncertain set: worst-case H2 and H-infinity, and the paper's mixed problem."""
+"""Methods for the uncertain set: worst-case H2, and the paper's mixed problem."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import SynthesisError
-from ...synthesis import Injection, ObserverProblem, Synthesis, mixed, reduce_controller, worst_case_h2, worst_case_hinf
-from ...synthesis.worst_case.causal import causal_h2
+from ...synthesis import Injection, ObserverProblem, Synthesis, mixed, worst_case_h2
 from ...uncertainty import fit_magnitude
 from ..task import DesignResult, DesignTask, first_of
 from .disturbance_model import TUNED, DisturbanceModel, candidates
@@ -32,33 +31,14 @@ def design_worst_case_h2(task: DesignTask) -> DesignResult:
     if wanted != TUNED:
         model = DisturbanceModel(wanted)
         assumed = model.of(problem)
-        return task.designed(of_few_states(task, assumed, worst_case_h2(assumed, max_order=task.max_order)), assumed, **model.facts())
-    rough = partial(worst_case_h2, tolerance_db=3.0, refinements=0, fit=cached(fit_magnitude), causal=False)
+        return task.designed(worst_case_h2(assumed, max_order=task.max_order), assumed, **model.facts())
+    rough = partial(worst_case_h2, tolerance_db=3.0, refinements=0, fit=cached(fit_magnitude))
     model = best_model(task, problem, partial(rough, bounded=False, max_order=1))
     assumed = model.of(problem)
     _, synthesis = best_design(
         task, [partial(rough, assumed, max_order=order) for order in (1, 2)]
     )  # order 2 in the search takes twice as long
-    synthesis = replace(synthesis, causal_h2=causal_h2(assumed, synthesis.controller))
-    return task.designed(of_few_states(task, assumed, synthesis), assumed, **model.facts())
-
-
-def of_few_states(task: DesignTask, problem: ObserverProblem, synthesis: Synthesis) -> Synthesis:
-    """Return the observer's filter with at most `max_states` states, polished at that order."""
-    most = task.settings.max_states
-    if most is None or synthesis.controller.n_states <= most:
-        return synthesis
-    small = reduce_controller(problem, synthesis, most, polished=True)
-    return replace(small, causal_h2=causal_h2(problem, small.controller))
-
-
-def design_worst_case_hinf(task: DesignTask) -> DesignResult:
-    """Worst-case H-infinity with the disturbance model asked for, or the best one; of low order, to keep the search short."""
-    problem, wanted = task.require_problem(), task.settings.input_weight
-    rough = partial(worst_case_hinf, max_order=2, tolerance_db=3.0, refinements=0, fit=cached(fit_magnitude))
-    model = best_model(task, problem, partial(rough, bounded=False)) if wanted == TUNED else DisturbanceModel(wanted)
-    assumed = model.of(problem)
-    return task.designed(rough(assumed), assumed, **model.facts())
+    return task.designed(synthesis, assumed, **model.facts())
 
 
 def best_model(task: DesignTask, problem: ObserverProblem, design: Callable[[ObserverProblem], Synthesis]) -> DisturbanceModel:

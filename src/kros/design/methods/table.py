@@ -30,7 +30,6 @@ METHODS = (
     Method("mixed", 3.0, 3, not_refined=_LIFTED),
     Method("paper", 1.5, 10, not_refined=_LIFTED),
     Method("worst_case_h2", 4.0, 1),
-    Method("worst_case_hinf", 8.0, 2),
     Method("residual_h2", 2.0, 4),
     Method("memory", 5.0, 5, refined_only=_FITTED),
 )

@@ -43,7 +43,6 @@ FIGURES: dict[str, Row] = {
     "forms_entrywise": Row("Six uncertainty forms, entry by entry", "uncertainty.forms_entrywise"),
     "weights_entrywise": Row("Weights entry by entry", "uncertainty.weights_entrywise"),
     "synthesis": Row("Plant, weights and correction filters", "synthesis.bode"),
-    "members": Row("Random members of the uncertain set", "synthesis.members"),
     "errors": Row("Errors of all observers", "observers.errors"),
     "left_out": Row("Units that were left out", "observers.left_out"),
     "observers_in_time": Row("Estimates", "observers.in_time"),

@@ -15,7 +15,6 @@ SEE = {
     "forms_entrywise": "Every thin line lies below the thick one: entries alone make a form look smaller than it is.",
     "weights_entrywise": "Black lines lie above all blue ones: entries are bounded, which is less than bounding the perturbation.",
     "synthesis": "Where the weights are low the correction may be small; where they are high it has to follow the measurements.",
-    "members": "Nothing may lie right of the black line, the certified bound; the nearer to it, the less the bound gives away.",
     "errors": "Observers are in the order of their errors, the best on top; the deployed one is in bold.",
     "left_out": "Discs as far left as rings say that an observer works as well on a machine that it never saw.",
     "observers_in_time": "The flatter an error, the better the estimate; the zoom shows how much of the oscillation is left in it.",

@@ -7,7 +7,7 @@ from typing import Any
 
 from ...core.artifacts import load_artifact
 from ..content import Cell, Cells, Section, Table, where
-from ..names import number, observer_label
+from ..names import observer_label
 from ..run_folder import NotShownError, RunFolder
 from ..trust import dropout_text, sensor_text, trusts
 from ..verdict import findings
@@ -55,7 +55,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     lists = [
         ("What is claimed", claimed),
         ("Under which assumptions", [*_ASSUMED, *_assumed(run, deployed)]),
-        ("How it was recomputed", [*_RECOMPUTED, *_members(metrics)]),
+        ("How it was recomputed", list(_RECOMPUTED)),
     ]
     return Section("trust", "Trust", [], [table, *_remarks(run)], lists=lists, notes=[_COLUMNS])
 
@@ -66,14 +66,6 @@ def _assumed(run: RunFolder, deployed: str | None) -> list[str]:
         return []
     own = load_artifact(run.folder / "observers", "relift")[0]["certificates"].get(deployed, {}).get("assumptions", [])
     return [f"As “{observer_label(deployed)}” runs: {'; '.join(own)}."] if own else []
-
-
-def _members(metrics: Mapping[str, Any]) -> list[str]:
-    return [
-        f"{row['members']} random members of the set of plants were drawn for “{observer_label(row['observer'])}”: the largest H2 norm of its error is "
-        f"{number(row['largest'])}, the certified bound {number(row['bound'])}."
-        for row in metrics.get("monte_carlo", {}).get("sets", [])[:1]
-    ]
 
 
 def _remarks(run: RunFolder) -> list[Table]:

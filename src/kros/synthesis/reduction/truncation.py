@@ -13,30 +13,26 @@ P. Wortelboer, *Frequency-weighted balanced reduction of closed-loop mechanical 
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
 
 from ...core.errors import ConfigError, SynthesisError
 from ...core.lti import StateSpace
+from ...core.norms import h2_norm, hinf_norm
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
-from ..result import Synthesis
+from ..problem.plants import generalized_plant
+from ..result import Status, Synthesis, enclosed
+from ..riccati.h2_optimal import stability_margin
+from ..worst_case.certificate import certify
 from .balancing import Balancing, gramian_root
-from .objective import Objective, objective_of
-from .polishing import polish
 
 _NEGLIGIBLE = 1e-10
 
 
 def reduce_controller(
-    problem: ObserverProblem | GeneralizedPlant,
-    synthesis: Synthesis,
-    order: int | None = None,
-    largest_loss_percent: float = 2.0,
-    *,
-    polished: bool = False,
+    problem: ObserverProblem | GeneralizedPlant, synthesis: Synthesis, order: int | None = None, largest_loss_percent: float = 2.0
 ) -> Synthesis:
     """Return the controller of lowest order whose certified cost is close to that of the full one.
 
@@ -49,8 +45,6 @@ def reduce_controller(
     order : int, optional
         Reduce to this order, whatever it costs. Default: the lowest with at most `largest_loss_percent`.
     largest_loss_percent : float
-    polished : bool
-        Polish every order before it is judged (`polish`), which often makes a lower one do.
 
     Returns
     -------
@@ -78,44 +72,76 @@ def reduce_controller(
     """
     if largest_loss_percent < 0 or (order is not None and order < 0):
         raise ConfigError(f"Order reduction: order = {order} and largest_loss_percent = {largest_loss_percent} should not be negative.")
-    start = time.perf_counter()
-    objective = objective_of(problem)
-    full = objective.inside(synthesis.controller)
-    allowed = objective.value(full) * (1 + largest_loss_percent / 100)
-    if not np.isfinite(allowed):
+    full = synthesis.controller
+    before = _cost(problem, full)
+    if not np.isfinite(before):
         raise SynthesisError("Order reduction: the controller to be reduced does not stabilise; start from one that does.")
     if not full.n_states:
         return synthesis
-    balancing = objective.balanced(full)
+    balancing = _balanced(problem, full)
     for k in range(full.n_states) if order is None else [min(order, full.n_states)]:
-        for value, how, K in _candidates(balancing, full, k, objective):
-            if not polished and order is None and value > allowed:
-                continue
-            what = f"order {full.n_states} reduced to {K.n_states} by {how}"
-            candidate = objective.restated(synthesis, objective.outside(K), what, time.perf_counter() - start)
-            if polished:
-                candidate = polish(problem, candidate)
-                value = objective.value(objective.inside(candidate.controller))
-            if order is not None or value <= allowed:
-                return candidate
+        for value, how, K in _candidates(problem, balancing, full, k):
+            if order is not None or value <= before * (1 + largest_loss_percent / 100):
+                note = f"order {full.n_states} reduced to {K.n_states} by {how}: cost {value:.6g} against {before:.6g} before"
+                return _restated(problem, synthesis, K, note)
     if order is not None:
         raise SynthesisError(f"Order reduction: no controller of order {order} that was found stabilises; ask for a higher one.")
     return synthesis
 
 
-def _candidates(balancing: Balancing, full: StateSpace, k: int, objective: Objective) -> list[tuple[float, str, StateSpace]]:
+def _cost(problem: ObserverProblem | GeneralizedPlant, K: StateSpace) -> float:
+    """Certified worst-case H2 norm, or the H2 norm of channel 1; infinite where the controller does not stabilise."""
+    if isinstance(problem, GeneralizedPlant):
+        return h2_norm(problem.channel(problem.rows(1), problem.columns(1)).close(K))
+    try:
+        return certify(problem, K)[0]
+    except SynthesisError:
+        return float("inf")
+
+
+def _balanced(problem: ObserverProblem | GeneralizedPlant, K: StateSpace) -> Balancing:
+    """Balance the states of a controller by the blocks of the closed loop's Gramians."""
+    if isinstance(problem, ObserverProblem):
+        plant, K = generalized_plant(problem), problem.to_scaled(K)
+    else:
+        plant = problem.channel(problem.rows(1), problem.columns(1))
+    closed, n = plant.close(K), plant.sizes[0]
+    return Balancing.of(gramian_root(closed.A, closed.B, closed.dt)[n:], gramian_root(closed.A.T, closed.C.T, closed.dt)[n:])
+
+
+def _candidates(
+    problem: ObserverProblem | GeneralizedPlant, balancing: Balancing, full: StateSpace, k: int
+) -> list[tuple[float, str, StateSpace]]:
     """Reduced controllers of one order that stabilise, the better one first."""
-    order = min(k, len(balancing.values))
-    found = []
+    order, found = min(k, len(balancing.values)), []
     for how, reduced in (("truncation", balancing.truncated), ("residualisation", balancing.residualised)):
         try:
             K = reduced(full, order)
         except np.linalg.LinAlgError:
             continue
-        value = objective.value(K)
-        if np.isfinite(value):
+        if np.isfinite(value := _cost(problem, K)):
             found.append((value, how, K))
     return sorted(found, key=lambda row: row[0])
+
+
+def _restated(problem: ObserverProblem | GeneralizedPlant, synthesis: Synthesis, K: StateSpace, note: str) -> Synthesis:
+    """Recompute norms and certificate of another controller; a lower bound stays, since it does not depend on the controller."""
+    if isinstance(problem, ObserverProblem):
+        value, error = certify(problem, K)
+        loop, white = problem.error_system(K), problem.nominal.n_inputs + problem.nominal.n_states
+        noise = h2_norm(StateSpace(loop.A, loop.B[:, white:], loop.C, loop.D[:, white:], loop.dt))
+        radius = float(loop.spectral_radius())
+        found = replace(synthesis, worst_case_h2=value, quadrature_error=error, h2_norm=noise, hinf_norm=None, spectral_radius=radius)
+        bounded = synthesis.worst_case_h2 is not None
+    else:
+        value, closed, two = _cost(problem, K), problem.close(K), problem.channel(problem.rows(2), problem.columns(2))
+        split = problem.n_w1 is not None or problem.n_z1 is not None
+        gain = hinf_norm(two.close(K) if split else closed)
+        found = replace(synthesis, worst_case_h2=None, h2_norm=value, hinf_norm=gain, spectral_radius=stability_margin(closed))
+        bounded = synthesis.method in ("h2", "mixed")
+    lower, gap, notes = enclosed(value, synthesis.lower_bound) if bounded else (None, None, ())
+    notes = (*synthesis.notes, note, *notes)
+    return replace(found, controller=K, status=Status.CERTIFIED, lower_bound=lower, gap_percent=gap, notes=notes)
 
 
 def truncate(plant: GeneralizedPlant, n_states: int) -> tuple[GeneralizedPlant, float]:

@@ -1,6 +1,4 @@
-r"""Steady-state Kalman predictor and Luenberger observer: the baselines with a constant gain.
-
-Both correct the state directly: ``x_hat+ = A x_hat + B u + L (y - C x_hat)``.
+"""Steady-state Kalman predictor: a constant correction of the state, ``x_hat+ = A x_hat + B u + L (y - C x_hat)``.
 
 Symbols
 -------
@@ -10,7 +8,6 @@ Q, R : process and measurement noise covariance;  P : covariance of the one-step
 from __future__ import annotations
 
 import time
-import warnings
 from typing import Any
 
 import numpy as np
@@ -24,7 +21,6 @@ from ..result import Injection, Status, Synthesis
 from .equations import discrete_gain, solve_riccati
 
 Array = npt.NDArray[Any]
-_CLOSE = 1e-6  # to the poles that are wanted
 
 
 def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLike, dt: float = 1.0) -> Synthesis:
@@ -99,88 +95,6 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
         spectral_radius=radius,
         solve_s=elapsed,
         solver="riccati",
-    )
-
-
-def _only_gain(A: Array, C: Array, poles: Array) -> Array | None:
-    """Return the gain of one measurement, which is unique; None where rounding decides.
-
-    Left eigenvectors of A - L C are ``w' = (w' L) C (A - p I)^-1`` with ``w' L = 1``.
-    """
-    try:
-        W = np.vstack([np.linalg.solve((A - p * np.eye(len(A))).T, C[0]) for p in poles])
-        size = np.abs(W).max(axis=1)
-        if size.min() < np.finfo(float).tiny:  # nothing is measured
-            return None
-        L = np.linalg.solve(W / size[:, None], 1 / size).real[:, None]
-        reached = np.linalg.eigvals(A - L @ C)
-    except np.linalg.LinAlgError:  # singular, or no numbers any more
-        return None
-    return L if max(np.abs(reached - p).min() for p in poles) <= _CLOSE else None
-
-
-def _one_of_many_gains(A: Array, C: Array, poles: Array) -> Array:
-    """Return the gain whose eigenvectors are conditioned well."""
-    from scipy.signal import place_poles  # a second to load
-
-    with warnings.catch_warnings():  # of eigenvectors that could be better conditioned still; the poles reached are checked
-        warnings.filterwarnings("ignore", message="Convergence was not reached", category=UserWarning)
-        return np.asarray(place_poles(A.T, C.T, poles).gain_matrix.T)
-
-
-def luenberger(A: npt.ArrayLike, C: npt.ArrayLike, poles: npt.ArrayLike, dt: float = 1.0) -> Synthesis:
-    """Return the constant gain that places the poles of the error dynamics (17).
-
-    Parameters
-    ----------
-    A : array_like, shape (n, n)
-    C : array_like, shape (q, n)
-    poles : array_like, shape (n,)
-        Wanted poles, inside the unit circle, complex ones in conjugate pairs; none repeated more than q times.
-    dt : float, s
-
-    Raises
-    ------
-    SynthesisError
-        When a pole is not inside the unit circle, the pair is not observable enough to move it, or the poles cannot be placed.
-
-    Examples
-    --------
-    >>> from kros.synthesis import luenberger
-    >>> luenberger([[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.0]], [0.5, 0.6]).controller.D.round(6).ravel().tolist()
-    [0.9, 2.0]
-    """
-    A, C = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (A, C))
-    wanted = np.atleast_1d(np.asarray(poles))
-    if wanted.shape != (A.shape[0],) or C.shape[1:] != A.shape[:1]:
-        raise DimensionError(f"Luenberger observer: needs {A.shape[0]} poles and C (q, {A.shape[0]}), found {wanted.shape} and {C.shape}.")
-    if np.abs(wanted).max() >= 1:
-        raise SynthesisError(
-            f"Luenberger observer: wanted poles should lie inside the unit circle, found magnitude {np.abs(wanted).max():.6g}."
-        )
-    start = time.perf_counter()
-    try:
-        L = _only_gain(A, C, wanted) if len(C) == 1 else None
-        L = _one_of_many_gains(A, C, wanted) if L is None else L
-    except (ValueError, np.linalg.LinAlgError) as error:
-        raise SynthesisError(
-            f"Luenberger observer: the poles cannot be placed ({error}); use distinct poles in conjugate pairs, or measure more."
-        ) from error
-    elapsed = time.perf_counter() - start
-    reached = np.linalg.eigvals(A - L @ C)
-    miss = max(np.abs(reached - pole).min() for pole in wanted)
-    if miss > 1e-3:
-        raise SynthesisError(
-            f"Luenberger observer: a pole was missed by {miss:.3g}; the pair (A, C) is nearly unobservable, keep that pole where A has it."
-        )
-    return Synthesis(
-        "luenberger",
-        gain(L, dt),
-        Status.OPTIMAL,
-        Injection.STATE,
-        spectral_radius=float(np.abs(reached).max()),
-        solve_s=elapsed,
-        solver="pole placement",
     )
 
 

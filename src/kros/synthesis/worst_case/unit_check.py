@@ -14,7 +14,6 @@ s : scaled input;  e : error;  x_p : state of the unit
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,17 +21,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DimensionError, SynthesisError
+from ...core.errors import DimensionError
 from ...core.lti import StateSpace
-from ...core.norms import h2_norm, hinf_norm
+from ...core.norms import h2_norm
 from ..problem.interconnect import interconnect
 from ..problem.observer_problem import ObserverProblem
 from .certificate import certify, density
 from .disturbance import design_grid
-from .robust_gain import robust_gain
 
 Array = npt.NDArray[Any]
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,48 +39,45 @@ class UnitCheck:
     Parameters
     ----------
     units : tuple of str
-    h2_norm, hinf_norm : ndarray, shape (unit,)
-        Norms of ``W_p S (Gp - G) W_u``.
+    h2_norm : ndarray, shape (unit,)
+        Norm of ``W_p S (Gp - G) W_u``.
     density_ratio : ndarray, shape (unit,)
         Largest ratio, over a grid of frequencies, of the unit's root power density to the bound's, both without noise: the sharpest test, since
         norms may hide a frequency.
-    worst_case_h2, worst_case_hinf : float
-        The certified bounds, noise included; infinite where none is proven.
+    worst_case_h2 : float
+        The certified bound, noise included.
 
     Examples
     --------
     >>> import numpy as np
     >>> from kros.synthesis import UnitCheck
-    >>> UnitCheck(("a",), np.array([0.1]), np.array([0.2]), np.array([0.9]), worst_case_h2=0.3, worst_case_hinf=0.4).holds
+    >>> UnitCheck(("a",), np.array([0.1]), np.array([0.9]), worst_case_h2=0.3).holds
     True
     """
 
     units: tuple[str, ...]
     h2_norm: Array
-    hinf_norm: Array
     density_ratio: Array
     worst_case_h2: float
-    worst_case_hinf: float
 
     @property
     def largest_ratio(self) -> float:
-        """Largest ratio of a unit's norm to its bound, over units and both norms; zero where there is no unit."""
-        ratios = [self.h2_norm / self.worst_case_h2, self.hinf_norm / self.worst_case_hinf]
-        return float(np.max(ratios, initial=0.0))
+        """Largest ratio of a unit's norm to the bound; zero where there is no unit."""
+        return float(np.max(self.h2_norm / self.worst_case_h2, initial=0.0))
 
     @property
     def holds(self) -> bool:
-        """Whether every unit is below both bounds."""
+        """Whether every unit is below the bound."""
         return self.largest_ratio <= 1
 
     def rows(self) -> list[dict[str, Any]]:
         """Return the table, one row a unit."""
-        columns = ("h2_norm", "hinf_norm", "density_ratio")
+        columns = ("h2_norm", "density_ratio")
         return [{"unit": unit} | {c: float(getattr(self, c)[k]) for c in columns} for k, unit in enumerate(self.units)]
 
 
 def check_units(problem: ObserverProblem, controller: StateSpace, units: StateSpace, unit_ids: Sequence[str] | None = None) -> UnitCheck:
-    """Compare the error of every unit's model with the certified bounds.
+    """Compare the error of every unit's model with the certified bound.
 
     Parameters
     ----------
@@ -132,20 +126,9 @@ def check_units(problem: ObserverProblem, controller: StateSpace, units: StateSp
     return UnitCheck(
         tuple(unit_ids) if unit_ids is not None else tuple(str(k) for k in range(len(errors))),
         np.array([h2_norm(e) for e in errors]),
-        np.array([hinf_norm(e, tol=1e-4) for e in errors]),
         np.array([np.max(s / np.maximum(bound, 1e-300)) for s in size]),
         certify(problem, controller)[0],
-        _gain_or_infinity(problem, controller),
     )
-
-
-def _gain_or_infinity(problem: ObserverProblem, controller: StateSpace) -> float:
-    """Infinity is a bound too, where no smaller one is proven."""
-    try:
-        return robust_gain(problem, controller).value
-    except SynthesisError as error:
-        log.warning("%s", error)
-        return float("inf")
 
 
 def unit_error(problem: ObserverProblem, controller: StateSpace, A_p: Array, B_p: Array) -> StateSpace:

@@ -16,7 +16,6 @@ from ...core.lti import StateSpace
 from ...core.norms import h2_norm
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis, enclosed
-from .causal import causal_h2
 from .disturbance import Channels, Fit, Shaping, default_fit, design_grid, symmetric
 from .search import Search
 from .shaped_filter import design
@@ -31,7 +30,6 @@ def worst_case_h2(
     refinements: int = 1,
     rtol: float = 1e-5,
     fit: Fit | None = None,
-    causal: bool = True,
     bounded: bool = True,
 ) -> Synthesis:
     """Return an observer filter with a certified H2 norm for every member of the uncertain set.
@@ -51,8 +49,6 @@ def worst_case_h2(
     fit : callable, optional
         ``fit(freqs_hz, magnitude, dt, order=, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter; default
         `kros.uncertainty.fit_magnitude`.
-    causal : bool
-        Estimate the worst causal perturbation as well.
     bounded : bool
         False: only the first design, neither certified nor bounded from below, for those who design many and compare them on recordings.
 
@@ -60,8 +56,7 @@ def worst_case_h2(
     -------
     Synthesis
         ``worst_case_h2`` with ``quadrature_error`` included, ``lower_bound`` for all observers of either injection, and their gap; ``h2_norm``
-        is the norm of the error under measurement and process noise alone (the nominal machine), ``causal_h2`` the largest norm that was found
-        for a causal perturbation: the truth for those lies between it and ``worst_case_h2``.
+        is the norm of the error under measurement and process noise alone (the nominal machine).
 
     Raises
     ------
@@ -91,9 +86,9 @@ def worst_case_h2(
         spectrum = spectrum.mixed_with(*channels.worst(search.best.controller), 1 / round_)
         search.again(spectrum)
     if not symmetric(problem):
-        return _result(problem, search, search.bound(channels.below_average()), causal)
+        return _result(problem, search, search.bound(channels.below_average()))
     worst = channels.worst(search.best.controller)
-    return _result(problem, search, search.bound(spectrum.mixed_with(*worst, 1 / (refinements + 1))), causal)
+    return _result(problem, search, search.bound(spectrum.mixed_with(*worst, 1 / (refinements + 1))))
 
 
 def _design_alone(problem: ObserverProblem, shaping: Shaping) -> Synthesis:
@@ -109,7 +104,7 @@ def _design_alone(problem: ObserverProblem, shaping: Shaping) -> Synthesis:
     )
 
 
-def _result(problem: ObserverProblem, search: Search, lower: float | None, causal: bool) -> Synthesis:
+def _result(problem: ObserverProblem, search: Search, lower: float | None) -> Synthesis:
     best, loop = search.best, problem.error_system(search.best.controller)
     n_d = problem.nominal.n_inputs + problem.nominal.n_states
     lower, gap, notes = enclosed(best.value, lower)
@@ -120,7 +115,6 @@ def _result(problem: ObserverProblem, search: Search, lower: float | None, causa
         injection=problem.injection,
         h2_norm=h2_norm(StateSpace(loop.A, loop.B[:, n_d:], loop.C, loop.D[:, n_d:], loop.dt)),
         worst_case_h2=best.value,
-        causal_h2=causal_h2(problem, best.controller) if causal else None,
         lower_bound=lower,
         gap_percent=gap,
         quadrature_error=best.error,

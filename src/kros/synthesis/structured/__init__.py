@@ -1,1 +1,0 @@
-"""Structured perturbations: bounds of the structured singular value, and D-K iteration."""

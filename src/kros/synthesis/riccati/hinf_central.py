@@ -19,7 +19,6 @@ stabilizing controllers that satisfy an H-infinity-norm bound", Systems & Contro
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -36,18 +35,6 @@ _AXIS = 1e-14
 _ROUNDING = 1e-12
 _NEGATIVE = 1e-7
 _ASYMMETRY = 1e-5
-
-
-class Obstacle(str, Enum):
-    """What stands against a level in floating point. None of them proves that no controller attains it: `hinf_bound` does."""
-
-    DIRECT = "the direct gain from w to z cannot be brought below it"
-    CONTROL_AXIS = "the control Hamiltonian has eigenvalues on the stability boundary"
-    FILTER_AXIS = "the filter Hamiltonian has eigenvalues on the stability boundary"
-    CONTROL_SIGN = "the control Riccati solution is not positive semidefinite"
-    FILTER_SIGN = "the filter Riccati solution is not positive semidefinite"
-    COUPLING = "the spectral radius of X Y reaches gamma squared"
-    NUMERICAL = "a Riccati equation could not be solved accurately"
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +72,10 @@ def normalise(p: GeneralizedPlant) -> Normalised:
     )
 
 
-def central(p: GeneralizedPlant, gamma: float) -> StateSpace | Obstacle:
-    """Return the central controller of a normalised plant for the level `gamma`, or what stands against it."""
+def central(p: GeneralizedPlant, gamma: float) -> StateSpace | None:
+    """Return the central controller of a normalised plant for the level `gamma`; None proves nothing, `hinf_bound` does."""
     if gamma <= direct_bound(p):
-        return Obstacle.DIRECT
+        return None
     n, n_w, _, n_z, _ = p.sizes
     B, C = np.hstack([p.B1, p.B2]), np.vstack([p.C1, p.C2])
     row, column = np.hstack([p.D11, p.D12]), np.vstack([p.D11, p.D21])
@@ -100,22 +87,19 @@ def central(p: GeneralizedPlant, gamma: float) -> StateSpace | Obstacle:
         X = _stabilising(p.A, B, p.C1, row, R)
         Y = _stabilising(p.A.T, C.T, p.B1.T, column.T, S)
         if X is None or Y is None:
-            return Obstacle.NUMERICAL
-        if isinstance(X, str):
-            return Obstacle.CONTROL_AXIS if X == "axis" else Obstacle.CONTROL_SIGN
-        if isinstance(Y, str):
-            return Obstacle.FILTER_AXIS if Y == "axis" else Obstacle.FILTER_SIGN
+            return None
         coupling = Y @ X / gamma**2
         if np.abs(np.linalg.eigvals(coupling)).max(initial=0.0) >= 1:
-            return Obstacle.COUPLING
+            return None
         F = -np.linalg.solve(R, row.T @ p.C1 + B.T @ X)
         L = -np.linalg.solve(S, column @ p.B1.T + C @ Y).T
         return _assemble(p, gamma, F, L, np.eye(n) - coupling)
     except (LinAlgError, ValueError):
-        return Obstacle.NUMERICAL
+        return None
 
 
 def _assemble(p: GeneralizedPlant, gamma: float, F: Array, L: Array, E: Array) -> StateSpace:
+    """Central controller (Zhou, Doyle and Glover, theorem 17.1)."""
     _, n_w, n_u, n_z, n_y = p.sizes
     free_z, free_w = n_z - n_u, n_w - n_y
     D1111, D1112 = p.D11[:free_z, :free_w], p.D11[:free_z, free_w:]
@@ -128,8 +112,8 @@ def _assemble(p: GeneralizedPlant, gamma: float, F: Array, L: Array, E: Array) -
     return StateSpace(A, solved, F[n_w:] - D @ innovation, D, 0.0)
 
 
-def _stabilising(A: Array, B: Array, C: Array, D: Array, R: Array) -> Array | str | None:
-    """Stabilising X of the indefinite Riccati equation; "axis" or "sign" when there is none that is semidefinite, None in doubt."""
+def _stabilising(A: Array, B: Array, C: Array, D: Array, R: Array) -> Array | None:
+    """Stabilising X of the indefinite Riccati equation; None when there is none that is semidefinite, or in doubt."""
     n = len(A)
     if not n:
         return np.zeros((0, 0))
@@ -143,7 +127,7 @@ def _stabilising(A: Array, B: Array, C: Array, D: Array, R: Array) -> Array | st
     T, Z, stable = schur(H, output="real", sort="lhp")
     # LAPACK's real Schur form has the real parts of all eigenvalues on its diagonal.
     if stable != n or np.abs(np.diag(T)).min() <= _AXIS * np.linalg.norm(H):
-        return "axis"
+        return None
     X1, X2 = Z[:n, :n], Z[n:, :n]
     product = X1.T @ X2
     if np.abs(product - product.T).max() > _ASYMMETRY * max(np.abs(product).max(), 1e-3):
@@ -151,4 +135,4 @@ def _stabilising(A: Array, B: Array, C: Array, D: Array, R: Array) -> Array | st
     X: Array = np.linalg.solve(X1.T, X2.T).T
     X = unit * (X + X.T) / 2
     values = np.linalg.eigvalsh(X)
-    return "sign" if values[0] < -_NEGATIVE * max(values[-1], -values[0], 1e-300) and values[0] < -1e-10 else X
+    return None if values[0] < -_NEGATIVE * max(values[-1], -values[0], 1e-300) and values[0] < -1e-10 else X

@@ -161,4 +161,5 @@ def _root(w: float, inner: float, z: float) -> float:
 
 
 def _diagonal(a: Array, b: Array) -> Array:
+    """Block diagonal matrix."""
     return np.block([[a, np.zeros((len(a), len(b)))], [np.zeros((len(b), len(a))), b]])

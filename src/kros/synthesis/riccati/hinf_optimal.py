@@ -15,10 +15,8 @@ from __future__ import annotations
 import time
 import warnings
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...core.errors import ConfigError, KrosError, SynthesisError
 from ...core.lti import StateSpace, gain
@@ -28,17 +26,15 @@ from ..generalized_plant import GeneralizedPlant
 from ..result import Injection, Status, Synthesis
 from .h2_optimal import h2, stability_margin
 from .hinf_bound import proven_bound
-from .hinf_central import Obstacle, central
-from .hinf_coordinates import Balance, Coordinates, coordinates
+from .hinf_central import central
+from .hinf_coordinates import Coordinates, coordinates
 from .hinf_pointwise import direct_bound
-
-Array = npt.NDArray[Any]
 
 _MAX_STEPS = 60
 _MAX_RAISES = 40
 _NEGLIGIBLE = 1e-9
 _ROUNDING = 1e-5
-_RELAXATIONS = np.geomspace(1e-6, 1.0, 13)
+_COARSE = 1e-3
 
 
 def hinf(
@@ -89,169 +85,113 @@ def hinf(
     start = time.perf_counter()
     if 0 in plant.sizes[2::2]:
         return _without_control(plant, injection, gamma)
-    search = _Search.begin(plant, tolerance)
-    search = search.at(gamma) if gamma is not None else search.bisect(tolerance)
+    if gamma is not None:
+        (best, lower), vanishes = _at(plant, gamma), False
+    else:
+        best, lower, vanishes = _optimum(plant, coordinates(plant), tolerance)
     elapsed = time.perf_counter() - start
-    return _result(search, injection, elapsed, tolerance if gamma is None else None)
+    optimal = gamma is None and (vanishes or best.norm <= lower * (1 + tolerance) * (1 + 2e-6))
+    return _result(plant, best, 0.0 if vanishes else lower, optimal, injection, elapsed)
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
-    """The best controller so far with its recomputed norm, and the proven bound; later coordinates are for levels where earlier ones fail."""
+class _Loop:
+    """A controller and the recomputed norm of its closed loop; infinite where there is none or it is unstable."""
 
-    plant: GeneralizedPlant
-    frames: tuple[Coordinates, ...]
     K: StateSpace | None
-    norm: float
-    lower: float
-    scale: float
+    norm: float = float("inf")
 
-    @classmethod
-    def begin(cls, plant: GeneralizedPlant, tolerance: float) -> _Search:
-        """Bracket the optimum: controllers that are at hand from above, what is proven from below."""
-        frames = tuple(coordinates(plant, balance) for balance in Balance)
-        search = cls(plant, frames, None, float("inf"), 0.0, 0.0)
-        _, _, n_u, _, n_y = plant.sizes
-        search = search.consider(gain(np.zeros((n_u, n_y)), plant.dt))
-        search = search.consider(_h2_controller(plant))
-        for frame in frames:
-            if search.K is None and (K := _h2_controller(frame.plant)) is not None:
-                search = search.consider(frame.controller(K))
-        return search._open().proven(tolerance)
 
-    def proven(self, tolerance: float) -> _Search:
-        """Raise the bound, looking from the best norm downwards."""
-        return replace(self, lower=max(self.lower, proven_bound(self.plant, self.norm, tolerance)))
+def _closed(plant: GeneralizedPlant, K: StateSpace | None) -> _Loop:
+    """Close the loop; what a controller is worth is its norm, whatever the equations promise."""
+    try:
+        return _Loop(None) if K is None else _Loop(K, hinf_norm(plant.close(K)))
+    except (KrosError, np.linalg.LinAlgError):
+        return _Loop(None)
 
-    def uncancelled(self) -> float:
-        """Size that the closed loop would have if nothing in it cancelled: a norm far below it is rounding."""
-        assert self.K is not None
-        closed = self.plant.close(self.K)
-        direct = float(np.linalg.norm(self.plant.D11))
-        if not closed.n_states:
-            return direct
-        n = closed.n_states
-        states = StateSpace(closed.A, closed.B, np.eye(n), np.zeros((n, closed.n_inputs)), closed.dt)
-        top = 0.5 / closed.dt if closed.dt > 0 else 10 * max(float(closed.spectral_radius()), 1e-300)
-        gains = np.linalg.norm(states.frequency_response(top * np.geomspace(1e-6, 1, 50)), axis=-1)
-        return direct + float((gains @ np.linalg.norm(closed.C, axis=0)).max())
 
-    def consider(self, K: StateSpace | None) -> _Search:
-        """Keep the controller if its closed loop is stable and better than the best so far."""
-        if K is None:
-            return self
-        try:
-            norm = hinf_norm(self.plant.close(K))
-        except (KrosError, np.linalg.LinAlgError):
-            return self
-        return replace(self, K=K, norm=norm) if norm < self.norm else self
+def _level(plant: GeneralizedPlant, frame: Coordinates, gamma: float) -> _Loop:
+    """Try one level."""
+    K = central(frame.plant, gamma)
+    try:
+        return _closed(plant, None if K is None else frame.controller(K))
+    except SynthesisError:
+        return _Loop(None)
 
-    def level(self, gamma: float) -> tuple[_Search, Obstacle | None]:
-        """Try one level; what the controller is worth is the norm of its closed loop, whatever the equations promise."""
-        search, verdict = self, None
-        for frame in self.frames:
-            found = central(frame.plant, gamma)
-            if isinstance(found, Obstacle):
-                verdict = verdict or found
-                continue
-            try:
-                search = search.consider(frame.controller(found))
-            except SynthesisError:
-                continue
-            if search.norm <= gamma * (1 + 1e-6):
-                return search, None
-        return search, verdict
 
-    def alone(self, gamma: float) -> _Search:
-        """Controllers of one level without those that are at hand, which may be better but less calm."""
-        return replace(self, K=None, norm=float("inf")).level(gamma)[0]
-
-    def at(self, gamma: float) -> _Search:
-        """Controller for a level that was asked for."""
-        for margin in (0.0, 1e-7, 1e-6, 1e-5):
-            search = self.alone(gamma * (1 - margin))
-            if search.norm <= gamma * (1 + 1e-6 * (margin > 0)):
-                return search
-        best = self.bisect(1e-3)
-        if best.norm <= gamma:
+def _first(plant: GeneralizedPlant, frame: Coordinates) -> _Loop:
+    """Any stable loop: without control, of the H2 optimum, else of a level that is raised until there is one."""
+    best = min((_idle(plant), _closed(plant, _h2_controller(plant))), key=lambda loop: loop.norm)
+    gamma = 2 * max(direct_bound(plant), float(np.linalg.norm(plant.D11)), 1e-3)
+    for _ in range(_MAX_RAISES):
+        if np.isfinite(best.norm):
             return best
-        reached = f"the best that was reached is {best.norm:.6g}, and no controller is below {best.lower:.6g}"
-        if best.lower >= gamma:
-            _, why = self.level(gamma)
-            reason = f" ({why.value})" if why is not None else ""
-            raise SynthesisError(f"H-infinity synthesis: the level gamma = {gamma:.6g} is out of reach{reason}; {reached}. Raise gamma.")
-        raise SynthesisError(
-            f"H-infinity synthesis: the level gamma = {gamma:.6g} was not reached, which does not prove that it cannot be; {reached}. Raise gamma, or scale "
-            "states, inputs and outputs to similar size."
-        )
-
-    def bisect(self, tolerance: float) -> _Search:
-        """Close the gap to the proven bound, or come as low as the equations lead."""
-        search = self
-        for _ in range(2):
-            calm = search.alone(search.lower * (1 + 0.9 * tolerance))
-            if calm.norm <= search.lower * (1 + tolerance):
-                return calm
-            search = search._narrow(tolerance)
-            if search._closed(tolerance):
-                break
-            search = search.proven(tolerance)
-        return search
-
-    def _closed(self, tolerance: float) -> bool:
-        return self.norm <= max(self.lower * (1 + tolerance), _NEGLIGIBLE * self.scale)
-
-    def _narrow(self, tolerance: float) -> _Search:
-        """Bisect between the bound and the best norm. A level that fails only leads the search elsewhere; nothing is concluded from it."""
-        search, low = self, self.lower
-        floor = _NEGLIGIBLE * search.scale
-        for _ in range(_MAX_STEPS):
-            high = search.norm
-            if high <= max(low * (1 + tolerance / 4), floor) or search._closed(tolerance):
-                break
-            bottom = max(low, floor)
-            middle = float(np.sqrt(bottom * high)) if high > 2 * bottom else (bottom + high) / 2
-            search, _ = search.level(middle)
-            if search.norm > middle * (1 + 1e-6):
-                low = middle
-        for relaxation in _RELAXATIONS:
-            trial = max(search.lower, floor) * (1 + relaxation)
-            if search._closed(tolerance) or trial >= search.norm:
-                break
-            search, _ = search.level(trial)
-        return search
-
-    def _open(self) -> _Search:
-        """Find any controller when none is at hand, by raising the level."""
-        search, gamma, obstacle = self, 2 * max(direct_bound(self.plant), float(np.linalg.norm(self.plant.D11)), 1e-3), None
-        for _ in range(_MAX_RAISES):
-            if np.isfinite(search.norm):
-                return replace(search, scale=search.uncancelled())
-            search, obstacle = search.level(gamma)
-            gamma *= 4
-        reason = obstacle.value if obstacle is not None else "no closed loop was stable"
-        raise SynthesisError(
-            f"H-infinity synthesis: no level up to {gamma:.3g} was attained ({reason}); scale states, inputs and outputs to similar size, "
-            "or raise noise and penalty."
-        )
+        best = _level(plant, frame, gamma)
+        gamma *= 4
+    raise SynthesisError(
+        f"H-infinity synthesis: no level up to {gamma:.3g} was attained; scale states, inputs and outputs to similar size, "
+        "or raise noise and penalty."
+    )
 
 
-def _result(search: _Search, injection: Injection, elapsed: float, tolerance: float | None) -> Synthesis:
-    K, plant = search.K, search.plant
-    if K is None or not np.isfinite(search.norm):
-        raise SynthesisError("H-infinity synthesis: no controller survived verification; scale states, inputs and outputs to similar size.")
-    norm, lower = search.norm, search.lower
-    _, _, n_u, _, n_y = plant.sizes
-    if tolerance is not None and K.n_states:
-        idle = replace(search, norm=float("inf")).consider(gain(np.zeros((n_u, n_y)), plant.dt))
-        if idle.norm <= lower * (1 + tolerance):
-            K, norm = gain(np.zeros((n_u, n_y)), plant.dt), idle.norm
-    vanishes = norm <= 10 * _NEGLIGIBLE * search.scale
-    if not vanishes and lower > norm * (1 + _ROUNDING):
+def _idle(plant: GeneralizedPlant) -> _Loop:
+    """Close the loop without control."""
+    return _closed(plant, gain(np.zeros((plant.sizes[2], plant.sizes[4])), plant.dt))
+
+
+def _optimum(plant: GeneralizedPlant, frame: Coordinates, tolerance: float) -> tuple[_Loop, float, bool]:
+    """Bisect between the proven bound and the best norm; the last value tells whether the optimum is zero.
+
+    A level that fails only leads the search elsewhere; nothing is concluded from it.
+    """
+    idle, best = _idle(plant), _first(plant, frame)
+    floor = _NEGLIGIBLE * (idle.norm if np.isfinite(idle.norm) else best.norm)
+    low = lower = proven_bound(plant, best.norm, tolerance)
+    if idle.norm <= lower * (1 + tolerance):
+        return idle, lower, False
+    middle = lower * (1 + 0.9 * tolerance)  # where the bound is tight this is the end, and a calmer controller than that of the optimum
+    for _ in range(_MAX_STEPS):
+        trial = _level(plant, frame, middle)
+        best = min((best, trial), key=lambda loop: loop.norm)
+        if trial.norm > middle * (1 + 1e-6):
+            low = middle
+        if best.norm <= max(low * (1 + tolerance / 4), lower * (1 + tolerance), floor):
+            break
+        bottom = max(low, floor)
+        middle = float(np.sqrt(bottom * best.norm)) if best.norm > 2 * bottom else (bottom + best.norm) / 2
+    if best.norm > lower * (1 + tolerance):
+        lower = max(lower, proven_bound(plant, best.norm, tolerance))
+    return best, lower, best.norm <= floor
+
+
+def _at(plant: GeneralizedPlant, gamma: float) -> tuple[_Loop, float]:
+    """Controller for a level that was asked for, and the proven bound."""
+    frame = coordinates(plant)
+    for margin in (0.0, 1e-7, 1e-6, 1e-5):
+        loop = _level(plant, frame, gamma * (1 - margin))
+        if loop.norm <= gamma:
+            return loop, proven_bound(plant, loop.norm, _COARSE)
+    best, lower, _ = _optimum(plant, frame, _COARSE)
+    if best.norm <= gamma:
+        return best, lower
+    reached = f"the best that was reached is {best.norm:.6g}, and no controller is below {lower:.6g}"
+    if lower >= gamma:
+        raise SynthesisError(f"H-infinity synthesis: the level gamma = {gamma:.6g} is out of reach; {reached}. Raise gamma.")
+    raise SynthesisError(
+        f"H-infinity synthesis: the level gamma = {gamma:.6g} was not reached, which does not prove that it cannot be; {reached}. Raise gamma, or scale "
+        "states, inputs and outputs to similar size."
+    )
+
+
+def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, injection: Injection, elapsed: float) -> Synthesis:
+    """Recompute the rest; the gap follows from the norm and the bound."""
+    K, norm = best.K, best.norm
+    assert K is not None
+    if lower > norm * (1 + _ROUNDING):
         raise SynthesisError(
             f"H-infinity synthesis: internal error, the bound {lower:.9g} lies above the norm {norm:.9g} that is attained; please report the plant."
         )
-    optimal = tolerance is not None and (vanishes or norm <= lower * (1 + tolerance) * (1 + 2e-6))
+    lower = min(lower, norm)
     closed = plant.close(K)
     return Synthesis(
         method="hinf",
@@ -260,8 +200,8 @@ def _result(search: _Search, injection: Injection, elapsed: float, tolerance: fl
         injection=injection,
         h2_norm=_h2_norm(closed),
         hinf_norm=norm,
-        lower_bound=0.0 if vanishes else min(lower, norm),
-        gap_percent=0.0 if vanishes else (100 * (norm / min(lower, norm) - 1) if lower > 0 else None),
+        lower_bound=lower,
+        gap_percent=100 * (norm / lower - 1) if lower > 0 else None,
         spectral_radius=stability_margin(closed),
         solve_s=elapsed,
         solver="riccati",

@@ -31,7 +31,7 @@ from ...core.lti import StateSpace
 from ...core.norms import h2_norm, hinf_norm
 from ..assumptions import require
 from ..generalized_plant import GeneralizedPlant
-from ..result import Injection, Status, Synthesis
+from ..result import Status, Synthesis
 from .equations import discrete_gain, solve_riccati
 
 Array = npt.NDArray[Any]
@@ -39,15 +39,13 @@ Array = npt.NDArray[Any]
 _AGREEMENT, _ROUNDING = 1e-4, 1e-12
 
 
-def h2(plant: GeneralizedPlant, injection: Injection = Injection.NONE) -> Synthesis:
+def h2(plant: GeneralizedPlant) -> Synthesis:
     """Return the controller with the smallest H2 norm from w to z.
 
     Parameters
     ----------
     plant : GeneralizedPlant
         ``D12`` of full column rank, ``D21`` of full row rank, and ``D11 = 0`` in continuous time.
-    injection : Injection
-        Recorded in the result, for plants of observers.
 
     Returns
     -------
@@ -84,7 +82,6 @@ def h2(plant: GeneralizedPlant, injection: Injection = Injection.NONE) -> Synthe
         method="h2",
         controller=K,
         status=Status.OPTIMAL,
-        injection=injection,
         h2_norm=norm,
         hinf_norm=hinf_norm(closed),
         lower_bound=lower,

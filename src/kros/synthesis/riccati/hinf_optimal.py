@@ -23,7 +23,7 @@ from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm, hinf_norm
 from ..assumptions import require
 from ..generalized_plant import GeneralizedPlant
-from ..result import Injection, Status, Synthesis
+from ..result import Status, Synthesis
 from .h2_optimal import h2, stability_margin
 from .hinf_bound import proven_bound
 from .hinf_central import central
@@ -37,9 +37,7 @@ _ROUNDING = 1e-5
 _COARSE = 1e-3
 
 
-def hinf(
-    plant: GeneralizedPlant, *, gamma: float | None = None, tolerance: float = 1e-5, injection: Injection = Injection.NONE
-) -> Synthesis:
+def hinf(plant: GeneralizedPlant, *, gamma: float | None = None, tolerance: float = 1e-5) -> Synthesis:
     r"""Return a controller with the smallest H-infinity norm from w to z, or one below a given level.
 
     .. math:: \min_K \|T_{zw}\|_\infty = \min_K \sup_\omega \bar\sigma(T_{zw}(e^{j\omega\Delta t}))
@@ -52,8 +50,6 @@ def hinf(
         Ask for this level instead of the optimum. A level well above the optimum gives a calmer controller.
     tolerance : float
         Distance of the norm from the proven bound, as a fraction of it, at which the search ends.
-    injection : Injection
-        Recorded in the result, for plants of observers.
 
     Returns
     -------
@@ -84,14 +80,14 @@ def hinf(
     require(plant, "H-infinity synthesis", proper=False)
     start = time.perf_counter()
     if 0 in plant.sizes[2::2]:
-        return _without_control(plant, injection, gamma)
+        return _without_control(plant, gamma)
     if gamma is not None:
         (best, lower), vanishes = _at(plant, gamma), False
     else:
         best, lower, vanishes = _optimum(plant, coordinates(plant), tolerance)
     elapsed = time.perf_counter() - start
     optimal = gamma is None and (vanishes or best.norm <= lower * (1 + tolerance) * (1 + 2e-6))
-    return _result(plant, best, 0.0 if vanishes else lower, optimal, injection, elapsed)
+    return _result(plant, best, 0.0 if vanishes else lower, optimal, elapsed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +179,7 @@ def _at(plant: GeneralizedPlant, gamma: float) -> tuple[_Loop, float]:
     )
 
 
-def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, injection: Injection, elapsed: float) -> Synthesis:
+def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, elapsed: float) -> Synthesis:
     """Recompute the rest; the gap follows from the norm and the bound."""
     K, norm = best.K, best.norm
     assert K is not None
@@ -197,7 +193,6 @@ def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, i
         method="hinf",
         controller=K,
         status=Status.OPTIMAL if optimal else Status.CERTIFIED,
-        injection=injection,
         h2_norm=_h2_norm(closed),
         hinf_norm=norm,
         lower_bound=lower,
@@ -208,7 +203,7 @@ def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, i
     )
 
 
-def _without_control(plant: GeneralizedPlant, injection: Injection, gamma: float | None) -> Synthesis:
+def _without_control(plant: GeneralizedPlant, gamma: float | None) -> Synthesis:
     """Nothing to choose: no control, or no measurement; by then the plant is known to be stable."""
     open_loop = StateSpace(plant.A, plant.B1, plant.C1, plant.D11, plant.dt)
     norm = hinf_norm(open_loop)
@@ -218,7 +213,6 @@ def _without_control(plant: GeneralizedPlant, injection: Injection, gamma: float
         method="hinf",
         controller=gain(np.zeros((plant.sizes[2], plant.sizes[4])), plant.dt),
         status=Status.OPTIMAL,
-        injection=injection,
         h2_norm=_h2_norm(open_loop),
         hinf_norm=norm,
         lower_bound=norm,

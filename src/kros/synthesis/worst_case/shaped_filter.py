@@ -82,7 +82,7 @@ def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:
     """Return the filter that is H2-optimal for the shaped disturbances, in physical units."""
     d, r = shaping.at_input_and_state(problem)
     if problem.injection is Injection.INPUT or problem.performance.n_states:
-        return problem.to_physical(h2(shaped_plant(problem, d, r), problem.injection).controller)
+        return problem.to_physical(h2(shaped_plant(problem, d, r)).controller)
     return problem.to_physical(_kalman(problem, d, r))
 
 

@@ -31,13 +31,7 @@ _MAX_ITERATIONS = 60
 
 
 def as_state_space(system: Any) -> StateSpace:
-    """Return one system as `StateSpace`; anything with `A, B, C, D, dt` will do.
-
-    Raises
-    ------
-    DimensionError
-        When it is a batch, or an attribute is missing.
-    """
+    """Return one system as `StateSpace`; anything with `A, B, C, D, dt` will do."""
     system = StateSpace.of(system)
     if system.batch_shape:
         raise DimensionError(

@@ -129,10 +129,7 @@ def _alarms(above: npt.NDArray[np.bool_]) -> int:
 
 
 def bound_of_peaks(peaks: Sequence[Sequence[float]], rate: float) -> float:
-    r"""Return what the highest level of one more unit, on as many motions of its own, exceeds with probability `rate`, in dB.
-
-    With few episodes e, which units share, :math:`\bar m + \sqrt{(b - \bar m)^2 + \max(t_{e-1}^2 - t_5^2,\, 0)\, 2v}`, v from halves of the episodes.
-    """
+    r"""Return what the highest level of one more unit, on as many motions of its own, exceeds with probability `rate`, in dB."""
     from scipy.special import stdtrit
 
     highest, shared = np.array([max(own) for own in peaks]), min(map(len, peaks))

@@ -141,20 +141,7 @@ class Measured:
             )
 
     def under(self, disturbances: Sequence[Disturbance | None], seed: int = 0) -> Measured:
-        """Return the measurements under every disturbance, side by side.
-
-        Parameters
-        ----------
-        disturbances : sequence of Disturbance or None
-            None for the measurements as recorded.
-        seed : int
-
-        Returns
-        -------
-        Measured
-            Batch of ``len(disturbances) * batch`` episodes, the first disturbance of all episodes first. NaN where a sample is missing; the
-            first sample of an episode never is, since that is where observers start.
-        """
+        """Return the measurements under every disturbance, side by side."""
         n_samples, batch, q = self.y.shape
         y = np.empty((n_samples, len(disturbances), batch, q))
         parameters = {name: np.repeat(values[None], len(disturbances), axis=0) for name, values in self.parameters.items()}

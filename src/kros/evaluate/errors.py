@@ -53,20 +53,7 @@ class ErrorSummary:
 
 
 def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> ErrorSummary:
-    """Summarise the error of an estimate.
-
-    Parameters
-    ----------
-    estimate, truth : ndarray, shape (n_samples, batch, n)
-    lengths : ndarray, shape (batch,)
-        Samples of every episode that count.
-    dt : float, s
-
-    Returns
-    -------
-    ErrorSummary
-        Not-a-number or infinite where the estimate diverged.
-    """
+    """Summarise the error of an estimate."""
     return summarise_all(estimate[None], truth, lengths, dt)[0]
 
 

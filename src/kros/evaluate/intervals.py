@@ -60,20 +60,7 @@ def _interval(means: Array) -> tuple[Array, Array]:
 
 
 def mean_intervals(rows: Sequence[Mapping[str, Any]], role: str = "off_nominal") -> dict[Cell, tuple[float, float]]:
-    """Return the 95 % interval of the mean error over units, by observer, condition and channel; the same resampled units for all.
-
-    Parameters
-    ----------
-    rows : sequence of mapping
-        As ``evaluation`` in ``metrics.json``: observer, unit, role, condition, channel, error_percent.
-    role : str
-        Of the units that count.
-
-    Returns
-    -------
-    dict
-        Nothing where an estimate diverged or there are fewer than three units.
-    """
+    """Return the 95 % interval of the mean error over units, by observer, condition and channel; the same resampled units for all."""
     found: dict[Cell, dict[str, float | None]] = {}
     for row in rows:
         if row["role"] == role:

@@ -136,28 +136,7 @@ def robustness_rows(
 
 
 def severity_of_growth(severities: npt.ArrayLike, errors: npt.ArrayLike, factor: float = 2.0) -> float:
-    """Return the severity at which an error reaches a multiple of that without disturbance.
-
-    Between two severities the square of the error is taken to be linear in the square of the severity, as for independent noise.
-
-    Parameters
-    ----------
-    severities : array_like, shape (k,)
-        Rising, the first one zero.
-    errors : array_like, shape (k,)
-        NaN or infinite where an estimate diverged.
-    factor : float
-
-    Returns
-    -------
-    float
-        Infinite where the error never grows that much.
-
-    Raises
-    ------
-    DimensionError
-        When the first severity is not zero, or lengths differ.
-    """
+    """Return the severity at which an error reaches a multiple of that without disturbance."""
     s, e = np.asarray(severities, dtype=float), np.asarray(errors, dtype=float)
     if s.shape != e.shape or s.ndim != 1 or not len(s) or s[0] != 0:
         raise DimensionError(f"Severity of growth: severities {s} should begin at zero, with as many errors, found {e.shape}.")

@@ -20,16 +20,7 @@ Array = npt.NDArray[np.float64]
 
 
 def as_shown(batch: EpisodeBatch, sensor: Sensors, states: Sequence[str], seed: int = 0) -> EpisodeBatch:
-    """Return episodes with what the declared sensors show of their states; where nothing is declared, as they are.
-
-    Parameters
-    ----------
-    batch : EpisodeBatch
-    sensor : mapping of str to Sensor
-        By name of a state, in the batch's units. A resolution that is not declared rounds nothing: recordings have it already.
-    states : sequence of str
-    seed : int
-    """
+    """Return episodes with what the declared sensors show of their states; where nothing is declared, as they are."""
     told = {list(states).index(name): own for name, own in sensor.items() if own != Sensor()}
     if not told:
         return batch

@@ -88,16 +88,6 @@ def delay_samples(signals: Array, truths: Array) -> Array:
     Minimises ``J(d) = sum_k (y_k - x_{k-d})^2`` over a window of samples that is the same for all `d`, so that the ends of an episode favour no delay.
     All whole `d` are computed at once, ``J(d) = sum y^2 - 2 sum y_k x_{k-d} + sum x_{k-d}^2``, by FFT and running sums; the least one and its
     neighbours are interpolated by a parabola, which for a signal sampled `s` times a period misses by about ``0.06 (2 pi / s)^2`` samples at most.
-
-    Parameters
-    ----------
-    signals, truths : ndarray, shape (n_samples, ...)
-
-    Returns
-    -------
-    ndarray, shape (...)
-        In samples, positive where the signal is late; NaN where it is not finite, where the truth does not move, and where no delay of up
-        to 200 samples or a quarter of the episode fits better than all others.
     """
     from scipy.fft import irfft, next_fast_len, rfft
 

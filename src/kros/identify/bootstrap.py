@@ -182,10 +182,7 @@ def bootstrap_edmd(R: Array, n_lifted: int, alpha: float, weights: Array, unit_i
 
 
 def one_step_deviations(normal: Array, information: Array, weights: Array) -> Array:
-    """Return where one Gauss-Newton step on resampled episodes leads from the estimate, shape (unit, draw, P).
-
-    H_w = information + sum_e (w_e - 1) H_e,     dV = H_w^-1 sum_e (w_e - 1) g_e,     w the weights of the episodes
-    """
+    """Return where one Gauss-Newton step on resampled episodes leads from the estimate, shape (unit, draw, P)."""
     units, episodes, P = normal.shape[0], normal.shape[1], normal.shape[-1] - 1
     if information.shape != (units, P, P) or weights.shape[0] != units or weights.shape[2] != episodes:
         raise DimensionError(

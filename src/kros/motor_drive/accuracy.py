@@ -45,21 +45,7 @@ class LoadAccuracy:
 def load_accuracy(
     estimate: npt.ArrayLike, load: npt.ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 0
 ) -> LoadAccuracy:
-    """Judge estimates of the load, shape (n_samples, batch), against known ones; episodes whose load is zero throughout give the floor.
-
-    Parameters
-    ----------
-    estimate, load : array_like, shape (n_samples, batch)
-    sample_period_s : float
-    corner_hz : float
-    skip : int
-        Samples at the start that do not count.
-
-    Raises
-    ------
-    DataError
-        When there are no episodes with load, or none without.
-    """
+    """Judge estimates of the load, shape (n_samples, batch), against known ones; episodes whose load is zero throughout give the floor."""
     truth = np.asarray(load, dtype=float)
     loaded = np.any(truth != 0, axis=0)
     if loaded.all() or not loaded.any():

@@ -21,21 +21,7 @@ _ORDER = 4
 
 
 def low_passed(signal: npt.ArrayLike, corner_hz: float, sample_period_s: float) -> Array:
-    """Return signals without what is faster than a corner, and without delay: a Butterworth filter of order 4, forward and backward.
-
-    Not causal: for references and for judging estimates, never in an observer.
-
-    Parameters
-    ----------
-    signal : array_like, shape (n_samples, ...)
-    corner_hz : float
-    sample_period_s : float
-
-    Raises
-    ------
-    ConfigError
-        When the corner is not below half the sampling rate.
-    """
+    """Return signals without what is faster than a corner, and without delay: a Butterworth filter of order 4, forward and backward."""
     from scipy.signal import butter, sosfiltfilt
 
     if not 0 < corner_hz < 0.5 / sample_period_s:
@@ -45,14 +31,7 @@ def low_passed(signal: npt.ArrayLike, corner_hz: float, sample_period_s: float) 
 
 
 def without_level(signal: npt.ArrayLike, level_s: float, sample_period_s: float) -> Array:
-    """Return the part of signals that can be seen: their change since the start, forgotten after `level_s`.
-
-    Parameters
-    ----------
-    signal : array_like, shape (n_samples, ...)
-    level_s : float, s
-    sample_period_s : float
-    """
+    """Return the part of signals that can be seen: their change since the start, forgotten after `level_s`."""
     from scipy.signal import lfilter
 
     signal = np.asarray(signal, dtype=float)

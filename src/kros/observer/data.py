@@ -173,11 +173,7 @@ class ObserverData:
         return self.lifting.states[: self.lifting.n_states - self.internal]
 
     def initial(self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None, u: npt.ArrayLike | None = None) -> Array:
-        """Return the first estimate: the first measurement where there is one, other states zero; shape (..., n).
-
-        Where measurements replace estimates, other states start at rest: where the lifted functions alone hold them, inputs
-        and measurements in balance. To that comes what the motion says (`Start`), where the inputs are known.
-        """
+        """Return the first estimate: the first measurement where there is one, other states zero; shape (..., n)."""
         first = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(first), first, 0.0)
         n = self.lifting.n_states

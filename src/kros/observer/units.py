@@ -20,25 +20,7 @@ O = TypeVar("O", bound=ObserverData)  # noqa: E741
 
 
 def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
-    """Return the observer for states and inputs divided by sizes.
-
-    Parameters
-    ----------
-    observer : Observer
-    sizes : mapping of str to float
-        By name of a state or an input, or text of a function, as in `Lifting.in_sizes`. What is not named keeps the recordings' unit; an empty mapping
-        is the way back to these.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import Observer
-    >>> from kros.observer.units import in_sizes
-    >>> observer = Observer.open_loop("lag", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), 0.01)
-    >>> in_sizes(observer, {"x": 2.0, "u": 10.0}).B.tolist()
-    [[5.0]]
-    """
+    """Return the observer for states and inputs divided by sizes."""
     lifting = observer.lifting.in_sizes(sizes)
     x, u = factors(observer, sizes)
     y, K = x[list(observer.measured)], observer.controller

@@ -89,10 +89,7 @@ def settle(figure: Figure) -> None:
 
 
 def _measure_once(axes: Axes, renderer: Any) -> None:
-    """Let an axes tell its size with ticks and labels from one measurement: the layout asks twice, and most of its time goes there.
-
-    Ticks stay those that were measured; others might have wider labels.
-    """
+    """Let an axes tell its size with ticks and labels from one measurement: the layout asks twice, and most of its time goes there."""
     from matplotlib.ticker import AutoLocator, FixedLocator
     from matplotlib.transforms import Bbox
 
@@ -287,17 +284,7 @@ def limit_decibels(axes: Axes, floor_db: float) -> None:
 
 
 def end_labels(axes: Axes, entries: Sequence[tuple[float, str, str]], spacing: float = 0.085) -> None:
-    """Write labels at the right ends of lines, moved apart where they would overlap.
-
-    Parameters
-    ----------
-    axes : Axes
-        With its final limits and linear scale.
-    entries : sequence of (value, text, colour)
-        Value of the line at its right end, in data units.
-    spacing : float
-        Smallest distance, as a share of the axes' height.
-    """
+    """Write labels at the right ends of lines, moved apart where they would overlap."""
     low, high = axes.get_ylim()
     shown = sorted(((value - low) / (high - low), text, colour) for value, text, colour in entries if np.isfinite(value))
     for place, (_, text, colour) in zip(spread([s[0] for s in shown], spacing), shown, strict=True):

@@ -106,10 +106,7 @@ def best_models(names: Iterable[str]) -> list[str]:
 
 
 def deployed_pair(names: Sequence[str], deployed: str | None) -> list[str]:
-    """Return the deployed observer and its linear twin, or without a robust twin what there is beside its tuned Kalman filter.
-
-    The first robust observer stands for the deployed one where that is unknown.
-    """
+    """Return the deployed observer and its linear twin, or without a robust twin what there is beside its tuned Kalman filter."""
     robust = [n for n in names if split_observer(n)[1] not in BASELINES]
     first = deployed if deployed is not None and deployed in names else (robust or list(names) or [""])[0]
     model, method = split_observer(first)

@@ -18,19 +18,7 @@ Line = tuple[Array, Tone, float]
 
 
 def spark(title: str, x: Array, lines: Sequence[Line], unit: str, logarithmic: bool = False) -> str:
-    """Return an inline SVG of lines over time or frequency, numbered at the ends of its axes.
-
-    Parameters
-    ----------
-    title : str
-    x : ndarray, shape (n,)
-    lines : sequence of (values of shape (n,), Tone, width in points)
-        What is not finite is cut.
-    unit : str
-        Of the horizontal axis.
-    logarithmic : bool
-        Whether the horizontal axis is.
-    """
+    """Return an inline SVG of lines over time or frequency, numbered at the ends of its axes."""
     at = np.log10(x) if logarithmic else x
     finite = np.concatenate([values[np.isfinite(values)] for values, _, _ in lines])
     if not finite.size or at[-1] <= at[0]:

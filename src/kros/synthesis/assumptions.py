@@ -85,18 +85,7 @@ def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
 
 
 def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> list[Violation]:
-    """Check every assumption of H2 synthesis and return those that fail.
-
-    Parameters
-    ----------
-    plant : GeneralizedPlant
-    proper : bool
-        Include ``D11 = 0`` in continuous time, which H-infinity synthesis does not need.
-
-    Returns
-    -------
-    list of Violation
-    """
+    """Check every assumption of H2 synthesis and return those that fail."""
     found = [Violation(Assumption.STABILISABLE, f"mode {mode:.6g}") for mode in unreachable_modes(plant.A, plant.B2, plant.dt)[:1]]
     found += [Violation(Assumption.DETECTABLE, f"mode {mode:.6g}") for mode in unreachable_modes(plant.A.T, plant.C2.T, plant.dt)[:1]]
     n, _, n_u, _, n_y = plant.sizes

@@ -140,10 +140,7 @@ class Synthesis:
 
 
 def enclosed(value: float, lower: float | None) -> tuple[float | None, float | None, tuple[str, ...]]:
-    """Return the lower bound of an attained value, their distance in percent, and notes.
-
-    A bound above what is attained is false whatever its proof, and dropped; a distance that rounding explains is none.
-    """
+    """Return the lower bound of an attained value, their distance in percent, and notes."""
     if value == 0 or lower == 0:
         return 0.0, None, ()
     if lower is None:

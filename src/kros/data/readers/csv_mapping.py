@@ -257,12 +257,7 @@ def _is_mark(text: str) -> bool:
 
 
 def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMapping:
-    """Return a mapping from a TOML file or a table with the same keys.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Return a mapping from a TOML file or a table with the same keys."""
     if isinstance(mapping, CsvMapping):
         return mapping
     if isinstance(mapping, Mapping):

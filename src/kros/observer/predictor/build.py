@@ -92,15 +92,7 @@ def identify_predictor(
 
 
 def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], batch: EpisodeBatch, ridge: float = RIDGE) -> Observer:
-    """Write a model F, G, H of `PastMoments.model` into an observer; the rows of the measured states are fitted to the recordings.
-
-    These rows matter where measurements are missing: the observer runs by them then. `ridge` is their penalty, relative to mean squares.
-
-    Returns
-    -------
-    Observer
-        Its lifting has ``memory_1, ...`` after the original states; measurements replace the estimates of measured states.
-    """
+    """Write a model F, G, H of `PastMoments.model` into an observer; the rows of the measured states are fitted to the recordings."""
     return embedded_with(name, past, model, inputs, batch, (ridge,))[0]
 
 

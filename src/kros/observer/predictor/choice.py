@@ -105,27 +105,7 @@ def choose(
     internal: Sequence[int] = (12,),
     until: npt.ArrayLike | None = None,
 ) -> Recipe:
-    """Choose a recipe on units that are left out in turn.
-
-    Parameters
-    ----------
-    past : PastMoments
-        Of the longest basis.
-    batch : EpisodeBatch
-        Recordings that models are run on.
-    emphasis : mapping of str to array_like, shape (h,) or a number
-        How much the logarithmic error in every condition counts; the first one is trained on in full, the others to the share that is best.
-    importance : array_like, shape (h,) or a number
-        How much that of every hidden state counts.
-    delays : sequence of int
-        Candidates, the shortest first; by default those of the basis.
-    lags : sequence of tuple of float
-        Sets of poles, the fastest first; by default those of the basis.
-    internal : sequence of int
-        Candidates, the fewest first.
-    until : array_like of int, shape (batch,), optional
-        As in `PastMoments.of`, of `batch`.
-    """
+    """Choose a recipe on units that are left out in turn."""
     stressed = {c: np.broadcast_to(np.asarray(own, dtype=float), past.power.shape[1:]) for c, own in emphasis.items()}
     share = np.broadcast_to(np.asarray(importance, dtype=float), past.power.shape[1:])
     share = share / share.sum()

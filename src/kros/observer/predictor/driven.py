@@ -48,39 +48,7 @@ def with_internal(
     start: Array | None = None,
     added: Array | None = None,
 ) -> Array:
-    """Return recordings with the internal states that they drive behind them, shape (n_samples, batch, n).
-
-    Parameters
-    ----------
-    observer : Observer
-    states : ndarray, shape (n_samples, batch, n_recorded)
-        Returned as they are where the observer has no internal states.
-    inputs : ndarray, shape (n_samples, batch, m)
-    parameters : mapping of str to array_like, shape (batch,)
-    start : ndarray, shape (batch, n), optional
-        Where the observer starts; as it does from the recorded first measurement by default.
-    added : ndarray, shape (count, batch, n), optional
-        What the observer adds to its first estimates (`started`): internal states are the observer's own, so that it counts for them as well.
-
-    Raises
-    ------
-    DimensionError
-        When there are neither as many states as are recorded nor as many as the observer has.
-
-    Examples
-    --------
-    >>> import kros
-    >>> from kros.data import EpisodeBatch
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import identify_predictor
-    >>> from kros.observer.predictor.driven import driven_coordinates, with_internal
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
-    >>> batch = EpisodeBatch.read(motors, motors.keys())
-    >>> predictor = identify_predictor("motor", Lifting(motors.states), (0,), motors.inputs, batch, internal=2, iterations=0)
-    >>> stable = driven_coordinates(predictor, batch, abs(batch.states).max(axis=(0, 1)))
-    >>> with_internal(stable, batch.states, batch.inputs).shape
-    (1000, 2, 5)
-    """
+    """Return recordings with the internal states that they drive behind them, shape (n_samples, batch, n)."""
     n, recorded = observer.lifting.n_states, len(observer.recorded)
     if states.shape[-1] == n:
         return states

@@ -23,10 +23,7 @@ _ALIKE = 1e-9
 
 
 def in_motion(truth: Array) -> bool:
-    """Whether recordings of hidden states, shape (n_samples, batch, h), begin while machines move: no state is near zero then.
-
-    A machine at rest may need a current to stay there, but has no velocity.
-    """
+    """Whether recordings of hidden states, shape (n_samples, batch, h), begin while machines move: no state is near zero then."""
     power = np.mean(truth**2, axis=1)
     return bool(np.all(power[0] > _AT_REST**2 * power.mean(axis=0)))
 

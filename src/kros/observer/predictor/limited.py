@@ -70,33 +70,7 @@ def limited_states(observer: Observer) -> list[int]:
 
 
 def conditioned(observer: Observer, batch: EpisodeBatch, importance: npt.ArrayLike = 1.0, iterations: int = 40) -> Observer:
-    """Return a predictor of `with_limits` with the gain that is best on recordings that meet the limits.
-
-    Parameters
-    ----------
-    observer : Observer
-    batch : EpisodeBatch
-    importance : array_like, shape (h,)
-        Weights of the hidden states' logarithmic errors.
-    iterations : int
-        Most steps.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import kros
-    >>> from kros.data import EpisodeBatch
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import identify_predictor
-    >>> from kros.observer.predictor.limited import conditioned
-    >>> from kros.observer.predictor.limited import with_limits
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
-    >>> batch = EpisodeBatch.read(motors, motors.keys())
-    >>> predictor = identify_predictor("motor", Lifting(motors.states), (0,), motors.inputs, batch, internal=2, iterations=0)
-    >>> limit = np.array([np.inf, np.inf, 0.8 * abs(batch.states[..., 2]).max()])  # of the current
-    >>> conditioned(with_limits(predictor, -limit, limit), batch, iterations=1).lifting.states
-    ('position', 'velocity', 'current', 'memory_1', 'memory_2', 'memory_3')
-    """
+    """Return a predictor of `with_limits` with the gain that is best on recordings that meet the limits."""
     problem = _Conditioning(observer, batch, importance)
     start = problem.at(np.zeros((len(problem.F), len(problem.raw))), problem.stability.first)
     found, _ = search(start, problem.steps, _DAMPING, iterations, 1e-3, patience=2)
@@ -115,10 +89,7 @@ def _turned(observer: Observer, rows: list[int], gain: Array) -> Observer:
 
 
 def _slopes_of(observer: Observer) -> tuple[ErrorSystem, Array]:
-    """The errors' dynamics without limits and delay, with slopes of lifted functions and multipliers that prove it stable.
-
-    Where slopes have no bound, or let errors grow alone, they are left out.
-    """
+    """The errors' dynamics without limits and delay, with slopes of lifted functions and multipliers that prove it stable."""
     alone, n = replace(observer, runtime=Runtime()), observer.lifting.n_states
     try:
         system = error_system(alone)

@@ -311,13 +311,7 @@ class Balanced:
     up: Array
 
     def model(self, order: int) -> Model:
-        """Return the model F, G, H of an order.
-
-        Raises
-        ------
-        DimensionError
-            When the order is below the number of hidden states.
-        """
+        """Return the model F, G, H of an order."""
         if not len(self.W) <= order:
             raise DimensionError(f"Predictor: {len(self.W)} hidden states need an order of at least as many, found {order}.")
         down, up = self.down[:order], self.up[:, :order]
@@ -342,11 +336,7 @@ def skipped(length: int) -> int:
 
 
 def followed_inputs(inputs: Array, y: Array, truth: Array) -> tuple[Array, tuple[int, ...]]:
-    """Return the part M of the measurement that the inputs explain, shape (q, m), and the inputs that no measurement follows.
-
-    `truth` are the hidden states: whether they are at rest at first says how M is found. M is zero where inputs leave much of a
-    measurement: it does not follow them then, but adds them up, say.
-    """
+    """Return the part M of the measurement that the inputs explain, shape (q, m), and the inputs that no measurement follows."""
     static = _static(inputs, y, in_motion(truth))
     left = _centred(y - inputs @ static.T).std(axis=0)
     static = np.where((left < _FOLLOWS * _centred(y).std(axis=0))[:, None], static, 0.0)

@@ -74,15 +74,7 @@ class Sensitivities:
         self.states = np.concatenate([states.reshape(n, -1), held[:, self._resting]], axis=-1)
 
     def signals(self, z: Array, rest: Array, every: int) -> Array:
-        """Return the signals that make up everything, shape (signals, batch, n_samples / every).
-
-        Parameters
-        ----------
-        z : ndarray, shape (channels, batch, n_samples)
-        rest : ndarray, shape (channels, batch)
-            What z was before.
-        every : int
-        """
+        """Return the signals that make up everything, shape (signals, batch, n_samples / every)."""
         moving = (z - rest[..., None]).reshape(-1, z.shape[-1])
         found = lattice_along(self._reflections, moving, every)
         found = found.reshape(len(found), self._channels, -1, found.shape[-1]).swapaxes(0, 1)

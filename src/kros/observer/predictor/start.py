@@ -97,10 +97,7 @@ def at_rest(seen: Array, moving: Array, first: Array, begun: bool) -> Array:
 
 
 def shows_motion(said: Array, known: Array, truth: Array) -> bool:
-    """Whether the first sample tells a machine in motion from one at rest: where recordings start at rest, it says nothing there.
-
-    `said`, shape (n, batch), is what it says at the starts of recordings, `known`, shape (n, windows), what there is to say in motion.
-    """
+    """Whether the first sample tells a machine in motion from one at rest: where recordings start at rest, it says nothing there."""
     if in_motion(truth):
         return True
     size = np.sqrt(np.mean(known**2, axis=1))

@@ -51,39 +51,7 @@ def tune_predictor(
     least_gain: float = 1e-4,
     weights: Weights | None = None,
 ) -> tuple[Model, tuple[float, ...]]:
-    """Improve a model of `PastMoments.model` on recordings of one length.
-
-    Parameters
-    ----------
-    model : F (order, order), G (order, channels), H (h, order)
-        A stable one.
-    past : PastMoments
-        Says what the channels are.
-    batch : EpisodeBatch
-    importance : array_like, shape (h,)
-        Weights s of the logarithms.
-    deviation : float
-        Share by which the lifted functions' effect may differ from machine to machine.
-    slowest : float, optional
-        Bound of the model's poles; by default what recordings of this length can judge, or the model's own slowest pole.
-    iterations : int
-        Most steps.
-    least_gain : float
-        Decrease of the criterion in two steps below which the search ends.
-    weights : mapping of str to array_like, shape (h,) or a number, optional
-        How much the logarithmic error in every condition counts; without them all recordings are alike.
-
-    Returns
-    -------
-    model : F, G, H
-    criterion : tuple of float
-        Before tuning and after every step.
-
-    Raises
-    ------
-    DataError
-        When the model is not stable.
-    """
+    """Improve a model of `PastMoments.model` on recordings of one length."""
     problem = _Tuning(past, batch, importance, deviation, weights)
     own = float(np.abs(np.linalg.eigvals(model[0])).max())
     problem.slowest = max(own, 1 - SETTLED / len(batch.states) if slowest is None else slowest)
@@ -158,11 +126,7 @@ class _Tuning:
             return _Point(blocks, found, mean_log(self.share.ravel(), found.ravel()))
 
     def steps(self, point: _Point) -> Callable[[float], _Point]:
-        """Gauss-Newton steps, bounded where they slow down the slowest pole.
-
-        Coefficients are those of all states and channels, white along the recordings, in the rows of white states: directions that change no
-        estimate, and those between nearly alike channels, cost nothing.
-        """
+        """Gauss-Newton steps, bounded where they slow down the slowest pole."""
         blocks, model = point.blocks, joined(point.blocks)
         n, outputs = len(model[0]), len(self.truth)
         free = self._free(blocks)
@@ -231,10 +195,7 @@ class _Tuning:
         return H
 
     def _gradient(self, point: _Point, free: FreeStart | None, weight: Array, into: Array) -> Array:
-        """How fast the weighted squares fall with all coefficients, of all recordings and samples.
-
-        What a signal added to a state does to all later estimates is gathered by the blocks' transposes running backwards: no response is needed.
-        """
+        """How fast the weighted squares fall with all coefficients, of all recordings and samples."""
         blocks = point.blocks
         inner, direct = np.zeros((sum(len(b.F) for b in blocks), len(into))), np.zeros((len(self.truth), sum(len(b.F) for b in blocks)))
         F, _, H = joined(blocks)

@@ -95,35 +95,7 @@ def residual_models(
     noise: Array,
     scale: Array,
 ) -> list[ResidualModel]:
-    """Return the model as identified and with rows fitted to single steps, the one that promises the smallest hidden errors first.
-
-    Measured rows are refitted with every choice of hidden ones.
-
-    Parameters
-    ----------
-    lifting : Lifting
-    A : ndarray, shape (n_lifted, n_lifted)
-    B : ndarray, shape (n_lifted, m)
-    measured : sequence of int
-    batch : EpisodeBatch
-    noise : ndarray, shape (q,)
-        Standard deviation of the measurement noise.
-    scale : ndarray, shape (n,)
-        Range of every state.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import kros
-    >>> from kros.data import EpisodeBatch
-    >>> from kros.observer.residual.models import residual_models
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> models = kros.identify(motors, refine=False).sets["linear_edmd"]
-    >>> batch = EpisodeBatch.read(motors, motors.keys())
-    >>> found = residual_models(models.lifting, models.A[0], models.B[0], (0,), batch, np.array([1e-3]), abs(batch.states).max(axis=(0, 1)))
-    >>> len(found) > 1
-    True
-    """
+    """Return the model as identified and with rows fitted to single steps, the one that promises the smallest hidden errors first."""
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(range(n))
     refitted, residual = refitted_models(lifting, A, B, measured, batch)

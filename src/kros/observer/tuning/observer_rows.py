@@ -40,42 +40,7 @@ _ALIKE = 1e-14
 
 
 def tune_observer(observer: O, batch: EpisodeBatch, iterations: int = 25) -> tuple[O, tuple[float, ...]]:
-    """Improve an observer with state injection on recordings.
-
-    Parameters
-    ----------
-    observer : Observer
-        Without delays in its lifting, all its states recorded; its filter keeps its dynamics.
-    batch : EpisodeBatch
-        Recordings of one length.
-    iterations : int
-        Most steps.
-
-    Returns
-    -------
-    observer : Observer
-    criterion : tuple of float
-        Mean over the hidden states of the logarithm of the root mean square error, before tuning and after every step.
-
-    Raises
-    ------
-    DimensionError
-        When the observer corrects through the input, has internal states, or its lifting reads earlier values.
-    DataError
-        When every state is measured, recordings are too short, or the observer diverges on them.
-
-    Examples
-    --------
-    >>> import kros
-    >>> from kros.data import EpisodeBatch
-    >>> from kros.observer.tuning.observer_rows import tune_observer
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=2.0, seed=3).simulate().population
-    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1)
-    >>> observer = kros.synthesize(uncertain, "kalman_tuned", methods=()).observer
-    >>> tuned, criterion = tune_observer(observer, EpisodeBatch.read(motors, motors.keys()), iterations=2)
-    >>> criterion[-1] <= criterion[0]
-    True
-    """
+    """Improve an observer with state injection on recordings."""
     if observer.injection is not Injection.STATE or observer.lifting.history or observer.internal:
         raise DimensionError(
             f"Tuning observer {observer.name}: it should correct through the state, read no earlier values and have no internal states."

@@ -34,10 +34,7 @@ _ABOUT_PAPER = "The paper's observers: mixed H2-H∞ synthesis, models of extend
 
 
 def recorded_episodes(run: RunFolder) -> list[Shown]:
-    """Return one held-out episode of one unit in every condition, the condition that was identified on first.
-
-    They are those that the evaluation kept, or come from the recordings in a run that stopped before it.
-    """
+    """Return one held-out episode of one unit in every condition, the condition that was identified on first."""
     try:
         unit = run.shown[0].key.unit
         found = [s for s in run.shown if s.key.unit == unit]
@@ -99,15 +96,7 @@ def steady_stretches(speed: Array) -> list[tuple[int, int]]:
 
 
 def overview_and_zoom(run: RunFolder, blocks: Sequence[tuple[str, Shown, Sequence[Strip]]], height_in: float) -> Figure:
-    """Draw whole episodes on the left and a zoom at constant speed on the right, one strip below the other.
-
-    Parameters
-    ----------
-    run : RunFolder
-    blocks : sequence of (title, episode, strips)
-    height_in : float
-        Of a strip.
-    """
+    """Draw whole episodes on the left and a zoom at constant speed on the right, one strip below the other."""
     figure, axes = grid(sum(len(strips) for _, _, strips in blocks), 2, height_in, width_ratios=(1.4, 1))
     first = 0
     for title, episode, strips in blocks:

@@ -45,16 +45,7 @@ def beside(model: UncertainModel, models: ModelSet) -> UnitResiduals:
 
 
 def entries_figure(found: Mapping[str, UnitResiduals], names: Mapping[str, Names], alarm: str | None = None) -> Figure:
-    """Draw magnitudes of entries of all units with their bound and its fit, models side by side or one below the other.
-
-    Parameters
-    ----------
-    found : mapping of model name to UnitResiduals
-    names : mapping of model name to (rows, columns)
-        Signals behind the entries.
-    alarm : str, optional
-        Unit that is drawn on top, in the colour of alarm.
-    """
+    """Draw magnitudes of entries of all units with their bound and its fit, models side by side or one below the other."""
     sizes = {name: (min(r.largest.shape[1], _MOST), min(r.largest.shape[2], _MOST)) for name, r in found.items()}
     together = sum(columns for _, columns in sizes.values()) <= _MOST
     rows = (max if together else sum)(p for p, _ in sizes.values())

@@ -13,10 +13,7 @@ from ..theme import Tone
 
 
 def best_last(cells: Mapping[str, Mapping[str, ErrorCell]], channels: Sequence[str]) -> list[str]:
-    """Return observers in the order of rows from below: the best on top, those that diverged at the bottom.
-
-    What counts is the mean logarithm of the errors over the smallest of their channel, so that observers of fewer channels have their place among the others.
-    """
+    """Return observers in the order of rows from below: the best on top, those that diverged at the bottom."""
     smallest = {c: min((m for own in cells.values() if c in own and (m := own[c].mean)), default=1.0) for c in channels}
 
     def behind(observer: str) -> float:

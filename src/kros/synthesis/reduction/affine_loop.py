@@ -107,11 +107,7 @@ class AffineLoop:
         return response[:, :rows, :columns], response[:, :rows, columns:], response[:, rows:, columns:]
 
     def typical(self, theta: Array) -> Array:
-        """Size of every entry of Theta that changes the norm by about as much as any other, shape of Theta.
-
-        An entry multiplies a signal that Theta sees, whose variance is on the diagonal of ``C_y P C_y' + D_y D_y'``, and drives the loop, which
-        turns it into an error with the energy on the diagonal of ``B_u' Q B_u + D_u' D_u``.
-        """
+        """Size of every entry of Theta that changes the norm by about as much as any other, shape of Theta."""
         loop, (B_u, D_u), (C_y, D_y) = self.close(theta), self.into, self.out_of
         P, Q = gramian(loop.A, loop.B, loop.dt), gramian(loop.A.T, loop.C.T, loop.dt)
         seen = np.einsum("ij,jk,ik->i", C_y, P, C_y) + np.sum(D_y**2, axis=1)

@@ -145,21 +145,7 @@ def _restated(problem: ObserverProblem | GeneralizedPlant, synthesis: Synthesis,
 
 
 def truncate(plant: GeneralizedPlant, n_states: int) -> tuple[GeneralizedPlant, float]:
-    """Balanced truncation of a stable plant from (w, u) to (z, y).
-
-    Parameters
-    ----------
-    plant : GeneralizedPlant
-        Stable; every signal should have a size near one, since all count alike.
-    n_states : int
-        At most; states whose Hankel singular value is negligible go in any case.
-
-    Returns
-    -------
-    GeneralizedPlant
-    float
-        Sum of the discarded Hankel singular values over the largest one; twice their sum bounds the error in the H-infinity norm.
-    """
+    """Balanced truncation of a stable plant from (w, u) to (z, y)."""
     B, C = np.hstack([plant.B1, plant.B2]), np.vstack([plant.C1, plant.C2])
     balancing = Balancing.of(gramian_root(plant.A, B, plant.dt), gramian_root(plant.A.T, C.T, plant.dt))
     h = balancing.values

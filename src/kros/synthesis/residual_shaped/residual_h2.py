@@ -281,11 +281,7 @@ class _Scaled:
         return float(np.log(self.unit_errors(self.correction(self.filter(equal))).mean(axis=0)[self.hidden]).sum())
 
     def worst_unit(self) -> tuple[Array, str]:
-        """Weights of the units for which the largest error of a unit is smallest.
-
-        An error is the mean over the states that are not measured, each relative to its mean over the units under equal weights. The weights
-        grow by multiplication with the unit's error over the weighted mean, which is ascent on a concave function.
-        """
+        """Weights of the units for which the largest error of a unit is smallest."""
 
         def errors(weights: Array) -> Array:
             return self.unit_errors(self.correction(self.filter(weights)))[:, self.hidden]

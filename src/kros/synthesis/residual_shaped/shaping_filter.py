@@ -86,26 +86,7 @@ def circle_weights(f: int) -> Array:
 
 
 def shaping_filter(spectrum: Array, basis: Basis, dt: float) -> StateSpace:
-    """Fit a shaping filter to a spectrum.
-
-    Parameters
-    ----------
-    spectrum : ndarray, shape (f, n, n), complex
-        Cross spectral density at equal steps from zero to Nyquist, both included; its mean over the circle is the covariance. Channels
-        should be scaled to similar size.
-    basis : Basis
-    dt : float, s
-
-    Returns
-    -------
-    StateSpace
-        From white noise of unit covariance to the signal.
-
-    Raises
-    ------
-    SynthesisError
-        When there is no signal, or it can be predicted without error: constant, or a sum of few tones.
-    """
+    """Fit a shaping filter to a spectrum."""
     f, n = spectrum.shape[:2]
     if spectrum.shape != (f, n, n) or f < 2:
         raise DimensionError(

@@ -103,19 +103,7 @@ def _even_coordinates(system: StateSpace) -> Array:
 
 
 def least_ratio(ratio: Ratio, edges: Array, rtol: float = 3e-3, max_arcs: int = 20000) -> Array:
-    """Return what a ratio of responses nowhere falls below, for every channel.
-
-    Parameters
-    ----------
-    ratio : callable
-        Takes middles and half widths of k arcs; returns the least ratio on each, proven, and the ratio in the middle, both (k, channels).
-    edges : ndarray, rad
-        First arcs, from 0 to pi.
-    rtol : float
-        How far what is proven may be from the least ratio that was seen.
-    max_arcs : int
-        Work limit; what is proven until then is returned.
-    """
+    """Return what a ratio of responses nowhere falls below, for every channel."""
     theta, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
     proven, seen = ratio(theta, half)
     least = seen.min(axis=0)

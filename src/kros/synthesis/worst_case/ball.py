@@ -102,11 +102,7 @@ class Ball:
         return np.sum(np.abs(self.center + self.left @ theta @ self.right) ** 2, axis=-1)
 
     def worst(self, T: Array, iterations: int = 15) -> Array:
-        """Contraction of an element that is (locally) worst for T, shape (f, b, a).
-
-        The squared error is convex in Theta, so its linearisation is a minorant, and moving to the maximiser of the linearisation, the
-        polar factor of the gradient, never decreases it. Where T hardly tells elements apart the first start wins, which fits smoothly.
-        """
+        """Contraction of an element that is (locally) worst for T, shape (f, b, a)."""
         P = T @ self.left
         _, _, Vh_p = np.linalg.svd(P)
         U_q, _, _ = np.linalg.svd(self.right)

@@ -39,21 +39,7 @@ def density(problem: ObserverProblem, loop: StateSpace, freqs_hz: Array) -> Arra
 
 
 def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5) -> tuple[float, float]:
-    """Return the certified worst-case H2 norm of ``W_p e`` and the quadrature error that it includes.
-
-    Parameters
-    ----------
-    problem : ObserverProblem
-    controller : StateSpace
-        In physical units: m outputs for input injection, n for state injection; q inputs.
-    rtol : float
-        Accuracy asked of the quadrature of the squared norm.
-
-    Raises
-    ------
-    SynthesisError
-        When the set is not well posed or the nominal observer loop is unstable.
-    """
+    """Return the certified worst-case H2 norm of ``W_p e`` and the quadrature error that it includes."""
     problem.require_sound()
     loop = problem.error_system(controller)
     if not loop.is_stable():

@@ -198,10 +198,7 @@ class Channels:
         return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
 
     def shaping(self, spectrum: Spectrum, fit: Fit, side: str, options: dict[str, Any], remainder: StateSpace | None = None) -> Shaping:
-        """Fit one rational factor a channel; those of the remainder unless they are given.
-
-        The best from below is the best from above but for its size, and channels whose spectra differ in size alone share a fit.
-        """
+        """Fit one rational factor a channel; those of the remainder unless they are given."""
 
         def factor(power: Array) -> StateSpace:
             systems = []

@@ -33,14 +33,7 @@ _STEPS = 4
 
 
 def dual_bound(a: Array, P: Array, Q: Array) -> Array:
-    """Upper bound of ``max ||a + P Theta Q||_F`` over contractions, shape (f,).
-
-    Parameters
-    ----------
-    a : ndarray, shape (f, p, m)
-    P : ndarray, shape (f, p, b)
-    Q : ndarray, shape (f, a, m)
-    """
+    """Upper bound of ``max ||a + P Theta Q||_F`` over contractions, shape (f,)."""
     U, s, _ = np.linalg.svd(P, full_matrices=False)
     _, q, Hh = np.linalg.svd(Q, full_matrices=False)
     d = (s[..., :, None] * q[..., None, :]) ** 2

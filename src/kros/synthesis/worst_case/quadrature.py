@@ -58,31 +58,7 @@ _GAUSS[1::2] = np.concatenate([_WG, _WG[-2::-1]])
 
 
 def circle_mean(density: Callable[[Array], Array], centers: Array, rtol: float = 1e-6, max_panels: int = 4000) -> tuple[float, float]:
-    """Integrate an even, non-negative density over the unit circle.
-
-    Parameters
-    ----------
-    density : callable
-        Takes angles in (0, pi], shape (k,), returns values of the same shape.
-    centers : ndarray, rad
-        Poles of the density, in the upper half plane, as complex numbers ``log z``: panels are laid around their angles at the scale of
-        their distance from the unit circle, so that no resonance falls between the nodes.
-    rtol : float
-        Relative accuracy asked for.
-    max_panels : int
-        Work limit.
-
-    Returns
-    -------
-    tuple of float
-        Mean, and the sum of the panels' differences between the two rules: an estimate of the error that is conservative for smooth
-        densities, since it is the error of the poorer rule.
-
-    Raises
-    ------
-    SynthesisError
-        When the accuracy is not reached within the work limit, or the density is not finite.
-    """
+    """Integrate an even, non-negative density over the unit circle."""
     edges = _edges(centers)
     left, right = edges[:-1], edges[1:]
     values, errors = _panels(density, left, right)

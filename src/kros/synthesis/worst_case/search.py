@@ -65,15 +65,7 @@ class Search:
         return Certified(*certify(self.problem, controller, self.rtol), controller)
 
     def first(self, spectrum: Spectrum) -> None:
-        """Design with shaping filters as asked and of order one; where the former are not the best, with those of every order.
-
-        Filters of a high order may have peaks between the frequencies that they are fitted at: a design for what is not there.
-
-        Raises
-        ------
-        SynthesisError
-            When no design survives.
-        """
+        """Design with shaping filters as asked and of order one; where the former are not the best, with those of every order."""
         as_asked = self.design(self._shaping(spectrum, self.asked), self.asked)
         highest = self.asked["max_order"]
         if self.asked["order"] is None and highest > 1:
@@ -110,11 +102,7 @@ class Search:
         return found.value
 
     def bound(self, spectrum: Spectrum) -> float | None:
-        """Return the best lower bound of filters below a spectrum; None where none could be proven.
-
-        An element that is worst for one observer may leave channels without power at some frequencies, which filters of low order cannot follow. Where
-        the bound is not close for that or another reason, half of the average over the set is mixed in.
-        """
+        """Return the best lower bound of filters below a spectrum; None where none could be proven."""
         channels = Channels(self.problem, self.channels.freqs_hz, apart=True)
         proofs = Everywhere(channels)
         found = self._bound(proofs, channels.mixture(spectrum))

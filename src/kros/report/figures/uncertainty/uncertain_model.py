@@ -15,11 +15,7 @@ from .weights import in_gauge
 
 
 def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entries: bool = False) -> Figure:
-    """Draw forms and weights of an uncertain model, and with the models that it was made of every unit over the weights.
-
-    With `entries` magnitudes of all units' entries are drawn instead, with the best fit above each, as in the paper's figures: an entry at a time bounds no
-    perturbation. That needs `models`, or raises `ConfigError`.
-    """
+    """Draw forms and weights of an uncertain model, and with the models that it was made of every unit over the weights."""
     if entries:
         if models is None:
             raise ConfigError("Plot of an uncertain model: it holds no entries of units; pass models= the ModelSet that it was made of.")

@@ -306,7 +306,7 @@ def figures(run_folder: Annotated[Path, typer.Argument(metavar="RUN")], out: Pat
 @app.command("list")
 def list_(run_folder: Annotated[Path, typer.Argument(metavar="RUN")]) -> None:
     """Say what a run holds: stages, observers by name and how well they do."""
-    from .study.commands.listing import list_run
+    from .study.commands.summary import list_run
 
     for line in list_run(run_folder):
         typer.echo(line)

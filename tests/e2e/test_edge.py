@@ -84,7 +84,7 @@ def test_any_exception_becomes_one_message(kros, tmp_path, monkeypatch, command,
         "demo": "kros.study.commands.demo.run_demo",
         "doctor": "kros.study.commands.doctor.diagnose",
         "init": "kros.study.commands.init.init_study",
-        "list": "kros.study.commands.listing.list_run",
+        "list": "kros.study.commands.summary.list_run",
     }
     arguments = {"run": 1, "report": 1, "check": 2, "estimate": 3, "figures": 2, "convert": 2, "simulate": 1, "init": 1, "list": 1}
     monkeypatch.setattr(places[command], fail)

@@ -11,7 +11,7 @@ from scipy.signal import welch
 from kros.evaluate.errors import error_spectrum, summarise
 from kros.lifting import Lifting
 from kros.observer import Observer
-from kros.study.stages.together import alike
+from kros.study.stages.disturbed import alike
 
 DT = 1e-3
 

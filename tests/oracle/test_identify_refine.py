@@ -11,8 +11,8 @@ from kros.core import IdentificationError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
 from kros.identify import Factor, combine, free_run, lifted_factor, reduce_episode
 from kros.identify.refine import RefinedModels, RefineOptions, refine_population
-from kros.identify.refine.barrier import stability_barrier
 from kros.identify.refine.metric import ResponsePrior
+from kros.identify.refine.problem import stability_barrier
 from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting

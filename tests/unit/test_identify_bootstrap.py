@@ -9,8 +9,8 @@ import pytest
 
 from kros.core import DataError, DimensionError, IdentificationError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
-from kros.identify import KoopmanMatrices, ModelSamples, bootstrap, bootstrap_edmd, bootstrap_refined, edmd, episode_weights
-from kros.identify.bootstrap import one_step_deviations
+from kros.identify import KoopmanMatrices, ModelSamples, bootstrap, bootstrap_edmd, edmd, episode_weights
+from kros.identify.bootstrap import bootstrap_refined, one_step_deviations
 from kros.identify.refine.episodes import segment_owners
 from kros.identify.refine.segments import read_segments
 

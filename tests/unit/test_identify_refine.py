@@ -9,8 +9,8 @@ from kros.core import ConfigError, DataError, DimensionError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
 from kros.identify import Factor
 from kros.identify.refine import RefineOptions, refine_population
-from kros.identify.refine.barrier import stability_barrier
 from kros.identify.refine.marquardt import Evaluate, minimise
+from kros.identify.refine.problem import stability_barrier
 from kros.identify.refine.segments import Segments, held_segments, read_segments
 from kros.lifting import Lifting
 

@@ -64,6 +64,10 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
         ("kros.observer.EstimateKind",),
     ),
     (
+        "Refined models of resampled episodes are made where a study quantifies; use bootstrap_edmd, or the noise_share of a run.",
+        ("kros.identify.bootstrap_refined",),
+    ),
+    (
         "The observers kalman_white and luenberger are no longer part of kros; use kalman_tuned.",
         ("observer.baselines=kalman_white", "observer.baselines=luenberger"),
     ),

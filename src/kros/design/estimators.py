@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, Protocol
@@ -23,8 +23,8 @@ from ..observer.baselines.extended_kalman import start_covariance
 from ..observer.baselines.kalman import like_measurement_noise
 from ..observer.baselines.learned import Features, Learned
 from ..observer.baselines.learned_moments import Moments
-from ..observer.baselines.restarts import restarted
 from ..observer.residual.one_step import one_step_covariance, one_step_residual
+from ..observer.samples import Screened
 from ..observer.screen import Screen
 from ..observer.sensor import delay_of
 from .methods.gains import EQUAL, RESIDUAL
@@ -82,6 +82,20 @@ class Baseline:
 
     def _piece(self, estimator: Estimator, y: Array, u: Array, parameters: Parameters) -> Array:
         return estimator.run(y if self.takes_missing else hold_missing(y), u, parameters)
+
+
+def restarted(run: Callable[[Array, Array, Mapping[str, Any]], Array], samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
+    """Run a batch, and every member once more from each sample at which it starts again to the next; shape (n_samples, batch, n)."""
+    n_samples, batch = samples.starts.shape
+    found = run(samples.y, samples.u, parameters)
+    for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:
+        own = np.flatnonzero(samples.starts[begin])
+        again = samples.starts[begin + 1 :, own]
+        lasts = np.where(again.any(axis=0), begin + 1 + again.argmax(axis=0), n_samples - 1) if len(again) else begin
+        rows = slice(begin, int(np.max(lasts)) + 1)
+        part = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[own] for name, v in parameters.items()}
+        found[begin + 1 : rows.stop, own] = run(samples.y[rows, own], samples.u[rows, own], part)[1:]
+    return found
 
 
 def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Array) -> Baseline:

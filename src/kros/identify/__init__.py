@@ -13,7 +13,8 @@ Examples
 import sys
 from types import ModuleType
 
-from .bootstrap import ModelSamples, bootstrap_edmd, bootstrap_refined, episode_weights
+from ..core.removed import refusing
+from .bootstrap import ModelSamples, bootstrap_edmd, episode_weights
 from .calibration import PhaseCalibration, PhaseSpec, find_segments, resolve_branches, unit_phase
 from .edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from .factors import Factor, combine, episode_factors, lifted_factor, reduce_episode
@@ -31,7 +32,6 @@ __all__ = [
     "PhaseCalibration",
     "PhaseSpec",
     "bootstrap_edmd",
-    "bootstrap_refined",
     "combine",
     "edmd",
     "episode_factors",
@@ -54,3 +54,5 @@ class _CallablePackage(ModuleType):
 
 
 sys.modules[__name__].__class__ = _CallablePackage
+
+__getattr__ = refusing(__name__)

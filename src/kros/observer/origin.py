@@ -35,7 +35,7 @@ _MOST = 64  # periods of the first function until all others repeat
 
 
 @dataclass(frozen=True, eq=False)
-class Shift:
+class OriginShift:
     """How an observer's signals move with the origin."""
 
     states: Array  # (n,)
@@ -44,7 +44,7 @@ class Shift:
     period: float
 
 
-def find_shift(observer: ObserverData) -> Shift | None:
+def find_shift(observer: ObserverData) -> OriginShift | None:
     """Return how the origin of an observer's one measurement can move; None where it cannot."""
     lifting = observer.lifting
     if len(observer.measured) != 1 or lifting.input_functions or lifting.history:
@@ -63,7 +63,7 @@ def find_shift(observer: ObserverData) -> Shift | None:
         others = frozenset(lifting.states[i] for i in range(n) if candidate[i] != 0 and i != at)
         period = _period(lifting, lifting.states[at], others)
         if period is not None:
-            return Shift((whole + candidate)[:n], whole[n:], candidate[n:], period or 0.01 * float(sizes[at]))
+            return OriginShift((whole + candidate)[:n], whole[n:], candidate[n:], period or 0.01 * float(sizes[at]))
     return None
 
 
@@ -116,7 +116,7 @@ class Origins:
         self.at: Array | None = None
 
     @cached_property
-    def shift(self) -> Shift | None:
+    def shift(self) -> OriginShift | None:
         """How the signals move; None where they cannot."""
         return find_shift(self._observer)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from .config import Stage
-from .engine.steps import Step
+from .engine.steps import StageStep
 from .stages import calibrate, identify, quantify, read, synthesize
 
 LEARNING = (
-    Step(Stage.READ, read.run, ("data", "split", "evaluate.reserve")),
-    Step(Stage.CALIBRATE, calibrate.run, ("calibrate", "lifting")),
-    Step(Stage.IDENTIFY, identify.run, ("identify", "lifting")),
-    Step(Stage.QUANTIFY, quantify.run, ("uncertainty",)),
-    Step(Stage.SYNTHESIZE, synthesize.run, ("synthesis", "predictor", "sensor", "limits", "observer", "require")),
+    StageStep(Stage.READ, read.run, ("data", "split", "evaluate.reserve")),
+    StageStep(Stage.CALIBRATE, calibrate.run, ("calibrate", "lifting")),
+    StageStep(Stage.IDENTIFY, identify.run, ("identify", "lifting")),
+    StageStep(Stage.QUANTIFY, quantify.run, ("uncertainty",)),
+    StageStep(Stage.SYNTHESIZE, synthesize.run, ("synthesis", "predictor", "sensor", "limits", "observer", "require")),
 )

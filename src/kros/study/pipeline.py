@@ -20,7 +20,7 @@ from .engine.context import Context
 from .engine.executors import open_executor
 from .engine.run_folder import load_run as load_run  # where readers of runs look for it
 from .engine.run_folder import open_run, require_own
-from .engine.steps import Step, run_steps
+from .engine.steps import StageStep, run_steps
 from .engine.store import Store, code_key
 from .learning import LEARNING
 from .metrics import collect_metrics
@@ -28,9 +28,9 @@ from .stages import evaluate, left_out, read, report
 
 STEPS = (
     *LEARNING,
-    Step(Stage.EVALUATE, evaluate.run, ("evaluate", "sensor", "load")),
-    Step(Stage.LEFT_OUT, left_out.run, ("evaluate", "sensor"), left_out.wanted),
-    Step(Stage.REPORT, report.run, ("name", "require")),
+    StageStep(Stage.EVALUATE, evaluate.run, ("evaluate", "sensor", "load")),
+    StageStep(Stage.LEFT_OUT, left_out.run, ("evaluate", "sensor"), left_out.wanted),
+    StageStep(Stage.REPORT, report.run, ("name", "require")),
 )
 
 

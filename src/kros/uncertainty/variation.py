@@ -128,7 +128,7 @@ def variation_and_noise(
     Parameters
     ----------
     models : ModelSamples
-        Of at least two units, with at least two draws, as `kros.identify.bootstrap_edmd` or `bootstrap_refined` gives them.
+        Of at least two units, with at least two draws, as `kros.identify.bootstrap_edmd` gives them.
     freqs_hz : array_like, shape (frequency,), Hz
     sample_period_s : float, s
     form : Form or str

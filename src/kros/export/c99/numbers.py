@@ -14,7 +14,7 @@ from ...lifting.c_code import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
 from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval
-from ...observer.origin import FAR, Shift
+from ...observer.origin import FAR, OriginShift
 from ...observer.samples import LONGEST
 from ...observer.screen import Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
@@ -54,7 +54,7 @@ class Source:
     realised: Realised
     name: str
     precision: Precision
-    shift: Shift | None
+    shift: OriginShift | None
     loop: PhaseLockedLoop | None = None
     load: LoadOutput | None = None
 

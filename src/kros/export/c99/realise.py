@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...observer import Observer
-from ...observer.origin import Shift, find_shift
+from ...observer.origin import OriginShift, find_shift
 from ...observer.predictor.driven import in_coordinates
 
 Array = npt.NDArray[np.float64]
@@ -34,7 +34,7 @@ class Realised:
     observer: Observer
     model: Array  # (n, n_lifted + m)
     less: tuple[tuple[int, int, float], ...]
-    shift: Shift | None
+    shift: OriginShift | None
     start_gain: Array | None  # (n, q + m)
 
     @classmethod

@@ -18,7 +18,7 @@ from ...lifting import Lifting
 from ..factors import Factor, combine
 from .model import RefinedModels
 from .options import SEED, RefineOptions
-from .problem import _ROW_WEIGHT, OneStep, Problem
+from .problem import _ROW_WEIGHT, OneStep, RefinementProblem
 from .segments import Segments, held_segments, read_segments
 from .sensitivity import normal_equations
 
@@ -62,7 +62,7 @@ def episode_normals(
     rows = np.arange(units) if pooled is None else np.flatnonzero(pooled)
     own = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters}
     one_step = OneStep.of(whole.R, T, n, nl, whole.n_samples, rows)
-    problem = Problem(lifting, own, segments, T, models.sigma, one_step, options.margin)
+    problem = RefinementProblem(lifting, own, segments, T, models.sigma, one_step, options.margin)
     total = np.zeros((units, most, V[0].size + 1, V[0].size + 1))
     runs, counts = _free_runs(V[:, :n], problem)
     owners = segment_owners(keys, options.segments)
@@ -73,7 +73,7 @@ def episode_normals(
     return total
 
 
-def _free_runs(V: Array, problem: Problem) -> tuple[Array, Array]:
+def _free_runs(V: Array, problem: RefinementProblem) -> tuple[Array, Array]:
     """Normal equations of every segment's free run (unit, segment, n p + 1, n p + 1), and a unit's number of residuals of a state."""
     units, n, p = V.shape
     count, width = problem.segments.valid.shape[2], n * p + 1
@@ -94,8 +94,8 @@ def _one_by_one(segments: Segments) -> Segments:
     return Segments(states, inputs, segments.valid.reshape(len(segments.valid), -1, 1), segments.history)
 
 
-def _add_one_step(total: Array, V: Array, factors: Factor, problem: Problem, share: Array) -> None:
-    """Add what each episode contributes to the rows of the lifted functions, weighted as in `Problem.evaluate`."""
+def _add_one_step(total: Array, V: Array, factors: Factor, problem: RefinementProblem, share: Array) -> None:
+    """Add what each episode contributes to the rows of the lifted functions, weighted as in `RefinementProblem.evaluate`."""
     n, nl, p = problem.lifting.n_states, problem.lifting.n_lifted, len(problem.T)
     white = np.concatenate([factors.R[..., :p] @ problem.T, factors.R[..., p + n : p + nl]], axis=-1)
     by_episode = np.swapaxes(white, -1, -2) @ white  # [psi sigma+]^T [psi sigma+], (unit, episode, p + f, p + f)

@@ -15,10 +15,9 @@ from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor
 from ..ranges import Ranges
-from .barrier import stability_barrier
 from .marquardt import minimise
 from .options import ALPHA_FACTOR, GUARD, LEAST_GAIN, RefineOptions
-from .problem import OneStep, Problem
+from .problem import OneStep, RefinementProblem, stability_barrier
 from .segments import Segments
 
 log = logging.getLogger(__name__)
@@ -35,7 +34,7 @@ def start_pooled(
     segments: Segments,
     rows: npt.NDArray[np.int64],
     options: RefineOptions,
-) -> tuple[Array, Problem, Array, Array]:
+) -> tuple[Array, RefinementProblem, Array, Array]:
     """Pooled EDMD in whitened parameters (1, n_lifted, p), the problem of all units without a prior, errors and ranges of states."""
     nl, n = lifting.n_lifted, lifting.n_states
     R = qr_triangle(factor.R[rows].reshape(-1, factor.R.shape[-1]))
@@ -45,7 +44,7 @@ def start_pooled(
     T = _whitening(R[:p, :p], int(factor.n_samples[rows].sum()))
     V = np.linalg.solve(T, np.concatenate([matrices.A, matrices.B], axis=-1).T).T[None]
     one_step = OneStep.of(factor.R, T, n, nl, factor.n_samples, rows)
-    problem = Problem(lifting, parameters, segments, T, np.ones(n), one_step, options.margin)
+    problem = RefinementProblem(lifting, parameters, segments, T, np.ones(n), one_step, options.margin)
     normal = restrict(problem, rows).run(V)
     with np.errstate(invalid="ignore"):
         error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())
@@ -54,7 +53,9 @@ def start_pooled(
     return V, replace(problem, sigma=_sigma(error, span, options.balance)), error, span
 
 
-def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, score: Callable[[Array], float], options: RefineOptions) -> Array:
+def refine_pooled(
+    V: Array, problem: RefinementProblem, error: Array, span: Array, score: Callable[[Array], float], options: RefineOptions
+) -> Array:
     """Fit one model to all units, horizons growing; shape (n_lifted, p)."""
     few = replace(problem, segments=problem.segments.first(max(2, -(-options.pooled_segments // problem.segments.n_units))))
     found: list[tuple[float, float, Array]] = []
@@ -86,7 +87,7 @@ def refine_pooled(V: Array, problem: Problem, error: Array, span: Array, score: 
 
 
 def _grow(
-    V: Array, problem: Problem, options: RefineOptions, admissible: Callable[[Array], npt.NDArray[np.bool_]], first: int
+    V: Array, problem: RefinementProblem, options: RefineOptions, admissible: Callable[[Array], npt.NDArray[np.bool_]], first: int
 ) -> Array | None:
     """Minimise at growing horizons from the first one asked for, at most the longest; None where free runs diverge."""
     V = V.copy()
@@ -100,14 +101,14 @@ def _grow(
     return V
 
 
-def normalised(problem: Problem, V: Array) -> Problem:
+def normalised(problem: RefinementProblem, V: Array) -> RefinementProblem:
     """The problem with errors in units of those that a pooled model V leaves, and with a soft edge of stability."""
     normal = problem.run(V)
     size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, _LEAST_ERROR**2))
     return replace(problem, sigma=problem.sigma * size, guard=GUARD)
 
 
-def _stabilise(V: Array, problem: Problem, options: RefineOptions) -> Array | None:
+def _stabilise(V: Array, problem: RefinementProblem, options: RefineOptions) -> Array | None:
     """Bring a model from outside the edge of stability to the inside; None where that fails."""
     n = problem.lifting.n_states
     shortened = []
@@ -134,11 +135,11 @@ def _stabilise(V: Array, problem: Problem, options: RefineOptions) -> Array | No
     return None
 
 
-def _radius(V: Array, problem: Problem) -> float:
+def _radius(V: Array, problem: RefinementProblem) -> float:
     return float(np.abs(np.linalg.eigvals((V @ problem.T.T)[..., : problem.lifting.n_lifted])).max())
 
 
-def restrict(problem: Problem, rows: npt.NDArray[np.int64]) -> Problem:
+def restrict(problem: RefinementProblem, rows: npt.NDArray[np.int64]) -> RefinementProblem:
     """The problem of one model for some units."""
     own = {name: values[rows] for name, values in problem.parameters.items()}
     one_step = replace(problem.one_step, matrix=problem.one_step.matrix[rows], least=problem.one_step.least[rows])

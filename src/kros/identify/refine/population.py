@@ -28,9 +28,9 @@ from .metric import ResponsePrior
 from .model import RefinedModels, TradeOff
 from .options import GUARD, LARGEST_RESIDUAL, LEAST_GAIN, NEGLIGIBLE_RESIDUAL, SEED, TOLERANCE, RefineOptions
 from .pooled import matrices_of, normalised, ranges, refine_pooled, restrict, start_pooled
-from .problem import Problem
+from .problem import RefinementProblem
 from .segments import held_segments, read_segments
-from .validation_set import ValidationSet, find_unbounded
+from .validation_set import HeldOutRuns, find_unbounded
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -116,7 +116,7 @@ def _refine(
     rows = np.flatnonzero(pooled)
     start, problem, error, span = start_pooled(lifting, parameters, factor, fitted, rows, options)
     spans = ranges(factor, rows, lifting)
-    validation = ValidationSet(population, keys, lifting, parameters, rows, problem, spans)
+    validation = HeldOutRuns(population, keys, lifting, parameters, rows, problem, spans)
     common = refine_pooled(start, restrict(problem, rows), error, span, lambda V: validation.trade_off([V], (np.inf,))[0].score, options)
     prepared = _with_prior(problem, common, factor, rows)
     validation = replace(validation, problem=prepared)
@@ -171,7 +171,7 @@ def _check(
         )
 
 
-def _with_prior(problem: Problem, common: Array, factor: Factor, rows: npt.NDArray[np.int64]) -> Problem:
+def _with_prior(problem: RefinementProblem, common: Array, factor: Factor, rows: npt.NDArray[np.int64]) -> RefinementProblem:
     """The problem of all units at the longest horizon, errors in units of those of the pooled model, with a prior around it."""
     edged = normalised(restrict(problem, rows), common[None])
     model = matrices_of(common, problem.T, problem.lifting.n_lifted)
@@ -179,12 +179,12 @@ def _with_prior(problem: Problem, common: Array, factor: Factor, rows: npt.NDArr
     return replace(problem, sigma=edged.sigma, guard=GUARD, prior=prior)
 
 
-def _strengthen(problem: Problem, strength: float) -> Problem:
+def _strengthen(problem: RefinementProblem, strength: float) -> RefinementProblem:
     """Give the prior a strength, in proportion to the residuals that a unit's free runs have."""
     return problem if problem.prior is None else replace(problem, prior=problem.prior.scaled(strength * problem.residuals))
 
 
-def _path(problem: Problem, common: Array, validation: ValidationSet, options: RefineOptions) -> tuple[list[Array], list[TradeOff]]:
+def _path(problem: RefinementProblem, common: Array, validation: HeldOutRuns, options: RefineOptions) -> tuple[list[Array], list[TradeOff]]:
     """Fit all units at falling strengths, each from the one before, until weaker ones bring nothing or too much uncertainty."""
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
     path: list[Array] = []
@@ -201,7 +201,7 @@ def _path(problem: Problem, common: Array, validation: ValidationSet, options: R
     return path, rows
 
 
-def _fit(problem: Problem, V: Array, iterations: int) -> Solution:
+def _fit(problem: RefinementProblem, V: Array, iterations: int) -> Solution:
     """Fit every unit by itself; those that are done are not run on."""
 
     def narrowed(rows: npt.NDArray[np.int64]) -> Evaluate:
@@ -210,7 +210,7 @@ def _fit(problem: Problem, V: Array, iterations: int) -> Solution:
     return minimise(problem.evaluate, problem.admissible, V, iterations, LEAST_GAIN, narrowed)
 
 
-def _settle(problem: Problem, V: Array, options: RefineOptions) -> Solution:
+def _settle(problem: RefinementProblem, V: Array, options: RefineOptions) -> Solution:
     """Fit all units to the end: those that have not converged go on by themselves."""
     solution = _fit(problem, V, options.iterations)
     for _ in range(_ROUNDS):
@@ -224,7 +224,7 @@ def _settle(problem: Problem, V: Array, options: RefineOptions) -> Solution:
 
 
 def _keep_bounded(
-    problem: Problem,
+    problem: RefinementProblem,
     solution: Solution,
     common: Array,
     strength: float,

@@ -2,6 +2,12 @@
 
     sum ||(x_data - x_free_run) / sigma||^2  +  sum ||(sigma+ - w psi) / sigma_row||^2  +  edge of stability  +  prior
 
+The edge of stability is soft: a search that only rejects unstable models stops where it first meets the edge, this one slides along it.
+
+    edge = weight sum_i max(0, (|lambda_i| - 1 + guard) / guard)^2,      d|lambda| = Re[conj(lambda) / |lambda|  y^H dA x / (y^H x)]
+
+with right and left eigenvectors x, y of A, and ``dA = (dV T^T)`` without its columns of inputs.
+
 A free run retracts and re-lifts, so it does not see the rows of the lifted functions; they enter only the linear model used in
 synthesis, and are fitted one step ahead, from the triangular factors.
 
@@ -19,7 +25,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ...lifting import Lifting
-from .barrier import stability_barrier
 from .metric import ResponsePrior
 from .segments import Segments
 from .sensitivity import Normal, normal_equations
@@ -66,7 +71,7 @@ class OneStep:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class RefinementProblem:
     """Least squares of all units at one horizon."""
 
     lifting: Lifting
@@ -93,7 +98,7 @@ class Problem:
         """Every how many steps the error counts."""
         return max(1, self.segments.horizon // _SAMPLES)
 
-    def at(self, horizon: int) -> Problem:
+    def at(self, horizon: int) -> RefinementProblem:
         """Return the same problem at a horizon up to that of the segments."""
         return replace(self, segments=self.segments.cut(horizon))
 
@@ -141,3 +146,18 @@ def _add(total: Array, part: Array, place: slice) -> None:
     total[:, place, -1] += part[:, :-1, -1]
     total[:, -1, place] += part[:, -1, :-1]
     total[:, -1, -1] += part[:, -1, -1]
+
+
+def stability_barrier(V: Array, T: Array, guard: float, weight: float) -> Array:
+    """Return ``[J r]^T [J r]`` of the cost above, shape (problem, n p + 1, n p + 1), for V (problem, n, p) and T (p, p)."""
+    problems, n, p = V.shape
+    values, right = np.linalg.eig((V @ T.T)[..., :n])
+    size = np.abs(values)
+    excess = np.maximum(0.0, (size - 1 + guard) / guard)  # (problem, eigenvalue)
+    left = np.linalg.pinv(right)  # rows y^H, with y^H x = 1
+    turn = np.conj(values) / np.maximum(size, np.finfo(float).tiny)
+    columns = np.swapaxes(right, -1, -2) @ T[:n]  # x^T of every eigenvalue, through dA = dV T^T
+    slope = (turn[..., None, None] * left[..., :, None] * columns[..., None, :]).real.reshape(problems, n, n * p)
+    J = np.where(excess[..., None] > 0, slope / guard, 0.0)
+    rows = np.sqrt(weight) * np.concatenate([J, -excess[..., None]], axis=-1)
+    return np.asarray(np.swapaxes(rows, -1, -2) @ rows)

@@ -13,7 +13,7 @@ from ...lifting import Lifting
 from ..free_run import free_run
 from .model import TradeOff
 from .pooled import matrices_of
-from .problem import Problem
+from .problem import RefinementProblem
 from .spread import peak_residual_db
 
 Array = npt.NDArray[np.float64]
@@ -97,7 +97,7 @@ def find_unbounded(
 
 
 @dataclass(frozen=True, eq=False)
-class ValidationSet:
+class HeldOutRuns:
     """Scores models on the last training episode of every pooled unit."""
 
     population: Population
@@ -105,7 +105,7 @@ class ValidationSet:
     lifting: Lifting
     parameters: Mapping[str, Array]
     rows: npt.NDArray[np.int64]
-    problem: Problem
+    problem: RefinementProblem
     scales: tuple[Array, Array]
 
     def trade_off(self, V: Sequence[Array], strengths: Sequence[float]) -> tuple[TradeOff, ...]:

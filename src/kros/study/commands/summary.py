@@ -1,11 +1,15 @@
-"""A few lines about a finished run for people at a terminal."""
+"""A few lines about a run for people at a terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from ...core.artifacts import load_artifact, read_json
 from ...report.caveats import confounded_text
+from ..config import Stage
+from ..engine.run_folder import open_finished
 from ..pipeline import RunResult
 
 
@@ -52,3 +56,17 @@ def observer_lines(result: RunResult) -> list[str]:
         mark = "  <- deployed" if name == metrics["study"].get("deployed") else ""
         lines.append(f"{name:<{width}}  {''.join(means)}{mark}")
     return lines
+
+
+def list_run(run: Path) -> list[str]:
+    """Return what was studied, which stages are done, which observers there are by name, and how well they do."""
+    with open_finished(run) as (config, store):
+        records = {stage.value: store.record(stage) for stage in Stage}
+        done = [f"{name} {record.seconds:.3g} s" for name, record in records.items() if record is not None]
+        lines = [f"study {config.name} of {config.data.source}", f"stages done: {', '.join(done) or 'none'}"]
+        if store.is_kept("metrics.json"):
+            return lines + summary_lines(RunResult(store.folder, read_json(store.path("metrics.json")), ()))
+        if store.record(Stage.SYNTHESIZE) is not None:
+            names = load_artifact(store.path("observers"), "observers")[0]["names"]
+            lines += [f"observers: {', '.join(names)}"]
+        return [*lines, "the run has not ended; the same command of kros run goes on with it"]

@@ -33,14 +33,14 @@ _LEVEL = 1  # of compression
 
 
 @dataclass(frozen=True)
-class Seen:
+class KnownResults:
     """What was computed earlier."""
 
     folder: Path
     key: str
     changed: Callable[[Path], None] | None = None
 
-    def read_only(self) -> Seen:
+    def read_only(self) -> KnownResults:
         """Return the same, which keeps nothing new."""
         return replace(self, changed=None)
 

@@ -25,7 +25,7 @@ def always(config: StudyConfig) -> bool:
 
 
 @dataclass(frozen=True)
-class Step:
+class StageStep:
     """One stage: what it does, which sections of the study, or ``section.key``, it depends on beside the stages before it, and which studies have it."""
 
     stage: Stage
@@ -34,7 +34,7 @@ class Step:
     wanted: Callable[[StudyConfig], bool] = always
 
 
-def run_steps(context: Context, steps: Sequence[Step], until: Stage) -> None:
+def run_steps(context: Context, steps: Sequence[StageStep], until: Stage) -> None:
     """Run steps up to a stage, from the first one that is not current; what later ones left goes where it is not current any more."""
     key, ahead = code_key(), False
     try:
@@ -54,7 +54,7 @@ def run_steps(context: Context, steps: Sequence[Step], until: Stage) -> None:
         context.store.tidy()
 
 
-def _run_step(context: Context, steps: Sequence[Step], upstream: str) -> str:
+def _run_step(context: Context, steps: Sequence[StageStep], upstream: str) -> str:
     """Run the first of some steps, or find it done; return what the next one depends on."""
     stage = steps[0].stage
     key = _key(context, steps[0], upstream)
@@ -78,7 +78,7 @@ def _next_key(context: Context, stage: Stage, key: str) -> str:
     return hash_of([key, context.store.output_key(stage)])
 
 
-def _outdate(context: Context, steps: Sequence[Step]) -> None:
+def _outdate(context: Context, steps: Sequence[StageStep]) -> None:
     """Remove what does not follow from the study any more; from here on the run folder is that of the study as it is now."""
     context.store.discard("metrics.json")
     for step in steps:
@@ -89,7 +89,7 @@ def _outdate(context: Context, steps: Sequence[Step]) -> None:
     context.store.keep("study.json", context.config.dump())
 
 
-def _key(context: Context, step: Step, upstream: str) -> str:
+def _key(context: Context, step: StageStep, upstream: str) -> str:
     dumped = context.config.dump()
     dumped |= {f"{section}.{key}": value for section, table in dumped.items() if isinstance(table, dict) for key, value in table.items()}
     inputs = _inputs_key(context) if step.stage is Stage.READ else ""

@@ -24,7 +24,7 @@ from ...core.artifacts import plain, write_json
 from ...core.errors import ConfigError, DataError
 from ...core.locks import NAME as LOCK
 from ...core.records import OWN, Record
-from .seen import Seen
+from .seen import KnownResults
 
 log = logging.getLogger(__name__)
 
@@ -197,7 +197,7 @@ class Store:
             self._write(Record(OWN, own=own))
         records.place(self.folder, name).unlink(missing_ok=True)
 
-    def seen(self, key: str) -> Seen:
+    def seen(self, key: str) -> KnownResults:
         """Return what stages of earlier runs computed unit by unit, with the same code by its key; it is of no stage, and stays when they go."""
 
         def note(path: Path) -> None:
@@ -205,7 +205,7 @@ class Store:
             files = dict(record.files) if record is not None else {}
             self._write(Record(SEEN, files=dict(sorted((files | {f"{SEEN}/{path.name}": records.digest(path)}).items()))))
 
-        return Seen(self.path(SEEN), key, note)
+        return KnownResults(self.path(SEEN), key, note)
 
     def _own(self) -> dict[str, str]:
         record = self.record(OWN)

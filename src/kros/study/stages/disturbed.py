@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -21,10 +21,10 @@ from ...evaluate.sensor import as_shown
 from ...observer import Observer, run_observers
 from ...observer.sensor import Sensors
 from ..engine.context import Context
-from .together import alike
 
 Array = npt.NDArray[np.float64]
 FEW_UNITS, FEW_S, ALL_S = 3, 3.0, 10.0
+_SIDE_BY_SIDE = 8  # observers of one piece of work: few enough to keep all processes busy
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,3 +111,20 @@ def contents(trial: Trial, errors: Mapping[str, tuple[Array, Sequence[int] | Non
         "seconds": trial.samples * trial.population.sample_period_s,
         "robustness": [row for name, (found, own) in errors.items() for row in robustness_rows(name, found, episodes, channels, own)],
     }
+
+
+def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
+    """Return observers in groups that can run side by side: of one lifting, with the same parameters, measured states and inputs."""
+    groups: list[list[Observer]] = []
+    for observer in observers:
+        key = _model_of(observer)
+        group = next((g for g in groups if len(g) < _SIDE_BY_SIDE and _model_of(g[0]) == key), None)
+        if group is None:
+            groups.append([observer])
+        else:
+            group.append(observer)
+    return groups
+
+
+def _model_of(observer: Observer) -> tuple[Any, ...]:
+    return observer.lifting, dict(observer.parameters), observer.measured, observer.inputs

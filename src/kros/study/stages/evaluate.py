@@ -29,9 +29,8 @@ from ...observer.limits import limits_of, sides
 from ...observer.sensor import Sensors
 from ...observer.simulate import run_some_at_a_time
 from ..engine.context import Context
-from .disturbed import Trial, make_trial, run_disturbed
+from .disturbed import Trial, alike, make_trial, run_disturbed
 from .load import run_load
-from .together import alike
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -41,7 +40,7 @@ _NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that s
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class TestOutcome:
     """What one model or observer did on the test episodes: errors, and trajectories of the episodes that are shown."""
 
     summary: ErrorSummary
@@ -67,7 +66,7 @@ def evaluate_observers(
     units: UnitParameters,
     shown: tuple[int, ...],
     sensor: Sensors,
-) -> list[Outcome]:
+) -> list[TestOutcome]:
     """Run observers that `alike` puts together on test episodes as the sensor shows them."""
     first = observers[0]
 
@@ -87,7 +86,7 @@ def evaluate_baseline(
     sensor: Sensors,
     trial: Trial | None = None,
     limits: tuple[Array, Array] | None = None,
-) -> Outcome | str:
+) -> TestOutcome | str:
     """Make a baseline and run it on test episodes as the sensor shows them, and on disturbed ones; the reason where it cannot be made."""
     try:
         baseline = replace(make(), limits=limits)
@@ -100,7 +99,7 @@ def evaluate_baseline(
 
 def evaluate_model(
     models: ModelSet, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
-) -> Outcome:
+) -> TestOutcome:
     """Run every unit's own model freely from the true first state, with delays from the first recorded ones."""
 
     def run(batch: EpisodeBatch) -> list[Array]:
@@ -122,7 +121,7 @@ def _outcomes(
     shown: tuple[int, ...],
     sensor: Sensors,
     truths: bool = True,
-) -> list[Outcome]:
+) -> list[TestOutcome]:
     """Return the outcomes of estimates, shape (estimate, n_samples, batch, n or more), a few at a time, some episodes after others."""
     found = []
     for start in range(0, len(keys) or 1, _EPISODES):  # none at all are refused where they are read
@@ -135,21 +134,21 @@ def _outcomes(
     return [_joined(of_blocks, [i for block in blocks for i in block], shown) for of_blocks in zip(*found, strict=True)]
 
 
-def _of_block(estimates: Array, batch: EpisodeBatch, population: Population, shown: Sequence[int]) -> list[Outcome]:
+def _of_block(estimates: Array, batch: EpisodeBatch, population: Population, shown: Sequence[int]) -> list[TestOutcome]:
     n, lengths = len(population.states), batch.lengths
     summaries = summarise_all(estimates, batch.states, lengths, population.sample_period_s)
     return [
-        Outcome(summary, [estimate[: lengths[i], i, :n].copy() for i in shown], true=_true(estimate[..., :n], batch, population))
+        TestOutcome(summary, [estimate[: lengths[i], i, :n].copy() for i in shown], true=_true(estimate[..., :n], batch, population))
         for summary, estimate in zip(summaries, estimates, strict=True)
     ]
 
 
-def _joined(parts: Sequence[Outcome], found: Sequence[int], shown: tuple[int, ...]) -> Outcome:
+def _joined(parts: Sequence[TestOutcome], found: Sequence[int], shown: tuple[int, ...]) -> TestOutcome:
     """Put outcomes of episodes one after the other; the pieces of `found` episodes, in the order of those that are `shown`."""
     pieces = dict(zip(found, (piece for part in parts for piece in part.shown), strict=True))
     true = [part.true for part in parts if part.true is not None]
     summary = ErrorSummary.joined([part.summary for part in parts])
-    return Outcome(summary, [pieces[i] for i in shown], true=TrueErrors.joined(true) if true else None)
+    return TestOutcome(summary, [pieces[i] for i in shown], true=TrueErrors.joined(true) if true else None)
 
 
 def _true(signals: Array, batch: EpisodeBatch, population: Population) -> TrueErrors | None:
@@ -174,8 +173,8 @@ def run(context: Context) -> None:
     work = estimation(context, population, keys, units, shown, trial)
     work += [Piece((f"free run/{m}",), partial(evaluate_model, found, population, on, units, shown_on)) for m, found in models.items()]
     results = outcomes(context, work)
-    free_runs = {m: outcome for m in models if isinstance(outcome := results.pop(f"free run/{m}"), Outcome)}
-    estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
+    free_runs = {m: outcome for m in models if isinstance(outcome := results.pop(f"free run/{m}"), TestOutcome)}
+    estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, TestOutcome)}
 
     band = band_hz(context)
     rows = []
@@ -220,9 +219,9 @@ def estimation(
     return work
 
 
-def outcomes(context: Context, work: Sequence[Piece]) -> dict[str, Outcome | str]:
+def outcomes(context: Context, work: Sequence[Piece]) -> dict[str, TestOutcome | str]:
     """Do the work; return outcomes by name, observers of the study first, in its order."""
-    found: dict[str, Outcome | str] = {}
+    found: dict[str, TestOutcome | str] = {}
     for piece, result in zip(work, context.work.run("evaluate", [piece.work for piece in work]), strict=True):
         found |= dict(zip(piece.names, result if isinstance(result, list) else [result], strict=True))
     return {name: found[name] for name in dict.fromkeys((*load_observers(context), *found))}
@@ -249,9 +248,9 @@ def baseline_makers(context: Context, population: Population, keys: tuple[Episod
     return makers
 
 
-def facts_of(name: str, result: Outcome | str) -> dict[str, Any]:
+def facts_of(name: str, result: TestOutcome | str) -> dict[str, Any]:
     """Return what the records say about a baseline that was made here."""
-    if isinstance(result, Outcome):
+    if isinstance(result, TestOutcome):
         return result.facts or {}
     log.info("%s could not be made: %s", name, result)
     return {"status": "failed", "reason": result}
@@ -292,7 +291,7 @@ def showcase(context: Context, keys: tuple[EpisodeKey, ...], roles: dict[str, st
 
 def error_rows(
     name: str,
-    outcome: Outcome,
+    outcome: TestOutcome,
     keys: tuple[EpisodeKey, ...],
     roles: dict[str, str],
     channels: tuple[str, ...],
@@ -358,8 +357,8 @@ def _arrays(
     shown: tuple[int, ...],
     shown_on: tuple[int, ...],
     roles: dict[str, str],
-    estimates: dict[str, Outcome],
-    free_runs: dict[str, Outcome],
+    estimates: dict[str, TestOutcome],
+    free_runs: dict[str, TestOutcome],
 ) -> dict[str, npt.NDArray[Any]]:
     """Collect what the figures need: shown trajectories (float32) and mean error spectra by role and condition."""
     arrays: dict[str, npt.NDArray[Any]] = {"freqs_hz": next(iter(free_runs.values())).summary.freqs_hz}

@@ -30,11 +30,11 @@ from ...identify.identified import recordings_of, recordings_path
 from ...observer import Observer
 from ..config import RequireConfig, Stage, StudyConfig
 from ..engine.context import Context
-from ..engine.seen import Seen
-from ..engine.steps import Step, run_steps
+from ..engine.seen import KnownResults
+from ..engine.steps import StageStep, run_steps
 from ..learning import LEARNING
 from . import calibrate
-from .evaluate import Outcome, UnitParameters, band_hz, error_rows, estimation, evaluate_observers, facts_of, outcomes
+from .evaluate import TestOutcome, UnitParameters, band_hz, error_rows, estimation, evaluate_observers, facts_of, outcomes
 from .read import FEWEST
 
 log = logging.getLogger(__name__)
@@ -103,9 +103,9 @@ def run_folds(context: Context, folds: Sequence[Sequence[str]]) -> None:
 def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> dict[str, Any]:
     """Make the study without some units, and run its observers on these; a fold that fails is a result too, with its reason."""
     progress = Fold(whole.work.progress, f"{number + 1}/{folds} ")
-    known = whole.work.seen.read_only() if isinstance(whole.work.seen, Seen) else None  # factors of the same episodes are the same
+    known = whole.work.seen.read_only() if isinstance(whole.work.seen, KnownResults) else None  # factors of the same episodes are the same
     context = Context(without(whole, held), whole.store.nested(FOLDER, str(number)), replace(whole.work, progress=progress, seen=known))
-    steps = (*LEARNING, Step(Stage.EVALUATE, partial(estimate_held, whole, held), ()))
+    steps = (*LEARNING, StageStep(Stage.EVALUATE, partial(estimate_held, whole, held), ()))
     try:
         run_steps(context, steps, Stage.EVALUATE)
     except KrosError as error:
@@ -140,7 +140,7 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
     record = context.observers_record
     band, rows = band_hz(whole), []
     for name, outcome in results.items():
-        if isinstance(outcome, Outcome):
+        if isinstance(outcome, TestOutcome):
             rows += error_rows(name, outcome, keys, dict.fromkeys(held, "left_out"), population.states, band)
     others = {name: facts_of(name, outcome) for name, outcome in results.items() if name not in record["facts"]}
     parameters = {unit: values for unit, values in units.items() if values}

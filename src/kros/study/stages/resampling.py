@@ -17,7 +17,8 @@ import numpy.typing as npt
 from ...core.errors import DataError
 from ...data.population import EpisodeKey, Population
 from ...data.scaled import scale_population
-from ...identify import Factor, KoopmanMatrices, ModelSamples, ModelSet, bootstrap_edmd, bootstrap_refined, episode_weights, lifted_factor
+from ...identify import Factor, KoopmanMatrices, ModelSamples, ModelSet, bootstrap_edmd, episode_weights, lifted_factor
+from ...identify.bootstrap import bootstrap_refined
 from ...identify.ranges import Ranges
 from ...identify.refine.episodes import episode_normals
 from ...identify.refine.model import RefinedModels

@@ -68,6 +68,10 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
         ("kros.identify.bootstrap_refined",),
     ),
     (
+        "Disturbed measurements of every observer, unit and condition are no longer part of a study; use evaluate.robustness = true.",
+        ("evaluate.robustness=all",),
+    ),
+    (
         "The observers kalman_white and luenberger are no longer part of kros; use kalman_tuned.",
         ("observer.baselines=kalman_white", "observer.baselines=luenberger"),
     ),

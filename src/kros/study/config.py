@@ -74,8 +74,7 @@ class EvaluateConfig(Settings):
 
     With `folds` the pooled units are parted into so many folds, and for each the study is made once more on all other units; 0 leaves that out.
     With `reserve` so many units take part in nothing, and their errors bound those of the next unit with this `confidence`.
-    With `robustness` observers of the deployed kind of model run on disturbed measurements of a few units, with "all" every observer on all
-    units in all conditions.
+    With `robustness` observers of the deployed kind of model run on disturbed measurements of a few units.
     """
 
     folds: int = Field(
@@ -83,9 +82,8 @@ class EvaluateConfig(Settings):
     )
     reserve: int = Field(0, ge=0, description="units that take part in nothing; their errors bound those of the next unit")
     confidence: float = Field(0.95, gt=0, lt=1, description="of that bound")
-    robustness: bool | Literal["all"] = Field(
-        True,
-        description="disturbed measurements: of the deployed kind of model on a few units, or all observers on all units in all conditions",
+    robustness: bool = Field(
+        True, description="whether observers of the deployed kind of model run on disturbed measurements of a few units"
     )
 
     @field_validator("folds")

@@ -23,7 +23,7 @@ from ...observer.sensor import Sensors
 from ..engine.context import Context
 
 Array = npt.NDArray[np.float64]
-FEW_UNITS, FEW_S, ALL_S = 3, 3.0, 10.0
+FEW_UNITS, FEW_S = 3, 3.0
 _SIDE_BY_SIDE = 8  # observers of one piece of work: few enough to keep all processes busy
 
 
@@ -68,23 +68,21 @@ class Trial:
 
 def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, dict[str, float]], roles: Mapping[str, str]) -> Trial | None:
     """Return what is run on disturbed measurements; None where the study asks for nothing of it."""
-    config = context.config.evaluate
-    if not config.robustness:
+    if not context.config.evaluate.robustness:
         return None
-    everything = config.robustness == "all"
     record = context.observers_record
     kind = split_name(str(record["deployed"]))[0]
-    names = tuple(name for name in record["names"] if everything or split_name(name)[0] == kind)
+    names = tuple(name for name in record["names"] if split_name(name)[0] == kind)
     models = context.identified.models()
     firsts = {(k.unit, k.condition): k for k in reversed(keys) if roles[k.unit] != "outlier"}
-    chosen = [k for k in keys if firsts.get((k.unit, k.condition)) == k and (everything or k.condition == context.facts.identify_on)]
+    chosen = [k for k in keys if firsts.get((k.unit, k.condition)) == k and k.condition == context.facts.identify_on]
     dt = context.population.sample_period_s
-    given = tuple(chosen if everything else sorted(chosen, key=lambda k: roles[k.unit] != "nominal")[:FEW_UNITS])
+    given = tuple(sorted(chosen, key=lambda k: roles[k.unit] != "nominal")[:FEW_UNITS])
     if not given:
         return None
     calibrated = any(units.values())
     disturbances = tuple(standard_disturbances([k for k in Kind if calibrated or k is not Kind.PHASE]))
-    samples = round((ALL_S if everything else FEW_S) / dt)
+    samples = round(FEW_S / dt)
     return Trial(context.population, given, samples, units, models.measured, disturbances, names, context.config.sensor)
 
 

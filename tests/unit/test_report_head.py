@@ -17,9 +17,7 @@ from kros.report.content import Level
 from kros.report.error_tables import error_table
 from kros.report.run_folder import RunFolder
 from kros.report.sections import deployment
-from kros.report.sparks import spark
 from kros.report.summary import summary
-from kros.report.theme import Tone
 from kros.report.trust import best_certified, dropout_text, sensor_text, trust_of, trusts
 from kros.synthesis.result import Injection
 
@@ -153,15 +151,3 @@ def test_the_card_says_what_an_engineer_needs_and_what_voids_the_certificate(tmp
     assert "of 38 units. One more good unit leaves it with a probability of 2 %, and 2.00 times an hour of motion" in card["Monitor"]
     assert "On c, whose recorded signals are outside" in card["It is void"]
     assert deployment.section(RunFolder(tmp_path), metrics(study={"deployed": None})) is None
-
-
-def test_small_pictures_keep_their_lines_inside_and_cut_what_diverges() -> None:
-    x = np.linspace(0.0, 20.0, 5000)
-    values = np.where(x < 15, np.sin(x), np.inf)
-    drawn = spark("a <b>", x, [(values, Tone.BLUE, 1.0)], "s")
-    assert "a &lt;b&gt;" in drawn
-    assert drawn.count("<path") == 2  # the line, and zero
-    assert len(drawn) < 5000
-    points = [float(v) for pair in drawn.split('d="M')[2].split('"')[0].split("L") for v in pair.split()]
-    assert 0 <= min(points) <= max(points) <= 380
-    assert spark("nothing", x, [(np.full(5000, np.nan), Tone.BLUE, 1.0)], "s") == ""

@@ -39,8 +39,6 @@ class Cell:
         Share of the cell's width that is shaded, 0 to 1.
     value : float or None
         What the cell is sorted by; its text by default.
-    href : str
-        Anchor that the text leads to.
     """
 
     text: str
@@ -48,7 +46,6 @@ class Cell:
     note: str = ""
     bar: float | None = None
     value: float | None = None
-    href: str = ""
 
 
 Cells = Sequence[Cell | str]
@@ -98,17 +95,6 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Panel:
-    """A part of a section that stands for one thing of many, such as a unit: anchor, title, terms, tables and inline pictures."""
-
-    key: str
-    title: str
-    card: Sequence[tuple[str, Sequence[str]]] = ()
-    tables: Sequence[Table] = ()
-    pictures: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
 class Section:
     """A section of the report; figures are named and come after the tables.
 
@@ -128,8 +114,6 @@ class Section:
         Terms and what there is to say about them.
     notes : sequence of str
         Paragraphs behind the tables.
-    panels : sequence of Panel
-        What the reader opens one at a time.
     """
 
     key: str
@@ -141,7 +125,6 @@ class Section:
     lists: Sequence[tuple[str, Sequence[str]]] = ()
     card: Sequence[tuple[str, Sequence[str]]] = ()
     notes: Sequence[str] = ()
-    panels: Sequence[Panel] = ()
 
 
 def where(names: Iterable[str], name: str | None) -> list[int]:

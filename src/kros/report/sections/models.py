@@ -33,7 +33,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         text += f"Lifted functions: {', '.join(lifted)}."
     units = [f"{row['unit']} ({row['status']})" for row in metrics.get("units", []) if row["status"] not in ("ok", "not calibrated")]
     paragraphs = [text] + ([f"Units with a remark: {'; '.join(units)}."] if units else [])
-    return Section("models", "Models", paragraphs, [_table(models)], ["models", "free_run", "free_run_spectra", "trade_off"])
+    return Section("models", "Models", paragraphs, [_table(models)], ["models", "free_run", "free_run_spectra"])
 
 
 def _table(models: Mapping[str, Any]) -> Table:

@@ -1,4 +1,4 @@
-"""Every unit: its errors, score, residual and phase in a table, and all that is known of it behind its name."""
+"""Every unit: its errors, score, residual and phase in a table."""
 
 from __future__ import annotations
 
@@ -11,22 +11,14 @@ from typing import Any
 import numpy as np
 
 from ...core.artifacts import load_artifact
-from ...core.errors import KrosError
-from ...data import EpisodeBatch
-from ...data.population import EpisodeKey
-from ...evaluate.sensor import as_shown
-from ...observer import run_observer
-from ..content import Cell, Cells, Panel, Section, Table
-from ..figures.recordings.phase import GOOD
-from ..names import axis_label, channel_units, condition_label, in_condition, minus, number, observer_label, readable_unit
-from ..run_folder import Array, NotShownError, RunFolder
-from ..sparks import spark
-from ..theme import Tone
-from .outliers import score_card, score_names, some_of, undecided_text
+from ..content import Cell, Cells, Section, Table
+from ..names import axis_label, channel_units, condition_label, in_condition, number, observer_label
+from ..run_folder import RunFolder
+from .outliers import some_of, undecided_text
 
 log = logging.getLogger(__name__)
 Row = Mapping[str, Any]
-_MOST, _ROWS = 100, 400  # units that get a panel with pictures, and units that all get a row; more would make the page too large
+_ROWS = 400  # units that all get a row; more would make the page too large
 _FAR = 20  # largest of every column that get a row where not all do
 _SHARES = {"5 %": 0.05, "median": 0.5, "95 %": 0.95}
 
@@ -42,27 +34,26 @@ class _Known:
 
 
 def section(run: RunFolder, metrics: Row) -> Section | None:
-    """Return the table of units and a panel for each; None where no unit is known."""
+    """Return the table of units; None where no unit is known."""
     if not metrics.get("units"):
         return None
     found, name = _known(run, metrics), metrics["study"].get("deployed")
     hidden = [c for c in dict.fromkeys(r["channel"] for known in found.values() for r in known.errors) if c not in run.measured_states]
     flagged = [unit for unit, known in found.items() if any(r["outlier"] for r in known.scores)]
     named = some_of(flagged)
-    text = f"A name leads to all that is known of the unit{f', with “{observer_label(name)}”' if name else ''}. "
+    text = f"Errors are those of “{observer_label(name)}”. " if name else ""
     text += f"Flagged as not belonging to the batch: {named}." if flagged else "No unit is flagged."
     shown, tables = found, list[Table]()
     if len(found) > _ROWS:
         columns = _columns(metrics, found, hidden)
         shown, tables = _extremes(found, columns), [_quantiles(columns, len(found))]
-    panels = _panels(run, metrics, dict(list(shown.items())[:_MOST]))
     cut = (
         "Every unit"
         if shown is found
         else f"{len(shown)} of {len(found)} units, those flagged and the {_FAR} largest of every column; metrics.json has all"
     )
-    tables.append(_table(run, metrics, shown, hidden, {p.key for p in panels}, cut))
-    return Section("units", "Units", [text, *undecided_text(metrics.get("outliers", []))], tables, panels=panels)
+    tables.append(_table(run, metrics, shown, hidden, cut))
+    return Section("units", "Units", [text, *undecided_text(metrics.get("outliers", []))], tables)
 
 
 def _columns(metrics: Row, found: Mapping[str, _Known], hidden: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -117,13 +108,13 @@ def _known(run: RunFolder, metrics: Row) -> dict[str, _Known]:
     return dict(sorted(found.items(), key=lambda item: (not any(r["outlier"] for r in item[1].scores), item[0])))
 
 
-def _table(run: RunFolder, metrics: Row, found: Mapping[str, _Known], hidden: Sequence[str], panels: set[str], cut: str) -> Table:
+def _table(run: RunFolder, metrics: Row, found: Mapping[str, _Known], hidden: Sequence[str], cut: str) -> Table:
     home, units = metrics["study"]["identify_on"], channel_units(metrics)
     conditions = list(dict.fromkeys(r["condition"] for r in metrics.get("outliers", [])))
     rows: list[Cells] = []
     for unit, known in found.items():
         status = "flagged" if any(r["outlier"] for r in known.scores) else known.own.get("status", "ok")
-        row: list[Cell | str] = [Cell(unit, href=_key(unit) if _key(unit) in panels else ""), Cell(status, strong=status != "ok")]
+        row: list[Cell | str] = [unit, Cell(status, strong=status != "ok")]
         errors = {r["channel"]: r for r in known.errors if r["condition"] == home}
         for channel in hidden:
             own = errors.get(channel, {})
@@ -151,120 +142,3 @@ def _cell(value: float | None, strong: bool = False) -> Cell:
 
 def _degrees(angle_rad: float | None) -> float | None:
     return None if angle_rad is None else math.degrees(angle_rad)
-
-
-def _key(unit: str) -> str:
-    return "unit-" + "".join(c if c.isalnum() else f"-{ord(c):x}-" for c in unit)
-
-
-def _panels(run: RunFolder, metrics: Row, found: Mapping[str, _Known]) -> list[Panel]:
-    pictures = _signals(run, found)
-    residuals = _residuals(run, metrics)
-    names = {r["condition"]: score_names(run, r["condition"]) for r in metrics.get("outliers", [])}
-    panels = []
-    for unit, known in found.items():
-        scores = [score_card(r, names[r["condition"]]).removeprefix(f"Unit {unit} ") for r in known.scores]
-        card = [("Phase", _phase(run, unit)), ("Scores", scores), ("Bound as it runs", _bound(known.bound))]
-        table = [_errors(known.errors, channel_units(metrics))] if known.errors else []
-        group, status = known.own.get("group") or "population", known.own.get("status", "ok")
-        recorded = ", ".join(condition_label(c) for c in known.own.get("conditions", []))
-        title = f"Unit {unit}: {group}, {status}" + (f"; recorded {recorded}" if recorded else "")
-        panels.append(
-            Panel(_key(unit), title, [(t, told) for t, told in card if told], table, [*pictures.get(unit, []), *residuals.get(unit, [])])
-        )
-    return panels
-
-
-def _phase(run: RunFolder, unit: str) -> list[str]:
-    own = run.calibration.units.get(unit) if run.calibrated else None
-    if own is None:
-        return []
-    weak = "; low, so the phase is uncertain" if own.concentration < GOOD else ""
-    phase, lag = (minus(f"{math.degrees(value):.1f}") for value in (own.phase_rad, own.lag_rad))
-    return [
-        f"{phase}° with a lag of {lag}°, from {own.n_segments} segments at constant speed, concentration {number(own.concentration, 4)}{weak}."
-    ]
-
-
-def _bound(row: Row) -> list[str]:
-    if not row:
-        return []
-    told = {key: number(100 * row[key]) for key in ("error", "bound", "gain_bound")}
-    return [
-        f"Error {told['error']} %, bound {told['bound']} % (by the gain alone {told['gain_bound']} %), all states together; residual {number(row['residual'])} "
-        "times the population's."
-    ]
-
-
-def _errors(rows: Sequence[Row], units: Mapping[str, str]) -> Table:
-    cells: list[Cells] = [
-        [
-            r["channel"].replace("_", " "),
-            condition_label(r["condition"]),
-            f"{number(r['rms'])} {readable_unit(units.get(r['channel'], ''))}".strip(),
-            "diverged" if r["error_percent"] is None else number(r["error_percent"]),
-        ]
-        for r in rows
-    ]
-    return Table(["error of", "condition", "RMS", "% of the largest value"], cells)
-
-
-def _signals(run: RunFolder, found: Mapping[str, _Known]) -> dict[str, list[str]]:
-    """Draw recorded and estimated hidden states, and the error below, of the first held-out episode of every unit; nothing where recordings are gone."""
-    try:
-        home, calibrated = run.identify_on, run.calibration.units if run.calibrated else {}
-        keys = {key.unit: key for key in (EpisodeKey(*row) for row in reversed(run.facts["test"])) if key.condition == home}
-        keys = {unit: key for unit, key in keys.items() if unit in found and (not run.calibrated or unit in calibrated)}
-        observer, population = run.observer, run.population
-        parameters = {u: {run.calibration.spec.parameter: calibrated[u].phase_rad} for u in keys} if run.calibrated else None
-        batch = EpisodeBatch.read(population, list(keys.values()), parameters=parameters)
-        shown = as_shown(batch, observer.sensor, population.states)
-        own = observer.own(batch.parameters)
-        estimate = run_observer(observer, shown.measurements(observer.measured), batch.inputs, own)
-    except (NotShownError, KrosError, OSError) as reason:
-        log.info("signals of units are left out: %s", reason)
-        return {}
-    hidden = [(i, c) for i, c in enumerate(run.states) if not c.measured][:2]
-    pictures = {}
-    for k, unit in enumerate(keys):
-        length = int(batch.lengths[k])
-        time_s = np.arange(length) * batch.sample_period_s
-        pictures[unit] = [
-            picture
-            for i, channel in hidden
-            for picture in _pair(axis_label(channel.name, channel.unit), time_s, batch.states[:length, k, i], estimate[:length, k, i])
-        ]
-    return pictures
-
-
-def _pair(label: str, time_s: Array, recorded: Array, estimate: Array) -> list[str]:
-    with np.errstate(invalid="ignore", over="ignore"):
-        error = np.where(np.abs(estimate) < 1e6, recorded - estimate, np.nan)
-    if not np.isfinite(error).any():
-        return [(spark(f"{label}, recorded; the estimate diverges", time_s, [(recorded, Tone.INK, 1.0)], "s"))]
-    return [
-        (spark(f"{label}, recorded", time_s, [(recorded, Tone.INK, 1.0)], "s")),
-        (spark(f"{label}, recorded minus estimated", time_s, [(error, Tone.BLUE, 0.8)], "s")),
-    ]
-
-
-def _residuals(run: RunFolder, metrics: Row) -> dict[str, list[str]]:
-    """Draw every unit's residual over the weights, with the largest of all units, of the models behind the deployed observer."""
-    model = (metrics["study"].get("deployed") or "").rpartition("/")[0]
-    try:
-        found = run.unit_residuals
-    except NotShownError:
-        return {}
-    residuals = found.get(model) or next(iter(found.values()))
-    levels = 20 * np.log10(np.maximum(residuals.ratio, 1e-3))
-    kept = residuals.freqs_hz > 0
-    freqs, most = residuals.freqs_hz[kept], levels.max(axis=0)[kept]
-    lines = {
-        u: [(most, Tone.GREY, 1.0), (levels[k][kept], Tone.BLUE, 1.2)]
-        for k, u in enumerate(residuals.unit_ids)
-        if u != residuals.nominal_id
-    }
-    return {
-        u: [(spark("Residual over the weights (dB); grey: the largest of all units", freqs, own, "Hz", logarithmic=True))]
-        for u, own in lines.items()
-    }

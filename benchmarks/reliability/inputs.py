@@ -29,7 +29,7 @@ from kros.core.errors import KrosError
 from kros.core.lti import StateSpace
 from kros.core.records import read_record
 from kros.data import Channel, Role, check_population, from_arrays, from_frame, from_pykoop, read, write_parquet
-from kros.data.checks import scan_prints
+from kros.data.checks import scan_digests
 from kros.identify import ModelSet
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime
@@ -177,7 +177,7 @@ def recorded(population: Any) -> Any:
     """Everything that is in a population, for comparison."""
     check_population(population, allow_single=True)
     facts = plain([population.channels, population.sample_period_s, population.units, population.metadata])
-    return facts, [(str(key), found.digest) for key, found in scan_prints(population)]
+    return facts, [(str(key), digest) for key, digest in scan_digests(population)]
 
 
 def matrices(value: Any) -> Any:

@@ -140,7 +140,7 @@ def test_every_key_of_a_study_is_on_the_page_of_keys(monkeypatch: pytest.MonkeyP
 def test_every_key_of_a_mapping_says_something(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = page_of_keys(monkeypatch).split("## A mapping")[1].split("## Preparation steps")[0].splitlines()
     rows = [row for row in lines if row.startswith("| `")]
-    assert len(rows) == 28
+    assert len(rows) == 26
     assert [row for row in rows if row.endswith("|  |")] == []
 
 
@@ -160,7 +160,7 @@ def test_every_public_object_has_a_page_and_a_row(monkeypatch: pytest.MonkeyPatc
     objects = pages_of_objects(monkeypatch)
     public = {f"{p.__name__}.{name}": getattr(p, name) for p in packages() for name in p.__all__}
     expected = {name for name, found in public.items() if not isinstance(found, ModuleType)}
-    assert len(expected) > 200
+    assert len(expected) > 100
     (tmp_path / "kros.core.gone.rst").touch()
     objects.write(tmp_path)
     assert {path.stem for path in tmp_path.iterdir()} == expected | {package.__name__ for package in packages()}

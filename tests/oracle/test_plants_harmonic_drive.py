@@ -188,13 +188,13 @@ def test_at_rest_the_load_torque_is_gravity_and_the_current_holds_it(drives):
             gravity = truth.parameters.load_moment[row] * np.sin(start[3]) / truth.parameters.torque_constant[row]
             assert truth.load_torque(key)[0] == pytest.approx(gravity, abs=2e-3)  # the twist turns the load by less than 5 mrad
             held = drives.raw.read(key)[:1000, 2].mean()
-            assert held == pytest.approx(truth.load_torque(key)[0] + truth.gearbox_current(unit, start[3]), abs=2e-3)
+            assert held == pytest.approx(truth.load_torque(key)[0] + truth.parameters.take([row]).gearbox_current(start[3:4])[0], abs=2e-3)
 
 
 def test_load_torque_follows_the_target_in_motion(drives):
     """Away from the gear's resonance the load turns as commanded: inertia times acceleration, plus gravity."""
     p, key = drives.truth.parameters, drives.population.keys("001003", "load")[0]
-    row = drives.truth.row("001003")
+    row = drives.truth.unit_ids.index("001003")
     x = drives.population.read(key)
     smooth = np.convolve(np.gradient(x[:, 4], PERIOD), np.ones(120) / 120, "same")
     expected = (p.load_inertia[row] * smooth + p.load_moment[row] * np.sin(x[:, 3])) / p.torque_constant[row]

@@ -8,7 +8,7 @@ import pytest
 
 import kros
 from kros.core.errors import DataError, MissingDependencyError
-from kros.data import Channel, EpisodeKey, Role, Unit, from_arrays, from_frame, from_pykoop, to_pykoop
+from kros.data import Channel, EpisodeKey, Role, from_arrays, from_frame, from_pykoop, to_pykoop
 
 CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 
@@ -75,13 +75,6 @@ def test_names_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
         kros.from_arrays({"a": [dict(zip("xvu", values(0).T, strict=True))]}, **{**NAMES, **changes})
 
 
-def test_units_and_metadata() -> None:
-    facts = [Unit("b", "outliers", {"line": 2}), Unit("never recorded")]
-    population = from_arrays({"a": [values(0)], "b": [values(1)]}, CHANNELS, 0.1, units=facts, metadata={"plant": "p"})
-    assert [(u.id, u.group) for u in population.units] == [("a", ""), ("b", "outliers")]
-    assert population.metadata == {"plant": "p"}
-
-
 @pytest.mark.parametrize(
     ("episode", "message"),
     [
@@ -121,13 +114,6 @@ def test_frame() -> None:
     assert [k.episode for k in population.episodes] == ["2", "10", "2"]
     np.testing.assert_array_equal(population.read(EpisodeKey("a", "hot", "10")), values(1))
     assert kros.from_frame(frame(), states=["x", "v"], inputs=["u"], measured=["x"], time="t").measured == ("x",)
-
-
-def test_frame_with_defaults_and_renamed_columns() -> None:
-    one = frame().query("unit == 'b'").drop(columns=["condition", "episode"]).rename(columns={"unit": "serial"})
-    population = from_frame(one, CHANNELS, sample_period_s=0.5, unit="serial", units=[Unit("b", "outliers")])
-    assert population.episodes == (EpisodeKey("b", "default", "0"),)
-    assert population.unit("b").group == "outliers"
 
 
 def test_frame_refuses() -> None:

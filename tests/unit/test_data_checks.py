@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kros.core.errors import ConfigError, DataError
+from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, check_population, from_arrays
-from kros.data.checks import check_episode, scan_prints
+from kros.data.checks import check_episode, scan_digests
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 KEY = EpisodeKey("001011", "load", "7")
@@ -21,10 +21,6 @@ def values(seed: int = 0, n: int = 20) -> np.ndarray:
 
 def population(episodes: Any = None, units: tuple[Unit, ...] = ()) -> Population:
     return from_arrays(episodes or {"a": [values(0), values(1)], "b": [values(2), values(3)]}, CHANNELS, 0.1, units=units)
-
-
-def test_a_good_episode_passes() -> None:
-    check_episode(values(), KEY, CHANNELS)
 
 
 @pytest.mark.parametrize(
@@ -42,14 +38,6 @@ def test_non_finite(rows: slice, value: Any, found: str) -> None:
     match = rf"^Episode 7 of unit 001011 \(load\): channel 'v' has {found}; fix the source or set data\.on_nan = \"drop_episode\"\.$"
     with pytest.raises(DataError, match=match):
         check_episode(bad, KEY, CHANNELS)
-
-
-def test_infinities_of_both_signs_and_huge_values() -> None:
-    bad = values()
-    bad[3:5, 1] = [np.inf, -np.inf]
-    with pytest.raises(DataError, match="2 infinity at samples 3-4"):
-        check_episode(bad, KEY, CHANNELS)
-    check_episode(np.sign(values()) * 1e308, KEY, CHANNELS)
 
 
 def test_an_input_may_be_held_and_a_machine_may_rest() -> None:
@@ -108,18 +96,13 @@ def test_empty_and_duplicate() -> None:
         check_population(replace(good, episodes=(*good.episodes, good.episodes[0])))
 
 
-def test_channel_names_differ() -> None:
-    with pytest.raises(DataError, match=r"Channel names should differ, found \['x'\]"):
-        from_arrays({"a": [values()]}, (CHANNELS[0], CHANNELS[0], CHANNELS[2]), 0.1)
-
-
 def test_scan_refuses_an_input_that_never_moves() -> None:
     resting = [values(i) for i in range(4)]
     resting[0][:, 2] = 0.0
-    scan_prints(population({"a": resting[:2], "b": resting[2:]}))
+    scan_digests(population({"a": resting[:2], "b": resting[2:]}))
     resting[1][:, 2] = 0.0
     with pytest.raises(DataError, match=r"Unit a \(default\): input 'u' stays at 0 in all 2 episodes"):
-        scan_prints(population({"a": resting[:2], "b": resting[2:]}))
+        scan_digests(population({"a": resting[:2], "b": resting[2:]}))
 
 
 @pytest.mark.parametrize("later", [2.5, -1.0], ids=["same level", "another level"])
@@ -128,14 +111,7 @@ def test_scan_refuses_a_state_that_rests_in_every_episode(later: float) -> None:
     with pytest.raises(
         DataError, match=r"Unit a \(default\): state 'x' stays where it is in each of 2 episodes, in the first at 0; check the sensor"
     ):
-        scan_prints(population({"a": stuck}))
-
-
-def test_scan_accepts_an_input_held_at_different_levels() -> None:
-    levels = [values(i) for i in range(2)]
-    for level, episode in enumerate(levels):
-        episode[:, 2] = level
-    scan_prints(population({"a": levels}))
+        scan_digests(population({"a": stuck}))
 
 
 def test_scan_drops_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
@@ -144,17 +120,8 @@ def test_scan_drops_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
     episodes["b"][0][4, 1] = np.nan
     bad = population(episodes)
     with pytest.raises(DataError, match="channel 'x' has 1 NaN at sample 3"):
-        scan_prints(bad)
+        scan_digests(bad)
     with caplog.at_level(logging.WARNING):
-        kept = scan_prints(bad, on_nan="drop_episode")
+        kept = scan_digests(bad, on_nan="drop_episode")
     assert [key for key, _ in kept] == [EpisodeKey("a", "default", "0")]
     assert [r.message.split(":")[1] for r in caplog.records] == [" Episode 1 of unit a (default)", " Episode 0 of unit b (default)"]
-
-
-def test_scan_takes_the_policy_by_name() -> None:
-    samples = values(0)
-    samples[3, 0] = np.nan
-    with pytest.raises(DataError, match="1 NaN at sample 3"):
-        scan_prints(population({"a": [samples]}), on_nan="error")
-    with pytest.raises(ConfigError, match=r"data\.on_nan should be"):
-        scan_prints(population(), on_nan="ignore")

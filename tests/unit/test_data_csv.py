@@ -88,30 +88,12 @@ def test_several_units_in_one_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(population.read(EpisodeKey("rig/joint2", "default", "1")), values[:, 3:], rtol=1e-15)
 
 
-def test_columns_of_a_unit_may_stand_beside_its_suffix(tmp_path: Path) -> None:
-    values = np.column_stack([samples(0), samples(1)[:, 1:]])
-    write(tmp_path / "rig_1.csv", values, "t,pos1,volt1,pos2,volt2")
-    channel = [{k: v for k, v in c.items() if k != "column"} for c in CHANNEL]
-    units = [{"suffix": "/1", "x": "pos1", "u": "volt1"}, {"suffix": "/2", "x": "pos2", "columns": {"u": "volt2"}}]
-    population = read_csv_folder(tmp_path, mapping(files="(?P<unit>rig)", channel=channel, unit=units))
-    np.testing.assert_allclose(population.read(EpisodeKey("rig/2", "default", "0"))[:, 1], values[:, 4])
-    units[0]["z"] = "pos2"
-    with pytest.raises(ConfigError, match=r"unit\[0\]: unknown key 'z'; known keys are suffix, columns"):
-        read_csv_folder(tmp_path, mapping(files="(?P<unit>rig)", channel=channel, unit=units))
-
-
 def test_decimal_comma_skipped_lines_and_quoted_names(tmp_path: Path) -> None:
     text = '\ufeffBench 4\n;;\n"t";"pos; raw";"volt"\n0,00;1,5;-2e0\n0,01;2,5;3\n0,02;4,5;3\n'
     (tmp_path / "a_1.csv").write_text(text, encoding="utf-8")
     channel = [CHANNEL[0], {**CHANNEL[1], "column": "pos; raw"}]
     population = read_csv_folder(tmp_path, mapping(files="a_1", channel=channel, delimiter=";", decimal=",", skip_rows=2))
     np.testing.assert_allclose(population.read(population.episodes[0]), [[1.5e-3, -2], [2.5e-3, 3], [4.5e-3, 3]])
-
-
-def test_spaces_and_quotes_around_names_and_cells(tmp_path: Path) -> None:
-    (tmp_path / "a_1.csv").write_text('t, "pos", volt\r\n0.00, 1.5, -2e0\r\n0.01, 2.5, 3\r\n0.02, 4.5, 3\r\n')
-    values = read_csv_folder(tmp_path, mapping(files=r"(?P<unit>a)_(?P<episode>\d)")).read(EpisodeKey("a", "default", "1"))
-    np.testing.assert_allclose(values, [[1.5e-3, -2], [2.5e-3, 3], [4.5e-3, 3]])
 
 
 def test_tab_separated_without_header(tmp_path: Path) -> None:
@@ -159,11 +141,6 @@ def test_columns_that_are_missing_or_double(folder: Path, header: str, message: 
     write(folder / "b" / "cold_1.csv", samples(0), header)
     with pytest.raises(DataError, match=message):
         read_csv_folder(folder, MAPPING)
-
-
-def test_columns_nobody_asked_for_are_left_alone(folder: Path) -> None:
-    write(folder / "b" / "cold_1.csv", np.column_stack([samples(0), samples(1)]), "t,pos,volt,a,b,c")
-    np.testing.assert_allclose(read_csv_folder(folder, MAPPING).read(EpisodeKey("b", "cold", "1"))[:, 1], samples(0)[:, 2])
 
 
 @pytest.mark.parametrize(
@@ -260,33 +237,11 @@ def test_files_that_cannot_be_read(folder: Path) -> None:
         read_csv_folder(folder, MAPPING)
 
 
-def test_header_alone(folder: Path) -> None:
-    write(folder / "b" / "cold_1.csv", samples(0)[:0])
-    with pytest.raises(DataError, match=r"Episode 1 of unit b \(cold\): at least 3 samples are needed, found 0"):
-        read_first(folder, "b")
-    write(folder / "a" / "cold_1.csv", samples(0)[:1])
-    with pytest.raises(DataError, match=r"Episode 1 of unit a \(cold\): the sampling period needs at least two samples with time, found 1"):
-        read_csv_folder(folder, MAPPING)
-
-
-def test_time_that_stands_still(folder: Path) -> None:
-    write(folder / "a" / "cold_1.csv", samples(0) * [0, 1, 1])
-    with pytest.raises(DataError, match="the median time step is 0 s; name the column that holds time"):
-        read_csv_folder(folder, MAPPING)
-
-
 def test_one_unit_in_two_groups(tmp_path: Path) -> None:
     for name in ("good/a_1.csv", "outliers/a_2.csv"):
         write(tmp_path / name, samples(0))
     with pytest.raises(DataError, match="Unit a is in both groups 'good' and 'outliers'"):
         read_csv_folder(tmp_path, mapping(files=r"(?P<group>\w+)/(?P<unit>a)_(?P<episode>\d)"))
-
-
-def test_restricted_to_one_unit(folder: Path) -> None:
-    population = read_csv_folder(folder, MAPPING)
-    one = population.select(units=["a"])
-    assert len(one.source.recordings.places) == 2  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(one.read(one.episodes[0]), population.read(one.episodes[0]))
 
 
 def test_pieces_are_the_recording_in_parts(tmp_path: Path) -> None:

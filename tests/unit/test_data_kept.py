@@ -30,13 +30,6 @@ def test_a_file_that_was_written_anew_is_read_anew(tmp_path):
     np.testing.assert_array_equal(population.read(key), RAMP + 5.0)
 
 
-def test_what_is_kept_cannot_be_changed_by_who_reads_it(tmp_path):
-    written(tmp_path / "one", 1.0)
-    population = read_parquet(tmp_path / "one")
-    with pytest.raises(ValueError, match="read-only"):
-        population.read(population.episodes[0])[0, 0] = 3.0
-
-
 def test_no_more_is_kept_than_stated_and_a_large_array_throws_nothing_out():
     kept = Kept(limit=1000)
     for name in "abcd":

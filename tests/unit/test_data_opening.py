@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError
-from kros.data import Channel, Role, from_arrays, read, read_parquet, write_parquet, write_raw
+from kros.data import Channel, Role, from_arrays, read, write_parquet, write_raw
 from kros.data.readers.motor_drive_raw import CHANNELS, STEPS
 from kros.data.readers.opening import detect_reader
 
@@ -93,15 +93,3 @@ def test_unknown_reader_and_options(folders: Path) -> None:
         read(folders / "parquet", "parquet", mapping=MAPPING)
     with pytest.raises(ConfigError, match=r"data\.prepare\[0\] \(step 'trim'\): unknown key"):
         read(folders / "parquet", "parquet", prepare=[{"step": "trim", "from": 3}])
-
-
-@pytest.mark.parametrize("name", ["motor-drive-raw", "parquet", "csv"])
-def test_declared_steps_come_after_the_readers_own(folders: Path, name: str) -> None:
-    mapping = MAPPING if name == "csv" else None
-    whole = read(folders / name, name, mapping=mapping)
-    trimmed = read(folders / name, name, mapping=mapping, prepare=[{"step": "trim", "start": 2}])
-    np.testing.assert_array_equal(trimmed.read(whole.episodes[0]), whole.read(whole.episodes[0])[2:])
-
-
-def test_paths_may_be_text(folders: Path) -> None:
-    assert read(str(folders / "parquet"), "parquet").episodes == read_parquet(str(folders / "parquet")).episodes

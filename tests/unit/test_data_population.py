@@ -1,6 +1,6 @@
 """Names, selections and the split."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kros.core.errors import DataError
-from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, prepare, split_episodes, steps, write_parquet
+from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, split_episodes, write_parquet
 from kros.data.population import natural_key
 from kros.data.prepare import assemble
 from kros.data.readers.arrays import ArrayRecordings
@@ -46,22 +46,6 @@ def test_keys_select_and_groups_agree() -> None:
         part.read(EpisodeKey("b", "hot", "0"))
 
 
-def test_order_of_episodes_survives_selection() -> None:
-    whole = population({("a", "hot"): 2, ("b", "hot"): 2})
-    mixed = replace(whole, episodes=tuple(whole.episodes[i] for i in (2, 0, 3, 1)))
-    assert mixed.select(units=["b", "a", "b"]).episodes == mixed.episodes
-    assert mixed.select(units=iter(["a"])).episodes == (whole.episodes[0], whole.episodes[1])
-    assert mixed.select(units=["b", "a"]).unit_ids == ("a", "b")
-
-
-def test_states_and_inputs_apart() -> None:
-    whole = population({("a", "hot"): 1})
-    states, inputs = whole.read_parts(whole.episodes[0])
-    assert (states.shape, inputs.shape) == ((5, 1), (5, 1))
-    with pytest.raises(DataError, match="Asked for unit 'z'; the population has a"):
-        whole.unit("z")
-
-
 @pytest.mark.parametrize(("n", "test"), [(20, ["18", "19"]), (10, ["9"]), (2, ["1"]), (19, ["18"]), (30, ["27", "28", "29"])])
 def test_split_by_default(n: int, test: list[str]) -> None:
     split = split_episodes(population({("a", "hot"): n}))["a", "hot"]
@@ -88,14 +72,6 @@ class Counter:
 
     def __call__(self, key: EpisodeKey) -> np.ndarray:
         return self.start + np.arange(20.0).reshape(10, 2)
-
-
-def test_any_source_can_be_prepared() -> None:
-    keys = (EpisodeKey("a", "hot", "0"), EpisodeKey("b", "hot", "0"))
-    plain = Population(CHANNELS, 0.1, (Unit("a"), Unit("b")), keys, Counter(5.0))
-    assert prepare(plain, []) is plain
-    trimmed = prepare(plain, [steps.Trim(start=4)]).select(units=["b"])
-    np.testing.assert_array_equal(trimmed.read(keys[1]), plain.read(keys[1])[4:])
 
 
 def test_order_of_what_is_given_does_not_matter(tmp_path: Path) -> None:

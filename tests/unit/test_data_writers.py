@@ -128,20 +128,6 @@ def test_a_failed_conversion_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failed_group_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="NaN"):
-        write_group(broken(), "b", "warm", tmp_path)
-    assert list(tmp_path.iterdir()) == []
-    assert write_group(broken(), "b", "warm", tmp_path, "drop_episode").episodes == ("0", "2")
-
-
-def test_resting_input(tmp_path: Path) -> None:
-    samples = values(0)
-    samples[:, 2] = 3.0
-    with pytest.raises(DataError, match=r"Unit a \(default\): input 'u' stays at 3 in all 1 episodes"):
-        write_parquet(from_arrays({"a": [samples]}, CHANNELS, 0.01), tmp_path / "out")
-
-
 def test_existing_folders_are_kept(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
@@ -159,11 +145,6 @@ def test_channel_named_like_a_key_column(tmp_path: Path) -> None:
     channels = (Channel("k", Role.STATE), *CHANNELS[1:])
     with pytest.raises(DataError, match=r"channels \['k'\] have the name of a key column"):
         write_parquet(from_arrays({"a": [values(0)]}, channels, 0.01), tmp_path / "out")
-
-
-def test_unknown_group(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"unit z \(cold\); the population has no episode"):
-        write_group(population(), "z", "cold", tmp_path)
 
 
 def test_damaged_folders(tmp_path: Path) -> None:

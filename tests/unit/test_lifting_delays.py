@@ -63,14 +63,6 @@ def test_advancing_a_window_is_sliding_it():
         np.testing.assert_array_equal(DELAYED.window.advance(windows[k], u[k + 3]), windows[k + 1, 2:])
 
 
-def test_a_plain_lifting_has_no_history_and_passes_inputs_through():
-    plain = Lifting(STATES, ("sin(position)",))
-    x, u = recording()
-    assert (plain.history, plain.window.names) == (0, STATES)
-    assert plain.windows(x, u) is x
-    assert plain.lift_inputs(u, x) is u
-
-
 def test_slopes_have_a_column_for_every_entry_of_the_window():
     x, u = recording()
     windows = DELAYED.windows(x, u)[:5]
@@ -109,16 +101,6 @@ def test_free_run_equals_a_plain_loop(shared):
             theta, lifted_u = by_hand(x, u[i], k, phases[i])
             x[k + 1] = ((A if shared else A[i]) @ theta + (B if shared else B[i]) @ lifted_u)[:2]
         np.testing.assert_allclose(found[i], x, rtol=1e-11, atol=1e-12)
-
-
-def test_a_free_run_needs_the_history():
-    A, B = np.eye(5), np.ones((5, 4))
-    with pytest.raises(DimensionError, match="with a history of 3 samples and 4 inputs"):
-        free_run(A, B, DELAYED, {"phase": 0.0}, np.zeros((1, 2)), np.zeros((1, 9, 2)))
-    with pytest.raises(DimensionError, match="and 4 inputs"):
-        free_run(A, B[:, :2], DELAYED, {"phase": 0.0}, np.zeros((1, 4, 2)), np.zeros((1, 9, 2)))
-    with pytest.raises(DataError, match="at least 4 samples for the delay of 3 in 'voltage', found 3"):
-        free_run(A, B, DELAYED, {"phase": 0.0}, np.zeros((1, 4, 2)), np.zeros((1, 3, 2)))
 
 
 def test_factors_give_the_models_of_plain_least_squares():
@@ -212,14 +194,6 @@ def test_batched_and_single_observers_equal_the_equations(injection, order):
         running = o.start(y[0, i], {"phase": phase})
         stepped = [running.estimate] + [running.step(y[k, i], u[k, i]) for k in range(29)]
         np.testing.assert_allclose(stepped, x[3:], rtol=1e-10, atol=1e-10)
-
-
-def test_reset_forgets_the_history():
-    o = observer()
-    running = o.start([0.5])
-    first = [running.step([0.4], [1.0, 2.0]), running.step([0.1], [0.0, 1.0])]
-    running.reset([0.5])
-    np.testing.assert_array_equal([running.step([0.4], [1.0, 2.0]), running.step([0.1], [0.0, 1.0])], first)
 
 
 @pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])

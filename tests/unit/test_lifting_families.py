@@ -103,21 +103,6 @@ def test_delays():
     assert delays(["position", "voltage"], 2) == ("position[-1]", "voltage[-1]", "position[-2]", "voltage[-2]")
 
 
-def test_a_large_lifting_shares_its_passes():
-    functions = concatenate(
-        harmonics("position", 100, [1, 2], "phase"),
-        polynomials(STATES, 2),
-        radial(STATES, np.random.default_rng(1).uniform(-1, 1, (85, 3)), 0.5),
-    )
-    lifting = Lifting(STATES, functions, ("phase",))
-    assert len(functions) == 95
-    assert [len(lifting.lift(X, {"phase": 0.1})[0]), len(lifting.separation.basis)] == [98, 95]
-    assert max(np.size(np.arange(98)[columns]) for columns, _ in lifting._columns.blocks) == 85
-    for i in (0, 3, 9, 40, 94):
-        alone = lifting.formulas[i](**{s: X[:, j] for j, s in enumerate(STATES)}, phase=0.1)
-        np.testing.assert_allclose(lifting.lift(X, {"phase": 0.1})[:, 3 + i], alone, rtol=1e-15)
-
-
 @pytest.mark.parametrize(
     ("build", "message"),
     [

@@ -1,16 +1,10 @@
 """Formulas: what is read, what is refused, and that evaluation, derivative and C agree with NumPy."""
 
-import math
-import pickle
-import shutil
-import subprocess
-
 import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DimensionError
 from kros.lifting import Lifting
-from kros.lifting.c_code import c_code
 from kros.lifting.formula import Formula, parse
 
 NAMES = ("position", "velocity", "phase")
@@ -72,32 +66,6 @@ def test_error_names_what_is_known():
         parse("sin(speed)", NAMES)
 
 
-def test_slopes_agree_with_finite_differences():
-    lifting = Lifting(("position", "velocity"), ("sin(3*position + phase)", "position*velocity**2"), ("phase",))
-    x = np.random.default_rng(1).normal(size=(7, 2))
-    phase = {"phase": np.linspace(0, 6, 7)}
-    slopes = lifting.slopes(x, phase)
-    for j in range(2):
-        step = np.zeros(2)
-        step[j] = 1e-6
-        slope = (lifting.lift(x + step, phase) - lifting.lift(x - step, phase))[..., 2:] / 2e-6
-        np.testing.assert_allclose(slopes[..., j], slope, rtol=1e-7, atol=1e-8)
-
-
-def test_c_expression_computes_the_same(tmp_path):
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        pytest.skip("no C compiler on this machine")
-    formula = Formula("sin(100*position + phase)*velocity**3 - abs(position)/3", NAMES)
-    body = f'double position=0.7,velocity=-1.3,phase=2.1;printf("%.17g",{c_code(formula.expression, str)});return 0;'
-    source = f"#include <math.h>\n#include <stdio.h>\nint main(void){{{body}}}"
-    (tmp_path / "f.c").write_text(source)
-    subprocess.run([compiler, str(tmp_path / "f.c"), "-o", str(tmp_path / "f"), "-lm"], check=True)
-    printed = float(subprocess.run([str(tmp_path / "f")], check=True, capture_output=True, text=True).stdout)
-    expected = math.sin(100 * 0.7 + 2.1) * (-1.3) ** 3 - 0.7 / 3
-    assert printed == pytest.approx(expected, rel=1e-14)
-
-
 def test_separation_rebuilds_the_lifting_for_any_phase():
     lifting = Lifting(
         ("position", "velocity"), ("sin(100*position + phase)", "2*cos(position - 3*phase)*velocity", "velocity**2"), ("phase",)
@@ -113,17 +81,6 @@ def test_a_parameter_inside_another_function_does_not_separate():
     lifting = Lifting(("position",), ("tanh(position*phase)",), ("phase",))
     with pytest.raises(ConfigError, match="must enter as factors or as phases"):
         _ = lifting.separation
-
-
-def test_retraction_undoes_lifting_and_travels_between_processes():
-    lifting = Lifting(("position", "velocity"), ("sin(position + phase)",), ("phase",))
-    x = np.random.default_rng(4).normal(size=(5, 4, 2))
-    phase = {"phase": np.arange(20.0).reshape(5, 4)}
-    lifted = lifting.lift(x, phase)
-    assert lifted.shape == (5, 4, 3)
-    np.testing.assert_array_equal(lifting.retract(lifted), x)
-    copy = pickle.loads(pickle.dumps(lifting))
-    np.testing.assert_array_equal(copy.lift(x, phase), lifted)
 
 
 def test_bad_liftings_are_refused():

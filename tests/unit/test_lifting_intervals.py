@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kros.core.errors import ConfigError
-from kros.lifting import Lifting, radial
+from kros.lifting import Lifting
 from kros.lifting.formula import Formula
 from kros.lifting.intervals import bounds_of
 
@@ -65,26 +65,6 @@ def test_pieces_tighten_what_appears_twice():
     low, high = bounds("x - x**2", x=(0, 1))  # the range is [0, 1/4]; without pieces [-1, 1]
     assert -1e-3 < low <= 0
     assert 0.25 <= high < 0.2505
-
-
-def test_slopes_of_the_gear_error_are_the_known_box():
-    """The slope box of section 9 of the method: sin(100 theta + phi) has slopes in [-100, 100], whatever angle and phase."""
-    lifting = Lifting(("position", "velocity"), ("sin(100*position + phase)", "position[-1]*velocity"), ("phase",))
-    lower, upper = lifting.slope_bounds({"velocity": (-2, 3)})
-    assert lifting.window.names == ("position", "velocity", "position[-1]")
-    np.testing.assert_allclose(lower, [[-100, 0, 0], [0, -INF, -2]], rtol=1e-11)
-    np.testing.assert_allclose(upper, [[100, 0, 0], [0, INF, 3]], rtol=1e-11)
-    lower, upper = lifting.slope_bounds({"position": (0, 0.01), "velocity": (-2, 3)}, {"phase": 0.0})
-    np.testing.assert_allclose([lower[0, 0], upper[0, 0]], [100 * np.cos(1), 100], rtol=1e-11)
-    np.testing.assert_allclose([lower[1, 1], upper[1, 1]], [0, 0.01], rtol=1e-11)  # an earlier position has the range of the position
-
-
-def test_slopes_of_a_radial_function_are_those_of_calculus():
-    """exp(-s**2/2) is steepest one length scale from its centre, exp(-1/2) per length scale."""
-    lower, upper = Lifting(("x",), radial(["x"], [[0.3]], 0.5)).slope_bounds({"x": (-5, 5)})
-    steepest = np.exp(-0.5) / 0.5
-    assert steepest <= upper[0, 0] <= 1.01 * steepest
-    assert -1.01 * steepest <= lower[0, 0] <= -steepest
 
 
 def test_jumps_and_roots_have_no_bound():

@@ -44,13 +44,6 @@ def test_boxes_are_in_the_same_sizes():
     np.testing.assert_allclose(plain.in_sizes({"x": 100.0, "x**2": 50.0}).slope_bounds({"x": (-0.01, 0.03)})[1], 6.0 * 100 / 50)
 
 
-def test_formulas_and_names_stay_as_they_are_written():
-    scaled = FULL.in_sizes(SIZES)
-    assert (scaled.names, scaled.input_functions) == (FULL.names, FULL.input_functions)
-    assert scaled != FULL
-    assert scaled.in_sizes({}) == FULL
-
-
 def test_sizes_travel_between_processes_and_into_files():
     scaled = FULL.in_sizes(SIZES)
     assert pickle.loads(pickle.dumps(scaled)) == scaled

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from typer.testing import CliRunner
 
 from kros.cli import app
-from kros.core.errors import ConfigError
 from kros.data import EpisodeKey, read_parquet
 from kros.plants import PLANTS, DcMotorPopulation
 
@@ -42,17 +40,6 @@ def test_parameters_spread_log_normally_around_the_nominal_ones():
     assert abs(deviation.mean()) < 4 * 0.15 / 20  # four standard errors
     assert deviation.std() == pytest.approx(0.15, rel=0.15)
     assert json.loads(json.dumps(replace(SMALL, spread=0.0).simulate().truth.as_dict()))["units"]["001"]["resistance"] == 1.0
-
-
-def test_recordings_travel_between_processes():
-    population = SMALL.simulate().population
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(population)).read(KEY), population.read(KEY))
-
-
-@pytest.mark.parametrize("settings", [{"n_units": 0}, {"n_episodes": 0}, {"seconds": 0.5}, {"spread": -1.0}, {"seed": -1}])
-def test_settings_out_of_range_are_refused(settings):
-    with pytest.raises(ConfigError, match=next(iter(settings))):
-        DcMotorPopulation(**settings)
 
 
 def test_the_command_writes_motors_with_their_truth(tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 
 from kros.core.errors import ConfigError
 from kros.data import EpisodeKey
-from kros.plants import PLANTS, PendulumPopulation
+from kros.plants import PendulumPopulation
 
 SMALL = PendulumPopulation(n_units=3, n_episodes=2, seconds=4.0, seed=4, outlier=True)
 KEY = EpisodeKey("002", "default", "1")
@@ -41,17 +40,7 @@ def test_truth_is_plain_json_and_the_outlier_is_stiff_jointed():
     assert bad["damping"] > 2 * good["damping"]
 
 
-def test_recordings_travel_between_processes():
-    population = SMALL.simulate().population
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(population)).read(KEY), population.read(KEY))
-
-
 @pytest.mark.parametrize("settings", [{"n_units": 0}, {"n_episodes": 0}, {"seconds": 0.5}, {"spread": -1.0}, {"seed": -1}])
 def test_settings_out_of_range_are_refused(settings):
     with pytest.raises(ConfigError, match=next(iter(settings))):
         PendulumPopulation(**settings)
-
-
-def test_plants_are_found_by_name():
-    assert PLANTS["pendulum"] is PendulumPopulation
-    assert set(PLANTS) == {"harmonic-drive", "pendulum", "dc-motor"}

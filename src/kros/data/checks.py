@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError
 from ..core.files import shortened
-from .copies import Print, print_of, refuse_copies
+from .copies import digest_of, refuse_copies
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role, TrueChannel
 from .recording import title
 
@@ -216,17 +216,17 @@ def check_population(population: Population, allow_single: bool = False) -> None
             )
 
 
-def scan_prints(population: Population, on_nan: str = "error", look: Look | None = None) -> list[tuple[EpisodeKey, Print]]:
-    """Read and check every episode, and return those that are left with what they are recognised by; `look` is shown the samples of each."""
-    kept = [(key, mark) for _, _, keys in population.groups() for key, _, mark in usable_episodes(population, keys, on_nan, look)]
+def scan_digests(population: Population, on_nan: str = "error", look: Look | None = None) -> list[tuple[EpisodeKey, str]]:
+    """Read and check every episode, and return those that are left with their digests; `look` is shown the samples of each."""
+    kept = [(key, digest) for _, _, keys in population.groups() for key, _, digest in usable_episodes(population, keys, on_nan, look)]
     refuse_copies(kept)
     return kept
 
 
 def usable_episodes(
     population: Population, keys: Iterable[EpisodeKey], on_nan: str, look: Look | None = None
-) -> Iterator[tuple[EpisodeKey, npt.NDArray[np.float64], Print]]:
-    """Yield the episodes of one unit and condition that pass all checks, all columns of their samples and what they are recognised by."""
+) -> Iterator[tuple[EpisodeKey, npt.NDArray[np.float64], str]]:
+    """Yield the episodes of one unit and condition that pass all checks, all columns of their samples and their digest."""
     if on_nan not in ON_NAN:
         raise ConfigError(f"data.on_nan should be one of {list(ON_NAN)}, found {on_nan!r}; correct it.")
     columns = population.columns
@@ -244,6 +244,6 @@ def usable_episodes(
         watch.add(values)
         if look is not None:
             look(key, values)
-        yield key, values, print_of(values, columns)
+        yield key, values, digest_of(values)
     if key is not None:
         watch.check(key.unit, key.condition)

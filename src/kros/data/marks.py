@@ -27,7 +27,7 @@ def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declar
     about: list[Any] = []
     while isinstance(source, PreparedSource | EvenRecordings):
         if isinstance(source, PreparedSource):
-            about.append((source.channels, source.period_s, source.steps, source.tolerance, source.gaps))
+            about.append((source.channels, source.period_s, source.steps, source.gaps))
             source = source.recordings
         else:
             source = source.source

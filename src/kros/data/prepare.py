@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ..core.errors import DataError
 from .checks import check_episode, check_period, check_structure
 from .population import Channel, EpisodeKey, EpisodeSource, Population, Unit, columns_in_order, natural_key, part_columns, restrict
-from .recording import TIME_TOLERANCE, Recording, Recordings, check_even, estimate_period
+from .recording import Recording, Recordings, check_even, estimate_period
 from .scaling import Scalings
 from .steps import Step
 
@@ -41,14 +41,13 @@ class PreparedSource:
     period_s: float  # as recorded, found in the episode `reference`
     reference: EpisodeKey
     steps: tuple[Step, ...] = ()
-    tolerance: float = TIME_TOLERANCE  # largest deviation of one time step, in sampling periods
     gaps: bool = False  # whether samples may be missing; see `with_gaps`
 
     def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
         """Return one prepared episode, shape (n_samples, n_channels)."""
         recording = self.recordings(key)
         if not any(step.makes_even for step in self.steps):
-            check_even(recording, self.period_s, self.reference, self.tolerance)
+            check_even(recording, self.period_s, self.reference)
         channels, period = self.channels, self.period_s
         for step in self.steps:
             recording = step.apply(recording, channels, period)
@@ -74,7 +73,6 @@ def assemble(
     metadata: Mapping[str, Any] | None = None,
     *,
     steps: Iterable[Step] = (),
-    tolerance: float = TIME_TOLERANCE,
     scaling: Scalings | None = None,
 ) -> Population:
     """Make the population that a reader found: natural order, one sampling period, steps declared, names checked."""
@@ -88,7 +86,7 @@ def assemble(
     found = [facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes)]
     first = episodes[0]
     period = check_period(sample_period_s if sample_period_s is not None else estimate_period(recordings(first)), "Population")
-    source = PreparedSource(recordings, channels, period, first, tolerance=tolerance)
+    source = PreparedSource(recordings, channels, period, first)
     parts = part_columns(channels)
     return prepare(
         Population(

@@ -97,7 +97,7 @@ def check_increasing(recording: Recording) -> None:
         )
 
 
-def check_even(recording: Recording, period_s: float, reference: EpisodeKey, tolerance: float) -> None:
+def check_even(recording: Recording, period_s: float, reference: EpisodeKey) -> None:
     """Check that an episode is sampled evenly, at the population's period."""
     time = recording.time_s
     if time is None or len(time) < 2:
@@ -107,15 +107,15 @@ def check_even(recording: Recording, period_s: float, reference: EpisodeKey, tol
     own = estimate_period(recording)
     deviation = np.abs(steps - own)
     worst = int(deviation.argmax())
-    if deviation[worst] > tolerance * own:
-        count = int(np.count_nonzero(deviation > tolerance * own))
+    if deviation[worst] > TIME_TOLERANCE * own:
+        count = int(np.count_nonzero(deviation > TIME_TOLERANCE * own))
         raise DataError(
             f"{title(recording.key)}: uneven time, {count} of {len(steps)} steps differ from {own:g} s by more than "
-            f"{tolerance:g} of it, the worst "
+            f"{TIME_TOLERANCE:g} of it, the worst "
             f'{steps[worst]:g} s at sample {worst}; declare [[data.prepare]] step = "resample", period_s = {own:.3g}, or fix the source.'
         )
     mean = float((time[-1] - time[0]) / len(steps))
-    if abs(mean - period_s) > max(PERIOD_TOLERANCE, tolerance / len(steps)) * period_s:
+    if abs(mean - period_s) > max(PERIOD_TOLERANCE, TIME_TOLERANCE / len(steps)) * period_s:
         raise DataError(
             f"Two sampling periods: {period_s:g} s in {reference} and {own:g} s in {recording.key}; a population has one, "
             f'declare [[data.prepare]] step = "resample", period_s = {max(own, period_s):g}, or leave one out.'

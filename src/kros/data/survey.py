@@ -22,8 +22,8 @@ from ..core.loading import loader
 from ..core.records import is_file
 from ..core.work import Work
 from .alerts import period_alerts
-from .checks import check_population, scan_prints
-from .copies import Print, refuse_copies
+from .checks import check_population, scan_digests
+from .copies import refuse_copies
 from .flat_tops import Ends, FlatTops, FoundLimit, ends_of, found_limit
 from .marks import recording_marks
 from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
@@ -113,13 +113,13 @@ class _Found:
     written: str | None
     episodes: tuple[EpisodeKey, ...]
     resolution: dict[str, float]
-    prints: list[tuple[EpisodeKey, Print]]
+    scanned: list[tuple[EpisodeKey, str]]
     alerts: tuple[str, ...]
     ends: dict[str, list[Ends]]
     inputs: npt.NDArray[np.float64]
 
 
-_KINDS = (_Found, GroupRecord, EpisodeKey, Print, Ends, FlatTops)
+_KINDS = (_Found, GroupRecord, EpisodeKey, Ends, FlatTops)
 
 
 def survey(
@@ -164,7 +164,7 @@ def survey(
         limits=_limits(
             [f for task, f in zip(tasks, found, strict=True) if task.unit not in aside and kept.unit(task.unit).group != OUTLIERS]
         ),
-        digests={key: mark.digest.hex() for f in own for key, mark in f.prints},
+        digests=dict(pair for f in own for pair in f.scanned),
     )
     for name, limit in facts.limits.items():
         log.info("%s is limited at %s.", name, limit)
@@ -216,11 +216,11 @@ def _read_group(task: _Group) -> _Found:
         reach[:] = np.minimum(reach[0], columns[own].min(axis=1)), np.maximum(reach[1], columns[own].max(axis=1))
 
     if task.folder is None:
-        prints = scan_prints(population.select([task.unit], [task.condition]), on_nan=task.on_nan, look=look)
+        digests = scan_digests(population.select([task.unit], [task.condition]), on_nan=task.on_nan, look=look)
     else:
         record = write_group(population, task.unit, task.condition, task.folder, task.on_nan, look)
-        prints, record = record.recognised, replace(record, prints=())
-    episodes = tuple(key for key, _ in prints)
+        digests, record = record.recognised, replace(record, digests=())
+    episodes = tuple(key for key, _ in digests)
     if not episodes:
         raise DataError(f"Unit {task.unit} ({task.condition}): every episode was dropped; fix the source or leave the unit out.")
     first = shown[0][:, : len(population.channels)]
@@ -228,7 +228,7 @@ def _read_group(task: _Group) -> _Found:
     steps = {m: resolution(first[:, names.index(m)]) for m in population.measured}
     alerts = period_alerts(first, population.channels, population.sample_period_s)
     written = None if record is None or task.folder is None else _digest(task.folder / record.file)
-    return _Found(record, written, episodes, steps, prints, alerts, ends, reach)
+    return _Found(record, written, episodes, steps, digests, alerts, ends, reach)
 
 
 def _digest(path: Path) -> str:
@@ -259,10 +259,10 @@ def _kept(population: Population, found: Sequence[_Found], folder: Path | None) 
     if folder is not None:
         from .readers.parquet import read_parquet
 
-        records = [replace(f.record, prints=tuple(mark for _, mark in f.prints)) for f in found if f.record is not None]
+        records = [replace(f.record, digests=tuple(digest for _, digest in f.scanned)) for f in found if f.record is not None]
         write_index(population, records, folder)
         return read_parquet(folder)
-    refuse_copies(pair for f in found for pair in f.prints)
+    refuse_copies(pair for f in found for pair in f.scanned)
     present = {key for f in found for key in f.episodes}
     if len(present) == len(population.episodes):
         return population

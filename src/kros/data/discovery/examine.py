@@ -14,7 +14,7 @@ from ...core.errors import DataError
 from ...core.work import Work
 from ..alerts import period_alerts
 from ..checks import MIN_SAMPLES, is_constant
-from ..copies import Print, copies_among, print_of
+from ..copies import copies_among, digest_of
 from ..population import Channel, EpisodeKey, Population, Role
 from ..prepare import PreparedSource
 from ..recording import TIME_TOLERANCE, title
@@ -44,7 +44,7 @@ class EpisodeLook:
     nan : bool
     gap : tuple of float and int, or None
         Longest step of time, s, where it is a gap, and the sample before it.
-    mark : Print or None
+    digest : str
     alerts : tuple of str
     """
 
@@ -56,7 +56,7 @@ class EpisodeLook:
     uneven: bool = False
     nan: bool = False
     gap: tuple[float, int] | None = None
-    mark: Print | None = None
+    digest: str = ""
     alerts: tuple[str, ...] = ()
 
 
@@ -86,8 +86,8 @@ def examine(population: Population, work: Work | None = None) -> Examined:
     bridged = max((g for g, _ in broken.values() if g <= BRIDGED * median), default=0.0) if MANY * len(broken) > len(good) else 0.0
     wrong |= {key: f"a gap of {g:.3g} s after sample {k}" for key, (g, k) in broken.items() if g > bridged}
     good = [s for s in good if s.key not in wrong]
-    for key, other, shared in copies_among((s.key, s.mark) for s in good if s.mark is not None):
-        wrong.setdefault(key, f"{'a copy' if shared >= 1 else f'shares {100 * shared:.0f} % of its samples'} of {other}")
+    for key, other in copies_among((s.key, s.digest) for s in good if s.digest):
+        wrong.setdefault(key, f"a copy of {other}")
     good = [s for s in good if s.key not in wrong]
     different = any(abs(s.period_s - median) > 1e-4 * median for s in good)
     resample = float(f"{median:.3g}") if any(s.uneven for s in good) or different else None
@@ -149,7 +149,7 @@ def _looked(key: EpisodeKey, values: Array, time: Array | None, channels: Sequen
             key, f"state {stuck!r} stays at {values[0, still[0]]:g} in all samples while others move: a stuck sensor", n_samples=n
         )
     alerts = period_alerts(values, channels, period) if first else ()
-    return EpisodeLook(key, "", tuple(_rests(key, values, channels)), n, period, uneven, False, gap, print_of(values, channels), alerts)
+    return EpisodeLook(key, "", tuple(_rests(key, values, channels)), n, period, uneven, False, gap, digest_of(values), alerts)
 
 
 def _rests(key: EpisodeKey, values: Array, channels: Sequence[Channel]) -> list[str]:

@@ -149,10 +149,8 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
         raise DataError(f"Reading {source} as csv: no file matches files = {chosen.files!r}{_sample(source)}; correct the expression.")
     recordings = CsvRecordings(places, dialect, None if chosen.time is None else chosen.time_scale, chosen.timestamp)
     units = [Unit(unit, group) for unit, group in groups.items()]
-    period, tolerance = chosen.sample_period_s, chosen.time_tolerance
-    return assemble(
-        recordings, chosen.channels, units, period, chosen.metadata, steps=chosen.steps, tolerance=tolerance, scaling=chosen.scaling
-    )
+    period = chosen.sample_period_s
+    return assemble(recordings, chosen.channels, units, period, chosen.metadata, steps=chosen.steps, scaling=chosen.scaling)
 
 
 def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:

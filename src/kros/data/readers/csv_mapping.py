@@ -13,7 +13,6 @@ from typing import Any, Literal
 from ...core.errors import ConfigError
 from ...core.files import read_toml
 from ..population import Channel, Role, TrueChannel, columns_in_order
-from ..recording import TIME_TOLERANCE
 from ..scaling import Scaling
 from ..steps import Scale, Step, parse_steps
 from ..tables import build
@@ -94,8 +93,6 @@ class CsvMapping:
         Where one file holds several units.
     time_scale : float
         Factor from the column of time to seconds.
-    time_tolerance : float
-        Largest deviation of one time step, in sampling periods.
     sample_period_s : float, optional
         In place of a column of time.
     exclude : str, optional
@@ -127,7 +124,6 @@ class CsvMapping:
     time: Column | None = None
     unit: tuple[UnitMapping, ...] = ()
     time_scale: float = 1.0
-    time_tolerance: float = TIME_TOLERANCE
     sample_period_s: float | None = None
     exclude: str | None = None
     delimiter: str = ","
@@ -166,7 +162,7 @@ class CsvMapping:
     def _check_numbers(self) -> None:
         """Refuse what no time and no scale can be."""
         periods = {} if self.sample_period_s is None else {"sample_period_s": self.sample_period_s}
-        for name, value in {**periods, "time_scale": self.time_scale, "time_tolerance": self.time_tolerance}.items():
+        for name, value in {**periods, "time_scale": self.time_scale}.items():
             if not 0 < value < math.inf:
                 raise ConfigError(f"CSV mapping: {name} should be a number above zero, found {value}; correct it.")
         for channel in self.channel:
@@ -261,21 +257,5 @@ def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMap
     if isinstance(mapping, CsvMapping):
         return mapping
     if isinstance(mapping, Mapping):
-        return build(CsvMapping, _with_columns(mapping), "CSV mapping")
-    return build(CsvMapping, _with_columns(read_toml(Path(mapping), "CSV mapping")), f"CSV mapping {mapping}")
-
-
-def _with_columns(table: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the table with columns that a ``[[unit]]`` gives beside its suffix (``position = "pos1"``) under `columns`."""
-    channels, units = table.get("channel"), table.get("unit")
-    if not isinstance(channels, (list, tuple)) or not isinstance(units, (list, tuple)):
-        return table
-    names = {c["name"] for c in channels if isinstance(c, Mapping) and isinstance(c.get("name"), str)}
-    return {**table, "unit": [_unit_table(u, names - {"suffix", "columns"}) if isinstance(u, Mapping) else u for u in units]}
-
-
-def _unit_table(unit: Mapping[str, Any], names: set[Any]) -> dict[str, Any]:
-    beside = {key: value for key, value in unit.items() if key in names}
-    rest = {key: value for key, value in unit.items() if key not in names}
-    columns = rest.get("columns", {})
-    return rest if not beside or not isinstance(columns, Mapping) else {**rest, "columns": {**columns, **beside}}
+        return build(CsvMapping, mapping, "CSV mapping")
+    return build(CsvMapping, read_toml(Path(mapping), "CSV mapping"), f"CSV mapping {mapping}")

@@ -25,7 +25,7 @@ from ...core.artifacts import save_artifact
 from ...core.errors import DataError
 from ..arrow import from_numpy, repeated
 from ..checks import Look, check_structure, usable_episodes
-from ..copies import Print, refuse_copies
+from ..copies import refuse_copies
 from ..population import EpisodeKey, Population
 from ..readers.parquet import INDEX, KEYS
 from .folders import in_threads, whole_folder
@@ -47,13 +47,13 @@ class GroupRecord:
     file: str
     episodes: tuple[str, ...]  # in the order of the row groups
     samples: tuple[int, ...]  # length of each episode
-    prints: tuple[Print, ...] = ()  # what each episode is recognised by
+    digests: tuple[str, ...] = ()  # of all samples of each episode
 
     @property
-    def recognised(self) -> list[tuple[EpisodeKey, Print]]:
-        """Episodes with their prints."""
+    def recognised(self) -> list[tuple[EpisodeKey, str]]:
+        """Episodes with their digests."""
         keys = [EpisodeKey(self.unit, self.condition, episode) for episode in self.episodes]
-        return list(zip(keys, self.prints, strict=True)) if self.prints else []
+        return list(zip(keys, self.digests, strict=True)) if self.digests else []
 
 
 def group_file(unit: str, condition: str) -> str:
@@ -81,8 +81,8 @@ def write_group(
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-    episodes, samples, prints = zip(*written, strict=True)
-    return GroupRecord(unit, condition, path.name, episodes, samples, prints)
+    episodes, samples, digests = zip(*written, strict=True)
+    return GroupRecord(unit, condition, path.name, episodes, samples, digests)
 
 
 def write_index(population: Population, records: Iterable[GroupRecord], folder: Path | str) -> None:
@@ -137,7 +137,7 @@ def write_parquet(population: Population, out: Path | str) -> None:
 
 def _write_episodes(
     population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: str, look: Look | None = None
-) -> Iterable[tuple[str, int, Print]]:
+) -> Iterable[tuple[str, int, str]]:
     from pyarrow import parquet
 
     names = [c.name for c in population.columns]
@@ -150,9 +150,9 @@ def _write_episodes(
         "write_page_checksum": True,
     }
     with parquet.ParquetWriter(path, schema, column_encoding=encoding, **options) as writer:
-        for key, values, mark in usable_episodes(population, keys, on_nan, look):
+        for key, values, digest in usable_episodes(population, keys, on_nan, look):
             writer.write_table(_table(key, values, schema), row_group_size=len(values))
-            yield key.episode, len(values), mark
+            yield key.episode, len(values), digest
 
 
 def _schema(names: Sequence[str]) -> Any:

@@ -49,24 +49,11 @@ class Truth:
         """Response of the velocity error to the disturbance current at a constant speed, complex, shape (n_units,), rad/s."""
         return disturbance_response(self.parameters, self.gains, loaded, speed)
 
-    def row(self, unit: str) -> int:
-        """Return a unit's place on the unit axis."""
-        if unit not in self.unit_ids:
-            known = ", ".join(self.unit_ids[:10]) + (" ..." if len(self.unit_ids) > 10 else "")
-            raise DataError(f"Asked for the truth of unit {unit!r}; the simulation has {known}; use one of them.")
-        return self.unit_ids.index(unit)
-
     def load_torque(self, key: EpisodeKey) -> Array:
         """Return the torque that the load takes from the flange in an episode, inertia and gravity, shape (n_samples,)."""
         if key not in self.load_rows:
             raise DataError(f"Asked for the load torque of {key}; only the {len(self.load_rows)} loaded episodes have one.")
         return self.load_signals[self.load_rows[key]]
-
-    def gearbox_current(self, unit: str, position: npt.ArrayLike) -> Array:
-        """Return the disturbance (34) of a unit at given output angles (rad), shape of `position`, fraction of full scale."""
-        angles = np.asarray(position, float)
-        rows = np.full(angles.size, self.row(unit))
-        return self.parameters.take(rows).gearbox_current(angles.ravel()).reshape(angles.shape)
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything but the long signals, ready for JSON: one entry per unit."""

@@ -54,7 +54,7 @@ def metrics(demo) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def few_figures() -> Iterator[None]:
     """Reports have two figures, drawn in this process, where tests are about something else: drawing takes longest."""
-    some = ("errors", "forms")
+    some = ("observers_in_time", "forms")
 
     def drawn(name: str, run: RunFolder) -> Drawn:
         return draw(name, run) if name in some else Drawn(name, name, reason="not asked for")

@@ -28,11 +28,9 @@ from kros.data.population import Channel, EpisodeKey, Population, Role, Unit
 from kros.data.survey import RecordingFacts
 from kros.design import Design
 from kros.evaluate import standard_disturbances
-from kros.identify import KoopmanMatrices, ModelSet, PhaseCalibration, PhaseSpec
+from kros.identify import ModelSet, PhaseCalibration, PhaseSpec
 from kros.identify.calibration import UnitPhase
 from kros.identify.identified import IdentifiedModels
-from kros.identify.refine import RefinedModels
-from kros.identify.refine.model import TradeOff
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.report import plot, render, write_figures
@@ -53,7 +51,7 @@ from kros.report.run_folder import NotShownError, RunFolder
 from kros.report.theme import Tone
 from kros.study.pipeline import RunResult
 from kros.synthesis.result import Injection, Status, Synthesis
-from kros.uncertainty import Cover, Form, OutlierModel, UncertainModel, VariationAndNoise, quantify_systems, residual, score_outliers
+from kros.uncertainty import Cover, Form, OutlierModel, UncertainModel, quantify_systems, residual, score_outliers
 from kros.uncertainty.quantify import UncertainModels
 from kros.uncertainty.unit_residuals import UnitResiduals
 from kros.uncertainty.weights.cover import cover_ratio
@@ -130,26 +128,6 @@ def write_read_stage(run: Path) -> None:
     save_artifact(run / "population", "facts", {**facts, "dropped": []})
 
 
-def refined(found: ModelSet) -> RefinedModels:
-    """What a refinement may say: weaker priors, better predictions, more uncertainty."""
-    rows = [TradeOff(s, (0.01, 0.2 + 0.1 * k, 5.0 + k), 1.0, db) for k, (s, db) in enumerate([(1.0, -6.0), (10.0, -12.0), (100.0, -20.0)])]
-    pooled = TradeOff(np.inf, (0.01, 0.6, 12.0), 2.0, -np.inf)
-    p = found.A.shape[-1] + found.B.shape[-1]
-    return RefinedModels(
-        unit_ids=UNITS,
-        units=KoopmanMatrices(found.A, found.B),
-        pooled=KoopmanMatrices(found.A[0], found.B[0]),
-        strength=10.0,
-        strengths=np.full(5, 10.0),
-        trade_off=(pooled, *rows[::-1]),
-        sigma=np.ones(3),
-        converged=np.ones(5, dtype=bool),
-        information=np.ones((5, 1, 1)),
-        whitening=np.eye(p),
-        spectral_radius=np.full(5, 0.9),
-    )
-
-
 def write_models(run: Path, uncertain: dict[str, UncertainModel]) -> None:
     phases = {u: UnitPhase(0.5 * i, -0.9 - 0.01 * i, 0.99 - 0.1 * (i == 2), 12) for i, u in enumerate(UNITS)}
     PhaseCalibration(PhaseSpec(), -0.9, phases).save(run / "calibration")
@@ -157,7 +135,6 @@ def write_models(run: Path, uncertain: dict[str, UncertainModel]) -> None:
         models(name, "noload", 1).save(run / "models" / name)
         models(name, "load", 2).save(run / "models" / f"{name}@load")
         uncertain[name].save(run / "uncertainty" / name)
-    refined(models("koopman_edmd", "noload", 1)).save(run / "refinement" / "koopman")
     save_artifact(run / "uncertainty", "choice", {"nominal": "001", "worst_off_nominal": "002", "dropped": []})
     write_diagnostics(run, uncertain)
     rows = [
@@ -172,16 +149,6 @@ def write_models(run: Path, uncertain: dict[str, UncertainModel]) -> None:
         for c in ("load", "noload")
     ]
     write_json(run / "outliers" / "scores.json", {"schema": 1, "rows": rows})
-
-
-def noise(model: UncertainModel) -> VariationAndNoise:
-    """Half of the squared residual is noise at low frequency, none at high."""
-    freqs = model.freqs_hz
-    sizes = np.outer([0.0, 0.02, 0.03, 0.02], np.ones(len(freqs)))
-    total = np.full(len(freqs), 1e-3)
-    return VariationAndNoise(
-        model.form, model.unit_ids, 0, 0.95, freqs, sizes, 0.1 * sizes + 1e-3, total, total * np.linspace(0.5, 0, len(freqs))
-    )
 
 
 def scores(condition: str) -> OutlierModel:
@@ -202,7 +169,6 @@ def beside_others(name: str) -> UnitResiduals:
 
 def write_diagnostics(run: Path, uncertain: dict[str, UncertainModel]) -> None:
     for name, model in uncertain.items():
-        noise(model).save(run / "uncertainty" / name / "noise")
         beside(model, models(name, "noload", 1)).save(run / "uncertainty" / name / "units")
         beside_others(name).save(run / "outliers" / f"{name}@load" / "others")
     for condition, folder in (("noload", "koopman_edmd"), ("load", "koopman_edmd@load")):
@@ -396,11 +362,9 @@ def test_identifiers_are_unique_and_references_lead_somewhere(page: str) -> None
 
 
 def test_every_figure_is_on_the_page_with_a_caption(page: str) -> None:
-    expected = set(ON_THE_PAGE) - {
-        "load_torque",
-    }  # of studies that declare a load alone, or whose recordings are in their place
+    expected = set(ON_THE_PAGE) - {"load_torque"}  # of studies that declare a load
     assert page.count("<figure") == page.count("<figcaption>") == len(expected)
-    assert page.count("is left out") == 0
+    assert "is left out" not in page
 
 
 _LOOK = """
@@ -524,7 +488,7 @@ def test_broken_artifact_is_an_error(tmp_path: Path) -> None:
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> tuple[str, ...]:
     """Leave out most figures, for speed."""
-    chosen = ("phase", "forms", "errors")
+    chosen = ("phase", "forms", "observers_in_time")
     monkeypatch.setattr("kros.report.figures.FIGURES", {name: FIGURES[name] for name in chosen})
     return chosen
 
@@ -590,7 +554,7 @@ def test_plot_takes_every_result(uncertain: dict[str, UncertainModel]) -> None:
     population = from_arrays({"a": [np.zeros((50, 5)) + np.arange(50.0)[:, None]]}, CHANNELS, sample_period_s=DT)
     before = dict(matplotlib.rcParams)
     some = (population, models("koopman_edmd", "noload", 1), uncertain["linear_edmd"], synthesis(4, "mixed"))
-    for result in (*some, noise(uncertain["linear_edmd"]), scores("load")):
+    for result in (*some, scores("load")):
         figure = plot(result)
         assert isinstance(figure, Figure)
         assert figure.axes
@@ -703,7 +667,7 @@ def test_every_class_that_can_be_plotted_has_its_figure() -> None:
 
 def test_a_run_is_plotted_by_any_figure_of_its_report(finished: tuple[Path, dict[str, Any]]) -> None:
     run = RunResult(finished[0], finished[1], ())
-    assert len(plot(run).axes) == len(STATES)
+    assert len(plot(run).axes) == 16
     assert len(plot(run, name="phase").axes) == 3
     with pytest.raises(ConfigError, match="declares no load"):
         plot(run, name="load_torque")

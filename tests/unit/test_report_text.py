@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from kros.report.canvas import decibel, log_ticks, power_of_ten, spread, thin, thin_log
 from kros.report.error_tables import error_table
-from kros.report.figures.rows import best_last
 from kros.report.names import best_models, deployed_pair, model_label, number, observer_label, observer_look, paper_pair
 from kros.report.sections.observers import baseline_notes
 from kros.report.theme import Tone
@@ -302,11 +299,3 @@ def test_decibels() -> None:
     assert decibel([1.0, -10.0, 0.1j]) == pytest.approx([0.0, 20.0, -20.0])
     assert np.isnan(decibel([0.0])).all()
     assert power_of_ten(1e-12) == "10⁻¹²"
-
-
-def test_observers_of_fewer_channels_have_their_place_among_the_others() -> None:
-    def of(velocity: float | None, current: float | None = 0.0) -> dict[str, SimpleNamespace]:
-        return {"velocity": SimpleNamespace(mean=velocity)} | ({"current": SimpleNamespace(mean=current)} if current != 0.0 else {})
-
-    cells = {"best": of(0.02, 4.0), "half": of(0.1), "poor": of(0.4, 20.0), "lost": of(None, 4.0)}
-    assert best_last(cells, ["velocity", "current"]) == ["lost", "poor", "half", "best"]

@@ -239,18 +239,6 @@ def log_ticks(low: float, high: float, most: int = 3) -> list[float]:
     return found[:: ceil(len(found) / most)]
 
 
-def fit_log_axis(axes: Axes, values: Sequence[float], most: int = 3) -> None:
-    """Fit a logarithmic horizontal axis around values and number it in plain figures, as many as there is room for."""
-    from matplotlib.ticker import FixedLocator, NullLocator
-
-    low, high = min(values) / 1.6, max(max(values) * 1.6, 4 * min(values))
-    axes.set_xscale("log")
-    axes.set_xlim(low, high)
-    axes.xaxis.set_major_locator(FixedLocator(log_ticks(low, high, most)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_locator(NullLocator())
-
-
 def units_axis(axes: Axes, units: Sequence[str]) -> None:
     """Label the horizontal axis with units at 0, 1, 2, ...: their names as long as they can be read, else their count."""
     axes.set_xlim(-0.7, len(units) - 0.3)
@@ -260,15 +248,6 @@ def units_axis(axes: Axes, units: Sequence[str]) -> None:
         axes.set_xlabel("unit")
     else:
         axes.set_xlabel(f"{len(units)} units, in order")
-
-
-def name_rows(axes: Axes, labels: Sequence[str], bold: int | None, shift: float = 0.0, **options: Any) -> None:
-    """Name rows at 0, 1, 2, ... from below on the vertical axis, `shift` above them, one in bold."""
-    axes.set_yticks(np.arange(len(labels)) + shift, labels, **options)
-    for i, label in enumerate(axes.get_yticklabels()):
-        label.set_fontweight("bold" if i == bold else "normal")
-    axes.set_ylim(-0.6, len(labels) - 0.4)
-    axes.grid(visible=False, axis="y")
 
 
 def label_below(axes: Iterable[Axes], text: str = "frequency (Hz)") -> None:

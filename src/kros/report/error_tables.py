@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,8 +35,6 @@ class ErrorCell:
         Units whose estimate diverged.
     rms : float or None
         Root mean square error in the channel's own unit of measure, over the units that `mean` is over.
-    units : mapping of str to float or None
-        Of every unit that was left out.
     band_db : float or None
         Power of the error around the gearbox frequency, mean over the units, in dB relative to that of `PAPER` on the same units.
     """
@@ -48,7 +46,6 @@ class ErrorCell:
     nominal: float | None = None
     diverged: int = 0
     rms: float | None = None
-    units: Mapping[str, float | None] = field(default_factory=dict)
     band_db: float | None = None
 
 
@@ -146,7 +143,7 @@ def _left_out_cell(rows: Rows, band_db: float | None) -> ErrorCell:
     units = {r["unit"]: r["error_percent"] for r in rows}
     known = {unit: float(error) for unit, error in units.items() if error is not None and np.isfinite(error)}
     if len(known) < len(units):
-        return ErrorCell(units=units, band_db=band_db, diverged=len(units) - len(known))
+        return ErrorCell(band_db=band_db, diverged=len(units) - len(known))
     worst, values = max(known, key=lambda u: known[u]), list(known.values())
     interval = None
     if len(values) > 1:
@@ -154,7 +151,7 @@ def _left_out_cell(rows: Rows, band_db: float | None) -> ErrorCell:
         interval = (float(low), float(high))
     rms = [float(v) for r in rows if (v := r.get("rms")) is not None]
     mean_rms = float(np.mean(rms)) if len(rms) == len(rows) else None
-    return ErrorCell(float(np.mean(values)), known[worst], worst, interval, rms=mean_rms, units=units, band_db=band_db)
+    return ErrorCell(float(np.mean(values)), known[worst], worst, interval, rms=mean_rms, band_db=band_db)
 
 
 def _band_db(rows: Rows, papers: Rows) -> float | None:

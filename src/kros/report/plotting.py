@@ -21,14 +21,11 @@ PLOTS = {
     "PhaseCalibration": "recordings.phase:phase_figure",
     "ModelSet": "models.bode:bode_figure",
     "UncertainModel": "uncertainty.uncertain_model:uncertain_figure",
-    "VariationAndNoise": "uncertainty.variation:variation_figure",
     "OutlierModel": "outliers.scores:scores_figure",
     "Synthesis": "synthesis.correction:synthesis_figure",
     "Observer": "synthesis.correction:observer_figure",
-    "ErrorSummary": "observers.summary:summary_figure",
 }
 """Name of a result's class -> file of a figure and the function in it that draws the result. Its further parameters are the options of `plot`."""
-_SIDE_BY_SIDE = ("VariationAndNoise", "OutlierModel")  # figures that take several results by name
 
 
 def plot(result: Any, **options: Any) -> Figure:
@@ -38,8 +35,8 @@ def plot(result: Any, **options: Any) -> Figure:
     ----------
     result : one of the classes in `PLOTS`
         A population is shown by the first episode of its first unit, models by their Bode magnitudes, uncertain models by forms, weights and every unit
-        over the weights, a design, a synthesis or an observer by the correction filter and its certificate, errors by their spectra, and a run by the
-        errors of all observers.
+        over the weights, a design, a synthesis or an observer by the correction filter and its certificate, and a run by the
+        estimates of its deployed observer.
     **options
         ``kind`` of identified and uncertain models, such as ``"linear"``; ``entries=True`` for the paper's figure of an uncertain model, entry by entry.
         ``models`` of a design, the identified models behind it: its estimates on a held-out episode. ``name`` of a run: any figure of its report.
@@ -74,5 +71,5 @@ def plot(result: Any, **options: Any) -> Figure:
     if unknown:
         raise ConfigError(f"Plot: a {name} has no option {', '.join(map(repr, unknown))}; it has {', '.join(known) or 'none'}.")
     with style():
-        figure: Figure = draw({"": result} if name in _SIDE_BY_SIDE else result, **options)
+        figure: Figure = draw({"": result} if name == "OutlierModel" else result, **options)
     return figure

@@ -20,10 +20,9 @@ from ..core.artifacts import load_artifact, read_arrays, read_json
 from ..core.records import recorded_files
 from ..data.population import Channel, EpisodeKey, Population, Role
 from ..identify import ModelSet, PhaseCalibration
-from ..identify.refine import RefinedModels
 from ..observer import Observer
 from ..synthesis.result import Synthesis
-from ..uncertainty import OutlierModel, UncertainModel, VariationAndNoise
+from ..uncertainty import OutlierModel, UncertainModel
 from ..uncertainty.unit_residuals import UnitResiduals
 
 Array = npt.NDArray[Any]
@@ -147,12 +146,6 @@ class RunFolder:
         found = self._load("models", "model.json", ModelSet.load, "no models have been identified yet", at_home=True)
         return dict(sorted(found.items(), key=lambda item: (not item[0].startswith("koopman"), item[0])))
 
-    @cached_property
-    def refined(self) -> dict[str, RefinedModels]:
-        """What the refinement found out, by kind of model, Koopman models first."""
-        found = self._load("refinement", "refinement.json", RefinedModels.load, "this study has no refined models")
-        return dict(sorted(found.items(), key=lambda item: not item[0].startswith("koopman")))
-
     def condition_models(self, name: str, condition: str) -> ModelSet:
         """Return the models of one kind in a condition."""
         if condition == self.identify_on:
@@ -165,12 +158,6 @@ class RunFolder:
     def uncertain(self) -> dict[str, UncertainModel]:
         """Uncertain models of the condition that was identified on."""
         return self._load("uncertainty", "*.json", UncertainModel.load, "the uncertainty has not been quantified yet", at_home=True)
-
-    @cached_property
-    def noise(self) -> dict[str, VariationAndNoise]:
-        """Variation and noise, by kind of model."""
-        reason = "variation and noise were not separated; it takes two training episodes of every unit"
-        return _in_order(self._load("uncertainty", "noise/*.json", VariationAndNoise.load, reason))
 
     @cached_property
     def unit_residuals(self) -> dict[str, UnitResiduals]:
@@ -241,11 +228,6 @@ class RunFolder:
     def disturbed(self) -> dict[str, Any]:
         """What was found on disturbed measurements; empty where the study does not ask for it."""
         return load_artifact(self.folder / "disturbed", "disturbed")[0] if self.has("disturbed/disturbed.json") else {}
-
-    @cached_property
-    def left_out(self) -> dict[str, Any]:
-        """What observers did on units that took no part in their design."""
-        return self._record("left_out", "left_out", "no unit was left out; set evaluate.folds")
 
     @cached_property
     def arrays(self) -> dict[str, Array]:

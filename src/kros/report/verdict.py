@@ -17,23 +17,15 @@ Metrics = Mapping[str, Any]
 
 def verdict(metrics: Metrics, measured: tuple[str, ...] = ()) -> list[str]:
     """Return the sentences of the verdict from ``metrics.json``, any part of which may be absent; errors of `measured` channels are left to the table."""
-    return [*findings(metrics, measured), *trust(metrics)]
-
-
-def findings(metrics: Metrics, measured: tuple[str, ...] = ()) -> list[str]:
-    """Return what was recorded, what is deployed and how well it works, and which units are flagged."""
     return [
         *_recorded(metrics),
         *_deployed(metrics, measured),
         *needed_sensor(metrics, measured),
         *_left_out(metrics, measured),
         *_next_unit(metrics),
+        *_covered(metrics),
+        *_certificate(metrics),
     ]
-
-
-def trust(metrics: Metrics) -> list[str]:
-    """Return what stands behind the numbers; nothing where no observer was made."""
-    return [*_covered(metrics), *_certificate(metrics)]
 
 
 def _recorded(metrics: Metrics) -> list[str]:

@@ -36,27 +36,21 @@ FIGURES: dict[str, Row] = {
     "free_run": Row("Predictions of the models", "models.free_run"),
     "free_run_spectra": Row("Spectra of the prediction errors", "models.free_run_spectra"),
     "forms": Row("Six uncertainty forms", "uncertainty.forms"),
-    "variation": Row("Manufacturing or finite recordings", "uncertainty.variation"),
     "weights": Row("Weights over the optimal cover", "uncertainty.weights"),
     "forms_entrywise": Row("Six uncertainty forms, entry by entry", "uncertainty.forms_entrywise"),
     "weights_entrywise": Row("Weights entry by entry", "uncertainty.weights_entrywise"),
     "synthesis": Row("Plant, weights and correction filters", "synthesis.bode"),
-    "errors": Row("Errors of all observers", "observers.errors"),
-    "left_out": Row("Units that were left out", "observers.left_out"),
     "observers_in_time": Row("Estimates", "observers.in_time"),
     "observers_in_time_paper": Row("Estimates of the paper's observers", "observers.in_time", {"paper": True}),
     "observer_spectra": Row("Spectra of the estimation errors", "observers.spectra"),
-    "loaded": Row("Errors in the other condition", "observers.other_condition"),
-    "loaded_paper": Row("Errors of the paper's observers in the other condition", "observers.other_condition", {"paper": True}),
+    "loaded_paper": Row("Errors of the paper's observers in the other condition", "observers.other_condition"),
     "loaded_spectra": Row("Spectra of the errors in the other condition", "observers.other_condition_spectra"),
     "load_torque": Row("Load torque", "observers.load_torque"),
     "robustness": Row("Disturbed measurements", "observers.robustness"),
-    "robustness_second": Row("Disturbed measurements, the second hidden state", "observers.robustness", {"number": 1}),
     "outlier_scores": Row("Outlier scores", "outliers.scores"),
-    "outlier_ratio": Row("The highest-scoring unit against the cover of the others", "outliers.ratio"),
     "outlier_residuals": Row("The highest-scoring unit, entry by entry", "outliers.residuals"),
 }
-LEFT_TO_FILES = ("forms_entrywise", "weights_entrywise", "robustness_second", "outlier_residuals")
+LEFT_TO_FILES = ("forms_entrywise", "weights_entrywise", "outlier_residuals")
 ON_THE_PAGE = tuple(name for name in FIGURES if name not in LEFT_TO_FILES)
 
 

@@ -100,13 +100,12 @@ def _limits(levels: Sequence[Array]) -> tuple[float, float]:
     return max(float(np.percentile(finite, 1)), high - _FLOOR_DB) - 3.0, high + 14.0
 
 
-def ratio_panel(axes: Axes, residuals: UnitResiduals, alarm: str | None = None, most: int = 4) -> None:
+def ratio_panel(axes: Axes, residuals: UnitResiduals, most: int = 4) -> None:
     """Draw the ratio of every unit to the weights, dB; the dashed line is what the weights allow."""
     inside, freqs = residuals.rows(inside=True), residuals.freqs_hz
     levels = decibel(residuals.ratio)
     lines_of_units(axes, freqs, levels[inside], Tone.BLUE.light, "units", [residuals.unit_ids[k] for k in inside])
     axes.plot(freqs, decibel(residuals.ratio[inside].max(axis=0)), color=Tone.BLUE.light, lw=1.3, label="largest")
-    _mark_unit(axes, residuals, levels, alarm)
     axes.axhline(0, color=Tone.INK.light, lw=0.9, ls="--")
     axes.set_ylim(_LOWEST_DB, float(np.nanmax(levels, initial=0.0)) + 4)
     frequency_axis(axes, freqs, "", most)

@@ -33,7 +33,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         _table(table, found["observers"], folds, run.measured_states, study.get("deployed"), units)
         for table in left_out_tables(found["rows"], study["identify_on"])
     ]
-    return Section("left-out", "On units that were left out", paragraphs, tables, ["left_out"])
+    return Section("left-out", "On units that were left out", paragraphs, tables)
 
 
 def _table(

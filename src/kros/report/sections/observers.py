@@ -52,7 +52,7 @@ def estimates(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "The observers as they run: at every step the estimate is cut back to the original states and re-lifted with the unit's own parameters. An estimate "
         "for the next sample uses data up to this one."
     )
-    figures = ["errors", "observers_in_time_paper", "observer_spectra"]
+    figures = ["observers_in_time_paper", "observer_spectra"]
     return Section("estimates", "Estimates", [text], _against_truth(metrics), figures)
 
 

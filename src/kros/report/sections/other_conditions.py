@@ -18,5 +18,5 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         return None
     names = ", ".join(condition_label(c) for c in others)
     text = f"Models, weights and observers know only “{condition_label(study['identify_on'])}”. Here they meet what they were not designed for: {names}."
-    figures = ["loaded", "loaded_paper", "loaded_spectra", *(["load_torque"] if metrics.get("load_torque") else [])]
+    figures = ["loaded_paper", "loaded_spectra", *(["load_torque"] if metrics.get("load_torque") else [])]
     return Section("other-conditions", names[:1].upper() + names[1:], [text], [], figures)

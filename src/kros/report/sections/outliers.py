@@ -18,7 +18,7 @@ _MEANING = (
 
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
-    """Return how scores are made, and the highest one against the cover of the others; None where none were computed."""
+    """Return how scores are made, and where flagged units differ; None where none were computed."""
     rows = metrics.get("outliers")
     if not rows:
         return None
@@ -27,7 +27,8 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "Scores look at the recordings only, never at serial or group. Some unit always has the highest score, so there is a threshold; above it a unit is "
         "flagged."
     )
-    return Section("outliers", "Outliers", [text, *undecided_text(rows), _MEANING], [], ["outlier_scores", "outlier_ratio"])
+    flagged = [score_card(row, score_names(run, row["condition"])) for row in rows if row["outlier"]][:_NAMED]
+    return Section("outliers", "Outliers", [text, *undecided_text(rows), _MEANING, *flagged], figures=["outlier_scores"])
 
 
 def undecided_text(rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -10,8 +10,7 @@ from ..content import Cell, Cells, Section, Table, where
 from ..names import observer_label
 from ..run_folder import NotShownError, RunFolder
 from ..trust import dropout_text, sensor_text, trusts
-from ..verdict import findings
-from ..verdict import trust as sentences
+from ..verdict import verdict
 
 _COLUMNS = (
     "For the set: “plants”, a bound on the error's H2 norm for every plant between the weights around the nominal unit; “signals”, a bound on its RMS for all "
@@ -51,7 +50,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     ]
     head = ["observer", "certified for the set", "certified as it runs", "tolerates dropouts", "sensor needed"]
     table = Table(head, rows, "What stands behind every observer", emphasised=where(found, deployed), prose=True, sortable=True)
-    claimed = [*findings(metrics, run.measured_states), *sentences(metrics)]
+    claimed = verdict(metrics, run.measured_states)
     lists = [
         ("What is claimed", claimed),
         ("Under which assumptions", [*_ASSUMED, *_assumed(run, deployed)]),

@@ -40,7 +40,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     paragraphs = [text, *([_PAPER] if tall else []), *([_HIGH.format(names=", ".join(model_label(n) for n in high))] if high else [])]
     paragraphs += [*confounded_text(metrics), *small_set_text(metrics), *noise_text(entries)]
     tables = [_peaks(entries), _weights(entries)]
-    return Section("uncertainty", "Uncertainty", paragraphs, tables, ["forms", "variation", "weights"])
+    return Section("uncertainty", "Uncertainty", paragraphs, tables, ["forms", "weights"])
 
 
 def noise_text(entries: Mapping[str, Any]) -> list[str]:

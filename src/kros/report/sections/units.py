@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +15,6 @@ from ..names import axis_label, channel_units, condition_label, in_condition, nu
 from ..run_folder import RunFolder
 from .outliers import some_of, undecided_text
 
-log = logging.getLogger(__name__)
 Row = Mapping[str, Any]
 _ROWS = 400  # units that all get a row; more would make the page too large
 _FAR = 20  # largest of every column that get a row where not all do

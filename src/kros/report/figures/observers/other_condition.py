@@ -1,19 +1,18 @@
-"""Estimation errors of the nominal unit in a condition that no model has seen, of the deployed pair or the paper's (the paper's Figure 13)."""
+"""Estimation errors of the nominal unit of the paper's pair in a condition that no model has seen (the paper's Figure 13)."""
 
 from __future__ import annotations
 
 from ...canvas import Figure
-from ...names import condition_label, deployed_pair, episode_title
+from ...names import condition_label, episode_title
 from ...run_folder import NotShownError, RunFolder, Shown
 from ..episodes import Strip, overview_and_zoom, require_paper_pair
 from .in_time import error_lines
 
 
-def draw(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
+def draw(run: RunFolder) -> tuple[Figure, str]:
     """Draw errors over the episode and over a zoom at constant speed."""
     shown = other_episode(run)
-    found = list(shown.observers)
-    names, text = require_paper_pair(found) if paper else (deployed_pair(found, run.deployed), "")
+    names, text = require_paper_pair(shown.observers)
     strips = [Strip(channel, error_lines(shown, names, i)) for i, channel in enumerate(run.states[:4])]
     text += f"Recorded minus estimated, with models identified in {condition_label(run.identify_on)} only. "
     if any(c.name == "current" for c in run.states) and shown.key.condition == "load":

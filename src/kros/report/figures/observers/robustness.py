@@ -17,12 +17,12 @@ _COLUMNS, _AS_LARGE = 4, 100.0
 _ZERO = 0.06  # place of "not disturbed" on a logarithmic axis, as a share of the smallest severity
 
 
-def draw(run: RunFolder, number: int = 0) -> tuple[Figure, str]:
-    """Draw one panel a disturbance, one line an observer, of one of the states that are not measured."""
+def draw(run: RunFolder) -> tuple[Figure, str]:
+    """Draw one panel a disturbance, one line an observer, of the first state that is not measured."""
     rows, hidden = run.disturbed.get("robustness", []), run.hidden_states
-    if not rows or number >= len(hidden):
-        raise NotShownError("the study did not run observers on disturbed measurements, or has no such state")
-    channel, condition = hidden[number], run.identify_on
+    if not rows:
+        raise NotShownError("the study did not run observers on disturbed measurements")
+    channel, condition = hidden[0], run.identify_on
     found = curves(rows, condition)
     names = [n for n in shown_observers(list(found), run.deployed) if any(channel in c for c in found[n].values())]
     kinds = [kind for kind in Kind if any(kind in found[n] for n in names)]

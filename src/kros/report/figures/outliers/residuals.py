@@ -16,6 +16,6 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     names = {n: entry_names(r.form, run.condition_models(n, condition)) for n, r in found.items()}
     text = (
         f"Entries of the {form_label(first.form.value)} residuals against unit {first.nominal_id}{in_condition(condition)}, beside weights that are "
-        f"fitted to all units but {unit}. It differs where it leaves them; the figure above judges all entries at once."
+        f"fitted to all units but {unit}. It differs where it leaves them."
     )
     return entries_figure(found, names, alarm=unit), text

@@ -93,7 +93,7 @@ def write_csv(source: Path, target: Path) -> None:
     """Write Parquet recordings as CSV, a folder for each unit."""
     import numpy as np
 
-    from kros.data import read_parquet
+    from kros.data.readers.parquet import read_parquet
 
     population = read_parquet(source)
     header = ",".join(["time", *(c.name for c in population.channels)])

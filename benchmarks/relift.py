@@ -23,7 +23,8 @@ import numpy as np
 
 from kros.core.artifacts import read_json, write_json
 from kros.core.work import Work
-from kros.data import EpisodeBatch, read_parquet
+from kros.data import EpisodeBatch
+from kros.data.readers.parquet import read_parquet
 from kros.design.methods.design import design
 from kros.design.synthesize import tasks_of
 from kros.observer import Observer, ReliftScales, relift_certificate

@@ -28,8 +28,8 @@ from kros.core.artifacts import CHECKSUM, load_artifact, plain, read_json, save_
 from kros.core.errors import KrosError
 from kros.core.lti import StateSpace
 from kros.core.records import read_record
-from kros.data import Channel, Role, check_population, from_arrays, from_frame, from_pykoop, read, write_parquet
-from kros.data.checks import scan_digests
+from kros.data import Channel, Role, from_arrays, from_frame, from_pykoop, read, write_parquet
+from kros.data.checks import check_population, scan_digests
 from kros.identify import ModelSet
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime

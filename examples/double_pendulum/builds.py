@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from kros.data import Channel, EpisodeKey, Population, Role, Unit, read_csv_folder
+import kros
+from kros.data import Channel, EpisodeKey, Population, Role, Unit
 from kros.identify import (
     Factor,
     KoopmanMatrices,
@@ -49,7 +50,7 @@ Recordings = dict[str, dict[str, np.ndarray]]
 
 def read(folder: Path, spikes: bool) -> Recordings:
     """Return episodes by build, columns q1 q2 w1 w2 held1 held2 command1 command2, 400 samples a second."""
-    population = read_csv_folder(folder, Path(__file__).parent / "builds.toml")
+    population = kros.read(folder, mapping=Path(__file__).parent / "builds.toml")
     found: Recordings = {}
     for key in population.episodes:
         if spikes or key.episode not in SPIKES.get(key.unit, ()):

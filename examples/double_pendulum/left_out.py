@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from kros.core.artifacts import load_artifact
-from kros.data import EpisodeBatch, Population, read_parquet, split_episodes
+from kros.data import EpisodeBatch, Population, read, split_episodes
 from kros.design.estimators import make_difference, make_extended, make_learned
 from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent, unit_interval
@@ -63,7 +63,7 @@ def main() -> None:
     config = without_other_joint(config) if options.alone else config
     run_study(config, options.out / "all", Stage.READ)
     source = next((options.out / "all").glob("*/population.json")).parent
-    recordings, table = read_parquet(source), dict[str, list[Row]]()
+    recordings, table = read(source), dict[str, list[Row]]()
     for held in folds(recordings.unit_ids, options.builds, options.drives):
         changes = {"source": source.absolute(), "reader": "parquet", "prepare": (), "csv": None, "exclude": held}
         folder = options.out / "+".join(held)

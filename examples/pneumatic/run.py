@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from kros.cli import app
-from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, read_csv_folder, write_parquet
+from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, read, write_parquet
 
 PIECES, PIECE, TRAINING, STEPS_BACK = 10, 310, 0.7, 5
 CREEP_MM_S = 0.5
@@ -38,7 +38,7 @@ if __name__ == "__main__":
     here = Path(__file__).parent
     if "KROS_DATA" not in os.environ:
         sys.exit("Set KROS_DATA to the folder that holds pneumatic_cc0; study.toml says where it is published.")
-    recordings = read_csv_folder(Path(os.environ["KROS_DATA"]) / "pneumatic_cc0", here / "recordings.toml")
+    recordings = read(Path(os.environ["KROS_DATA"]) / "pneumatic_cc0", mapping=here / "recordings.toml")
     with tempfile.TemporaryDirectory() as folder:
         write_parquet(prepared(recordings), Path(folder) / "recordings")
         source = f"data.source={Path(folder) / 'recordings'}"

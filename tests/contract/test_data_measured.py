@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import EpisodeKey, check_population, prepare, read, split_episodes, steps
+from kros.data import EpisodeKey, prepare, read, split_episodes, steps
+from kros.data.checks import check_population
 
 PENDULUM_SIGNALS = [
     ("position", "state", "pos_meas", "rad"),

@@ -134,7 +134,8 @@ def test_estimates_are_written_one_row_group_an_episode(kros, demo, tmp_path, me
     assert table.column_names == ["unit", "condition", "episode", "k", "position_hat", "velocity_hat", "current_hat"]
     rows = table.to_pandas() if hasattr(table, "to_pandas") else None
     one = rows[(rows.unit == "001002") & (rows.condition == "noload") & (rows.episode == "3")]
-    from kros.data import EpisodeKey, read_parquet
+    from kros.data import EpisodeKey
+    from kros.data.readers.parquet import read_parquet
 
     truth = read_parquet(recorded).read(EpisodeKey("001002", "noload", "3"))
     error = 100 * np.sqrt(np.mean((one["velocity_hat"].to_numpy() - truth[:, 1]) ** 2)) / np.abs(truth[:, 1]).max()
@@ -148,7 +149,7 @@ def test_estimates_are_written_one_row_group_an_episode(kros, demo, tmp_path, me
 
 
 def test_in_the_field_measured_channels_and_inputs_are_enough(kros, demo, recorded, tmp_path):
-    from kros.data import read_parquet
+    from kros.data.readers.parquet import read_parquet
 
     population = read_parquet(recorded)
     seen = ["position", "target_position", "target_velocity"]

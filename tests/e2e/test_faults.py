@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kros.data import read_parquet
+from kros.data.readers.parquet import read_parquet
 from kros.identify import PhaseCalibration
 from kros.observer import Observer, run_observer, sample_status
 from kros.observer.certificate.error import error_system

@@ -10,7 +10,8 @@ import pytest
 
 from kros.core.artifacts import read_arrays, read_json
 from kros.core.work import Work
-from kros.data import read_parquet, split_episodes, write_parquet
+from kros.data import split_episodes, write_parquet
+from kros.data.readers.parquet import read_parquet
 from kros.evaluate import unit_interval
 from kros.identify import ModelSet
 from kros.observer import Observer, run_observer

@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from kros.data import Population, read_parquet
+from kros.data import Population
+from kros.data.readers.parquet import read_parquet
 from kros.identify import ModelSet, free_run
 
 UNITS, EPISODES, SECONDS = 4, 5, 10

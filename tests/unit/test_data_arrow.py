@@ -46,10 +46,10 @@ def test_reading_and_writing_leave_pandas_alone(tmp_path: Path) -> None:
     (tmp_path / "csv" / "a.csv").write_text("t,x\n0,1\n0.1,2\n0.2,4\n")
     code = """
 import sys
-from kros.data import read, read_parquet, write_parquet
+from kros.data import read, write_parquet
 table = {"files": "a", "time": "t", "channel": [{"name": "x", "column": "x", "role": "state"}]}
 write_parquet(read(sys.argv[1] + "/csv", "csv", mapping=table), sys.argv[1] + "/out")
-population = read_parquet(sys.argv[1] + "/out")
+population = read(sys.argv[1] + "/out")
 assert population.read(population.episodes[0]).ravel().tolist() == [1, 2, 4]
 assert "pandas" not in sys.modules
 """

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import Channel, EpisodeKey, Population, Role, Unit, check_population, from_arrays
-from kros.data.checks import check_episode, scan_digests
+from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays
+from kros.data.checks import check_episode, check_population, scan_digests
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 KEY = EpisodeKey("001011", "load", "7")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError
-from kros.data import EpisodeKey, Population, read_csv_folder
+from kros.data import EpisodeKey, Population
+from kros.data.readers.csv_folder import read_csv_folder
 
 N = 50
 CHANNEL: list[dict[str, Any]] = [

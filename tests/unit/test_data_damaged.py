@@ -15,9 +15,10 @@ from pyarrow import parquet
 
 from kros.core import limits
 from kros.core.errors import ConfigError, DataError
-from kros.data import Channel, EpisodeKey, Role, from_arrays, from_frame, from_pykoop, prepare, read, read_parquet, steps, write_parquet
+from kros.data import Channel, EpisodeKey, Role, from_arrays, from_frame, from_pykoop, prepare, read, steps, write_parquet
 from kros.data.alerts import period_alerts
 from kros.data.checks import scan_digests
+from kros.data.readers.parquet import read_parquet
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 MAPPING: dict[str, Any] = {

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import kros
-from kros.data import read_parquet, write_parquet
-from kros.data.readers.parquet import Kept
+from kros.data import write_parquet
+from kros.data.readers.parquet import Kept, read_parquet
 
 RAMP = np.arange(40.0).reshape(20, 2)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import EpisodeKey, Unit, from_arrays, read_motor_drive_raw, write_raw
-from kros.data.readers.motor_drive_raw import CHANNELS, STEPS
+from kros.data import EpisodeKey, Unit, from_arrays, write_raw
+from kros.data.readers.motor_drive_raw import CHANNELS, STEPS, read_motor_drive_raw
 
 HEADER = "t,theta,omega,tau,theta_ref,omega_ref"
 N = 1100

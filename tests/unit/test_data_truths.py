@@ -9,7 +9,8 @@ import pytest
 
 from kros.core.artifacts import read_json
 from kros.core.errors import DataError
-from kros.data import Channel, EpisodeBatch, Population, Role, TrueChannel, from_arrays, prepare, read, read_parquet, steps, write_parquet
+from kros.data import Channel, EpisodeBatch, Population, Role, TrueChannel, from_arrays, prepare, read, steps, write_parquet
+from kros.data.readers.parquet import read_parquet
 from kros.data.scaled import scale_population
 from kros.data.survey import survey
 from kros.plants import PLANTS

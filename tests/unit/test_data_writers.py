@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from kros.core.errors import ConfigError, DataError
 from kros.core.locks import locked
-from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, read_parquet, write_parquet
+from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, write_parquet
+from kros.data.readers.parquet import read_parquet
 from kros.data.writers.parquet import group_file, write_group, write_index
 
 CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("y/z", Role.STATE), Channel("u", Role.INPUT, "V"))

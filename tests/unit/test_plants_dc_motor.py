@@ -10,7 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from kros.cli import app
-from kros.data import EpisodeKey, read_parquet
+from kros.data import EpisodeKey
+from kros.data.readers.parquet import read_parquet
 from kros.plants import PLANTS, DcMotorPopulation
 
 SMALL = DcMotorPopulation(n_units=3, n_episodes=2, seconds=2.0, seed=4, outlier=True)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError
-from kros.data import EpisodeKey, read_motor_drive_raw, write_raw
+from kros.data import EpisodeKey, write_raw
+from kros.data.readers.motor_drive_raw import read_motor_drive_raw
 from kros.plants import HarmonicDrivePopulation
 from kros.plants.harmonic_drive.parameters import NOMINAL, OUTLIER_LOG_FACTORS, RIPPLE_DEVIATION, draw_outlier, draw_parameters
 from kros.plants.harmonic_drive.reference import (

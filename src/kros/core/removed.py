@@ -139,6 +139,21 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
         "disturbed measurements.",
         ("kros.evaluate.MonteCarlo", "kros.evaluate.sample_errors", "evaluate.monte_carlo"),
     ),
+    (
+        "Readers of one format are no longer public; use kros.read, which finds the format or is told it.",
+        (
+            "kros.data.read_csv_folder",
+            "kros.data.read_motor_drive_raw",
+            "kros.data.read_parquet",
+        ),
+    ),
+    (
+        "The check of a population and the class of a split are no longer public; kros.identify checks, split_episodes splits.",
+        (
+            "kros.data.Split",
+            "kros.data.check_population",
+        ),
+    ),
 )
 
 

@@ -12,17 +12,14 @@ Examples
 (('angle',), (50, 3))
 """
 
+from ..core.removed import refusing
 from . import steps
 from .batch import EpisodeBatch
-from .checks import check_population
-from .population import Channel, EpisodeKey, Population, Role, Split, TrueChannel, Unit, split_episodes
+from .population import Channel, EpisodeKey, Population, Role, TrueChannel, Unit, split_episodes
 from .prepare import prepare
 from .readers.arrays import from_arrays
-from .readers.csv_folder import read_csv_folder
 from .readers.frame import from_frame
-from .readers.motor_drive_raw import read_motor_drive_raw
 from .readers.opening import read
-from .readers.parquet import read_parquet
 from .readers.pykoop_array import from_pykoop, to_pykoop
 from .writers.parquet import write_parquet
 from .writers.raw import write_raw
@@ -33,21 +30,17 @@ __all__ = [
     "EpisodeKey",
     "Population",
     "Role",
-    "Split",
     "TrueChannel",
     "Unit",
-    "check_population",
     "from_arrays",
     "from_frame",
     "from_pykoop",
     "prepare",
     "read",
-    "read_csv_folder",
-    "read_motor_drive_raw",
-    "read_parquet",
     "split_episodes",
     "steps",
     "to_pykoop",
     "write_parquet",
     "write_raw",
 ]
+__getattr__ = refusing(__name__)

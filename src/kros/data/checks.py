@@ -180,25 +180,7 @@ def _check_truths(channels: Sequence[Channel]) -> None:
 
 
 def check_population(population: Population, allow_single: bool = False) -> None:
-    """Check what can be told without reading: not empty, no duplicates, a state, a measured state, more than one unit.
-
-    Parameters
-    ----------
-    population : Population
-    allow_single : bool
-        Accept one unit, which suffices for identification but not for uncertainty. Units of the group ``outliers`` do not count.
-
-    Raises
-    ------
-    DataError
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import kros
-    >>> alone = kros.from_arrays({"a": [np.ones((5, 2))]}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
-    >>> kros.data.check_population(alone, allow_single=True)  # says nothing where nothing is wrong
-    """
+    """Check what can be told without reading: not empty, no duplicates, a state, a measured state, more than one unit."""
     check_structure(population.columns, population.episodes)
     if not population.measured:
         raise DataError(

@@ -156,15 +156,7 @@ def part_columns(columns: Iterable[Channel]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Split:
-    """Training and test episodes, in natural order.
-
-    Examples
-    --------
-    >>> from kros.data import EpisodeKey, Split
-    >>> split = Split(train=(EpisodeKey("a", "default", "0"),), test=(EpisodeKey("a", "default", "1"),))
-    >>> split.test[0].episode
-    '1'
-    """
+    """Training and test episodes, in natural order."""
 
     train: tuple[EpisodeKey, ...]
     test: tuple[EpisodeKey, ...]

@@ -214,7 +214,7 @@ class IdentifiedModels:
 
 def recordings_of(folder: Path) -> Population:
     """Open the recordings of a run folder, or of a saved result."""
-    from ..data import read_parquet
+    from ..data.readers.parquet import read_parquet
 
     return read_parquet(recordings_path(folder))
 

@@ -11,20 +11,7 @@ Array = npt.NDArray[np.float64]
 
 
 def filtered(x: Array, rest: Array, a1: float, a2: float, every: int = 1) -> tuple[Array, Array]:
-    """Return ``held[k] = x[k - 1] - a1 held[k - 1] - a2 held[k - 2]`` at every so many samples, and one sample before these.
-
-    Parameters
-    ----------
-    x : ndarray, shape (..., n_samples)
-    rest : ndarray, shape (...)
-        What x was before, for ever: the filter is stable.
-    a1, a2 : float
-    every : int
-
-    Returns
-    -------
-    now, before : ndarray, shape (..., n_samples / every)
-    """
+    """Return ``held[k] = x[k - 1] - a1 held[k - 1] - a2 held[k - 2]`` at every so many samples, and one sample before these."""
     kept = -(-x.shape[-1] // every)
     if (loops := library()) is not None:
         now, before = (np.empty((*x.shape[:-1], kept)) for _ in range(2))
@@ -48,21 +35,7 @@ def all_pole(x: Array, a1: float, a2: float = 0.0) -> Array:
 
 
 def recursion(F: Array, driven: Array, first: Array, G: Array | None = None) -> Array:
-    """Return ``h[k + 1] = F h[k] + G driven[k]``.
-
-    Parameters
-    ----------
-    F : ndarray, shape (n, n)
-    driven : ndarray, shape (n_samples, batch, m)
-        The last sample drives nothing.
-    first : ndarray, shape (batch, n)
-    G : ndarray, shape (n, m), optional
-        The identity by default.
-
-    Returns
-    -------
-    ndarray, shape (n_samples, batch, n)
-    """
+    """Return ``h[k + 1] = F h[k] + G driven[k]``, shape (n_samples, batch, n)."""
     (n_samples, batch, m), n = driven.shape, len(F)
     if not n:
         return np.zeros((n_samples, batch, 0))
@@ -88,27 +61,7 @@ def recursion(F: Array, driven: Array, first: Array, G: Array | None = None) -> 
 
 
 def blocks_along(F: Array, G: Array, H: Array, z: Array, rest: Array, held: Array, every: int = 1, *, states: bool = True) -> Array:
-    """Return the states of a model in blocks of two, ``h[k + 1] = F h[k] + G z[k]``, or its estimates ``H h[k]``.
-
-    Parameters
-    ----------
-    F : ndarray, shape (blocks, 2, 2)
-    G : ndarray, shape (blocks, 2, channels)
-    H : ndarray, shape (outputs, blocks, 2)
-    z : ndarray, shape (channels, batch, n_samples)
-    rest : ndarray, shape (channels, batch)
-        What z was before, for ever: the model is stable.
-    held : ndarray, shape (blocks, 2, batch)
-        What the states were before.
-    every : int
-        States at every so many samples.
-    states : bool
-        False: the estimates.
-
-    Returns
-    -------
-    ndarray, shape (blocks * 2, batch, n_samples / every) or (outputs, batch, n_samples)
-    """
+    """Return the states of a model in blocks of two, ``h[k + 1] = F h[k] + G z[k]``, or its estimates ``H h[k]``."""
     (blocks, _, channels), (batch, samples) = G.shape, z.shape[1:]
     if (loops := library()) is not None:
         found = np.empty((2 * blocks, batch, -(-samples // every)) if states else (len(H), batch, samples))
@@ -127,23 +80,9 @@ def blocks_along(F: Array, G: Array, H: Array, z: Array, rest: Array, held: Arra
 def lattice_along(reflections: Array, x: Array, every: int = 1) -> Array:
     """Return the states of normalised lattice sections in a row along signals, from rest: those of an orthonormal basis.
 
-    Parameters
-    ----------
-    reflections : ndarray, shape (sections, 2)
-        k1 and k2 of the all-pass ``(k2 + k1 (1 + k2) q + q^2) / (1 + k1 (1 + k2) q + k2 q^2)``, q the delay; not a number in place of k2: of
-        ``(k1 + q) / (1 + k1 q)``.
-    x : ndarray, shape (signals, n_samples)
-    every : int
-
-    Returns
-    -------
-    ndarray, shape (states, signals, n_samples / every)
-        Before every so many samples.
-
-    References
-    ----------
     A. H. Gray and J. D. Markel, "A normalized digital filter structure", IEEE Trans. Acoust., Speech, Signal Process. 23 (1975) 268-277.
     """
+    # k1 and k2 of (k2 + k1 (1 + k2) q + q^2) / (1 + k1 (1 + k2) q + k2 q^2), q the delay; without k2 of (k1 + q) / (1 + k1 q)
     single = np.isnan(reflections[:, 1])
     if (loops := library()) is not None:
         held = np.empty((int(np.sum(2 - single)), len(x), -(-x.shape[1] // every)))

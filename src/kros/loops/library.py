@@ -34,14 +34,7 @@ CHOICE, CHOICES = "KROS_LOOPS", ("compiled", "numpy")
 
 
 class Library:
-    """Functions of a C source whose arguments are structs of 64-bit numbers and pointers.
-
-    Parameters
-    ----------
-    code : CDLL
-    source : str
-        Says what the structs hold.
-    """
+    """Functions of a C source whose arguments are structs of 64-bit numbers and pointers."""
 
     def __init__(self, code: ctypes.CDLL, source: str) -> None:
         self._code = code
@@ -51,14 +44,7 @@ class Library:
             self._types[name] = {field: (_TYPES[kind], not given) if pointer else None for given, kind, pointer, field in fields}
 
     def call(self, name: str, *jobs: tuple[str, Mapping[str, Any]]) -> None:
-        """Call a function with structs by type: numbers and arrays by field, nothing for a field that is left out.
-
-        What the function writes into has the field's type and is contiguous; all else is brought into that form.
-
-        Raises
-        ------
-        MemoryError
-        """
+        """Call a function with structs by type: numbers and arrays by field, nothing for a field that is left out."""
         alive: list[Any] = []  # arrays that were made here live until the call is over
         structs = [self._struct(type_, values, alive) for type_, values in jobs]
         if self._code[name](*structs):
@@ -82,13 +68,7 @@ class Library:
 
 @cache
 def library() -> Library | None:
-    """Return the compiled loops; None where NumPy takes their place, because it was asked for by ``KROS_LOOPS=numpy`` or there is no compiler that works.
-
-    Raises
-    ------
-    ConfigError
-        When something else was asked for.
-    """
+    """Return the compiled loops; None where NumPy takes their place: ``KROS_LOOPS=numpy``, or no compiler that works."""
     choice = os.environ.get(CHOICE, CHOICES[0])
     if choice not in CHOICES:
         raise ConfigError(f"{CHOICE}={choice}: should be one of {', '.join(CHOICES)}.")

@@ -54,17 +54,7 @@ class Tape:
 
 @lru_cache(maxsize=64)
 def tape_of(lifting: Lifting, m: int, entries: tuple[int, ...] = (), of_inputs: bool = True) -> Tape:
-    """Return the tape of a lifting with m recorded inputs.
-
-    Parameters
-    ----------
-    lifting : Lifting
-    m : int
-    entries : tuple of int
-        Entries of the window by which derivatives are wanted.
-    of_inputs : bool
-        Whether those of input functions are wanted too.
-    """
+    """Return the tape of a lifting with m recorded inputs."""
     window, n_lifted = lifting.window.names, lifting.n_lifted
     inputs = lifting.inputs or tuple(f"input {i}" for i in range(m))  # which no formula can read
     writer = _TapeWriter([*window, *inputs, *lifting.parameters])

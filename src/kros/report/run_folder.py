@@ -89,7 +89,7 @@ class RunFolder:
     @cached_property
     def population(self) -> Population:
         """The recordings, where they are still in place."""
-        from ..data import read_parquet
+        from ..data.readers.parquet import read_parquet
 
         folder = self.folder / self.facts["recordings"]
         if not (folder / "population.json").exists():

@@ -28,34 +28,16 @@ _SLOWER = 1.5
 
 @dataclass(frozen=True)
 class EpisodeLook:
-    """What one episode looks like.
-
-    Parameters
-    ----------
-    key : EpisodeKey
-    wrong : str
-        Why it cannot be used, or nothing.
-    doubts : tuple of str
-        What is odd about it.
-    n_samples : int
-    period_s : float
-        Median step of time; NaN where there is no column of time.
-    uneven : bool
-    nan : bool
-    gap : tuple of float and int, or None
-        Longest step of time, s, where it is a gap, and the sample before it.
-    digest : str
-    alerts : tuple of str
-    """
+    """What one episode looks like."""
 
     key: EpisodeKey
-    wrong: str = ""
-    doubts: tuple[str, ...] = ()
+    wrong: str = ""  # why it cannot be used, or nothing
+    doubts: tuple[str, ...] = ()  # what is odd about it
     n_samples: int = 0
-    period_s: float = np.nan
+    period_s: float = np.nan  # median step of time; NaN where there is no column of time
     uneven: bool = False
     nan: bool = False
-    gap: tuple[float, int] | None = None
+    gap: tuple[float, int] | None = None  # or None; Longest step of time, s, where it is a gap, and the sample before it
     digest: str = ""
     alerts: tuple[str, ...] = ()
 

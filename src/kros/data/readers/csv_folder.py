@@ -85,41 +85,7 @@ def _latest(recordings: CsvRecordings, place: FilePlace, *version: int) -> npt.N
 
 
 def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str, optional: Collection[str] = ()) -> Population:
-    """Read a folder of CSV files (also gzip-compressed), or of anybody's Parquet files.
-
-    Parameters
-    ----------
-    source : Path
-    mapping : CsvMapping, mapping or Path
-        See `CsvMapping`; a path names a TOML file.
-    optional : collection of str
-        Channels that are left out where the first file has no column for them.
-
-    Returns
-    -------
-    Population
-        Files are listed and their first lines read; samples are read on demand.
-
-    Raises
-    ------
-    ConfigError
-        A mapping that is not valid.
-    DataError
-        No file matches, a column is missing, or two files are the same episode.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from tempfile import TemporaryDirectory
-    >>> import numpy as np
-    >>> from kros.data import read_csv_folder
-    >>> mapping = {"files": "(?P<unit>[a-z]+)[.]csv", "time": "t", "channel": [{"name": "x", "role": "state", "measured": True}]}
-    >>> with TemporaryDirectory() as folder:
-    ...     for unit in ("left", "right"):
-    ...         np.savetxt(Path(folder, f"{unit}.csv"), [[0, 1], [0.01, 2], [0.02, 3]], delimiter=",", header="t,x", comments="")
-    ...     read_csv_folder(folder, mapping).unit_ids
-    ('left', 'right')
-    """
+    """Read a folder of CSV files (also gzip-compressed), or of anybody's Parquet files."""
     chosen, source = load_mapping(mapping), Path(source)
     dialect = chosen.dialect
     places: dict[EpisodeKey, FilePlace] = {}

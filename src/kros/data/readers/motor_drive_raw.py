@@ -80,35 +80,7 @@ def find_root(source: Path) -> Path | None:
 
 
 def read_motor_drive_raw(source: Path | str) -> Population:
-    """Read the paper's raw layout.
-
-    Parameters
-    ----------
-    source : Path
-        The folder that holds ``batch_b``, or the one that holds ``population`` and ``outliers``.
-
-    Returns
-    -------
-    Population
-        States position (rad, gear output, measured), velocity (rad/s), current (fraction of full scale); inputs target_position (rad),
-        target_velocity (rad/s). Files are listed and their header lines read; samples are read on demand.
-
-    Raises
-    ------
-    DataError
-        A folder or file that does not fit the layout, missing or extra columns, duplicate episodes, a unit in two groups.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> from kros.data import read_motor_drive_raw, write_raw
-    >>> from kros.plants import HarmonicDrivePopulation
-    >>> simulated = HarmonicDrivePopulation(n_units=1, n_episodes=1, seconds=2.0, conditions=("noload",)).simulate()
-    >>> with TemporaryDirectory() as folder:
-    ...     write_raw(simulated.raw, f"{folder}/raw")
-    ...     print(read_motor_drive_raw(f"{folder}/raw").states)
-    ('position', 'velocity', 'current')
-    """
+    """Read the paper's raw layout."""
     root = find_root(Path(source))
     if root is None:
         raise DataError(

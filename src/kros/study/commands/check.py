@@ -9,7 +9,8 @@ from urllib.parse import quote
 from ...core.artifacts import plain
 from ...core.errors import ConfigError, DataError
 from ...core.work import Executor
-from ...data import Population, check_population
+from ...data import Population
+from ...data.checks import check_population
 from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes

@@ -13,7 +13,8 @@ from typing import Any
 from ...core.errors import ConfigError, DataError, IdentificationError
 from ...core.files import parse_toml
 from ...core.work import Progress, Work
-from ...data import Population, Role, check_population
+from ...data import Population, Role
+from ...data.checks import check_population
 from ...data.discovery.discover import Ask, Discovery, Wanted, discover
 from ...data.discovery.roles import ColumnPart, TableColumn, is_commanded, kind_of
 from ...data.readers.opening import LOOKS, detect_reader

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import kros.core
 from kros.core import DimensionError, KrosError, StateSpace, gain, h2_norm, hinf_norm
 from kros.core.linalg import radius_text
 from kros.core.lti import dense_response
@@ -54,12 +53,6 @@ def test_bad_input_is_named():
         hinf_norm(gain([[np.nan]], 1.0))
     with pytest.raises(KrosError, match="tol"):
         hinf_norm(gain([[1.0]], 1.0), tol=0)
-
-
-def test_names_of_the_core_are_found_lazily():
-    assert set(kros.core.__all__) <= set(dir(kros.core))
-    with pytest.raises(AttributeError, match="no_such_name"):
-        _ = kros.core.no_such_name
 
 
 @pytest.mark.parametrize(

@@ -176,21 +176,6 @@ def test_pykoop_rows_of_an_episode_may_be_scattered(caplog: pytest.LogCaptureFix
     assert "rows of episode 0 of unit 0 do not stand together" in caplog.text
 
 
-def test_pykoop_episodes_that_are_text_or_huge_are_told_apart() -> None:
-    names = np.array([[2**53 + k // 12] for k in range(24)], dtype=object)
-    X = np.hstack([names, np.vstack([values(0), values(1)])])
-    assert [k.episode for k in from_pykoop(X, 1, 0.1).episodes] == [str(2**53), str(2**53 + 1)]
-    X[:12, 0], X[12:, 0] = "run 7", "run 07"
-    population = from_pykoop(X, 1, 0.1)
-    np.testing.assert_array_equal(population.read(EpisodeKey("0", "default", "run 07")), values(1))
-    with pytest.raises(DataError, match=r"below 2\*\*53.* found 9007199254740992\.0 in row 0 of unit 0"):
-        from_pykoop(np.column_stack([np.full(12, 2.0**53), values(0)]), 1, 0.1)
-    with pytest.raises(DataError, match=r"found 1\.5 in row 0"):
-        from_pykoop(np.hstack([np.full((12, 1), 1.5, dtype=object), values(0)]), 1, 0.1)
-    with pytest.raises(DataError, match="of unit 0 should be numbers"):
-        from_pykoop(np.full((12, 4), "a"), 1, 0.1)
-
-
 def test_pykoop_agrees_with_pykoop() -> None:
     pykoop = pytest.importorskip("pykoop", exc_type=ImportError)
     population = from_pykoop(koopman_array(), 1, 0.1)

@@ -66,11 +66,6 @@ def test_mapping_from_a_toml_file(folder: Path, tmp_path: Path) -> None:
     assert read_csv_folder(folder, str(path)).channels == read_csv_folder(folder, MAPPING).channels
 
 
-def test_missing_groups_get_defaults(tmp_path: Path) -> None:
-    write(tmp_path / "only.csv", samples(0))
-    assert read_csv_folder(tmp_path, mapping(files="only")).episodes == (EpisodeKey("unit", "default", "0"),)
-
-
 def test_exclude_and_group(folder: Path) -> None:
     population = read_csv_folder(folder, mapping(exclude="_10|warm"))
     assert [(k.unit, k.episode) for k in population.episodes] == [("a", "1"), ("a", "2"), ("b", "1"), ("b", "2")]
@@ -109,12 +104,6 @@ def test_tab_separated_without_header(tmp_path: Path) -> None:
     table["channel"] = [{**CHANNEL[0], "column": 4}, channel[1]]
     with pytest.raises(DataError, match=r"a_1\.tsv: column 4 is asked for, found 3 columns"):
         read_csv_folder(tmp_path, table)
-
-
-def test_period_in_place_of_time(folder: Path) -> None:
-    table = mapping(sample_period_s=0.5)
-    del table["time"]
-    assert read_csv_folder(folder, table).sample_period_s == 0.5
 
 
 def test_mapping_with_preparation_and_metadata(folder: Path) -> None:
@@ -159,15 +148,6 @@ def test_bad_rows(folder: Path, row: str, message: str) -> None:
     path = folder / "a" / "cold_1.csv"
     path.write_text(path.read_text() + row + "\n")
     with pytest.raises(DataError, match=message):
-        read_first(folder)
-
-
-def test_text_among_columns_nobody_asked_for(folder: Path) -> None:
-    path = folder / "a" / "cold_1.csv"
-    path.write_text("note,volt,t,note,pos\nfine,1,0,,4\n,2,0.01,good,5\n,3,0.02,x,7\n")
-    np.testing.assert_allclose(read_csv_folder(folder, MAPPING).read(EpisodeKey("a", "cold", "1")), [[4e-3, 1], [5e-3, 2], [7e-3, 3]])
-    path.write_text("note,volt,t,note,pos\nfine,1,0,,4\n,2,0.01,good,5\n,3,0.02,x,seven\n")
-    with pytest.raises(DataError, match=r"cold_1\.csv: in column 'pos'.*'seven'"):
         read_first(folder)
 
 

@@ -206,14 +206,6 @@ def test_the_observer_file_holds_delays_and_input_functions(tmp_path, injection)
     np.testing.assert_array_equal(run_observer(again, y, u), run_observer(o, y, u))
 
 
-def test_observers_refuse_inputs_that_do_not_fit():
-    o = observer()
-    with pytest.raises(DimensionError, match="expected inputs"):
-        run_observer(o, np.zeros((5, 1, 1)), np.zeros((5, 1, 4)))
-    with pytest.raises(DimensionError, match="2 functions of them need as many columns of B, found 2"):
-        Observer("x", DELAYED, o.A, o.B[:, :2], (0,), INPUTS, o.controller, Injection.STATE, 0.01)
-
-
 def test_models_survive_the_disk(tmp_path):
     channels = (
         Channel("position", Role.STATE, "rad", True),
@@ -295,13 +287,6 @@ def test_bad_input_functions_are_refused():
         Lifting(STATES, (), (), (), ("voltage*position",))
     with pytest.raises(ConfigError, match="rename"):
         Lifting(STATES, (), (), ("position",))
-
-
-def test_missing_earlier_values_are_named():
-    with pytest.raises(DimensionError, match=r"earlier values \('position\[-1\]'"):
-        DELAYED.lift_into(np.zeros((2, 5)), {"phase": 0.0})
-    with pytest.raises(DimensionError, match="expected 8 entries of a window"):
-        DELAYED.lift(np.zeros((2, 2)), {"phase": 0.0})
 
 
 def test_what_recordings_do_not_show_is_named(caplog):

@@ -26,13 +26,6 @@ def test_population_has_two_states_and_an_input():
     assert np.abs(population.read(KEY)[:, 0]).max() > 0.3
 
 
-def test_a_unit_is_the_same_whatever_else_is_simulated():
-    first, second = SMALL.simulate(), PendulumPopulation(n_units=2, n_episodes=5, seconds=4.0, seed=4).simulate()
-    np.testing.assert_allclose(first.population.read(KEY), second.population.read(KEY), atol=1e-12)
-    np.testing.assert_array_equal(first.population.read(KEY), SMALL.simulate().population.read(KEY))
-    assert np.abs(replace(SMALL, seed=5).simulate().population.read(KEY) - first.population.read(KEY)).max() > 0.1
-
-
 def test_truth_is_plain_json_and_the_outlier_is_stiff_jointed():
     truth = json.loads(json.dumps(replace(SMALL, spread=0.0).simulate().truth.as_dict()))
     good, bad = truth["units"]["001"], truth["units"]["000"]

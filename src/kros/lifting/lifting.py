@@ -25,7 +25,7 @@ from .continuity import slope_bounds_of
 from .evaluation import ColumnEvaluator
 from .formula import Formula, base_and_delay, require_text
 from .intervals import Box
-from .separation import Separation
+from .separation import FormulaSeparation
 from .window import Window
 
 Array = npt.NDArray[np.float64]
@@ -309,14 +309,14 @@ class Lifting:
         return slope_bounds_of(self.formulas, self.window.names, given)
 
     @cached_property
-    def separation(self) -> Separation:
+    def separation(self) -> FormulaSeparation:
         """The functions as parameter-dependent combinations of parameter-free ones."""
-        return Separation.of(self.formulas, self.window, self.parameters)
+        return FormulaSeparation.of(self.formulas, self.window, self.parameters)
 
     @cached_property
-    def input_separation(self) -> Separation:
+    def input_separation(self) -> FormulaSeparation:
         """The same for the input functions."""
-        return Separation.of(self.input_formulas, self.window, self.parameters)
+        return FormulaSeparation.of(self.input_formulas, self.window, self.parameters)
 
     @cached_property
     def _columns(self) -> ColumnEvaluator:

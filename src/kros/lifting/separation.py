@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Separation:
+class FormulaSeparation:
     """Lifted functions written as ``sigma(w; q) = M(q) g(w)``."""
 
     window: Window  # what ``w`` holds
@@ -29,7 +29,7 @@ class Separation:
     terms: tuple[tuple[tuple[int, Any], ...], ...]  # for each function its pairs of a column of ``g`` and the SymPy tree of the coefficient
 
     @classmethod
-    def of(cls, formulas: Sequence[Formula], window: Window, parameters: tuple[str, ...]) -> Separation:
+    def of(cls, formulas: Sequence[Formula], window: Window, parameters: tuple[str, ...]) -> FormulaSeparation:
         """Separate every formula; one that does not separate raises ConfigError."""
         import sympy as sp
 

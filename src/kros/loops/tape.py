@@ -31,24 +31,12 @@ _POWERS: dict[float, tuple[int, bool, bool]] = {
 
 @dataclass(frozen=True, eq=False)
 class Tape:
-    """Operations of a lifting.
+    """Operations of a lifting."""
 
-    Parameters
-    ----------
-    constants : ndarray, shape (constants,)
-    code : ndarray of int, shape (operations, 4)
-        What is done, the register that it goes into, and those it is done with.
-    lifted : ndarray of int, shape (n_lifted + inputs,)
-        Registers of the lifted states, then of the inputs and their functions.
-    slopes : ndarray of int, shape (slopes, 3)
-        Column of a model, entry among those asked for, and register, of every derivative that is not zero.
-    registers : int
-    """
-
-    constants: npt.NDArray[np.float64]
-    code: Whole
-    lifted: Whole
-    slopes: Whole
+    constants: npt.NDArray[np.float64]  # shape (constants,)
+    code: Whole  # shape (operations, 4); What is done, the register that it goes into, and those it is done with
+    lifted: Whole  # shape (n_lifted + inputs,); Registers of the lifted states, then of the inputs and their functions
+    slopes: Whole  # shape (slopes, 3); Column of a model, entry among those asked for, and register, of every derivative that is not zero
     registers: int
 
 

@@ -27,7 +27,6 @@ belastet unbelastet mitlast charge vide froid chaud forward reverse
 _CONDITIONS = set(_STATES.split())
 _MEASURE = re.compile(r"^\d+(?:[.,]\d+)?(?:bar|mbar|psi|kpa|degc|°c|c|k|kg|g|n|nm|v|a|rpm|hz|mm|m|percent|pct|%)$", re.IGNORECASE)
 _DATE = re.compile(r"^(?:19|20)\d{6}(?:T?\d{4,6})?$")
-_MARKS = re.compile(r"([/_\-. ]+)")
 
 
 @dataclass(frozen=True)

@@ -57,11 +57,11 @@ def _seconds(column: Any) -> Any:
     return pc.multiply(whole.cast(pa.float64()), 1e-9)
 
 
-def parquet_head(path: Path, rows: int = 60) -> tuple[list[str], list[tuple[str, ...]]]:
+def parquet_head(path: Path) -> tuple[list[str], list[tuple[str, ...]]]:
     """Return the names of a file's columns, and its first rows as text; text and dates of columns that hold no numbers are no numbers."""
     from pyarrow import parquet
 
     fields = parquet_fields(path)
-    batch = next(parquet.ParquetFile(path).iter_batches(batch_size=rows), None)
+    batch = next(parquet.ParquetFile(path).iter_batches(batch_size=60), None)
     columns = [] if batch is None else [["" if v is None else str(v) for v in column.to_pylist()] for column in batch.columns]
     return fields, list(zip(*columns, strict=True))

@@ -45,9 +45,9 @@ class Truth:
         """Phase `eta` of the disturbance's effect on the velocity error at full speed without load, shape (n_units,), rad."""
         return np.angle(self.response())
 
-    def response(self, loaded: bool = False, speed: float = MAX_SPEED) -> Array:
-        """Response of the velocity error to the disturbance current at a constant speed, complex, shape (n_units,), rad/s."""
-        return disturbance_response(self.parameters, self.gains, loaded, speed)
+    def response(self, loaded: bool = False) -> Array:
+        """Response of the velocity error to the disturbance current at full speed, complex, shape (n_units,), rad/s."""
+        return disturbance_response(self.parameters, self.gains, loaded, MAX_SPEED)
 
     def load_torque(self, key: EpisodeKey) -> Array:
         """Return the torque that the load takes from the flange in an episode, inertia and gravity, shape (n_samples,)."""

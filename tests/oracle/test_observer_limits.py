@@ -132,7 +132,7 @@ def test_a_gain_leaves_room_for_the_slopes_of_lifted_functions(predictor):
     batch = recorded(limit=0.05, size=20.0, batch=1)  # more than limits and slopes together leave stable
     found = conditioned(with_limits(ripple(predictor), [-np.inf, -0.05], [np.inf, 0.05]), batch)
     assert np.abs(found.A[2:4, 1]).max() > 1e-3
-    certificate = relift_certificate(found, lookahead=-1, mismatch=False)
+    certificate = relift_certificate(found, mismatch=False)
     assert certificate.certified
     assert len(certificate.channels) == 2
 

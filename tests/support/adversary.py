@@ -94,7 +94,6 @@ class _Search:
         assert certificate.gain is not None
         self.system, self.rng, self.gain, self.steps = system, rng, certificate.gain, 0
         self.R = certificate.roots[0]
-        self.exact = len(certificate.roots) == 1  # with memory, V depends on the slopes to come
         self.inverse = np.linalg.inv(self.R)
         n_w, n_p = system.B.shape[1], system.L.shape[1]
         self.d = rng.choice([-1.0, 1.0], (horizon, _BATCH, n_p))
@@ -102,8 +101,7 @@ class _Search:
         self.w = rng.standard_normal((horizon, _BATCH, n_w))
         self._sinusoids()
         self.first = np.zeros((_BATCH, len(system.A)))
-        if self.exact:
-            self.first[_BATCH // 2 :] = rng.standard_normal((_BATCH // 2, len(system.A)))
+        self.first[_BATCH // 2 :] = rng.standard_normal((_BATCH // 2, len(system.A)))
         self._normalise()
         self._greedy(slice(4, 8))
         self.xi = self._run()

@@ -154,6 +154,10 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
             "kros.data.check_population",
         ),
     ),
+    (
+        "Certificates for any pattern of lost measurements are no longer part of kros; use kros.observer.dropout_bound for losses at a rate.",
+        ("kros.observer.Dropped",),
+    ),
 )
 
 

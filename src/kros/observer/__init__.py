@@ -18,7 +18,7 @@ from .certificate.certificate import ReliftCertificate, relift_certificate
 from .certificate.error import ReliftScales
 from .certificate.mean_square import DropoutBound, dropout_bound
 from .certificate.signals import SignalBound, signal_bound
-from .certificate.status import Dropped, ReliftStatus
+from .certificate.status import ReliftStatus
 from .monitor import Monitor
 from .observer import Observer
 from .predictor.build import identify_predictor
@@ -33,7 +33,6 @@ from .tracking import Tracked, track_parameter
 
 __all__ = [
     "DropoutBound",
-    "Dropped",
     "Estimate",
     "ExtendedKalman",
     "FilteredDifference",

@@ -9,9 +9,8 @@ its *frozen response* e', the linear response to the same omega and n with every
 
 .. math:: \|e - e'\|_2 \le \kappa \, \|q'\|_2,    q' = M e' the largest movement of the lifted functions that e' can cause.
 
-Since e' is computed for the residual as it was, this bound uses its whole course, and not its energy alone. Methods, in this order: a Riccati equation
-with multipliers; a semidefinite program over the corners; one whose Lyapunov function knows the next slopes. What is returned was proven in exact
-arithmetic.
+Since e' is computed for the residual as it was, this bound uses its whole course, and not its energy alone. A Riccati equation
+with multipliers proposes; what is returned was proven in exact arithmetic.
 """
 
 from __future__ import annotations
@@ -30,9 +29,9 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.loading import loader
 from ..data import ObserverData
 from ..units import factors
-from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes, without_measurement
+from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes
 from .search import MOST_CORNERS, frozen_gain, mismatch_gain, prove
-from .status import Dropped, ReliftStatus
+from .status import ReliftStatus
 
 Array = npt.NDArray[np.float64]
 
@@ -47,8 +46,6 @@ class ReliftCertificate:
     assumptions : tuple of str
         What has to hold, in words.
     box, parameters : mapping of str to (lower, upper)
-    clipped : bool
-    dropped : Dropped
         What was asked; see `relift_certificate`.
     status : ReliftStatus
     reason : str
@@ -62,8 +59,8 @@ class ReliftCertificate:
         Gain that a frozen slope attains: no certificate of any kind is below it.
     start : ndarray, shape (n_xi, n_window)
         Where the first error enters.
-    roots : ndarray, shape (n_words, n_xi, n_xi)
-        Upper triangular factors of the Lyapunov matrices, ``P = R'R``; one where slopes to come are not looked at.
+    roots : ndarray, shape (1, n_xi, n_xi)
+        Upper triangular factor of the Lyapunov matrix, ``P = R'R``.
     corners : ndarray, shape (n_corners, n_p)
         Places of the slopes in their intervals, -1 or 1.
     multipliers : ndarray, shape (n_p,)
@@ -92,8 +89,6 @@ class ReliftCertificate:
     assumptions: tuple[str, ...]
     box: Box
     parameters: Box
-    clipped: bool
-    dropped: Dropped
     status: ReliftStatus = ReliftStatus.UNBOUNDED
     reason: str = ""
     certified: bool = False
@@ -111,12 +106,7 @@ class ReliftCertificate:
 
     def system(self, observer: ObserverData) -> ErrorSystem:
         """Return the error dynamics that the certificate is about."""
-        return self._modes(observer)[0]
-
-    def _modes(self, observer: ObserverData) -> list[ErrorSystem]:
-        """Return it with that of every kind of step without a measurement."""
-        steps = [{}, *without_measurement(self.dropped)]
-        return [error_system(observer, self.scales, self.box, self.parameters, clipped=self.clipped, **step) for step in steps]
+        return error_system(observer, self.scales, self.box, self.parameters)
 
     def initial_energy(self, error: npt.ArrayLike) -> Array:
         """Return V(e_0) in scaled units, shape (...): the price of starting with an error, shape (..., n_window), the controller at rest.
@@ -136,7 +126,7 @@ class ReliftCertificate:
         y = x[list(observer.measured)]
         scales = ReliftScales(self.scales.error * x[:n], self.scales.residual * x[:n], self.scales.noise * y)
         box = {name: tuple(np.multiply(value, by_name.get(name, 1.0)).tolist()) for name, value in self.box.items()}
-        assumptions = _assumptions(observer, box, self.parameters, self.dropped, clipped=self.clipped)
+        assumptions = _assumptions(observer, box, self.parameters)
         roots = self.roots.copy()
         if roots.size:
             roots /= state_sizes(observer, self.scales, np.array(errors))
@@ -155,9 +145,7 @@ class ReliftCertificate:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "relift")
         values: dict[str, Any] = {name: content[name] for name in _PLAIN}
-        values |= {"status": ReliftStatus(content["status"]), "dropped": Dropped(content["dropped"])} | {
-            name: tuple(content[name]) for name in ("channels", "assumptions")
-        }
+        values |= {"status": ReliftStatus(content["status"])} | {name: tuple(content[name]) for name in ("channels", "assumptions")}
         scales = ReliftScales(**{name: arrays[f"scales/{name}"] for name in ReliftScales.__dataclass_fields__})
         values |= {name: arrays[name] for name in _ARRAYS}
         return cls(scales=scales, **values)
@@ -178,12 +166,7 @@ def relift_certificate(
     scales: ReliftScales | None = None,
     parameters: Box | None = None,
     *,
-    clipped: bool = False,
-    dropped: Dropped | str = Dropped.NEVER,
-    lookahead: int = 1,
     mismatch: bool = True,
-    tight: bool = False,
-    time_limit_s: float = 20.0,
 ) -> ReliftCertificate:
     """Certify an observer as it runs: any lifting with bounded slopes, any correction filter or none, either way of injection.
 
@@ -197,18 +180,8 @@ def relift_certificate(
         Sizes of errors, residuals and noise; one by default, which leaves physical units.
     parameters : mapping of str to number or (lower, upper), optional
         Ranges of the lifting's parameters; any value by default, so that the certificate holds for every unit.
-    clipped : bool
-        The lifted functions see the estimate clipped to the box; then only the true state has to stay inside.
-    dropped : Dropped or str
-        What the observer does without a measurement, where any may be missing, in any pattern.
-    lookahead : int
-        How many coming slopes the Lyapunov function may know, where one matrix does not do.
     mismatch : bool
         Whether to certify the distance from the frozen response as well.
-    tight : bool
-        Go on for a lower gain where the first proof is more than ten percent above what frozen slopes attain.
-    time_limit_s : float
-        For each semidefinite program.
 
     Returns
     -------
@@ -225,30 +198,30 @@ def relift_certificate(
     >>> round(relift_certificate(plant).gain, 1)
     3.3
     """
-    start, dropped = time.perf_counter(), Dropped(dropped)
-    assumptions = _assumptions(observer, box, parameters, dropped, clipped=clipped)
-    asked = ReliftCertificate(scales or ReliftScales.ones(observer), assumptions, dict(box or {}), dict(parameters or {}), clipped, dropped)
+    start = time.perf_counter()
+    asked = ReliftCertificate(
+        scales or ReliftScales.ones(observer), _assumptions(observer, box, parameters), dict(box or {}), dict(parameters or {})
+    )
     try:
-        modes = asked._modes(observer)
+        system = asked.system(observer)
     except UnboundedSlopeError as error:
         return replace(asked, status=ReliftStatus.UNBOUNDED, reason=f"No certificate: {error}.", solve_s=time.perf_counter() - start)
-    system = modes[0]
     few, width = system.corner_count <= MOST_CORNERS, system.L.shape[1]
     corners = np.array(list(product((-1.0, 1.0), repeat=width))) if few else np.zeros((0, width))
-    found, reason, status = prove(modes, lookahead, time_limit_s, tight=tight)
+    found, reason, status = prove(system)
     first = np.zeros((0, 0)) if system.start is None else system.start
     tried = replace(asked, corners=corners, channels=system.channels, status=status, reason=reason, start=first)
     if found is None:
         return replace(tried, solve_s=time.perf_counter() - start)
     proposal, margin = found
-    kappa = mismatch_gain(modes, lookahead, time_limit_s) if mismatch else None
+    kappa = mismatch_gain(system) if mismatch else None
     return replace(
         tried,
         certified=True,
         gain=proposal.gain,
         mismatch_gain=kappa,
         lower_bound=frozen_gain(system),
-        roots=proposal.roots,
+        roots=proposal.root[None],
         multipliers=np.zeros(0) if few or proposal.multipliers is None else proposal.multipliers,
         margin=margin,
         method=proposal.how,
@@ -256,25 +229,16 @@ def relift_certificate(
     )
 
 
-_WITHOUT = {
-    Dropped.INNOVATION: "the innovation is then zero, and the filter's own correction is applied",
-    Dropped.CORRECTION: "the innovation is then zero, and no correction is applied",
-    Dropped.EITHER: "the innovation is then zero, and the filter's own correction is applied or withheld",
-}
-
-
-def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None, dropped: Dropped, *, clipped: bool) -> tuple[str, ...]:
+def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None) -> tuple[str, ...]:
     """Return what has to hold, in words."""
     found = ["the machine and the observer have the same inputs", "machine and observer lift with the same parameters"]
     if parameters:
         found.append(f"parameters within {_ranges(parameters)}")
     elif observer.lifting.parameters:
         found.append(f"any value of {', '.join(observer.lifting.parameters)}")
-    if box and clipped:
-        found.append(f"the true state stays within {_ranges(box)}, and lifted functions see the estimate clipped to it")
-    elif box:
+    if box:
         found.append(f"true and estimated state stay within {_ranges(box)}")
-    found.append("every measurement arrives" if dropped is Dropped.NEVER else f"any measurement may be missing; {_WITHOUT[dropped]}")
+    found.append("every measurement arrives")
     limits, names = observer.runtime, observer.lifting.states
     if limits.delay:
         found.append(f"measurements arrive {limits.delay} samples late")

@@ -33,7 +33,6 @@ from ...core.lti import StateSpace
 from ...lifting.continuity import break_of, slope_bounds_of
 from ...lifting.formula import delayed_name
 from ..data import ObserverData
-from .status import Dropped
 
 Array = npt.NDArray[np.float64]
 Box = Mapping[str, Any]
@@ -224,9 +223,7 @@ def error_system(
     box: Box | None = None,
     parameters: Box | None = None,
     *,
-    clipped: bool = False,
     arrives: npt.ArrayLike = True,
-    applied: bool = True,
 ) -> ErrorSystem:
     """Return the error dynamics of an observer as it runs, its delay and limits included.
 
@@ -235,12 +232,8 @@ def error_system(
     observer : ObserverData
     scales : ReliftScales, optional
     box, parameters : mapping of str to (lower, upper), optional
-    clipped : bool
-        As in `relift_certificate`.
     arrives : bool or array_like of bool, shape (q,)
         Which measurements arrive at this step; the innovation of the others is zero. The channels are the same whatever arrives.
-    applied : bool
-        Whether the correction is applied at this step.
 
     Raises
     ------
@@ -257,7 +250,7 @@ def error_system(
         )
     lags = [(name, lag) for name, lag in lifting.window.quantities if name in lifting.states]
     names = [delayed_name(name, lag) for name, lag in lags]
-    lower, upper = slope_box(observer, names, box, parameters, clipped=clipped)
+    lower, upper = slope_box(observer, names, box, parameters)
     columns = np.hstack([observer.A[:n, n:], observer.B[:n, len(observer.inputs) :]])
     functions = lifting.functions + lifting.input_functions
     middle, half = (lower + upper) / 2, (upper - lower) / 2 * _WIDER
@@ -297,7 +290,7 @@ def error_system(
     for k, i in enumerate(cuts, n_p - len(cuts)):
         q_rows[k], channels[k], rest[k] = _WIDER / 2 * v[i], f"limit of correction {i}", 1.0
         v[i] = v[i] / 2 + of.p(k, 1)[0]
-    after[:n] -= into @ v * applied
+    after[:n] -= into @ v
     omega = of.w(0, n, scales.residual)
     held = [of.xi(h + order + i * width, width) for i in range(delay)]  # residuals, the latest first
     enters = np.zeros((h, width))
@@ -340,9 +333,7 @@ def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> 
     return np.concatenate([errors, np.ones(observer.controller.n_states), *late])
 
 
-def slope_box(
-    observer: ObserverData, names: Sequence[str], box: Box | None = None, parameters: Box | None = None, *, clipped: bool = False
-) -> tuple[Array, Array]:
+def slope_box(observer: ObserverData, names: Sequence[str], box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
     """Return bounds of the slopes of lifted and input functions by some entries of the window, each of shape (p + r, len(names)).
 
     Earlier inputs are not among the names: machine and observer have the same ones.
@@ -359,11 +350,4 @@ def slope_box(
             + (f", {where}" if (where := break_of(formulas[i].expression, ranges)) else "")
             + "; give a box: the ranges of the states and inputs it depends on"
         )
-    return (np.minimum(lower, 0.0), np.maximum(upper, 0.0)) if clipped else (lower, upper)
-
-
-def without_measurement(dropped: Dropped) -> list[dict[str, bool]]:
-    """Return what may happen at a step whose measurement is missing, as arguments of `error_system`."""
-    runs_on, withheld = {"arrives": False}, {"arrives": False, "applied": False}
-    steps: dict[Dropped, list[dict[str, bool]]] = {Dropped.NEVER: [], Dropped.INNOVATION: [runs_on], Dropped.CORRECTION: [withheld]}
-    return steps.get(dropped, [runs_on, withheld])
+    return lower, upper

@@ -99,7 +99,7 @@ def dropout_bound(certificate: ReliftCertificate, observer: ObserverData, rates:
     for arrives in product((True, False), repeat=len(rates)):
         probability = float(np.prod(np.where(arrives, 1 - rates, rates)))
         if probability > 0:
-            modes.append((probability, error_system(observer, *options, clipped=certificate.clipped, arrives=arrives)))
+            modes.append((probability, error_system(observer, *options, arrives=arrives)))
     if len(modes[0][1].A) > _MOST_STATES:
         return DropoutBound(worst, None, f"its error has {len(modes[0][1].A)} states, more than {_MOST_STATES}")
     gain = _least(modes)
@@ -141,7 +141,7 @@ def _proven(modes: Sequence[tuple[float, ErrorSystem]], multipliers: Array, gain
     """Whether a gain is proven with these multipliers."""
     A, B, C, D = _stacked(modes, multipliers, gain)
     R = _root(A, B, C, D, gain, modes[0][1])
-    return R is not None and proven(R[None], [(A, B)], C, gain, D)
+    return R is not None and proven(R, [(A, B)], C, gain, D)
 
 
 def _stacked(modes: Sequence[tuple[float, ErrorSystem]], multipliers: Array, gain: float) -> tuple[Array, Array, Array, Array]:

@@ -1,13 +1,13 @@
 r"""Proof of a gain, independent of whatever solver proposed it.
 
-With Lyapunov matrices ``P_v = R_v' R_v``, one for every word v of the last corners (one in all without lookahead), the gain gamma is proven when
+With a Lyapunov matrix ``P = R' R`` the gain gamma is proven when
 
-    F = [[P_v, 0], [0, gamma^2 I]] - [A_c, B_c]' P_v' [A_c, B_c] - [C, D]' [C, D] > 0
+    F = [[P, 0], [0, gamma^2 I]] - [A_c, B_c]' P [A_c, B_c] - [C, D]' [C, D] > 0
 
-for every mode, every corner c and every step v -> v' that begins with c. What is subtracted is convex in the slopes, and F is linear in every
-P, so corners are enough. (D is zero but where multipliers stand in for corners: then p is an input and q an output.)
+for every corner c. What is subtracted is convex in the slopes, so corners are enough. (D is zero but where multipliers stand in for corners: then p is
+an input and q an output.)
 
-In the coordinates in which ``P_v = I`` it says that a matrix has a spectral norm below one: that is the margin, in floating point. The decision
+In the coordinates in which ``P = I`` it says that a matrix has a spectral norm below one: that is the margin, in floating point. The decision
 is exact: matrices of doubles are rational, so F is formed without rounding, and its positivity decided by a Cholesky factorisation in floating
 point of what is left without all that rounding can do; where that is not enough, by elimination of integers.
 
@@ -15,13 +15,11 @@ References
 ----------
 S. M. Rump, "Verification of positive definiteness", BIT Numerical Mathematics 46 (2006) 433-452.
 E. H. Bareiss, "Sylvester's identity and multistep integer-preserving Gaussian elimination", Mathematics of Computation 22 (1968) 565-578.
-A. A. Ahmadi, R. M. Jungers, P. A. Parrilo and M. Roozbehani, "Joint spectral radius and path-complete graph Lyapunov functions",
-SIAM Journal on Control and Optimization 52 (2014) 687-717.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,50 +33,37 @@ _BITS = 96  # of the scaled matrix that is decided on; the rounding to them is s
 _ROUNDING = 8.0  # times what a factorisation may be off, with a factor of five to spare
 
 
-def steps(n_corners: int, n_words: int) -> Iterator[tuple[int, int, int]]:
-    """Yield (corner, word, next word) of every step; words are numbers in the base of the corners, oldest corner first."""
-    if n_words == 1:
-        yield from ((c, 0, 0) for c in range(n_corners))
-        return
-    oldest = n_words // n_corners
-    for word in range(n_words):
-        for new in range(n_corners):
-            yield word // oldest, word, (word % oldest) * n_corners + new
+def margin(root: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> float:
+    """Return ``1 - max ||.||^2`` over corners (A, B) in the coordinates where P is the identity; positive for a proof, up to rounding.
 
-
-def margin(roots: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> float:
-    """Return ``1 - max ||.||^2`` over corners (A, B) in the coordinates where every P is the identity; positive for a proof, up to rounding.
-
-    `roots`, shape (n_words, n, n), are upper triangular R with ``P = R'R``; C has shape (n_z, n), and D, zero by default, (n_z, n_w).
+    `root`, shape (n, n), is the upper triangular R with ``P = R'R``; C has shape (n_z, n), and D, zero by default, (n_z, n_w).
     """
     worst = 0.0
-    for c, word, following in steps(len(corners), len(roots)):
-        A, B = corners[c]
-        top = roots[following] @ np.hstack([_right_divide(A, roots[word]), B / gain])
+    for A, B in corners:
+        top = root @ np.hstack([_right_divide(A, root), B / gain])
         direct = np.zeros((len(C), B.shape[1])) if D is None else D / gain
-        bottom = np.hstack([_right_divide(C, roots[word]), direct])
+        bottom = np.hstack([_right_divide(C, root), direct])
         worst = max(worst, float(np.linalg.norm(np.vstack([top, bottom]), 2)))
     return 1 - worst**2
 
 
-def proven(roots: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> bool:
+def proven(root: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> bool:
     """Tell whether the inequalities hold, in exact arithmetic on the numbers as they are stored.
 
     A and B may have several steps below one another, shape (k n, n): the squares of what they lead to add up.
     """
-    numbers = [roots, C, np.array(gain), *(matrix for corner in corners for matrix in corner)]
+    numbers = [root, C, np.array(gain), *(matrix for corner in corners for matrix in corner)]
     if not all(np.isfinite(part).all() for part in numbers):
         return False
     D = np.zeros((len(C), corners[0][1].shape[1])) if D is None else D
     out, level = _gram(_Exact.of(np.hstack([C, D]))), _gram(_Exact.of(np.array([[gain]])))
-    held = [_gram(_Exact.of(R)) for R in roots]
-    for c, word, following in steps(len(corners), len(roots)):
-        A, B = corners[c]
+    held = _gram(_Exact.of(root))
+    for A, B in corners:
         n, width = A.shape[1], B.shape[1]
-        moved = [_gram(_Exact.of(roots[following]) @ _Exact.of(step)) for step in np.split(np.hstack([A, B]), len(A) // n)]
-        shift = max(part.shift for part in (*moved, held[word], out, level))
+        moved = [_gram(_Exact.of(root) @ _Exact.of(step)) for step in np.split(np.hstack([A, B]), len(A) // n)]
+        shift = max(part.shift for part in (*moved, held, out, level))
         F = -sum(part.at(shift) for part in moved) - out.at(shift)
-        F[:n, :n] += held[word].at(shift)
+        F[:n, :n] += held.at(shift)
         F[range(n, n + width), range(n, n + width)] += level.at(shift)[0, 0]
         if not _positive(F):
             return False

@@ -43,10 +43,10 @@ _DOUBLINGS = 60
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A gain, not proven yet, with the Lyapunov factors ``P = R'R``, shape (n_words, n, n), and multipliers where there are any, shape (n_p,)."""
+    """A gain, not proven yet, with the Lyapunov factor ``P = R'R``, shape (n, n), and multipliers where there are any, shape (n_p,)."""
 
     gain: float
-    roots: Array
+    root: Array
     how: str
     multipliers: Array | None = None
 
@@ -65,7 +65,7 @@ def riccati_proposals(system: ErrorSystem) -> Iterator[Proposal]:
         # Multipliers that grow with the gain leave the error less weight, and the disturbance too: room for what the grid did not see.
         R = lyapunov_factor(system, multipliers * factor, least * factor)
         if R is not None:
-            yield Proposal(least * factor, R[None], how, multipliers * factor)
+            yield Proposal(least * factor, R, how, multipliers * factor)
 
 
 def frequency_bound(system: ErrorSystem) -> tuple[Array, float]:

@@ -285,7 +285,7 @@ def _signals(certificate: ReliftCertificate, observer: ObserverData, seen: Cours
     size[size == 0] = 1.0
     internal = np.zeros(observer.lifting.n_states - n)
     scales = replace(certificate.scales, residual=np.concatenate([size[:n], internal]), noise=size[n : n + q])
-    system = error_system(observer, scales, certificate.box, certificate.parameters, clipped=certificate.clipped)
+    system = error_system(observer, scales, certificate.box, certificate.parameters)
     nw = observer.lifting.n_states
     columns = [*range(n), *(range(nw, nw + q) if noisy else ())]
     B, D = system.B[:, columns], system.D[:, columns]

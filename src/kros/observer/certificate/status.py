@@ -16,45 +16,16 @@ class ReliftStatus(str, Enum):
     UNBOUNDED
         A lifted function may be arbitrarily steep. Name a box of states (and inputs) in which the observer works.
     NOT_FOUND
-        Neither a proof nor a counterexample was found. Allow a longer lookahead or more time, or take a smaller box.
-    NOT_COVERED
-        The observer runs in a way that the equations of the error do not know. No observer of this version does; it is kept for the reading of
-        earlier certificates.
+        Neither a proof nor a counterexample was found. Take a smaller box.
 
     Examples
     --------
     >>> from kros.observer import ReliftStatus
     >>> [status.value for status in ReliftStatus]
-    ['certified', 'unstable', 'unbounded', 'not_found', 'not_covered']
+    ['certified', 'unstable', 'unbounded', 'not_found']
     """
 
     CERTIFIED = "certified"
     UNSTABLE = "unstable"
     UNBOUNDED = "unbounded"
     NOT_FOUND = "not_found"
-    NOT_COVERED = "not_covered"
-
-
-class Dropped(str, Enum):
-    """What the observer does at a step without a measurement; any pattern of such steps is covered.
-
-    NEVER
-        Every measurement arrives.
-    INNOVATION
-        The innovation is zero; the filter's own correction is applied.
-    CORRECTION
-        The innovation is zero and nothing is applied; the filter runs on.
-    EITHER
-        One or the other, from step to step.
-
-    Examples
-    --------
-    >>> from kros.observer import Dropped
-    >>> [dropped.value for dropped in Dropped]
-    ['never', 'innovation', 'correction', 'either']
-    """
-
-    NEVER = "never"
-    INNOVATION = "innovation"
-    CORRECTION = "correction"
-    EITHER = "either"

@@ -117,22 +117,12 @@ def standard_disturbances(kinds: Sequence[Kind] = tuple(Kind)) -> list[Disturban
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Measurements of a batch of episodes, and what is calibrated about the machines behind them.
+    """Measurements of a batch of episodes, and what is calibrated about the machines behind them."""
 
-    Parameters
-    ----------
-    y : ndarray, shape (n_samples, batch, q)
-    parameters : mapping of str to ndarray, shape (batch,)
-        Lifting parameters.
-    sample_period_s : float
-    size : ndarray, shape (q,)
-        Range of every measurement.
-    """
-
-    y: Array
-    parameters: Mapping[str, Array]
+    y: Array  # shape (n_samples, batch, q)
+    parameters: Mapping[str, Array]  # mapping of str to ndarray, shape (batch,); Lifting parameters
     sample_period_s: float
-    size: Array
+    size: Array  # shape (q,); Range of every measurement
 
     def __post_init__(self) -> None:
         if self.y.ndim != 3 or self.size.shape != self.y.shape[2:]:

@@ -15,21 +15,11 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LoadAccuracy:
-    """Errors of a load estimate, low-passed, in units of the load.
+    """Errors of a load estimate, low-passed, in units of the load."""
 
-    Parameters
-    ----------
-    floor_rms : float
-        Of the estimate on episodes without load.
-    error_rms : float
-        Under load.
-    load_rms : float
-        Of the load itself.
-    """
-
-    floor_rms: float
-    error_rms: float
-    load_rms: float
+    floor_rms: float  # Of the estimate on episodes without load
+    error_rms: float  # Under load
+    load_rms: float  # Of the load itself
 
     @property
     def ratio(self) -> float:

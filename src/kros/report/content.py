@@ -26,26 +26,13 @@ class Alert:
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table.
-
-    Parameters
-    ----------
-    text : str
-    strong : bool
-        Best of its column, or worth seeing.
-    note : str
-        Shown smaller, behind the text.
-    bar : float or None
-        Share of the cell's width that is shaded, 0 to 1.
-    value : float or None
-        What the cell is sorted by; its text by default.
-    """
+    """A cell of a table."""
 
     text: str
-    strong: bool = False
-    note: str = ""
-    bar: float | None = None
-    value: float | None = None
+    strong: bool = False  # Best of its column, or worth seeing
+    note: str = ""  # Shown smaller, behind the text
+    bar: float | None = None  # Share of the cell's width that is shaded, 0 to 1
+    value: float | None = None  # What the cell is sorted by; its text by default
 
 
 Cells = Sequence[Cell | str]
@@ -96,35 +83,17 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the report; figures are named and come after the tables.
+    """A section of the report; figures are named and come after the tables."""
 
-    Parameters
-    ----------
-    key : str
-        Anchor.
-    title : str
-    paragraphs : sequence of str
-    tables : sequence of Table
-    figures : sequence of str
-    folded : sequence of (str, str)
-        Titles and preformatted texts that the reader opens.
-    lists : sequence of (str, sequence of str)
-        Titles and sentences, one below the other.
-    card : sequence of (str, sequence of str)
-        Terms and what there is to say about them.
-    notes : sequence of str
-        Paragraphs behind the tables.
-    """
-
-    key: str
+    key: str  # Anchor
     title: str
     paragraphs: Sequence[str] = ()
     tables: Sequence[Table] = ()
     figures: Sequence[str] = ()
-    folded: Sequence[tuple[str, str]] = ()
-    lists: Sequence[tuple[str, Sequence[str]]] = ()
-    card: Sequence[tuple[str, Sequence[str]]] = ()
-    notes: Sequence[str] = ()
+    folded: Sequence[tuple[str, str]] = ()  # sequence of (str, str); Titles and preformatted texts that the reader opens
+    lists: Sequence[tuple[str, Sequence[str]]] = ()  # sequence of (str, sequence of str); Titles and sentences, one below the other
+    card: Sequence[tuple[str, Sequence[str]]] = ()  # sequence of (str, sequence of str); Terms and what there is to say about them
+    notes: Sequence[str] = ()  # Paragraphs behind the tables
 
 
 def where(names: Iterable[str], name: str | None) -> list[int]:

@@ -35,24 +35,14 @@ class NotShownError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """One held-out episode with what every observer and model made of it.
-
-    Parameters
-    ----------
-    key : EpisodeKey
-    time_s : ndarray, shape (n_samples,)
-    states : ndarray, shape (n_samples, n)
-    inputs : ndarray, shape (n_samples, m)
-    observers : mapping of str to ndarray, shape (n_samples, n)
-    models : mapping of str to ndarray, shape (n_samples, n)
-    """
+    """One held-out episode with what every observer and model made of it."""
 
     key: EpisodeKey
-    time_s: Array
-    states: Array
-    inputs: Array
-    observers: Mapping[str, Array]
-    models: Mapping[str, Array]
+    time_s: Array  # shape (n_samples,)
+    states: Array  # shape (n_samples, n)
+    inputs: Array  # shape (n_samples, m)
+    observers: Mapping[str, Array]  # mapping of str to ndarray, shape (n_samples, n)
+    models: Mapping[str, Array]  # mapping of str to ndarray, shape (n_samples, n)
 
 
 @dataclass(frozen=True)

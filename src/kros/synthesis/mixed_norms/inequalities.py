@@ -45,17 +45,10 @@ _MARGIN = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class MixedInequalities:
-    """The inequalities of one balanced plant (D22 = 0) at one level, for any solver.
-
-    Parameters
-    ----------
-    balanced : Balanced
-    gamma : float
-        Level of the H-infinity constraint.
-    """
+    """The inequalities of one balanced plant (D22 = 0) at one level, for any solver."""
 
     balanced: Balanced
-    gamma: float
+    gamma: float  # Level of the H-infinity constraint
 
     @property
     def shapes(self) -> dict[str, tuple[int, int, bool]]:

@@ -39,21 +39,11 @@ from ...uncertainty.forms import Form
 
 @dataclass(frozen=True)
 class UncertaintyLocation:
-    """Where a perturbation acts, and what it sees.
+    """Where a perturbation acts, and what it sees."""
 
-    Parameters
-    ----------
-    at_input : bool
-        It acts on the plant's input, otherwise on its state.
-    sees_input : bool
-        It sees the input, otherwise the state.
-    inverse : bool
-        It sees its own effect too.
-    """
-
-    at_input: bool
-    sees_input: bool
-    inverse: bool
+    at_input: bool  # It acts on the plant's input, otherwise on its state
+    sees_input: bool  # It sees the input, otherwise the state
+    inverse: bool  # It sees its own effect too
 
     @property
     def N_name(self) -> str:  # noqa: N802

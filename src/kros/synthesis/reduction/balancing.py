@@ -43,21 +43,11 @@ def gramian_root(A: Array, B: Array, dt: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Balancing:
-    """Balanced coordinates of a system or of a part of one.
+    """Balanced coordinates of a system or of a part of one."""
 
-    Parameters
-    ----------
-    left : ndarray, shape (k, n)
-        Balanced state = left @ state.
-    right : ndarray, shape (n, k)
-        ``left @ right`` is the identity.
-    values : ndarray, shape (k,)
-        Hankel singular values, descending; negligible ones are left out.
-    """
-
-    left: Array
-    right: Array
-    values: Array
+    left: Array  # shape (k, n); Balanced state = left @ state
+    right: Array  # shape (n, k); ``left @ right`` is the identity
+    values: Array  # shape (k,); Hankel singular values, descending; negligible ones are left out
 
     @classmethod
     def of(cls, R: Array, S: Array) -> Balancing:

@@ -34,17 +34,10 @@ _PREDICTABLE = 1e-10
 
 @dataclass(frozen=True)
 class Basis:
-    """Delays and first-order lags of every channel.
-
-    Parameters
-    ----------
-    delays : int
-    poles : tuple of float
-        Poles of the lags, inside the unit circle, each one once.
-    """
+    """Delays and first-order lags of every channel."""
 
     delays: int = 8
-    poles: tuple[float, ...] = ()
+    poles: tuple[float, ...] = ()  # Poles of the lags, inside the unit circle, each one once
 
     def __post_init__(self) -> None:
         if self.delays < 0 or len(set(self.poles)) < len(self.poles) or not all(0 < abs(p) < 1 for p in self.poles):

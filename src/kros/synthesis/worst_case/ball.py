@@ -50,21 +50,11 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Ball:
-    """The set ``{X_c + R_l Theta R_r}`` over frequency, with the right factor M already multiplied in.
+    """The set ``{X_c + R_l Theta R_r}`` over frequency, with the right factor M already multiplied in."""
 
-    Parameters
-    ----------
-    center : ndarray, shape (f, b, m)
-        ``X_c M``.
-    left : ndarray, shape (f, b, b)
-        ``R_l``.
-    right : ndarray, shape (f, a, m)
-        ``R_r M``.
-    """
-
-    center: Array
-    left: Array
-    right: Array
+    center: Array  # shape (f, b, m); ``X_c M``
+    left: Array  # shape (f, b, b); ``R_l``
+    right: Array  # shape (f, a, m); ``R_r M``
 
     @classmethod
     def of(cls, N: Array, M: Array) -> Ball:

@@ -158,6 +158,10 @@ REMOVED: tuple[tuple[str, tuple[str, ...]], ...] = (
         "Certificates for any pattern of lost measurements are no longer part of kros; use kros.observer.dropout_bound for losses at a rate.",
         ("kros.observer.Dropped",),
     ),
+    (
+        "The place of corrections is no longer chosen in a study: worst_case_h2 corrects the state, mixed the input; remove the key injection.",
+        ("synthesis.injection",),
+    ),
 )
 
 

@@ -20,9 +20,6 @@ class SynthesisSettings(Settings):
     methods: tuple[METHODS, ...] = Field(
         ("mixed", "worst_case_h2", "residual_h2", "memory"), description="ways to an observer, each for every kind of model"
     )
-    injection: Literal["state", "input"] = Field(
-        "state", description="where corrections of worst_case_h2 enter; mixed is always the paper's"
-    )
     input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
     penalty: float = Field(1e-3, gt=0, description="on the correction, relative to the error")
     time_limit_s: float = Field(60.0, gt=0, description="for the optimisation of mixed")

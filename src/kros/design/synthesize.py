@@ -151,7 +151,7 @@ def synthesize(
     work : Work, optional
         Where it runs.
     **settings
-        Of `SynthesisSettings`: ``methods``, ``injection``, ``input_weight``, ``penalty``, ``time_limit_s``.
+        Of `SynthesisSettings`: ``methods``, ``input_weight``, ``penalty``, ``time_limit_s``.
 
     Returns
     -------

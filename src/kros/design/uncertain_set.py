@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ..core.errors import SynthesisError
 from ..identify import ModelSet
-from ..synthesis import Injection, ObserverProblem, check_units
+from ..synthesis import ObserverProblem, check_units
 from ..synthesis.worst_case.certificate import certify
 from ..uncertainty import UncertainModel
 from .settings import SynthesisSettings
@@ -26,9 +26,7 @@ def usable_problem(
 ) -> tuple[ObserverProblem | None, str]:
     """Return the synthesis problem of one kind of model, or None and why there is none."""
     try:
-        problem = ObserverProblem.from_uncertain(
-            models, uncertain, noise, injection=Injection(settings.injection), correction_penalty=settings.penalty
-        )
+        problem = ObserverProblem.from_uncertain(models, uncertain, noise, correction_penalty=settings.penalty)
         problem.require_sound()
         return problem, ""
     except SynthesisError as error:

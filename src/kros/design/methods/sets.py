@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 def design_worst_case(task: DesignTask) -> DesignResult:
     """Return the observer for signals or for the form, as recordings decide; of models that were not refined, or where an input weight is given, the form's."""
     settings = task.settings
-    if not kind_of(task.models.name).refined or settings.injection == "input" or settings.input_weight != TUNED:
+    if not kind_of(task.models.name).refined or settings.input_weight != TUNED:
         return design_worst_case_h2(task)
     made: list[DesignResult] = []
     reasons = []

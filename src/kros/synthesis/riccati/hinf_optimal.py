@@ -35,6 +35,7 @@ _MAX_RAISES = 40
 _NEGLIGIBLE = 1e-9
 _ROUNDING = 1e-5
 _COARSE = 1e-3
+_BOUNDARY = 1e-10
 
 
 def hinf(plant: GeneralizedPlant, *, gamma: float | None = None, tolerance: float = 1e-5) -> Synthesis:
@@ -101,9 +102,19 @@ class _Loop:
 def _closed(plant: GeneralizedPlant, K: StateSpace | None) -> _Loop:
     """Close the loop; what a controller is worth is its norm, whatever the equations promise."""
     try:
-        return _Loop(None) if K is None else _Loop(K, hinf_norm(plant.close(K)))
+        if K is None or _on_the_boundary(plant.close(K)):
+            return _Loop(None)
+        return _Loop(K, hinf_norm(plant.close(K)))
     except (KrosError, np.linalg.LinAlgError):
         return _Loop(None)
+
+
+def _on_the_boundary(closed: StateSpace) -> bool:
+    """Whether a pole is within rounding of the stability boundary, or beyond it."""
+    poles = closed.poles()
+    if closed.dt > 0:
+        return bool(np.abs(poles).max(initial=0.0) >= 1 - _BOUNDARY)
+    return bool(poles.real.max(initial=-1.0) >= -_BOUNDARY * np.abs(poles).max(initial=1.0))
 
 
 def _level(plant: GeneralizedPlant, frame: Coordinates, gamma: float) -> _Loop:

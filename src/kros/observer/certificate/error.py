@@ -225,21 +225,7 @@ def error_system(
     *,
     arrives: npt.ArrayLike = True,
 ) -> ErrorSystem:
-    """Return the error dynamics of an observer as it runs, its delay and limits included.
-
-    Parameters
-    ----------
-    observer : ObserverData
-    scales : ReliftScales, optional
-    box, parameters : mapping of str to (lower, upper), optional
-    arrives : bool or array_like of bool, shape (q,)
-        Which measurements arrive at this step; the innovation of the others is zero. The channels are the same whatever arrives.
-
-    Raises
-    ------
-    UnboundedSlopeError
-        When a slope is unbounded in the box; name ranges of the states it depends on.
-    """
+    """Return the error dynamics of an observer as it runs, its delay and limits included."""
     scales = scales or ReliftScales.ones(observer)
     lifting, K, q = observer.lifting, observer.controller, len(observer.measured)
     n, delay, limits = lifting.n_states, observer.runtime.delay, observer.runtime
@@ -334,10 +320,7 @@ def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> 
 
 
 def slope_box(observer: ObserverData, names: Sequence[str], box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
-    """Return bounds of the slopes of lifted and input functions by some entries of the window, each of shape (p + r, len(names)).
-
-    Earlier inputs are not among the names: machine and observer have the same ones.
-    """
+    """Return bounds of the slopes of lifted and input functions by some entries of the window, each of shape (p + r, len(names))."""
     formulas = observer.lifting.formulas + observer.lifting.input_formulas
     ranges = {**(box or {}), **(parameters or {})}
     lower, upper = slope_bounds_of(formulas, names, ranges)

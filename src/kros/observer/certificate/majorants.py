@@ -42,17 +42,7 @@ _SAFE = 1 + 1e-9  # for rounding of small matrices
 
 
 def majorants(system: StateSpace, edges: Array, weight: Array) -> Array:
-    """Return matrices above the responses of every row of a system in every band, shape (p, b, m, m).
-
-    Parameters
-    ----------
-    system : StateSpace
-        Stable, p outputs and m inputs.
-    edges : ndarray, shape (b + 1,), rad per sample
-        From zero to pi.
-    weight : ndarray, shape (b, m, m)
-        Energies that the matrices are for; they hold for all.
-    """
+    """Return matrices above the responses of every row of a system in every band, shape (p, b, m, m)."""
     size = np.sqrt(np.maximum(np.einsum("bii->i", weight).real, 0.0))
     size = np.where(size > 1e-100, size, 1.0)  # a channel without energy
     scaled = StateSpace(system.A, system.B * size, system.C, system.D * size, system.dt)

@@ -30,10 +30,7 @@ _BINDING = 0.1
 
 
 def best_multipliers(H: Array, width: int) -> Array | None:
-    """Return multipliers for which the gain is close to least, shape (n_p,); None where no multipliers prove stability.
-
-    H are responses from [p, w] to [q, z], shape (f, n_p + n_z, n_p + n_w); `width` is n_p.
-    """
+    """Return multipliers for which the gain is close to least, shape (n_p,); None where no multipliers prove stability."""
     G, some = H[:, :width, :width], _MOST_FREQUENCIES // 2
     largest = [np.argsort(-size)[:some] for size in (np.linalg.norm(H, axis=(1, 2)), _needed(G, _balanced(np.abs(G).max(axis=0))))]
     chosen = np.unique(np.concatenate([*largest, np.linspace(0, len(H) - 1, some).astype(int)]))

@@ -48,10 +48,7 @@ def margin(root: Array, corners: Corners, C: Array, gain: float, D: Array | None
 
 
 def proven(root: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> bool:
-    """Tell whether the inequalities hold, in exact arithmetic on the numbers as they are stored.
-
-    A and B may have several steps below one another, shape (k n, n): the squares of what they lead to add up.
-    """
+    """Tell whether the inequalities hold, in exact arithmetic on the numbers as they are stored."""
     numbers = [root, C, np.array(gain), *(matrix for corner in corners for matrix in corner)]
     if not all(np.isfinite(part).all() for part in numbers):
         return False
@@ -99,10 +96,7 @@ def _gram(matrix: _Exact) -> _Exact:
 
 
 def _positive(F: Integers) -> bool:
-    """Tell whether a symmetric matrix of integers is positive definite.
-
-    Powers of two bring its diagonal to about 2^96, entries are rounded down, and the largest effect of rounding on an eigenvalue is subtracted.
-    """
+    """Tell whether a symmetric matrix of integers is positive definite."""
     n = len(F)
     if any(F[i, i] <= 0 for i in range(n)):
         return False
@@ -116,11 +110,7 @@ def _positive(F: Integers) -> bool:
 
 
 def _clearly_positive(M: Integers) -> bool:
-    """Tell whether a matrix of integers is positive definite by far: a factorisation exists, whatever was rounded on the way.
-
-    A factorisation of n rows that is carried through is that of a matrix closer than ``(n + 2) u tr M``, in whatever order sums were taken, and no entry of
-    M, rounded to ``u |M_ij|``, exceeds the trace.
-    """
+    """Tell whether a matrix of integers is positive definite by far: a factorisation exists, whatever was rounded on the way."""
     try:
         rounded = M.astype(float) * 2.0**-_BITS
         spare = _ROUNDING * (len(M) + 4) * np.finfo(float).eps * float(np.trace(rounded))

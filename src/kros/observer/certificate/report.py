@@ -68,22 +68,7 @@ def relift_report(
     estimates: Array | None = None,
     seen: Course | None = None,
 ) -> list[ReliftRow]:
-    """Compare bounds and errors, episode by episode; recorded states stand for the true ones, so their noise is part of the residual.
-
-    Where the batch holds what a sensor shows, what it shows beside the states is the noise that drives the error, and all of it arrives.
-
-    Parameters
-    ----------
-    certificate : ReliftCertificate
-        Of this observer; certified.
-    observer : ObserverData
-        Internal states of the machine are those that recordings drive (`with_internal`).
-    batch : EpisodeBatch
-    estimates : ndarray, shape (n_samples, batch, n), optional
-        What `run_observer` returned; it is run where they are missing.
-    seen : Course, optional
-        What `course` found for these, where it is known already.
-    """
+    """Compare bounds and errors, episode by episode; recorded states stand for the true ones, so their noise is part of the residual."""
     if certificate.gain is None:
         raise DimensionError(f"Re-lift report of observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")
     seen, lengths, scales = seen or course(observer, batch, estimates), batch.lengths, certificate.scales
@@ -151,11 +136,7 @@ class Course:
 
 
 def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None, *, cut: bool = False) -> Course:
-    """Return what drove an observer along recorded episodes; recorded states stand for the true ones, and no sample is lost.
-
-    With `cut` what its limits took from its estimates counts as residual, with the other sign: without delay its error then obeys the equations of an
-    observer without these limits, exactly.
-    """
+    """Return what drove an observer along recorded episodes; recorded states stand for the true ones, and no sample is lost."""
     inputs, at, late = batch.inputs, list(observer.measured), observer.runtime.delay
     states = observer.runtime.within(batch.states)
     values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
@@ -200,10 +181,7 @@ def first_error(observer: ObserverData, error: Array) -> Array:
 
 
 def frozen_response(system: ErrorSystem, w: Array, first: Array) -> tuple[Array, Array]:
-    """Return the scaled error with slopes at rest, and what the channels act on then.
-
-    `w` is the scaled residual, shape (n_samples - 1, batch, k), with noise where k is as wide as the system's input; `first` has shape (batch, n_window).
-    """
+    """Return the scaled error with slopes at rest, and what the channels act on then."""
     plant = system.moved()
     start = first @ (np.eye(len(plant.A), first.shape[1]) if system.start is None else system.start).T
     drive = np.zeros((len(w) + 1, w.shape[1], len(plant.A)))

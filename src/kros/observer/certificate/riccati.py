@@ -111,10 +111,7 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
 
 
 def reachable_coordinates(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
-    """Return T and its inverse, for coordinates in which a reachability Gramian is the identity.
-
-    A Lyapunov matrix is then at most gamma^2 there, however poorly some states are reached.
-    """
+    """Return T and its inverse, for coordinates in which a reachability Gramian is the identity."""
     W = gramian(A, B, dt)
     size = np.sqrt(np.maximum(np.diag(W), 0.0))
     size[size == 0] = 1.0

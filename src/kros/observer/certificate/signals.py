@@ -268,10 +268,7 @@ def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
 
 
 def _signals(certificate: ReliftCertificate, observer: ObserverData, seen: Course) -> tuple[Array, ErrorSystem]:
-    """Return the signals, shape (n_samples, batch, m), each of size one, and the system from them to the errors over their ranges.
-
-    Channels are residuals of recorded states, noise where there is some, and, where the lifting reads earlier values, first errors of their own.
-    """
+    """Return the signals, shape (n_samples, batch, m), each of size one, and the system from them to the errors over their ranges."""
     n, q = len(observer.recorded), len(observer.measured)
     start = seen.first[None, :, :n]
     later = np.concatenate([seen.omega[..., :n], seen.noise], axis=-1)

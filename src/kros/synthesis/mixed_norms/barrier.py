@@ -91,23 +91,7 @@ def minimise(
     time_limit_s: float = 20.0,
     box: float = _BOX,
 ) -> Outcome:
-    """Minimise over the matrix inequalities.
-
-    Parameters
-    ----------
-    c : ndarray, shape (n,)
-    blocks : sequence of Block
-    start : ndarray, shape (n,)
-        Need not satisfy the inequalities: if it does not, a point that does is searched first.
-    Q : ndarray, shape (n, n), optional
-        Quadratic part of the objective, positive semidefinite.
-    rtol : float
-        Distance to the optimum, relative to the value.
-    time_limit_s : float
-        Looked at before every step; steps of the sizes in this package take milliseconds to a few tenths of a second.
-    box : float
-        Bound of every variable.
-    """
+    """Minimise over the matrix inequalities."""
     end = time.perf_counter() + time_limit_s
     steps = 0
     if not _feasible(blocks, start, box):

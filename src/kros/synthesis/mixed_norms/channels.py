@@ -59,10 +59,7 @@ def scaled(plant: GeneralizedPlant, a: float) -> GeneralizedPlant:
 
 
 def require_reachable(plant: GeneralizedPlant, gamma: float, attained: float | None = None) -> None:
-    """Raise a `SynthesisError` when the proven bound of ||T22|| shows that no controller attains the level.
-
-    The bound is tight where K does not enter T22 and for regular channels; its search begins at the norm that some closed loop attains.
-    """
+    """Raise a `SynthesisError` when the proven bound of ||T22|| shows that no controller attains the level."""
     two = plant.channel(plant.rows(2), plant.columns(2))
     if 0 in (two.sizes[1], two.sizes[3]):
         return

@@ -133,13 +133,7 @@ class MixedInequalities:
         return scale[:, None] * B, C * scale, D11 + part.D12 @ v["Dn"] @ D21
 
     def controller(self, x: Array) -> StateSpace:
-        """Controller of the plant before balancing (for D22 = 0) from the variables; ``V U = I - Y X``.
-
-        Raises
-        ------
-        LinAlgError
-            When ``I - Y X`` is singular.
-        """
+        """Controller of the plant before balancing (for D22 = 0) from the variables; ``V U = I - Y X``."""
         p, v = self.balanced.plant, self.values(x)
         X, Y, Bn, Cn, Dn = (v[name] for name in ("X", "Y", "Bn", "Cn", "Dn"))
         eye = np.eye(len(X))

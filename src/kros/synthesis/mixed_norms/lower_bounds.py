@@ -120,10 +120,7 @@ def impulse(system: StateSpace, count: int) -> Array:
 
 
 def mixed_lower_bound(plant: GeneralizedPlant, gamma: float, value: float, time_limit_s: float) -> float:
-    """Return a number that ``||T11||_2`` of no controller with ``||T22||_inf < gamma`` is below.
-
-    The H2 norm `value` of a known controller bounds the variables: better ones have a Q of less energy.
-    """
+    """Return a number that ``||T11||_2`` of no controller with ``||T22||_inf < gamma`` is below."""
     family = Family.around_h2(plant)
     free = h2_norm(family.channel(1)[0]) ** 2
     end = time.perf_counter() + time_limit_s

@@ -24,23 +24,7 @@ Sum = Mapping[str, Array]
 def interconnect(
     blocks: Mapping[str, StateSpace], wires: Mapping[str, Sum], inputs: Mapping[str, int], outputs: Mapping[str, Sum]
 ) -> StateSpace:
-    """Return the system from `inputs` to `outputs`.
-
-    Parameters
-    ----------
-    blocks : mapping of name to StateSpace
-    wires : mapping of name to sum
-        What goes into a block: matrices by name of a block (its output) or of an input of the whole; unknown names are an error.
-    inputs : mapping of name to int
-        Sizes of the inputs of the whole, in order.
-    outputs : mapping of name to sum
-        Outputs of the whole, in order, as sums.
-
-    Raises
-    ------
-    DimensionError
-        When a wire comes from nowhere, or the blocks form an algebraic loop without a solution.
-    """
+    """Return the system from `inputs` to `outputs`."""
     whole = block_diagonal(list(blocks.values()))
     sources = {name: block.n_outputs for name, block in blocks.items()}
     unknown = {source for row in [*wires.values(), *outputs.values()] for source in row} - sources.keys() - inputs.keys()

@@ -79,12 +79,7 @@ def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> Gene
 
 
 def mixed_plant(problem: ObserverProblem, noise_floor: float = 1e-3, penalty_floor: float = 3e-2) -> GeneralizedPlant:
-    """Reduced, regularised form of (37)-(39) for every form: w = (w1, n, w2), z = (W_p e, penalty, z2).
-
-    The remainder has no place in this problem and is left to the certificate. With the noise of a good encoder the covariances span twelve
-    decades, more than conic solvers can handle; `noise_floor` is the least noise here, as a fraction of the measured channel's range,
-    `penalty_floor` the least correction penalty.
-    """
+    """Reduced, regularised form of (37)-(39) for every form: w = (w1, n, w2), z = (W_p e, penalty, z2)."""
     whole = generalized_plant(replace(problem, remainder_left=None, remainder_right=None, process_noise=None))
     sigma = np.maximum(1.0, noise_floor * (np.abs(problem.C) @ problem.output_scale) / problem.noise)
     penalty = max(problem.correction_penalty, penalty_floor)

@@ -20,22 +20,7 @@ Array = npt.NDArray[Any]
 
 
 def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, method: str) -> Array:
-    """Return the stabilising solution X of the algebraic Riccati equation.
-
-    Parameters
-    ----------
-    A, B, Q, R, S : ndarray
-        Dynamics (n, n), input (n, m), state cost (n, n), input cost (m, m), cross cost (n, m).
-    dt : float, s
-        0 for the continuous equation.
-    method : str
-        For the message when it fails.
-
-    Raises
-    ------
-    SynthesisError
-        When there is no stabilising solution or its residual is large.
-    """
+    """Return the stabilising solution X of the algebraic Riccati equation."""
     from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov, solve_discrete_are
 
     if not A.size:
@@ -79,10 +64,7 @@ def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> flo
 
 
 def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
-    """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004): quadratic convergence, only additions of semidefinite matrices.
-
-    Returns None when it does not converge; the caller then uses the generic solver.
-    """
+    """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004): quadratic convergence, only additions of semidefinite matrices."""
     try:
         RiS, RiB = np.linalg.solve(R, S.T), np.linalg.solve(R, B.T)
         Ak, G, H = A - B @ RiS, B @ RiB, Q - S @ RiS

@@ -31,14 +31,7 @@ _FIRST, _GROWTH, _TRIES = 4.0, 16.0, 12
 
 
 def predictor_bound(A: Array, B: Array, C: Array, D: Array, Z: Array) -> float | None:
-    """Return a squared error ``E |Z (x - x_hat)|^2`` that no one-step predictor beats; None where none above zero could be proven.
-
-    Parameters
-    ----------
-    A, B, C, D : ndarray, shapes (n, n), (n, k), (q, n), (q, k)
-        Model of state and measurement, driven by white noise of unit covariance; A is stable or detectable through C.
-    Z : ndarray, shape (p, n)
-    """
+    """Return a squared error ``E |Z (x - x_hat)|^2`` that no one-step predictor beats; None where none above zero could be proven."""
     n = len(A)
     if not n or not Z.any():
         return None

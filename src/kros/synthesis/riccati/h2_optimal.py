@@ -99,13 +99,7 @@ def stability_margin(closed: StateSpace) -> float:
 
 
 def absorb_feedthrough(K: StateSpace, D22: Array) -> StateSpace:
-    """Turn a controller for ``y - D22 u`` into one for ``y``.
-
-    Raises
-    ------
-    SynthesisError
-        When ``I + D^c D22`` is singular: the algebraic loop has no solution.
-    """
+    """Turn a controller for ``y - D22 u`` into one for ``y``."""
     if not np.any(D22):
         return K
     loop = np.eye(K.n_outputs) + K.D @ D22

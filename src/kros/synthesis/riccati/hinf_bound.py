@@ -30,10 +30,7 @@ _GRID = 200
 
 
 def proven_bound(plant: GeneralizedPlant, attained: float, tolerance: float) -> float:
-    """Return a number that the H-infinity norm of no stable closed loop is below; tight for regular plants.
-
-    The search begins at the norm of a closed loop and ends when the bound is as close to it as the tolerance, a fraction of it.
-    """
+    """Return a number that the H-infinity norm of no stable closed loop is below; tight for regular plants."""
     p = scaled(replace(plant, D22=np.zeros_like(plant.D22)))
     best = max(direct_bound(p), pointwise_bound(p, _grid(p)))
     n = len(p.A)

@@ -147,10 +147,7 @@ def _idle(plant: GeneralizedPlant) -> _Loop:
 
 
 def _optimum(plant: GeneralizedPlant, frame: Coordinates, tolerance: float) -> tuple[_Loop, float, bool]:
-    """Bisect between the proven bound and the best norm; the last value tells whether the optimum is zero.
-
-    A level that fails only leads the search elsewhere; nothing is concluded from it.
-    """
+    """Bisect between the proven bound and the best norm; the last value tells whether the optimum is zero."""
     idle, best = _idle(plant), _first(plant, frame)
     floor = _NEGLIGIBLE * (idle.norm if np.isfinite(idle.norm) else best.norm)
     low = lower = proven_bound(plant, best.norm, tolerance)

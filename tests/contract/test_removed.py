@@ -14,7 +14,7 @@ from kros.core import ConfigError
 from kros.core.removed import REMOVED, instead_of
 
 CHANGES = (Path(__file__).parents[2] / "CHANGELOG.md").read_text(encoding="utf-8")
-PLACES = [(sentence, place) for sentence, places in REMOVED for place in places]
+PLACES = [(sentence, place) for sentence, places in REMOVED for place in places.split()]
 
 
 @pytest.mark.parametrize("sentence", [sentence for sentence, _ in REMOVED])

@@ -20,6 +20,7 @@ from .prepare import prepare
 from .readers.arrays import from_arrays
 from .readers.frame import from_frame
 from .readers.opening import read
+from .readers.parquet import read_parquet
 from .readers.pykoop_array import from_pykoop, to_pykoop
 from .writers.parquet import write_parquet
 from .writers.raw import write_raw
@@ -37,6 +38,7 @@ __all__ = [
     "from_pykoop",
     "prepare",
     "read",
+    "read_parquet",
     "split_episodes",
     "steps",
     "to_pykoop",

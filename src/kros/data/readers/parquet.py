@@ -140,7 +140,34 @@ def _check_label(column: Any, name: str, expected: str, path: Path) -> None:
 
 
 def read_parquet(folder: Path | str) -> Population:
-    """Read a population that `write_parquet` wrote."""
+    """Read a population that `write_parquet` wrote.
+
+    Parameters
+    ----------
+    folder : Path
+        Holds `population.json`.
+
+    Returns
+    -------
+    Population
+        Lazy: only `population.json` is read.
+
+    Raises
+    ------
+    DataError
+        No population there, or one of another schema.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> import kros
+    >>> population = kros.from_arrays({"a": [np.eye(5, 2)]}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> with TemporaryDirectory() as folder:
+    ...     kros.data.write_parquet(population, f"{folder}/recordings")
+    ...     print(kros.data.read_parquet(f"{folder}/recordings"))
+    Population(1 unit, 1 condition, 1 episode every 0.01 s; states x (measured); inputs u)
+    """
     content, _ = load_artifact(Path(folder), INDEX)
     try:
         channels = tuple(Channel(c["name"], Role(c["role"]), _text(c["unit"]), c["measured"] is True) for c in content["channels"])

@@ -26,33 +26,18 @@ _LEAST = {"n_units": 1, "n_episodes": 1, "seconds": 1.0, "seed": 0, "spread": 0.
 class Batch(ABC, Generic[T]):
     """Settings of a simulated batch.
 
-    Parameters
-    ----------
-    n_units : int
-        Units of the population, the outlier not counted.
-    n_episodes : int
-    seconds : float, s
-        Length of an episode.
-    seed : int
-        The same seed gives the same recordings; unit `k` does not depend on `n_units`.
-    spread : float
-        Scales the relative deviations of the parameters.
-    outlier : bool
-        Add one unit that is badly made, serial 000, group "outliers".
-    outlier_severity : float
-
     Raises
     ------
     ConfigError
         When a setting is out of its range.
     """
 
-    n_units: int = 8
+    n_units: int = 8  # Units of the population, the outlier not counted
     n_episodes: int = 10
-    seconds: float = 20.0
-    seed: int = 0
-    spread: float = 1.0
-    outlier: bool = False
+    seconds: float = 20.0  # s; Length of an episode
+    seed: int = 0  # The same seed gives the same recordings; unit `k` does not depend on `n_units`
+    spread: float = 1.0  # Scales the relative deviations of the parameters
+    outlier: bool = False  # Add one unit that is badly made, serial 000, group "outliers"
     outlier_severity: float = 1.0
 
     plant: ClassVar[str]

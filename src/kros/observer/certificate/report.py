@@ -27,29 +27,14 @@ _CLOSE = 1 + 1e-6
 
 @dataclass(frozen=True)
 class ReliftRow:
-    """One episode. All values are root mean squares over its samples of the scaled signals, the states' squares added.
-
-    Parameters
-    ----------
-    unit : str
-    residual : float
-        Of the one-step residual, divided by its size in the population.
-    gain_bound : float
-        What ``gamma`` makes of it, the initial error included.
-    frozen : float
-        Error that the residual would cause if every slope stayed in the middle of its interval.
-    bound : float
-        The smaller of `gain_bound` and the frozen response plus what the movement of the slopes can add.
-    error : float
-        Error of the observer as it ran.
-    """
+    """One episode. All values are root mean squares over its samples of the scaled signals, the states' squares added."""
 
     unit: str
-    residual: float
-    gain_bound: float
-    frozen: float
-    bound: float
-    error: float
+    residual: float  # Of the one-step residual, divided by its size in the population
+    gain_bound: float  # What ``gamma`` makes of it, the initial error included
+    frozen: float  # Error that the residual would cause if every slope stayed in the middle of its interval
+    bound: float  # The smaller of `gain_bound` and the frozen response plus what the movement of the slopes can add
+    error: float  # Error of the observer as it ran
 
     @property
     def holds(self) -> bool:

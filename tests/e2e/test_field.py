@@ -173,8 +173,6 @@ def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> No
     bad, *good = (row["level_db"] for row in rows.values())
     assert bad > max(0.0, max(good) + 1.0)
     assert result.exit_code == 0
-    said = kros("check", demo, data).stdout.splitlines()
-    lines, beside = ([line for line in said if line.startswith(" ") is wanted] for wanted in (False, True))
-    assert len(beside) == 6
-    assert all("too few units to tell: 5 of 8" in line for line in beside)
+    lines = kros("check", demo, data).stdout.splitlines()
+    assert len(lines) == 3
     assert all("without velocity, current" in line and "the monitor's bound" in line for line in lines)

@@ -263,5 +263,3 @@ def test_what_cannot_be_used_is_refused() -> None:
         KoopmanRegressor().fit(np.column_stack([X[:, :2], X[:, 0] + X[:, 1]]))
     with pytest.raises(DataError, match="several places"):
         KoopmanRegressor(n_inputs=1, episode_feature=True).fit(np.column_stack([np.arange(60) // 15 % 2, X]))
-    with pytest.raises(DataError, match="layout of `fit`"):
-        KoopmanRegressor(n_inputs=1, episode_feature=True).fit(recording()).predict(recording()[:, :3])

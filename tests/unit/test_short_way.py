@@ -73,7 +73,7 @@ def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Populati
         kros.run(population, "out", data={"reader": "parquet"})
     with pytest.raises(ConfigError, match="'learned': it is a baseline"):
         kros.synthesize(uncertain, method="learned")
-    with pytest.raises(ConfigError, match=r"Synthesize: penalti: unknown key; did you mean 'penalty'\? known are methods, injection"):
+    with pytest.raises(ConfigError, match=r"Synthesize: penalti: unknown key; did you mean 'penalty'\? known are methods, input_weight"):
         kros.synthesize(uncertain, penalti=1.0)
     with pytest.raises(ConfigError, match="Identify: alpha_factor"):
         kros.identify(population, alpha_factor=0.5)

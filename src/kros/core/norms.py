@@ -24,10 +24,13 @@ import numpy.typing as npt
 
 from .errors import DimensionError, KrosError
 from .lti import StateSpace
+from .precise import precise_gain, precise_h2_norm
 
 Array = npt.NDArray[Any]
 
 _MAX_ITERATIONS = 60
+_EPSILON = float(np.finfo(float).eps)
+_AGREE = 1e-7  # relative difference of what should be equal, beyond which double precision is not trusted
 
 
 def as_state_space(system: Any) -> StateSpace:
@@ -81,11 +84,35 @@ def h2_norm(system: Any) -> float:
     1.0
     """
     system = as_state_space(system)
-    if not system.is_stable() or (system.dt == 0 and np.any(system.D)):
+    if system.dt == 0 and np.any(system.D):
         return float("inf")
-    P = gramian(system.A, system.B, system.dt)
-    squared = float(np.trace(system.C @ P @ system.C.T))
+    if _near_the_limit(system):
+        return precise_h2_norm(system)
+    if not system.is_stable():
+        return float("inf")
+    squared = float(np.trace(system.C @ gramian(system.A, system.B, system.dt) @ system.C.T))
+    dual = float(np.trace(system.B.T @ gramian(system.A.T, system.C.T, system.dt) @ system.B))
+    if not abs(squared - dual) <= _AGREE * max(squared, dual):
+        return precise_h2_norm(system)
     return float(np.sqrt(max(squared, 0.0) + (np.sum(system.D**2) if system.dt > 0 else 0.0)))
+
+
+def _near_the_limit(system: StateSpace) -> bool:
+    """Tell whether rounding, ``eps ||A||`` in balanced coordinates, decides if a pole is stable."""
+    A = balanced(system).A
+    poles = np.linalg.eigvals(A)
+    distance = np.abs(1 - np.abs(poles)) if system.dt > 0 else np.abs(poles.real)
+    return bool((distance <= 10 * _EPSILON * np.linalg.norm(A)).any())
+
+
+def balanced(system: StateSpace) -> StateSpace:
+    """Return a system whose states are scaled by powers of two, so that rows and columns of A are of alike size."""
+    if not system.n_states:
+        return system
+    from scipy.linalg import matrix_balance
+
+    A, (size, _) = matrix_balance(system.A, permute=False, separate=True)
+    return StateSpace(A, system.B / size[:, None], system.C * size, system.D, system.dt)
 
 
 def hinf_norm(system: Any, tol: float = 1e-6) -> float:
@@ -121,17 +148,20 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
         return float("inf")
     if system.n_states == 0 or system.n_inputs == 0 or system.n_outputs == 0:
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
-    continuous = to_continuous(system) if system.dt > 0 else system
-    lower = _gains(system, _first_frequencies(continuous)).max()
-    lower = max(lower, float(np.linalg.norm(continuous.D, 2)))
+    system = balanced(system)
+    continuous = balanced(to_continuous(system)) if system.dt > 0 else system
+    points = _first_frequencies(continuous)
+    at, lower = _peak(system, points)
+    at, lower = max((at, lower), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda found: found[1])
     if lower == 0.0:
         return 0.0
+    error = _rounding(system, at) / lower
+    within = max(tol, error)
     for _ in range(_MAX_ITERATIONS):
-        candidates = crossings(continuous, lower * (1 + tol))
-        best = _gains(system, candidates).max(initial=0.0)
-        if best <= lower * (1 + tol):
-            return float(max(best, lower))
-        lower = best
+        further, best = _peak(system, crossings(continuous, lower * (1 + within)))
+        at, before, lower = (further, lower, best) if best > lower else (at, lower, lower)
+        if best <= before * (1 + within):
+            return lower if error <= tol else precise_gain(system, _in_hz(system, at))
     raise KrosError(
         f"H-infinity norm: no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}; ask for a larger tol than {tol}."
     )
@@ -146,12 +176,38 @@ def to_continuous(system: StateSpace) -> StateSpace:
     return StateSpace(solved[:, :n], np.sqrt(2) * solved[:, n:], np.sqrt(2) * output, system.D - system.C @ solved[:, n:], 0.0)
 
 
+def _peak(system: StateSpace, nu: Array) -> tuple[float, float]:
+    """Return the mapped frequency of the largest gain and that gain; around the largest one of those given it is searched for."""
+    nu = np.unique(nu)
+    gains = _gains(system, nu)
+    best = int(np.argmax(gains))
+    at, most, low, high = nu[best], gains[best], nu[max(best - 1, 0)], nu[min(best + 1, len(nu) - 1)]
+    while high - low > 1e-9 * high:
+        inside = np.linspace(low, high, 12)
+        gains = _gains(system, inside)
+        best = int(np.argmax(gains))
+        at, most = (inside[best], gains[best]) if gains[best] > most else (at, most)
+        low, high = inside[max(best - 1, 0)], inside[min(best + 1, 11)]
+    return float(at), float(most)
+
+
+def _in_hz(system: StateSpace, nu: Any) -> Any:
+    return np.arctan(nu) / (np.pi * system.dt) if system.dt > 0 else np.divide(nu, 2 * np.pi)
+
+
 def _gains(system: StateSpace, nu: Array) -> Array:
     """Largest singular values at the mapped frequencies `nu` (rad/s for a continuous system)."""
-    if not nu.size:
-        return np.zeros(0)
-    freqs_hz = np.arctan(nu) / (np.pi * system.dt) if system.dt > 0 else nu / (2 * np.pi)
-    return np.linalg.norm(system.frequency_response(freqs_hz), 2, axis=(-2, -1))
+    return np.linalg.norm(system.frequency_response(_in_hz(system, nu)), 2, axis=(-2, -1))
+
+
+def _rounding(system: StateSpace, nu: float) -> float:
+    """Bound of what rounding changes in the gain at one frequency, to first order: ``eps || |C R| (|z| I + |A|) |R B| ||``, R the resolvent."""
+    if np.isinf(nu) and system.dt == 0:
+        return 0.0
+    z = np.exp(2j * np.pi * _in_hz(system, nu) * system.dt) if system.dt > 0 else 1j * nu
+    resolvent = np.linalg.inv(z * np.eye(system.n_states) - system.A)
+    inside = np.abs(system.C @ resolvent) @ (np.abs(z) * np.eye(system.n_states) + np.abs(system.A)) @ np.abs(resolvent @ system.B)
+    return float(_EPSILON * np.linalg.norm(inside, 2))
 
 
 def _first_frequencies(system: StateSpace) -> Array:
@@ -175,7 +231,8 @@ def crossings(system: StateSpace, gamma: float) -> Array:
     Q = C.T @ C + C.T @ D @ F[:, :n]
     H = np.block([[closed, gamma * (B @ F[:, n:])], [-Q / gamma, -closed.T]])
     eigenvalues = np.linalg.eigvals(H)
-    near = eigenvalues[(np.abs(eigenvalues.real) <= 1e-3 * np.abs(eigenvalues)) & (eigenvalues.imag >= 0)]
+    rounding = 100 * _EPSILON * np.linalg.norm(H)
+    near = eigenvalues[(np.abs(eigenvalues.real) <= np.maximum(1e-3 * np.abs(eigenvalues), rounding)) & (eigenvalues.imag >= 0)]
     points = np.unique(np.concatenate([[0.0], near.imag]))
     between = np.concatenate([(points[1:] + points[:-1]) / 2, np.sqrt(points[1:] * points[:-1])])
     return np.concatenate([points, between])

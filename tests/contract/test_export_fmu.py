@@ -11,6 +11,7 @@ from machines import drive, in_python, samples, watched
 from kros.core.errors import ConfigError
 from kros.export import export_fmu
 from kros.export.c99.compiled import find_compiler
+from kros.export.text import plain
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler is on the PATH")
@@ -75,13 +76,16 @@ def test_the_monitor_is_told_the_condition(fmi, tmp_path):
     path = str(export_fmu(observer, tmp_path / "drive.fmu", fmi, "drive"))
     assert validate_fmu(path) == []
     (told,) = (v for v in fmpy.read_model_description(path).modelVariables if v.name == "condition")
-    assert (told.variability, [item.name for item in told.declaredType.items]) == ("tunable", ["unknown", *observer.monitor.bounds])
+    assert (told.variability, [item.name for item in told.declaredType.items]) == (
+        "tunable",
+        ["unknown", *map(plain, observer.monitor.bounds)],
+    )
     dtype = [("time", float)] + [(name, float) for name in ("position", "target", "rate")]
     rows = np.array([(k * 1e-3, *y[k], *u[k]) for k in range(len(y))], dtype)
     found = {}
     for condition in (None, *observer.monitor.bounds):
         numbers = {item.name: int(item.value) for item in told.declaredType.items}
-        start = {"position": y[0, 0]} | ({} if condition is None else {"condition": numbers[condition]})
+        start = {"position": y[0, 0]} | ({} if condition is None else {"condition": numbers[plain(condition)]})
         result = fmpy.simulate_fmu(
             path, stop_time=0.4, step_size=1e-3, output_interval=1e-3, start_values=start, input=rows, output=["status"]
         )

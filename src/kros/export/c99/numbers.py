@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +17,7 @@ from ...observer.origin import FAR, OriginShift
 from ...observer.samples import LONGEST
 from ...observer.screen import Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
+from ..text import plain, plain_names
 from .realise import Realised
 
 Array = npt.NDArray[np.float64]
@@ -83,14 +83,14 @@ class Source:
         return {
             "name": self.name,
             "NAME": self.name.upper(),
-            "observer": o,
+            "observer_name": plain(o.name),
             "real": self.precision.type,
             "suffix": self.precision.suffix,
             "zero": self.precision.literal(0.0),
             "single": self.precision.type == "float",
-            "states": o.recorded,
-            "measured": [lifting.states[i] for i in o.measured],
-            "inputs": o.inputs,
+            "states": plain_names(o.recorded),
+            "measured": plain_names(lifting.states[i] for i in o.measured),
+            "inputs": plain_names(o.inputs),
             "parameters": lifting.parameters,
             "at": o.measured,
             "n": n,
@@ -190,8 +190,8 @@ class Source:
             return None
         level, places, write = self.load.level, self.observer.recorded, Precision().literal
         return {
-            "load_name": self.load.load,
-            "current_name": self.load.current,
+            "load_name": plain(self.load.load),
+            "current_name": plain(self.load.current),
             "load": places.index(self.load.load),
             "current": places.index(self.load.current),
             "pole": write(level.pole),
@@ -230,7 +230,7 @@ class Source:
             "largest": self.precision.literal(LARGEST),
             "one": self.precision.literal(1.0),
             "settle": own.settle,
-            "conditions": [_comment(c) for c in own.bounds],
+            "conditions": [plain(c) for c in own.bounds],
             "products": [self.precision.literal(own.product(c)) for c in (None, *own.bounds)],
             "recovery": RECOVERY,
             "rates": {"percent": f"{100 * own.false_alarm_rate:g}", "units": own.units, "alarms": own.alarms, "hours": f"{own.hours:.3g}"}
@@ -302,11 +302,6 @@ def _uncorrected(observer: Observer) -> Array:
     A = observer.A.copy()
     A[:, list(observer.measured)] -= observer.into @ observer.controller.D
     return A
-
-
-def _comment(text: str) -> str:
-    """Return a name as it may stand in a comment of C."""
-    return re.sub(r"[^\w .@-]", "_", text) or "_"
 
 
 def _filled(values: Array | None, count: int, otherwise: float) -> Array:

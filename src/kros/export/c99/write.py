@@ -17,6 +17,7 @@ from ...core.errors import ConfigError
 from ...data.writers.folders import whole_folder
 from ...observer import Observer
 from ...observer.file import observer_content
+from ..text import plain, require_identifier
 from .accuracy import Accuracy, HeldOut
 from .board import OnBoard, missing_tools
 from .compiled import find_compiler
@@ -24,10 +25,6 @@ from .golden import Golden
 from .numbers import LoadOutput, Source
 
 _TOLERANCE = {"double": 1e-9, "float": 1e-3}
-_C_WORDS = """
-auto break case char const continue default do double else enum extern float for goto if inline int long register restrict return short signed sizeof
-static struct switch typedef union unsigned void volatile while main
-"""
 
 
 def export_c(
@@ -103,14 +100,6 @@ def export_c(
     return Path(out)
 
 
-def require_identifier(name: str) -> None:
-    """Refuse what is no C identifier, or a word of the language."""
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name) or name in _C_WORDS.split():
-        raise ConfigError(
-            f"Export to C: the name {name!r} should be a C identifier of letters, digits and underscores that begins with a letter, and no word of C."
-        )
-
-
 def c_files(
     observer: Observer,
     name: str,
@@ -123,6 +112,8 @@ def c_files(
     """Return the text of every file by its name; the same observer gives the same bytes."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    for parameter in observer.lifting.parameters:
+        require_identifier(parameter, "parameter")
     source, golden = Source.of(observer, name, precision, track, load), Golden.of(observer, track)
     context = source.context() | {"version": version("kros")}
     context["sigma_uses_parameters"] = any(set(f.used) & set(observer.lifting.parameters) for f in observer.lifting.formulas)
@@ -156,7 +147,7 @@ def c_files(
         "accuracy": None if accuracy is None else accuracy.content(),
         "board": None if board is None else asdict(board),
         "library": " and ".join(f"`{f}`" for f in functions) or "nothing",
-        "units": ", ".join(f"{k} {v}" for k, v in units_of_measure(observer).items()),
+        "units": ", ".join(f"{plain(k)} {plain(v)}" for k, v in units_of_measure(observer).items()),
     }
     environment = Environment(loader=PackageLoader("kros.export.c99"), undefined=StrictUndefined, keep_trailing_newline=True)
     texts = {
@@ -173,7 +164,7 @@ def c_files(
         "name": name,
         "precision": precision,
         "states": list(observer.recorded),
-        "measured": context["measured"],
+        "measured": [observer.lifting.states[i] for i in observer.measured],
         "inputs": list(observer.inputs),
         "parameters": list(observer.lifting.parameters),
         **({} if track is None else {"tracked": track}),

@@ -19,7 +19,8 @@ from ...core.errors import ConfigError
 from ...observer import Observer
 from ..c99.compiled import FLAGS, find_compiler
 from ..c99.numbers import Source
-from ..c99.write import c_files, require_identifier, units_of_measure
+from ..c99.write import c_files, units_of_measure
+from ..text import plain, plain_names, require_identifier
 
 _KROS = uuid.UUID("4b0a3f5e-7f2c-5d0e-9a61-6b726f733939")
 _FIXED = (1980, 1, 1, 0, 0, 0)  # the same bytes from the same observer
@@ -95,7 +96,13 @@ def rendered(source: Source, fmi: int, guid: str, units: Mapping[str, str]) -> d
 
     observer, name, context = source.observer, source.name, source.context()
     estimates = [*observer.recorded, *([] if source.loop is None else [source.loop.name])]
-    context |= {"version": version("kros"), "fmi": fmi, "guid": guid, "units": units, "estimates": len(estimates)}
+    context |= {
+        "version": version("kros"),
+        "fmi": fmi,
+        "guid": guid,
+        "units": {name: plain(unit) for name, unit in units.items()},
+        "estimates": len(estimates),
+    }
     context["variables"] = variables(observer, units, estimates)
     context["conditions"] = conditions(observer)
     context["wide_parameters"] = [f"{observer.parameters.get(p, 0.0):.17g}" for p in observer.lifting.parameters]
@@ -113,11 +120,11 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
     def rows(names: Any, causality: str, variability: str, description: str, start: Any, suffix: str = "") -> list[dict[str, Any]]:
         return [
             {
-                "name": n + suffix,
+                "name": plain(n) + suffix,
                 "causality": causality,
                 "variability": variability,
-                "description": description.format(n),
-                "unit": units.get(n, ""),
+                "description": description.format(plain(n)),
+                "unit": plain(units[n]) if units.get(n) else "",
             }
             | {"start": start(n), "kind": "real"}
             for n in names
@@ -142,7 +149,7 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
 def conditions(observer: Observer) -> list[str]:
     """Return the conditions that the monitor knows, in the order of their numbers, the unknown one first; nothing where it knows none."""
     known = () if observer.monitor is None else observer.monitor.bounds
-    return ["unknown", *known] if known else []
+    return ["unknown", *plain_names(known)] if known else []
 
 
 def compiled(files: Mapping[str, bytes], name: str, fmi: int) -> dict[str, bytes]:

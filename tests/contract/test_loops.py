@@ -6,6 +6,7 @@ import stat
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -242,7 +243,7 @@ def test_two_processes_may_compile_at_once(tmp_path):
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
     both = [subprocess.Popen([sys.executable, "-c", program], env=environment) for _ in range(2)]
     assert [process.wait() for process in both] == [0, 0]
-    assert [path.suffix for path in (tmp_path / "kros").iterdir()] == [".so"]
+    assert sorted(path.suffix for path in (tmp_path / "kros").iterdir()) == [".sha256", ".so"]
 
 
 @needs_compiler
@@ -253,7 +254,7 @@ def test_a_home_that_cannot_be_written_is_no_obstacle(tmp_path, monkeypatch):
     assert compiler.load(SOURCE, FLAGS).kros_answer() == 42
     folder = tmp_path / f"kros-{os.getuid()}"
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    assert len(list(folder.iterdir())) == 1
+    assert len(list(folder.iterdir())) == 2
 
 
 @needs_compiler
@@ -285,6 +286,56 @@ def test_without_a_compiler_that_works_numpy_takes_over_and_says_so_once(tmp_pat
     assert "no licence" in caplog.text
     assert run_observer(drive(), *(a[:, None] for a in samples(20, faults=False))).shape == (20, 1, 3)
     library.cache_clear()
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", ["cut", "changed", "empty", "checksum"])
+def test_a_damaged_library_is_compiled_again(damage, tmp_path, monkeypatch):
+    """A library that is cut short would end the process with SIGBUS at its first call."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    program = f"from kros.loops import compiler; assert compiler.load({SOURCE!r}, {FLAGS!r}).kros_answer() == 42"
+    subprocess.run([sys.executable, "-c", program], check=True)
+    built, checksum = (next((tmp_path / "kros").glob(f"*.{ending}")) for ending in ("so", "sha256"))
+    whole = built.read_bytes()
+    if damage == "checksum":
+        checksum.write_bytes(b"\xff")
+    else:
+        built.write_bytes({"cut": whole[: len(whole) // 2], "changed": whole[:-1] + b"x", "empty": b""}[damage])
+    subprocess.run([sys.executable, "-c", program], check=True)
+    assert compiler._is_whole(built)
+
+
+@pytest.mark.parametrize(
+    ("script", "reason"),
+    [
+        ("sleep 100 & sleep 100", "has not ended after"),
+        ("printf '\\377\\376 no' ; exit 1", "no"),
+        ("while [ $# -gt 1 ]; do [ $1 = -o ] && echo text > $2; shift; done", "does not run"),
+        ("true", "does not run"),
+    ],
+    ids=["hangs", "prints other bytes", "writes no library", "writes nothing"],
+)
+def test_a_compiler_that_does_not_work_is_no_obstacle(script, reason, tmp_path, monkeypatch, caplog):
+    (tmp_path / "cc").write_text(f"#!/bin/sh\n{script}\n")
+    (tmp_path / "cc").chmod(0o755)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr(compiler, "run_tool", partial(compiler.run_tool, seconds=1.0))
+    with caplog.at_level(logging.INFO, "kros"):
+        assert compiler.load(SOURCE, FLAGS) is None
+    assert reason in caplog.records[-1].getMessage()
+    assert len(caplog.records) == 1
+
+
+@needs_compiler
+def test_a_user_without_a_home_compiles_among_temporary_files(tmp_path, monkeypatch):
+    def nowhere():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(compiler.Path, "home", nowhere)
+    monkeypatch.setattr(compiler.tempfile, "gettempdir", lambda: str(tmp_path))
+    assert compiler.load(SOURCE, FLAGS).kros_answer() == 42
 
 
 def test_an_unknown_choice_is_refused(monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import stat
 import tomllib
@@ -45,7 +46,7 @@ def read_bytes(path: Path, limit: int, error: type[KrosError] = DataError) -> by
     require_regular(path, limit, error)
     try:
         with path.open("rb") as file:
-            return file.read(limit)
+            return file.read(min(limit, os.fstat(file.fileno()).st_size) + 1)  # Python makes room for as much as is asked for
     except (OSError, MemoryError) as found:
         raise error(f"Reading {path}: {found or 'not enough memory'}; check the file and its permissions.") from found
 

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
 import logging
 import os
 import shutil
+import signal
 import stat
 import subprocess
+import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 _log = logging.getLogger(__name__)
 COMPILERS = ("cc", "gcc", "clang")
-_SECONDS = 120.0
+_SECONDS = 60.0  # after which a compiler, or a library that is tried, is given up
+_TRIED = "\nint kros_trial(int);\nint kros_trial(int x) { return 2 * x; }\n"
+_TRIAL = "import ctypes, sys; library = ctypes.CDLL(sys.argv[1]); sys.exit(library.kros_trial(21) != 42)"
 
 
 def find_compiler() -> str | None:
@@ -33,16 +38,48 @@ def load(source: str, flags: tuple[str, ...]) -> ctypes.CDLL | None:
     for folder in _folders():
         try:
             library = folder / f"{_digest(source, flags, compiler)}.so"
-            if not library.exists():
-                _compile(source, flags, compiler, library)
+            if not _is_whole(library):
+                _build(source, flags, compiler, library)
             return ctypes.CDLL(str(library))
-        except subprocess.CalledProcessError as error:
-            reason = f"{compiler} refused the source: {error.stderr.strip()[:300]}"
+        except subprocess.SubprocessError as error:
+            reason = str(error)
             break
-        except (OSError, subprocess.TimeoutExpired) as error:
+        except OSError as error:
             reason = str(error)  # such as a folder from which nothing may be executed
     _log.info("Time loops run in NumPy, several times slower: %s.", reason)
     return None
+
+
+def run_tool(command: Sequence[str], given: str = "", seconds: float = _SECONDS) -> str:
+    """Run a compiler, or what it made, in a process group that ends in time; return what it printed, whatever its bytes.
+
+    Raises
+    ------
+    subprocess.SubprocessError
+        When it refuses, or takes too long, with the reason in one line.
+    OSError
+        When it cannot be run.
+    """
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(command, start_new_session=True, text=True, errors="replace", **pipes) as running:
+        try:
+            printed, _ = running.communicate(given, timeout=seconds)
+        except subprocess.TimeoutExpired as error:
+            raise subprocess.SubprocessError(f"{command[0]} has not ended after {seconds:g} s") from error
+        finally:  # what it has started itself would keep the pipe open
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(running.pid, signal.SIGKILL)
+    if running.returncode:
+        raise subprocess.SubprocessError(f"{command[0]} ended with {running.returncode}: {' '.join(printed.split())[:300]}")
+    return str(printed)
+
+
+def _is_whole(library: Path) -> bool:
+    """Tell whether a library has the bytes that were tried when it was compiled."""
+    try:
+        return library.with_suffix(".sha256").read_text() == hashlib.sha256(library.read_bytes()).hexdigest()
+    except (OSError, ValueError):
+        return False
 
 
 def _digest(source: str, flags: tuple[str, ...], compiler: str) -> str:
@@ -56,9 +93,11 @@ def _digest(source: str, flags: tuple[str, ...], compiler: str) -> str:
 
 def _folders() -> Iterator[Path]:
     """Folders to compile into that belong to this user alone: nobody else may put a library there."""
-    cache = os.environ.get("XDG_CACHE_HOME")
-    home = Path(cache) if cache else Path.home() / ".cache"
-    for folder in (home / "kros", Path(tempfile.gettempdir()) / f"kros-{os.getuid()}"):
+    folders = [Path(tempfile.gettempdir()) / f"kros-{os.getuid()}"]
+    with contextlib.suppress(RuntimeError):  # a user without a home
+        cache = os.environ.get("XDG_CACHE_HOME")
+        folders.insert(0, (Path(cache) if cache else Path.home() / ".cache") / "kros")
+    for folder in folders:
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             found = folder.lstat()
@@ -68,9 +107,15 @@ def _folders() -> Iterator[Path]:
             yield folder
 
 
-def _compile(source: str, flags: tuple[str, ...], compiler: str, library: Path) -> None:
+def _build(source: str, flags: tuple[str, ...], compiler: str, library: Path) -> None:
+    """Compile a library, try it in a process of its own, and put it in place with its checksum."""
     with tempfile.TemporaryDirectory(dir=library.parent) as scratch:
-        made = Path(scratch) / library.name
-        command = [compiler, *flags, "-x", "c", "-", "-o", str(made), "-lm"]
-        subprocess.run(command, input=source, capture_output=True, text=True, check=True, timeout=_SECONDS)
-        os.replace(made, library)
+        built, checksum = Path(scratch) / library.name, Path(scratch) / "sha256"
+        run_tool([compiler, *flags, "-x", "c", "-", "-o", str(built), "-lm"], source + _TRIED)
+        try:
+            run_tool([sys.executable, "-S", "-c", _TRIAL, str(built)])
+        except subprocess.SubprocessError as error:
+            raise subprocess.SubprocessError(f"what {compiler} made does not run") from error
+        checksum.write_text(hashlib.sha256(built.read_bytes()).hexdigest())
+        os.replace(built, library)
+        os.replace(checksum, library.with_suffix(".sha256"))

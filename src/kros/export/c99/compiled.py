@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import json
-import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError, DimensionError
+from ...loops.compiler import COMPILERS, find_compiler, run_tool
 
 Array = npt.NDArray[np.float64]
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fno-math-errno", "-ffp-contract=off")
-COMPILERS = ("cc", "gcc", "clang")
 # The loop over time, compiled beside the observer: what arrives and leaves lies sample after sample.
 _LOOP = """
 #include "{name}.h"
@@ -30,11 +29,6 @@ void {name}_run({name}_state *s, long count, const double *y, const double *u, d
     }}
 }}
 """
-
-
-def find_compiler() -> str | None:
-    """Return a C compiler on the PATH; None where there is none."""
-    return next((path for name in COMPILERS if (path := shutil.which(name))), None)
 
 
 class CompiledObserver:
@@ -78,7 +72,7 @@ class CompiledObserver:
         Raises
         ------
         ConfigError
-            When there is no C compiler, or it refuses the source.
+            When there is no C compiler, or it refuses the source, or takes more than a minute.
         """
         folder, compiler = Path(folder), compiler or find_compiler()
         if compiler is None:
@@ -88,9 +82,10 @@ class CompiledObserver:
         library, loop = folder / f"lib{name}.so", _LOOP.format(name=name, wide=_wide(manifest), **sizes)
         sources = [f"-I{folder}", str(folder / f"{name}.c"), str(folder / f"{name}_selftest.c"), "-x", "c", "-"]
         command = [compiler, *FLAGS, *flags, *sources, "-o", str(library), "-lm"]
-        done = subprocess.run(command, input=loop, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise ConfigError(f"Compiling {folder}: {compiler} refused the source: {done.stderr.strip()[:500]}")
+        try:
+            run_tool(command, loop)
+        except (OSError, subprocess.SubprocessError) as error:
+            raise ConfigError(f"Compiling {folder}: {error}; repair the compiler, or name another.") from error
         return cls(folder, library)
 
     def selftest(self) -> int:

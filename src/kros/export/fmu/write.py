@@ -16,8 +16,9 @@ from typing import Any
 
 from ...core.artifacts import write_bytes
 from ...core.errors import ConfigError
+from ...loops.compiler import find_compiler, run_tool
 from ...observer import Observer
-from ..c99.compiled import FLAGS, find_compiler
+from ..c99.compiled import FLAGS
 from ..c99.numbers import Source
 from ..c99.write import c_files, units_of_measure
 from ..text import plain, plain_names, require_identifier
@@ -166,9 +167,12 @@ def compiled(files: Mapping[str, bytes], name: str, fmi: int) -> dict[str, bytes
                 (Path(folder) / Path(file).name).write_bytes(content)
         library = Path(folder) / f"{name}_fmu.{ending}"
         sources = [str(Path(folder) / f"{part}.c") for part in (name, f"{name}_fmu")]
-        done = subprocess.run([compiler, *FLAGS, *sources, "-o", str(library), "-lm"], capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise ConfigError(f"Export of an FMU: {compiler} refused the source: {done.stderr.strip()[:500]}")
+        try:
+            run_tool([compiler, *FLAGS, *sources, "-o", str(library), "-lm"])
+        except (OSError, subprocess.SubprocessError) as error:
+            raise ConfigError(
+                f"Export of an FMU: {error}; repair the compiler, or take it off the PATH to leave the binary out."
+            ) from error
         return {f"binaries/{place}/{library.name}": library.read_bytes()}
 
 

@@ -47,8 +47,8 @@ def read_bytes(path: Path, limit: int, error: type[KrosError] = DataError) -> by
     try:
         with path.open("rb") as file:
             return file.read(min(limit, os.fstat(file.fileno()).st_size) + 1)  # Python makes room for as much as is asked for
-    except (OSError, MemoryError) as found:
-        raise error(f"Reading {path}: {found or 'not enough memory'}; check the file and its permissions.") from found
+    except OSError as found:
+        raise error(f"Reading {path}: {found}; check the file and its permissions.") from found
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:

@@ -18,16 +18,19 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import quote
 
 import numpy as np
 
+from ...core import limits
 from ...core.work import Usable, Work
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
+_BLOCK = 1 << 20
 _DAMAGED = (OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, zlib.error)
 _LEVEL = 1  # of compression
 
@@ -89,11 +92,13 @@ class KnownResults:
         if not path.is_file():
             return {}
         try:
-            with gzip.open(path, "rt", encoding="utf-8") as lines:
-                if next(lines).rstrip("\n") != self.key:
-                    return {}
-                return {mark: text for mark, _, text in (line.rstrip("\n").partition("\t") for line in lines)}
-        except (*_DAMAGED, StopIteration) as error:
+            with gzip.open(path, "rb") as packed:
+                text = b"".join(islice(iter(lambda: packed.read(_BLOCK), b""), limits.MAX_JSON_BYTES // _BLOCK + 1))
+            if len(text) > limits.MAX_JSON_BYTES:
+                raise ValueError(f"more than {limits.MAX_JSON_BYTES} bytes, unpacked")
+            key, *lines = text.decode().removesuffix("\n").split("\n")
+            return {mark: text for mark, _, text in (line.partition("\t") for line in lines)} if key == self.key else {}
+        except _DAMAGED as error:
             log.warning("%s: cannot be read (%s), so everything is computed", path, error)
             return {}
 

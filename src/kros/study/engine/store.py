@@ -249,7 +249,7 @@ def source_key(source: Path) -> str:
 
 @cache
 def code_key() -> str:
-    """Return a hash of kros's own source."""
+    """Return a hash of all files of kros: Python, C, templates and scripts."""
     root = Path(__file__).resolve().parents[2]
-    files = sorted(f for pattern in ("*.py", "*.jinja", "*.html", "*.css", "*.json") for f in root.rglob(pattern))
+    files = sorted(f for f in root.rglob("*") if f.is_file() and "__pycache__" not in f.parts)
     return hash_of([[str(f.relative_to(root)), records.digest(f)] for f in files])

@@ -148,23 +148,34 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
         return float("inf")
     if system.n_states == 0 or system.n_inputs == 0 or system.n_outputs == 0:
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
-    system = balanced(system)
-    continuous = balanced(to_continuous(system)) if system.dt > 0 else system
-    points = _first_frequencies(continuous)
-    at, lower = _peak(system, points)
+    continuous = to_continuous(system) if system.dt > 0 else system
+    at, lower = _largest(system, _first_frequencies(continuous))
     at, lower = max((at, lower), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda found: found[1])
     if lower == 0.0:
         return 0.0
     error = _rounding(system, at) / lower
-    within = max(tol, error)
+    if error > tol:  # eigenvalues of the Hamiltonian are no better
+        return _norm_of_stiff(system, continuous, at, lower, error)
     for _ in range(_MAX_ITERATIONS):
-        further, best = _peak(system, crossings(continuous, lower * (1 + within)))
-        at, before, lower = (further, lower, best) if best > lower else (at, lower, lower)
-        if best <= before * (1 + within):
-            return lower if error <= tol else precise_gain(system, _in_hz(system, at))
+        best = _largest(system, crossings(continuous, lower * (1 + tol)))[1]
+        if best <= lower * (1 + tol):
+            return max(best, lower)
+        lower = best
     raise KrosError(
         f"H-infinity norm: no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}; ask for a larger tol than {tol}."
     )
+
+
+def _norm_of_stiff(system: StateSpace, continuous: StateSpace, at: float, lower: float, error: float) -> float:
+    """Search the peak between the frequencies that level sets and poles name, in balanced coordinates, and return its gain in multiple precision."""
+    continuous = balanced(continuous)
+    known = _first_frequencies(continuous)
+    for _ in range(_MAX_ITERATIONS):
+        found, best = _peak(system, np.concatenate([known, crossings(continuous, lower * (1 + error), rounded=True)]))
+        before, (at, lower) = lower, (found, best) if best > lower else (at, lower)
+        if best <= before * (1 + error):
+            return precise_gain(system, _in_hz(system, at))
+    raise KrosError(f"H-infinity norm: no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}; scale states and time.")
 
 
 def to_continuous(system: StateSpace) -> StateSpace:
@@ -174,6 +185,13 @@ def to_continuous(system: StateSpace) -> StateSpace:
     n = system.n_states
     output = np.linalg.solve((system.A + eye).T, system.C.T).T
     return StateSpace(solved[:, :n], np.sqrt(2) * solved[:, n:], np.sqrt(2) * output, system.D - system.C @ solved[:, n:], 0.0)
+
+
+def _largest(system: StateSpace, nu: Array) -> tuple[float, float]:
+    """Return the mapped frequency of the largest gain and that gain; zero without frequencies."""
+    gains = _gains(system, nu)
+    best = int(np.argmax(gains)) if gains.size else 0
+    return (float(nu[best]), float(gains[best])) if gains.size else (0.0, 0.0)
 
 
 def _peak(system: StateSpace, nu: Array) -> tuple[float, float]:
@@ -197,6 +215,8 @@ def _in_hz(system: StateSpace, nu: Any) -> Any:
 
 def _gains(system: StateSpace, nu: Array) -> Array:
     """Largest singular values at the mapped frequencies `nu` (rad/s for a continuous system)."""
+    if not nu.size:
+        return np.zeros(0)
     return np.linalg.norm(system.frequency_response(_in_hz(system, nu)), 2, axis=(-2, -1))
 
 
@@ -220,7 +240,7 @@ def _first_frequencies(system: StateSpace) -> Array:
     return np.unique(np.concatenate([[0.0], sizes, np.abs(poles.imag), peaks, grid]))
 
 
-def crossings(system: StateSpace, gamma: float) -> Array:
+def crossings(system: StateSpace, gamma: float, rounded: bool = False) -> Array:
     """Frequencies at which a singular value may equal `gamma`, with the points between them."""
     A, B, C, D = system.A, system.B, system.C, system.D
     R = gamma**2 * np.eye(system.n_inputs) - D.T @ D
@@ -231,7 +251,7 @@ def crossings(system: StateSpace, gamma: float) -> Array:
     Q = C.T @ C + C.T @ D @ F[:, :n]
     H = np.block([[closed, gamma * (B @ F[:, n:])], [-Q / gamma, -closed.T]])
     eigenvalues = np.linalg.eigvals(H)
-    rounding = 100 * _EPSILON * np.linalg.norm(H)
+    rounding = 100 * _EPSILON * np.linalg.norm(H) if rounded else 0.0
     near = eigenvalues[(np.abs(eigenvalues.real) <= np.maximum(1e-3 * np.abs(eigenvalues), rounding)) & (eigenvalues.imag >= 0)]
     points = np.unique(np.concatenate([[0.0], near.imag]))
     between = np.concatenate([(points[1:] + points[:-1]) / 2, np.sqrt(points[1:] * points[:-1])])

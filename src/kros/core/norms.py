@@ -88,6 +88,7 @@ def h2_norm(system: Any) -> float:
         return float("inf")
     if _near_the_limit(system):
         return precise_h2_norm(system)
+    system = balanced(system) if system.dt == 0 else system
     if not system.is_stable():
         return float("inf")
     squared = float(np.trace(system.C @ gramian(system.A, system.B, system.dt) @ system.C.T))

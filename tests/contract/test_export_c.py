@@ -13,7 +13,7 @@ from machines import LIMITS, MACHINES, apart, drive, in_python, moving, replaced
 from kros.core.errors import ConfigError, DataError
 from kros.export import CompiledObserver, HeldOut, LoadOutput, export_c
 from kros.export.c99.board import missing_tools
-from kros.export.c99.compiled import find_compiler
+from kros.loops import find_compiler
 from kros.motor_drive import AngleLoad
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Werror", "-pedantic")

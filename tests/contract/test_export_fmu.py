@@ -10,8 +10,8 @@ from machines import drive, in_python, samples, watched
 
 from kros.core.errors import ConfigError
 from kros.export import export_fmu
-from kros.export.c99.compiled import find_compiler
 from kros.export.text import plain
+from kros.loops import find_compiler
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler is on the PATH")

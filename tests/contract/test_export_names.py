@@ -10,12 +10,12 @@ from machines import drive, watched
 
 from kros.core.errors import ConfigError
 from kros.export import LoadOutput, export_c
-from kros.export.c99.compiled import find_compiler
 from kros.export.c99.numbers import Source
 from kros.export.c99.write import units_of_measure
 from kros.export.fmu.write import rendered
 from kros.export.text import plain, plain_names
 from kros.lifting import Lifting
+from kros.loops import find_compiler
 from kros.motor_drive import AngleLoad
 
 HOSTILE = {

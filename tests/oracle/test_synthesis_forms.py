@@ -285,9 +285,7 @@ def drives(spread, n_units=6):
 def test_every_simulated_drive_is_below_the_bounds(spread, form):
     """Weights as the uncertainty stage makes them, remainder included: no drive has a larger error than the certificate says."""
     units = drives(spread)
-    uncertain = quantify_systems(
-        units, form, freqs_hz=np.geomspace(1e-2, 499, 80), max_order=2, tolerance_db=3.0
-    )
+    uncertain = quantify_systems(units, form, freqs_hz=np.geomspace(1e-2, 499, 80), max_order=2, tolerance_db=3.0)
     rest = uncertain.remainder
     case = ObserverProblem(
         nominal=units[uncertain.nominal],

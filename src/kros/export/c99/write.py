@@ -15,12 +15,12 @@ import numpy as np
 from ...core.artifacts import json_bytes, with_checksum, write_bytes
 from ...core.errors import ConfigError
 from ...data.writers.folders import whole_folder
+from ...loops.compiler import find_compiler
 from ...observer import Observer
 from ...observer.file import observer_content
 from ..text import plain, require_identifier
 from .accuracy import Accuracy, HeldOut
 from .board import OnBoard, missing_tools
-from .compiled import find_compiler
 from .golden import Golden
 from .numbers import LoadOutput, Source
 

@@ -7,7 +7,7 @@ import pytest
 from machines import LIMITS, apart, drive, in_python, moving, replaced, samples
 
 from kros.export import CompiledObserver, export_c
-from kros.export.c99.compiled import find_compiler
+from kros.loops import find_compiler
 from kros.observer import run_observer, step
 from kros.observer.origin import Origins, find_shift
 from kros.observer.runtime import Runtime

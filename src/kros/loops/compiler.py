@@ -60,8 +60,15 @@ def run_tool(command: Sequence[str], given: str = "", seconds: float = _SECONDS)
     OSError
         When it cannot be run.
     """
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    with subprocess.Popen(command, start_new_session=True, text=True, errors="replace", **pipes) as running:
+    with subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        text=True,
+        errors="replace",
+    ) as running:
         try:
             printed, _ = running.communicate(given, timeout=seconds)
         except subprocess.TimeoutExpired as error:

@@ -17,6 +17,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from ..core.choices import member
 from ..core.errors import DataError
 from .scaling import Scaling
 
@@ -73,6 +74,9 @@ class Channel:
     role: Role
     unit: str = ""
     measured: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "role", member(Role, self.role, f"Channel {self.name}: the role"))
 
 
 @dataclass(frozen=True)

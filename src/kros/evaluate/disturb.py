@@ -14,6 +14,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
+from ..core.choices import member
 from ..core.errors import ConfigError, DimensionError
 from ..data.batch import hold_missing as hold_missing  # beside what makes them miss
 
@@ -84,7 +85,7 @@ class Disturbance:
     draw: int = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "kind", Kind(self.kind))
+        object.__setattr__(self, "kind", member(Kind, self.kind, "Disturbance: the kind"))
         most = 1.0 if self.kind is Kind.DROPPED else np.inf
         if not 0 <= self.severity <= most or self.severity == np.inf:
             raise ConfigError(f"Disturbance {self.kind.value}: the severity {self.severity} should be between 0 and {most:g}.")

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.choices import member
 from ..core.errors import ConfigError, DimensionError
 from ..core.linalg import solve_balanced
 from ..core.lti import StateSpace
@@ -100,7 +101,7 @@ class ObserverData:
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "injection", Injection(self.injection))
+        object.__setattr__(self, "injection", member(Injection, self.injection, f"Observer {self.name}: the injection"))
         if self.B.shape[1] != len(self.inputs) + len(self.lifting.input_functions):
             raise DimensionError(
                 f"Observer {self.name}: {len(self.inputs)} inputs {self.inputs} and {len(self.lifting.input_functions)} functions of them need as many "

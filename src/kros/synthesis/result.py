@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.artifacts import load_artifact, save_artifact
+from ..core.choices import member
 from ..core.errors import SynthesisError
 from ..core.loading import loader
 from ..core.lti import StateSpace
@@ -117,6 +118,8 @@ class Synthesis:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for name, kind in (("status", Status), ("injection", Injection)):
+            object.__setattr__(self, name, member(kind, getattr(self, name), f"Synthesis {self.method}: the {name}"))
         if self.gap_percent is not None and not self.gap_percent >= 0:
             raise SynthesisError(
                 f"Synthesis {self.method}: a lower bound of {self.lower_bound} lies above what is attained ({self.gap_percent:.6g} %); "

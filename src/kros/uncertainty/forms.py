@@ -23,16 +23,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import Enum
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError, DimensionError
+from ..core.choices import member
+from ..core.errors import DimensionError
 from ..core.small_matrices import condition_number, entries_first, entries_last, multiply, pseudo_inverse_first, sigma_max
 
 Array = npt.NDArray[Any]
-E = TypeVar("E", bound=Enum)
 
 MAX_CONDITION = 1e12  # beyond this an inverse form cannot rebuild the plant
 
@@ -73,14 +73,6 @@ _DUAL = {
     Form.INVERSE_INPUT_MULTIPLICATIVE: Form.INVERSE_OUTPUT_MULTIPLICATIVE,
     Form.INVERSE_OUTPUT_MULTIPLICATIVE: Form.INVERSE_INPUT_MULTIPLICATIVE,
 }
-
-
-def member(kind: type[E], value: E | str, what: str) -> E:
-    """Return the member of an enumeration by its name, or raise a `ConfigError` that lists the names."""
-    try:
-        return kind(value)
-    except ValueError as error:
-        raise ConfigError(f"{what} {value!r} is unknown; choose one of {', '.join(str(m.value) for m in kind)}.") from error
 
 
 def as_form(form: Form | str) -> Form:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.choices import member
 from ...core.errors import ConfigError
 from ...data import prepare
 from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, TrueChannel, Unit
@@ -87,9 +88,7 @@ class HarmonicDrivePopulation:
     conditions: tuple[str, ...] = CONDITIONS
 
     def __post_init__(self) -> None:
-        if self.loop not in list(Loop):
-            raise ConfigError(f"Harmonic Drive population: loop {self.loop!r} is unknown; use one of {', '.join(x.value for x in Loop)}.")
-        object.__setattr__(self, "loop", Loop(self.loop))
+        object.__setattr__(self, "loop", member(Loop, self.loop, "Harmonic Drive population: the loop"))
         object.__setattr__(self, "conditions", tuple(self.conditions))
         if not self.conditions or len(set(self.conditions)) < len(self.conditions) or not set(self.conditions) <= set(CONDITIONS):
             raise ConfigError(f"Harmonic Drive population: conditions {self.conditions} should be one or both of {CONDITIONS}, each once.")

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.choices import member
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
@@ -77,7 +78,7 @@ class ObserverProblem:
         Left weight of the additive remainder on scaled states.
     remainder_right : StateSpace, (m, m), optional
         Right weight of the additive remainder on scaled inputs.
-    injection : Injection
+    injection : Injection or its name
         Where the correction enters.
     process_noise : ndarray, shape (n,), optional
         Standard deviation of white noise on every (lifted) state per sample, independent of everything else; default none.
@@ -118,6 +119,7 @@ class ObserverProblem:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "form", as_form(self.form))
+        object.__setattr__(self, "injection", member(Injection, self.injection, "Observer problem: the injection"))
         for name in ("nominal", "W_L", "W_R", "W_u", "remainder_left", "remainder_right"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, StateSpace.of(getattr(self, name)))
@@ -165,7 +167,7 @@ class ObserverProblem:
         uncertain: UncertainModel,
         noise: npt.ArrayLike,
         *,
-        injection: Injection | str = Injection.STATE,
+        injection: Injection = Injection.STATE,
         correction_penalty: float = 1e-3,
     ) -> ObserverProblem:
         """Return the problem of the nominal unit and the set around it, remainder included.
@@ -177,7 +179,7 @@ class ObserverProblem:
         uncertain : UncertainModel
         noise : array_like, shape (q,)
             Standard deviation of every measurement's noise, in the units of `models`.
-        injection : Injection or str
+        injection : Injection or its name
         correction_penalty : float
 
         Raises

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.choices import member
 from ...core.small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
-from ..forms import member
 
 Array = npt.NDArray[Any]
 

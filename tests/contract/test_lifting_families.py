@@ -27,7 +27,7 @@ def samples(lifting, n, seed=0):
     ends = np.array([BOX[name.partition("[")[0]] for name in (*lifting.window.names, *INPUTS)] + [PHASE])
     share = rng.uniform(size=(n, len(ends)))
     share[: n // 4] = rng.integers(0, 2, size=(n // 4, len(ends)))
-    drawn = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    drawn = np.clip(ends[:, 0] + share * (ends[:, 1] - ends[:, 0]), *ends.T)  # rounding may lead out of the box
     return drawn[:, :-2], drawn[:, -2:-1], drawn[:, -1]
 
 

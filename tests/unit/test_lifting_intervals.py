@@ -1,7 +1,10 @@
 """Bounds of values and slopes: tight for simple functions, infinite where a function is, never below a sample."""
 
+import itertools
+
 import numpy as np
 import pytest
+import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -126,3 +129,39 @@ def test_no_sample_escapes(text, middle, half):
         found = found[~np.isnan(found)]
         slack = 1e-9 * np.maximum(1, np.abs(np.where(np.isfinite(found), found, 1)))  # log(0) is where it should be, too
         assert np.all((found >= lower - slack) & (found <= upper + slack)), (text, expression)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(
+    text=st.recursive(LEAVES, grow, max_leaves=4), middle=st.tuples(*[st.floats(-3, 3)] * 3), half=st.sampled_from([0.0, 1e-12, 1e-6, 1e-2])
+)
+def test_bounds_hold_in_exact_arithmetic(text, middle, half):
+    """Values in 60 digits lie between the bounds, without any slack, where large terms cancel too."""
+    try:
+        formulas = [
+            Formula(cancelling, ("x", "y", "q")) for cancelling in (text, f"1e15*(sin({text}) - ({text}))", f"1e18*tanh(40*({text}))")
+        ]
+        trees = [tree for formula in formulas for tree in (formula.expression, formula.derivative("x"))]
+    except ConfigError:
+        return
+    box = {name: (m - half, m + half) for name, m in zip("xyq", middle, strict=True)}
+    for tree in trees:
+        if tree.has(sp.zoo, sp.nan, sp.DiracDelta):
+            continue
+        try:
+            lower, upper = bounds_of([tree], box)
+        except ConfigError:
+            continue
+        for corner in itertools.product(*box.values()):
+            exact = tree.subs({s: sp.Rational(dict(zip("xyq", corner, strict=True))[s.name]) for s in tree.free_symbols}).evalf(60)
+            if exact.is_real and exact.is_finite:
+                assert sp.Float(lower[0], 60) <= exact <= sp.Float(upper[0], 60), (text, tree, corner)
+
+
+@pytest.mark.parametrize(
+    ("text", "box", "secant"), [("1e18*tanh(40*x)", (0.5, 1.0), 16.9933), ("1e15*(sin(x) - x)", (-1e-8, 1e-8), -0.0166667)]
+)
+def test_slopes_hold_where_everything_cancels(text, box, secant):
+    """Secants computed in 60 digits."""
+    lower, upper = Lifting(("x",), (text,)).slope_bounds({"x": box})
+    assert lower[0, 0] <= secant <= upper[0, 0]

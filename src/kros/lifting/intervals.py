@@ -1,7 +1,7 @@
 """Interval arithmetic on SymPy trees: bounds that hold everywhere in a box.
 
 Intervals are pairs of arrays, one entry a piece of the box: the box is cut along its finite sides, and the bounds of a tree are the union
-over the pieces, which makes them tight where a quantity appears several times. Rounding is covered by a relative widening at the end.
+over the pieces, which makes them tight where a quantity appears several times. Every operation rounds outwards.
 A box that reaches beyond the domain of a root or a logarithm has no bounds.
 """
 
@@ -21,7 +21,8 @@ Interval = tuple[Array, Array]
 Box = Mapping[str, Any]
 
 _PIECES = 4096
-_WIDENING = 1e-12
+_EPSILON = float(np.finfo(float).eps)
+_ULPS = 4.0  # within which elementary functions are computed
 _REALS = (-np.inf, np.inf)
 
 
@@ -31,10 +32,7 @@ def bounds_of(expressions: Sequence[Any], box: Box) -> tuple[Array, Array]:
         _range(name, value)
     with np.errstate(all="ignore"):
         found = [pieces_of(expression, box) for expression in expressions]
-    lower, upper = np.array([np.min(low) for low, _ in found]), np.array([np.max(high) for _, high in found])
-    return lower - _WIDENING * np.abs(np.where(np.isfinite(lower), lower, 0.0)), upper + _WIDENING * np.abs(
-        np.where(np.isfinite(upper), upper, 0.0)
-    )
+    return np.array([np.min(low) for low, _ in found]), np.array([np.max(high) for _, high in found])
 
 
 def _range(name: str, value: Any) -> tuple[float, float]:
@@ -45,7 +43,7 @@ def _range(name: str, value: Any) -> tuple[float, float]:
 
 
 def pieces_of(expression: Any, box: Box) -> Interval:
-    """Return bounds of a tree over every piece of a box, each of shape (pieces,); rounding is not covered."""
+    """Return bounds of a tree over every piece of a box, each of shape (pieces,)."""
     names = sorted(symbol.name for symbol in expression.free_symbols)
     sides = {name: _range(name, box.get(name, box.get(base_and_delay(name)[0], _REALS))) for name in names}
     return _walk(expression, _pieces(sides))
@@ -74,7 +72,7 @@ def _walk(expression: Any, values: Mapping[str, Interval]) -> Interval:
         return values[expression.name]
     if expression.is_number:
         number = np.full(1, float(expression))
-        return number, number
+        return (number, number) if expression == float(expression) else _outward(number, number)
     if isinstance(expression, sp.Add | sp.Mul):
         combine = _add if isinstance(expression, sp.Add) else _multiply
         result, *rest = (_walk(argument, values) for argument in expression.args)
@@ -89,13 +87,26 @@ def _walk(expression: Any, values: Mapping[str, Interval]) -> Interval:
     return function(*_walk(expression.args[0], values))
 
 
+def _outward(low: Array, high: Array, ulps: float = 1.0) -> Interval:
+    """Widen bounds by what rounding may have changed; a sum, product or function that comes out as zero is exact, or is given apart."""
+    slack = ulps * np.spacing(np.maximum(np.abs(low), 1e-300)), ulps * np.spacing(np.maximum(np.abs(high), 1e-300))
+    below = np.where(np.isposinf(low), np.finfo(float).max, np.where(np.isfinite(low), low - slack[0], low))
+    above = np.where(np.isneginf(high), -np.finfo(float).max, np.where(np.isfinite(high), high + slack[1], high))
+    return np.where(low == 0, 0.0, below), np.where(high == 0, 0.0, above)
+
+
 def _add(a: Interval, b: Interval) -> Interval:
-    return _or_reals(a[0] + b[0], a[1] + b[1])
+    return _or_reals(*_outward(a[0] + b[0], a[1] + b[1]))
 
 
 def _multiply(a: Interval, b: Interval) -> Interval:
-    products = [np.where((x == 0) | (y == 0), 0.0, x * y) for x in a for y in b]
-    return np.minimum.reduce(products), np.maximum.reduce(products)
+    products = [np.where((x == 0) | (y == 0), 0.0, _away_from_zero(x * y, np.sign(x) * np.sign(y))) for x in a for y in b]
+    return _outward(np.minimum.reduce(products), np.maximum.reduce(products))
+
+
+def _away_from_zero(value: Array, sign: Array) -> Array:
+    """Replace what has underflowed by the smallest normal number of its sign."""
+    return np.where(np.abs(value) < np.finfo(float).tiny, sign * np.finfo(float).tiny, value)
 
 
 def _power(base: Interval, exponent: Any) -> Interval:
@@ -103,12 +114,14 @@ def _power(base: Interval, exponent: Any) -> Interval:
         return _reciprocal(_power(base, -exponent))
     low, high = base
     if exponent == int(exponent):
-        a, b = low ** int(exponent), high ** int(exponent)
-        if int(exponent) % 2:
-            return a, b
-        return np.where((low <= 0) & (high >= 0), 0.0, np.minimum(a, b)), np.maximum(a, b)
+        n = int(exponent)
+        a, b = (_away_from_zero(side**n, np.sign(side) ** n) for side in base)
+        if n % 2:
+            return _outward(a, b, _ULPS)
+        lower, upper = _outward(np.minimum(a, b), np.maximum(a, b), _ULPS)
+        return np.where((low <= 0) & (high >= 0), 0.0, lower), upper
     p = float(exponent)
-    return _where_defined(low >= 0, np.maximum(low, 0.0) ** p, np.maximum(high, 0.0) ** p)
+    return _where_defined(low >= 0, *_outward(np.maximum(low, 0.0) ** p, np.maximum(high, 0.0) ** p, _ULPS))
 
 
 def _reciprocal(a: Interval) -> Interval:
@@ -116,7 +129,7 @@ def _reciprocal(a: Interval) -> Interval:
     through = (low < 0) & (high > 0)
     lower = np.where(through | (high == 0), -np.inf, 1 / np.where(high == 0, 1.0, high))
     upper = np.where(through | (low == 0), np.inf, 1 / np.where(low == 0, 1.0, low))
-    return np.where((low == 0) & (high == 0), -np.inf, lower), np.where((low == 0) & (high == 0), np.inf, upper)
+    return _outward(np.where((low == 0) & (high == 0), -np.inf, lower), np.where((low == 0) & (high == 0), np.inf, upper))
 
 
 def _or_reals(low: Array, high: Array) -> Interval:
@@ -137,9 +150,10 @@ def _sine(low: Array, high: Array) -> Interval:
 
     ends = np.sin(np.where(np.isfinite(low), low, 0.0)), np.sin(np.where(np.isfinite(high), high, 0.0))
     endless = ~(np.isfinite(low) & np.isfinite(high))
+    slack = _ULPS * _EPSILON * (1 + np.maximum(np.abs(low), np.abs(high)))  # of the argument too, which may have been shifted
     return (
-        np.where(endless | touches(-np.pi / 2), -1.0, np.minimum(*ends)),
-        np.where(endless | touches(np.pi / 2), 1.0, np.maximum(*ends)),
+        np.where(endless | touches(-np.pi / 2), -1.0, np.maximum(np.minimum(*ends) - slack, -1.0)),
+        np.where(endless | touches(np.pi / 2), 1.0, np.minimum(np.maximum(*ends) + slack, 1.0)),
     )
 
 
@@ -150,11 +164,12 @@ def _cosine(low: Array, high: Array) -> Interval:
 def _tangent(low: Array, high: Array) -> Interval:
     branch = np.floor(low / np.pi + 0.5), np.floor(high / np.pi + 0.5)
     inside = (branch[0] == branch[1]) & np.isfinite(low) & np.isfinite(high) & (np.tan(low) <= np.tan(high))
-    return _where_defined(inside, np.tan(low), np.tan(high))
+    return _where_defined(inside, *_outward(np.tan(low), np.tan(high), _ULPS))
 
 
 def _logarithm(low: Array, high: Array) -> Interval:
-    return _where_defined(low >= 0, np.log(np.maximum(low, 0.0)), np.log(np.maximum(high, 0.0)))
+    below, above = _outward(np.log(np.maximum(low, 0.0)), np.log(np.maximum(high, 0.0)), _ULPS)
+    return _where_defined(low >= 0, below, np.where(high == 0, -np.inf, above))
 
 
 def _magnitude(low: Array, high: Array) -> Interval:
@@ -166,19 +181,25 @@ def _spike(low: Array, high: Array) -> Interval:
     return np.zeros_like(low), np.where((low <= 0) & (high >= 0), np.inf, 0.0)
 
 
-def _rising(function: Callable[[Array], Array]) -> Callable[[Array, Array], Interval]:
-    return lambda low, high: (function(low), function(high))
+def _rising(function: Callable[[Array], Array], least: float = -np.inf, most: float = np.inf) -> Callable[[Array, Array], Interval]:
+    """Bounds of a rising function, whose values are known to lie between two numbers."""
+
+    def bounds(low: Array, high: Array) -> Interval:
+        below, above = _outward(function(low), function(high), _ULPS)
+        return np.maximum(below, least), np.minimum(above, most)
+
+    return bounds
 
 
 _FUNCTIONS: dict[str, Callable[[Array, Array], Interval]] = {
     "sin": _sine,
     "cos": _cosine,
     "tan": _tangent,
-    "exp": _rising(np.exp),
+    "exp": _rising(np.exp, 0.0),
     "log": _logarithm,
-    "tanh": _rising(np.tanh),
+    "tanh": _rising(np.tanh, -1.0, 1.0),
     "atan": _rising(np.arctan),
-    "sign": _rising(np.sign),
+    "sign": lambda low, high: (np.sign(low), np.sign(high)),
     "Abs": _magnitude,
     "DiracDelta": _spike,
 }

@@ -60,6 +60,11 @@ typedef struct {
     const double *limit_c;    /* (width, order) */
     const double *limit_d;    /* (width, q) */
     const double *into;       /* (n, width) */
+    const double *low;        /* (observers, n + order): bounds beyond which a machine waits for a start; none */
+    const double *high;
+    const double *origin;     /* (n, batch): what states are relative to; none */
+    uint8_t *waiting;         /* (observers, batch), moved on */
+    uint8_t *restart;         /* (observers, batch): whether a machine ever waited */
     double *column;           /* (observers, columns, batch): x and c in their rows, moved on */
     double *past;             /* (observers, batch, earlier), moved on */
     uint8_t *fresh;           /* (batch): earlier values equal the present ones, moved on */
@@ -333,6 +338,30 @@ static void limit_states(const relift_job *s, whole n, vec *next, whole first, w
     }
 }
 
+/* Which machines go on: none that stands still or waits, and none that would leave the bounds; how many. */
+static whole guarded(const relift_job *s, whole o, whole n, const vec *next, whole first, whole lanes, const uint8_t *moving, uint8_t *waiting, uint8_t *going)
+{
+    const whole rows = n + s->order;
+    uint8_t within[WIDE * MOST];
+    whole count = 0;
+    memset(within, 1, sizeof within);
+    for (whole i = 0; s->low && i < rows; i++) {
+        const double low = s->low[o * rows + i], high = s->high[o * rows + i];
+        const double *origin = s->origin && i < n ? s->origin + i * s->batch + first : NULL;
+        for (whole b = 0; b < lanes; b++) {
+            const double x = LANES(next + i * MOST)[b] + (origin ? origin[b] : 0.0);
+            within[b] &= (uint8_t)(x >= low) & (uint8_t)(x <= high);
+        }
+    }
+    for (whole b = 0; b < lanes; b++) {
+        const uint8_t on = (uint8_t)(!(moving && !moving[b]) && !waiting[b]);
+        going[b] = on & within[b];
+        if (on && !within[b]) waiting[b] = 1, s->restart[o * s->batch + first + b] = 1;
+        count += going[b];
+    }
+    return count;
+}
+
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
@@ -349,9 +378,10 @@ int kros_relift(const formulas *f, const relift_job *s)
             for (whole i = 0; i < rows * columns; i++) gather(each + i * MOST, s->map + first * rows * columns + i, rows * columns, lanes);
         for (whole o = 0; o < s->observers; o++) {
             double *state = s->column + o * columns * batch + first, *past = s->past ? s->past + (o * batch + first) * ne : NULL;
-            uint8_t fresh[WIDE * MOST] = {0};
+            uint8_t fresh[WIDE * MOST] = {0}, waiting[WIDE * MOST] = {0}, on[WIDE * MOST];
             whole since[WIDE * MOST] = {0}, used = 0;
             if (s->fresh) memcpy(fresh, s->fresh + first, (size_t)lanes);
+            if (s->waiting) memcpy(waiting, s->waiting + o * batch + first, (size_t)lanes);
             if (s->since) memcpy(since, s->since + first, (size_t)lanes * sizeof(whole));
             for (whole i = 0; i < n; i++) gather(reg + i * MOST, state + i * batch, 1, lanes);
             for (whole i = 0; i < order; i++) gather(c + i * MOST, state + (f->n_lifted + i) * batch, 1, lanes);
@@ -387,7 +417,7 @@ int kros_relift(const formulas *f, const relift_job *s)
                     if (begin[b]) {
                         for (whole i = 0; i < n; i++) LANES(reg + i * MOST)[b] = s->begun[(o * s->begins + begin[b] - 1) * n + i];
                         for (whole i = 0; i < order; i++) LANES(c + i * MOST)[b] = 0.0;
-                        fresh[b] = 1, since[b] = s->begun_since[begin[b] - 1];
+                        fresh[b] = 1, waiting[b] = 0, since[b] = s->begun_since[begin[b] - 1];
                     }
                 whole going = moving ? 0 : lanes;
                 for (whole b = 0; moving && b < lanes; b++) going += moving[b];
@@ -421,7 +451,7 @@ int kros_relift(const formulas *f, const relift_job *s)
                 if (s->width) limit_corrections(s, n, c, nu, next, w);
                 if (s->lower) limit_states(s, n, next, first, lanes);
                 shifted(f, reg, older);
-                if (going == lanes) {
+                if (guarded(s, o, n, next, first, lanes, moving, waiting, on) == lanes) {
                     memcpy(reg, next, (size_t)n * MOST * sizeof(vec));
                     memcpy(c, next + n * MOST, (size_t)order * MOST * sizeof(vec));
                     memcpy(reg + n * MOST, older, (size_t)ne * MOST * sizeof(vec));
@@ -429,7 +459,7 @@ int kros_relift(const formulas *f, const relift_job *s)
                     continue;
                 }
                 for (whole b = 0; b < lanes; b++)
-                    if (moving[b]) {
+                    if (on[b]) {
                         for (whole i = 0; i < n; i++) LANES(reg + i * MOST)[b] = LANES(next + i * MOST)[b];
                         for (whole i = 0; i < order; i++) LANES(c + i * MOST)[b] = LANES(next + (n + i) * MOST)[b];
                         for (whole e = 0; e < ne; e++) LANES(reg + (n + e) * MOST)[b] = LANES(older + e * MOST)[b];
@@ -439,6 +469,7 @@ int kros_relift(const formulas *f, const relift_job *s)
             for (whole i = 0; i < n; i++) scatter(state + i * batch, reg + i * MOST, 1, lanes);
             for (whole i = 0; i < order; i++) scatter(state + (f->n_lifted + i) * batch, c + i * MOST, 1, lanes);
             for (whole e = 0; e < ne; e++) scatter(past + e, reg + (n + e) * MOST, ne, lanes);
+            if (s->waiting) memcpy(s->waiting + o * batch + first, waiting, (size_t)lanes);
             if (o == s->observers - 1) {
                 if (s->fresh) memcpy(s->fresh + first, fresh, (size_t)lanes);
                 if (s->since) memcpy(s->since + first, since, (size_t)lanes * sizeof(whole));

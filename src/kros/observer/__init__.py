@@ -19,6 +19,7 @@ from .certificate.error import ReliftScales
 from .certificate.mean_square import DropoutBound, dropout_bound
 from .certificate.signals import SignalBound, signal_bound
 from .certificate.status import ReliftStatus
+from .guard import Guard
 from .monitor import Monitor
 from .observer import Observer
 from .predictor.build import identify_predictor
@@ -28,7 +29,7 @@ from .runtime import Runtime, Seen
 from .samples import SampleStatus
 from .screen import sample_status
 from .sensor import Sensor
-from .simulate import run_observer, run_observers
+from .simulate import run_observer, run_observers, run_with_status
 from .tracking import Tracked, track_parameter
 
 __all__ = [
@@ -36,6 +37,7 @@ __all__ = [
     "Estimate",
     "ExtendedKalman",
     "FilteredDifference",
+    "Guard",
     "Monitor",
     "Observer",
     "PastMoments",
@@ -54,6 +56,7 @@ __all__ = [
     "relift_certificate",
     "run_observer",
     "run_observers",
+    "run_with_status",
     "sample_status",
     "signal_bound",
     "track_parameter",

@@ -27,6 +27,7 @@ from ..core.linalg import solve_balanced
 from ..core.lti import StateSpace
 from ..lifting import Lifting
 from ..synthesis.result import Injection
+from .guard import Guard
 from .monitor import Monitor
 from .runtime import Runtime, Seen
 from .sensor import Sensors, require_measured
@@ -70,6 +71,8 @@ class ObserverData:
         Watches the innovation for machines that are outside the population's envelope; nothing by default.
     start_in_motion : Start, optional
         What a machine's motion at the first samples says of its hidden states; without it the observer starts as from rest.
+    guard : Guard, optional
+        Bounds of its states beyond which it starts again; by default it does so where one is not finite.
     about : mapping of str to JSON values
         What people should know of it: units of measure, ranges, certificates. It is part of the file; nothing computes with it.
 
@@ -98,6 +101,7 @@ class ObserverData:
     sensor: Sensors = field(default_factory=dict)
     monitor: Monitor | None = None
     start_in_motion: Start | None = None
+    guard: Guard | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -131,6 +135,8 @@ class ObserverData:
         require_measured(self.sensor, [self.lifting.states[i] for i in self.measured])
         if self.start_in_motion is not None:
             self.start_in_motion.require_fit(self.name, n, len(self.measured), len(self.inputs))
+        if self.guard is not None:
+            self.guard.require_fit(self.name, n, K.n_states)
         if self.replaces and not measurement_replaces(self):
             raise DimensionError(
                 f"Observer {self.name}: where measurements replace estimates, the correction is a gain equal to the measured states' columns of A."

@@ -24,6 +24,7 @@ from ..core.lti import StateSpace
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .data import ObserverData
+from .guard import Guard
 from .monitor import Monitor
 from .runtime import Runtime, Seen
 from .sensor import Sensor
@@ -56,6 +57,7 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "measurement_replaces_estimate": observer.replaces,
         "internal_states": observer.internal,
         **({} if observer.start_in_motion is None else {"start_in_motion": observer.start_in_motion.content()}),
+        **({} if observer.guard is None else {"guard": observer.guard.content()}),
         **({"sensor": {name: own.model_dump() for name, own in observer.sensor.items()}} if observer.sensor else {}),
         **({"about": observer.about} if observer.about else {}),
         **({} if observer.monitor is None else {"monitor": observer.monitor.content()}),
@@ -124,6 +126,7 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
         sensor=_sensor(content.get("sensor", {}), where),
         monitor=_monitor(content.get("monitor"), q, where),
         start_in_motion=_start(content.get("start_in_motion"), lifting.n_states, q, len(content["inputs"]), where),
+        guard=_guard(content.get("guard"), lifting.n_states, order, where),
     )
     optional = ("runtime", "sensor", "start_in_motion", "lifting_inputs", "input_functions", "about", CHECKSUM)
     _known(content, [*observer_content(observer), *optional], where)
@@ -227,6 +230,16 @@ def _start(found: Any, n: int, measured: int, inputs: int, where: str) -> Start 
     return Start(
         gain, np.array(each).reshape(len(each), n, measured), matrix(rest, (len(rest), measured + inputs), f"{where}: start_in_motion.rest")
     )
+
+
+def _guard(found: Any, n: int, order: int, where: str) -> Guard | None:
+    if found is None:
+        return None
+    shapes = {"lower": n, "upper": n, "correction": order}
+    _known(found, [*shapes, "settle"], f"{where}: guard")
+    rows = {name: matrix([found[name]], (1, count), f"{where}: guard.{name}")[0] for name, count in shapes.items()}
+    _require(type(found["settle"]) is int, f"{where}: guard.settle should be a whole number", found["settle"])
+    return Guard.from_content({**rows, "settle": found["settle"]})
 
 
 def _sensor(found: Any, where: str) -> dict[str, Sensor]:

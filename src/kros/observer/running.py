@@ -152,6 +152,7 @@ class RunningObserver:
         first = self._judge(self._measurement(y), np.zeros(len(self.observer.inputs)))
         self._status, self._held = SampleStatus(int(first.status[0, 0])), Held.nothing(1, len(self.observer.inputs))
         self._known: Array | None = None
+        self._settling = 0
         self._fresh = bool(np.isfinite(first.y).any())
         if self._watch is not None:
             self._watch.reset()
@@ -203,20 +204,33 @@ class RunningObserver:
         measurement, known = self._take(self._measurement(y), self._input(u))
         self._inputs.append(known)
         if len(self._inputs) > self.observer.runtime.delay:
-            steps, taken, absent = self._steps, self._inputs.popleft(), None
-            if self._status and not (there := np.isfinite(measurement)).all():
-                absent = ~there
-            if self._watch is not None:
-                self._watch.take(steps.apart(measurement)[0, 0].tolist(), not self._status)
-            if self._loop is None:
-                steps.step(measurement, taken, absent)
-            else:
-                self.parameters[self._loop.name] = float(self._loop.step(steps, measurement, taken, absent)[0])
-            if self._limits is not None and self._limits.binds(steps.x[0, 0], steps.correction):
-                self._status |= SampleStatus.LIMIT
+            taken = self._inputs.popleft()
+            if not self._steps.waiting[0, 0]:
+                self._advance(measurement, taken)
+        if self._steps.waiting[0, 0] or self._settling:
+            self._status |= SampleStatus.RESTARTED
+            self._settling = max(self._settling - 1, 0)
+        if self._steps.waiting[0, 0]:
+            held = self._held if self._known is None else Held.good(self._known[None])
+            self._held, self._known = replace(held, stale=np.ones(1, dtype=bool)), None
+            self._settling = 0 if self.observer.guard is None else self.observer.guard.settle
         if self._watch is not None and self._watch.outside:
             self._status |= SampleStatus.UNCERTIFIED
         return self.estimate
+
+    def _advance(self, measurement: Array, taken: Array) -> None:
+        """Take the step of a sample, with the input of its time."""
+        steps, absent = self._steps, None
+        if self._status and not (there := np.isfinite(measurement)).all():
+            absent = ~there
+        if self._watch is not None:
+            self._watch.take(steps.apart(measurement)[0, 0].tolist(), not self._status)
+        if self._loop is None:
+            steps.step(measurement, taken, absent)
+        else:
+            self.parameters[self._loop.name] = float(self._loop.step(steps, measurement, taken, absent)[0])
+        if self._limits is not None and not steps.waiting[0, 0] and self._limits.binds(steps.x[0, 0], steps.correction):
+            self._status |= SampleStatus.LIMIT
 
     def _judge(self, y: Array, u: Array, held: Held | None = None) -> Screened:
         return self._screen.take(y[None, None], u[None, None], held)

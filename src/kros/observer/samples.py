@@ -31,6 +31,8 @@ class SampleStatus(IntFlag):
         A sample is beyond its limit or 1.5 times its range, or the estimate or the correction met a limit that is declared.
     UNCERTIFIED
         Outside what the observer is certified for: the innovation is beyond the envelope of the population (see `monitor`).
+    RESTARTED
+        The estimate left its bounds, as it may while samples are lost: the observer waits for a good sample to start at, or that start has not settled yet.
 
     Examples
     --------
@@ -45,6 +47,7 @@ class SampleStatus(IntFlag):
     INVALID_INPUT = 2
     LIMIT = 4
     UNCERTIFIED = 8
+    RESTARTED = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +77,13 @@ class Screened:
     u: Array  # (n_samples, batch, m)
     status: Bits  # (n_samples, batch)
     starts: Flags  # (n_samples, batch)
+    complete: Flags  # (n_samples, batch); An observer may start at them
     held: Held
 
     def of(self, members: Sequence[int]) -> Screened:
         """Return the samples of some members of the batch."""
         held = Held(self.held.inputs[members], self.held.since[members], self.held.stale[members])
-        return Screened(self.y[:, members], self.u[:, members], self.status[:, members], self.starts[:, members], held)
+        return Screened(*(signal[:, members] for signal in (self.y, self.u, self.status, self.starts, self.complete)), held)
 
 
 def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:

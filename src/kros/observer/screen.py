@@ -140,11 +140,11 @@ class Screen:
         inputs = np.take_along_axis(np.concatenate([before.inputs[None], limited]), latest, axis=0)
         lost, complete = np.asarray((since > LONGEST).any(axis=-1)), np.asarray(good.all(axis=-1) & plausible.any(axis=-1))
         starts, stale = _starts(lost, complete, before.stale)
-        return Screened(np.where(plausible, kept, np.nan), inputs, status, starts, Held(inputs[-1], since[-1], stale))
+        return Screened(np.where(plausible, kept, np.nan), inputs, status, starts, complete, Held(inputs[-1], since[-1], stale))
 
 
 def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:
-    """Return the bits of `SampleStatus` of every sample, shape (n_samples, batch), as the observer takes y and u in a batch.
+    """Return the bits of `SampleStatus` that samples have by themselves, shape (n_samples, batch); `run_with_status` adds those of the observer.
 
     Examples
     --------
@@ -173,7 +173,7 @@ def _bit(wrong: Flags, bit: SampleStatus) -> Bits:
 def _as_they_are(y: Array, u: Array, before: Held) -> Screened:
     starts = np.zeros(y.shape[:2], dtype=bool)
     starts[0] = before.stale
-    return Screened(y, u, np.zeros(y.shape[:2], np.uint8), starts, Held.good(u[-1]))
+    return Screened(y, u, np.zeros(y.shape[:2], np.uint8), starts, np.ones(y.shape[:2], dtype=bool), Held.good(u[-1]))
 
 
 def _starts(lost: Flags, complete: Flags, stale: Flags) -> tuple[Flags, Flags]:

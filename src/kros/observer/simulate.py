@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DimensionError
+from ..loops import library
 from .data import ObserverData
+from .guard import Restarts
 from .monitor import judged_samples
-from .samples import Flags, Screened, Whole
+from .samples import Bits, Flags, SampleStatus, Screened, Whole
 from .screen import Screen, screened
 from .step import Parameters, Steps
 
@@ -61,6 +64,33 @@ def run_observer(
     [4.0, 2.0, 4.0, 2.0]
     """
     return _run([observer], screened(observer, y, u), parameters)[0]
+
+
+def run_with_status(
+    observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
+) -> tuple[Array, Bits]:
+    """Run an observer as `run_observer` does, and return the bits of `SampleStatus` of every sample too, shape (n_samples, batch).
+
+    Bits that samples have by themselves, and `RESTARTED`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.core import gain
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Guard, Observer, run_with_status
+    >>> from kros.synthesis import Injection
+    >>> guard = Guard(np.array([-9.0]), np.array([9.0]), np.zeros(0), settle=1)
+    >>> unstable = np.array([[2.0]]), np.zeros((1, 0)), (0,), (), gain([[2.0]], 0.01), Injection.STATE, 0.01
+    >>> observer = Observer("x", Lifting(("x",)), *unstable, guard=guard)
+    >>> y = np.array([1.0, np.nan, np.nan, np.nan, 1.0, 1.0]).reshape(6, 1, 1)
+    >>> estimate, status = run_with_status(observer, y, np.zeros((6, 1, 0)))
+    >>> estimate.ravel().tolist(), status.ravel().tolist()  # 16 would be too large: it waits for the next measurement
+    ([1.0, 2.0, 4.0, 8.0, 8.0, 2.0], [0, 1, 1, 17, 16, 0])
+    """
+    samples, status = screened(observer, y, u), np.zeros(np.shape(y)[:2], np.uint8)
+    found = _run([observer], samples, parameters, status)[0]
+    return found, samples.status | status
 
 
 def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
@@ -145,8 +175,10 @@ def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters |
     return first, added
 
 
-def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None) -> Array:
-    """Run observers on screened samples, shape (observer, n_samples, batch, n)."""
+def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None, status: Bits | None = None) -> Array:
+    """Run observers on screened samples, shape (observer, n_samples, batch, n); bits of those that start again go into `status`."""
+    if len(observers) > 1 and library() is None:
+        return np.concatenate([_run([o], samples, parameters) for o in observers])
     observer, d = observers[0], observers[0].runtime.delay
     (n_samples, batch), values = samples.starts.shape, observer.values(parameters, samples.starts.shape[1:])
     steps, pending = Steps(observers, batch, values), _pending(samples.starts, d) if d else None
@@ -161,9 +193,58 @@ def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Param
         if before is not None:
             for own, of_one in zip(observers, found, strict=True):
                 _predict(own, of_one, *before, samples, values)
+        for i, machines in enumerate(np.flatnonzero(own) for own in steps.restart):
+            if len(machines):
+                again = _restarting(observers[i], samples.of(machines), observers[i].values(_values_of(values, machines)))
+                found[i][:, machines] = again.estimates
+                if status is not None:
+                    status[:, machines] = again.status
         if observer.runtime.binding:
             observer.runtime.clip_estimates(found)
     return found
+
+
+def _values_of(values: Parameters, machines: Whole) -> dict[str, npt.ArrayLike]:
+    """Return the parameters of some machines."""
+    return {name: value if np.size(value) == 1 else np.asarray(value)[machines] for name, value in values.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Restarting:
+    """What an observer does on machines on which its guard starts it again."""
+
+    estimates: Array  # (n_samples, batch, n)
+    innovation: Array  # (n_samples, batch, q)
+    status: Bits  # (n_samples, batch)
+    starts: Flags  # (n_samples, batch)
+    moving: Flags  # (n_samples, batch)
+
+
+def _restarting(observer: ObserverData, samples: Screened, values: Parameters) -> _Restarting:
+    """Step an observer, which starts again at the first complete sample after it left its bounds."""
+    (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
+    steps, restarts = Steps([observer], batch, values), Restarts(observer.guard, batch)
+    x, nu = np.empty((n_samples, batch, observer.lifting.n_states)), np.zeros(samples.y.shape)
+    earlier, pending = np.empty((n_samples, batch, len(observer.lifting.window.earlier))), np.zeros((n_samples, batch), dtype=np.intp)
+    starts, moving, status = samples.starts.copy(), np.zeros((n_samples, batch), dtype=bool), np.zeros((n_samples, batch), np.uint8)
+    since, missing = np.zeros(batch, dtype=np.intp), ~np.isfinite(samples.y)
+    steps.begin(samples.y[0])
+    steps.begin(samples.y[0], starts[0], samples.u[0])
+    for k in range(n_samples):
+        if k:
+            starts[k] |= steps.waiting[0] & samples.complete[k]
+            pending[k] = np.minimum(since + 1, d)
+            since = np.where(starts[k], 0, pending[k])
+        x[k], earlier[k] = steps.x[0], steps.earlier(samples.u[k - pending[k], np.arange(batch)])[0]
+        if k and starts[k].any():
+            steps.begin(samples.y[k], starts[k], samples.u[k])
+        nu[k] = steps.innovation(samples.y[k])[0]
+        moving[k] = (since == d) & ~steps.waiting[0]
+        steps.step(samples.y[k], samples.u[max(k - d, 0)], missing[k], moving[k])
+        status[k][restarts.after(steps.waiting[0])] = SampleStatus.RESTARTED
+    if d:
+        _predict(observer, x, earlier, pending, samples, values)
+    return _Restarting(x, nu, status, starts, moving)
 
 
 def run_innovations(
@@ -177,9 +258,16 @@ def run_innovations(
     steps.begin(samples.y[0])
     steps.begin(samples.y[0], samples.starts[0], samples.u[0])
     steps.through(samples.y, samples.u, d, moving if d else None, samples.starts, innovation=innovation)
-    starts = samples.starts.copy()
+    starts, status = samples.starts.copy(), samples.status
+    machines = np.flatnonzero(steps.restart[0])
+    if len(machines):
+        with np.errstate(over="ignore", invalid="ignore"):
+            again = _restarting(observer, samples.of(machines), observer.values(_values_of(values, machines)))
+        moving, status = moving.copy(), status.copy()
+        for signal, anew in ((innovation, again.innovation), (starts, again.starts), (moving, again.moving), (status, again.status)):
+            signal[:, machines] = anew if signal is not status else status[:, machines] | anew
     starts[0] = True
-    return innovation, judged_samples(settle, samples.status, starts, moving)
+    return innovation, judged_samples(settle, status, starts, moving)
 
 
 def _pending(starts: Flags, delay: int) -> Whole:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ..loops import formulas, library, tape_of
 from .data import ObserverData
+from .guard import bounds
 from .origin import Origins
 from .runtime import Runtime
 
@@ -45,6 +46,9 @@ class Steps:
         self._origins = Origins(observer, batch)
         self.correction: Array | None = None
         self.cut = np.zeros(self._next_x.shape)
+        self._low, self._high = (np.array(side) for side in zip(*(bounds(o.guard, n, order) for o in observers), strict=True))
+        self.waiting = np.zeros((len(observers), batch), dtype=bool)  # for a start: the next step would leave the bounds
+        self.restart = np.zeros((len(observers), batch), dtype=bool)  # whether that ever happened
 
     @property
     def x(self) -> Array:
@@ -59,6 +63,7 @@ class Steps:
             own[rows] = self._first(observer, y, u, self.values, slice(None))[rows]
         self._x_c[:, rows] = 0.0
         self._fresh[rows] = True
+        self.waiting[:, rows] = False
         self._since[rows] = 0
         if self._start is not None and u is not None:  # at rest there is nothing to find out
             resting = self._start.at_rest(y, u)
@@ -90,6 +95,7 @@ class Steps:
     def place(self, x: Array, earlier: Array) -> None:
         """Put states, shape (batch, n), and earlier values in place; corrections start at rest."""
         self._origins.at = None
+        self.waiting[...] = False
         self.near[...], self._x_c[...], self._earlier[...], self._fresh[:] = x, 0.0, earlier, False
         self._origins.follow(self.near)
         self._starting = False
@@ -140,16 +146,31 @@ class Steps:
             self._starting = bool(self._since.min() < len(self._start))
         if self._limits is not None:
             self._limit()
+        moving = self._guarded(moving)
         if moving is None:
             self.near[...] = self._next_x
             self._x_c[...] = self._next_c
         else:
-            np.copyto(self.near, self._next_x, where=moving[:, None])
-            np.copyto(self._x_c, self._next_c, where=moving[:, None])
+            np.copyto(self.near, self._next_x, where=moving[..., None])
+            np.copyto(self._x_c, self._next_c, where=moving[..., None])
         if following_earlier is not None:
-            np.copyto(self._earlier, following_earlier, where=True if moving is None else moving[:, None])
-            self._fresh &= False if moving is None else ~moving
+            np.copyto(self._earlier, following_earlier, where=True if moving is None else moving[..., None])
+            self._fresh &= False if moving is None else ~moving.all(axis=0)
         self._origins.follow(self.near)
+
+    def _guarded(self, moving: Flags | None) -> Flags | None:
+        """Return which observers and machines take the step, shape (observer, batch): none that wait, and none that would leave the bounds."""
+        following = self._following
+        if self._origins.at is not None:
+            following = following.copy()
+            following[..., : self.near.shape[2]] += self._origins.states
+        within = ((following >= self._low[:, None]) & (following <= self._high[:, None])).all(axis=-1)
+        if moving is None and within.all() and not self.waiting.any():
+            return None
+        going = ~self.waiting if moving is None else moving & ~self.waiting
+        self.waiting |= going & ~within
+        self.restart |= self.waiting
+        return going & within
 
     def through(
         self,
@@ -229,6 +250,11 @@ class Steps:
             "column": self._column,
             "past": self._earlier,
             "fresh": self._fresh.view(np.uint8),
+            "low": self._low,
+            "high": self._high,
+            "origin": None if self._origins.at is None else self._origins.states.T,
+            "waiting": self.waiting.view(np.uint8),
+            "restart": self.restart.view(np.uint8),
             "since": self._since,
             "states": states,
             "innovation": innovation,

@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from .data import ObserverData
+from .guard import Restarts
 from .screen import screened
 from .simulate import run_observer
 from .step import Flags, Steps
@@ -45,18 +46,21 @@ class Tracked:
         Row k from what arrived up to k - 1.
     values : ndarray, shape (n_samples, batch)
         The parameter, row k from what arrived up to k - 1.
+    restarted : ndarray of bool, shape (n_samples, batch)
+        Where the guard makes the observer start again (`SampleStatus.RESTARTED`).
 
     Examples
     --------
     >>> import numpy as np
     >>> from kros.observer import Tracked
-    >>> run = Tracked(estimates=np.zeros((100, 2, 3)), values=np.zeros((100, 2)))
+    >>> run = Tracked(np.zeros((100, 2, 3)), np.zeros((100, 2)), np.zeros((100, 2), dtype=bool))
     >>> run.values[-1].tolist()
     [0.0, 0.0]
     """
 
     estimates: Array
     values: Array
+    restarted: Flags
 
 
 class PhaseLockedLoop:
@@ -97,7 +101,8 @@ class PhaseLockedLoop:
         self._power += self.forget * (np.sum((psi / self._sizes) ** 2, axis=-1) - self._power)
         self._weight += self.forget * (1.0 - self._weight)  # over the mean of psi^2 so far
         pull = np.sum(psi * nu / self._sizes**2, axis=-1) * self._weight
-        seen = np.divide(pull, self._power, out=np.zeros_like(pull), where=(self._power > 0) & np.isfinite(pull))
+        usable = (self._power > 0) & np.isfinite(pull) & ~steps.waiting[0]
+        seen = np.divide(pull, self._power, out=np.zeros_like(pull), where=usable)
         return np.asarray(values[self.name] + self.forget * np.clip(seen, -MOST, MOST))
 
 
@@ -169,16 +174,19 @@ def track_parameter(
     values = {k: np.broadcast_to(np.asarray(v, dtype=float), (batch,)).copy() for k, v in values.items()}
     steps, missing = Steps([observer], batch, values), ~np.isfinite(y)
     estimates, followed = np.empty((*y.shape[:2], observer.lifting.n_states)), np.empty(y.shape[:2])
+    restarts, restarted = Restarts(observer.guard, batch), np.zeros(y.shape[:2], dtype=bool)
     steps.begin(y[0])
     steps.begin(y[0], starts[0], u[0])
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for k in range(len(y)):
             estimates[k], followed[k] = observer.runtime.clip_estimate(steps.x[0]), values[name]
-            if k and starts[k].any():  # the parameter stays
-                steps.begin(y[k], starts[k], u[k])
-                loop.begin(starts[k])
+            anew = starts[k] | (steps.waiting[0] & samples.complete[k])
+            if k and anew.any():  # the parameter stays
+                steps.begin(y[k], anew, u[k])
+                loop.begin(anew)
             values[name] = loop.step(steps, y[k], u[k], missing[k] if missing[k].any() else None)
-    return Tracked(estimates, followed)
+            restarted[k] = restarts.after(steps.waiting[0])
+    return Tracked(estimates, followed, restarted)
 
 
 def least_innovation(

@@ -12,6 +12,7 @@ from ...core.errors import ConfigError
 from ...lifting.c_code import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
+from ...observer.guard import bounds
 from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval
 from ...observer.origin import FAR, OriginShift
 from ...observer.samples import LONGEST
@@ -117,6 +118,7 @@ class Source:
             "controller": self.sums(np.hstack([K.A, K.B])),
             "filter_gain": self.sums(o.filter_gain),
             "monitor": self.monitor(),
+            "guard": self.guard(),
             "lower": self.numbers(_filled(run.lower, n, -np.inf), wide=True),
             "upper": self.numbers(_filled(run.upper, n, np.inf), wide=True),
             "largest": self.numbers(_filled(run.correction, o.into.shape[1], np.inf)),
@@ -236,6 +238,14 @@ class Source:
             "rates": {"percent": f"{100 * own.false_alarm_rate:g}", "units": own.units, "alarms": own.alarms, "hours": f"{own.hours:.3g}"}
             | {"interval": [f"{v / own.hours:.3g}" for v in poisson_interval(own.alarms)] if own.hours else None},
         }
+
+    def guard(self) -> dict[str, Any]:
+        """Return the bounds of states and of the correction, and how long a start takes."""
+        own, n, order = self.observer.guard, self.observer.lifting.n_states, self.observer.controller.n_states
+        most = np.finfo(np.float32 if self.precision.type == "float" else np.float64).max
+        low, high = (np.clip(side, -most, most) for side in bounds(own, n, order))
+        wide = {"lower": self.wide(low[:n]), "upper": self.wide(high[:n])}
+        return wide | {"correction": self.numbers(high[n:]), "settle": 0 if own is None else own.settle}
 
     def start_in_motion(self) -> dict[str, Any] | None:
         """Return what motion at the first samples adds to hidden states; rows of zeros are left out."""

@@ -196,7 +196,7 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     reals = context["n"] + context["order"] + context["history"] + len(context["parameters"]) + context["delay"] * context["m"]
     reals += context["n"] + context["order"] + 2 if context["tracked"] else 0
     reals += context["q"] * context["monitor"]["bands"] * 3 + 1 if context["monitor"] else 0
-    words = context["m"] + sum(bool(context[name]) for name in ("delay", "monitor", "start")) + 1
+    words = context["m"] + sum(bool(context[name]) for name in ("delay", "monitor", "start")) + 2
     words += 1 if context["monitor"] and context["monitor"]["conditions"] else 0
     size = 8 * doubles + real * reals + 4 * words
     align = 8 if doubles or real == 8 else 4

@@ -137,7 +137,7 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
         observer.lifting.parameters, "parameter", "tunable", "this machine's {}", lambda n: f"{observer.parameters.get(n, 0.0):.17g}"
     )
     found += rows(estimates, "output", "discrete", "estimate of {} at the end of the step", lambda _: None, "_hat")
-    bits = "1 missing measurement, 2 invalid input, 4 limit, 8 outside the certificate"
+    bits = "1 missing measurement, 2 invalid input, 4 limit, 8 outside the certificate, 16 restarted"
     found.append(
         {"name": "status", "causality": "output", "variability": "discrete", "description": bits, "unit": "", "start": None, "kind": "bits"}
     )

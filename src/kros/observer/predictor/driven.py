@@ -131,6 +131,6 @@ def in_coordinates(observer: Observer, turn: Array) -> Observer:
         turn @ observer.A @ np.linalg.inv(turn),
         None if observer.start_in_motion is None else observer.start_in_motion.turned(turn[:n, :n]),
     )
-    return replace(
-        observer, A=A, B=turn @ observer.B, start_in_motion=start, controller=replace(observer.controller, D=A[:, list(observer.measured)])
-    )
+    guard, controller = observer.guard, replace(observer.controller, D=A[:, list(observer.measured)])
+    guard = None if guard is None else guard.turned(turn[:n, :n])
+    return replace(observer, A=A, B=turn @ observer.B, start_in_motion=start, controller=controller, guard=guard)

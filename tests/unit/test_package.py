@@ -16,9 +16,7 @@ ROOT = Path(__file__).parents[2]
 INTERNAL = {"loops"}  # what no user calls
 SUBPACKAGES = sorted({p.parent.name for p in (ROOT / "src" / "kros").glob("*/__init__.py")} - INTERNAL)
 HEAVY = [
-    "clarabel",
     "control",
-    "cvxpy",
     "dask",
     "jinja2",
     "matplotlib",

@@ -12,7 +12,7 @@ from ..content import Cell, Section, Table
 from ..names import number
 from ..run_folder import RunFolder
 
-_PACKAGES = ("kros", "numpy", "scipy", "cvxpy", "clarabel", "matplotlib")
+_PACKAGES = ("kros", "numpy", "scipy", "matplotlib")
 
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section:

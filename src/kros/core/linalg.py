@@ -37,9 +37,14 @@ def least_squares(regressors: Array, values: Array, rcond: float | None = None) 
     return np.asarray(np.linalg.lstsq(regressors / size, values, rcond=rcond)[0] / size[:, None])
 
 
-def solve_balanced(A: Array, values: Array, rcond: float | None = None) -> Array:
-    """Return X that makes ``A X - values`` smallest for a square A between states, which is balanced first: units of measure change nothing."""
+def balanced_size(A: Array) -> Array:
+    """Sizes of the states, powers of two, in which rows and columns of A are of alike size, shape (n,)."""
     from scipy.linalg import matrix_balance
 
-    _, (size, _) = matrix_balance(A, permute=False, separate=True)
+    return np.asarray(matrix_balance(A, permute=False, separate=True)[1][0]) if A.size else np.ones(len(A))
+
+
+def solve_balanced(A: Array, values: Array, rcond: float | None = None) -> Array:
+    """Return X that makes ``A X - values`` smallest for a square A between states, which is balanced first: units of measure change nothing."""
+    size = balanced_size(A)
     return np.asarray(np.linalg.lstsq(A * size / size[:, None], values / size[:, None], rcond=rcond)[0] * size[:, None])

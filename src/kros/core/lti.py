@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import DimensionError
-from .linalg import adjoint
+from .linalg import adjoint, balanced_size
 
 Array = npt.NDArray[Any]
 
@@ -184,15 +184,16 @@ class StateSpace:
 
 def dense_response(system: StateSpace, freqs_hz: npt.ArrayLike) -> Array:
     """Return the response of one system at very many frequencies by one Schur decomposition in balanced coordinates."""
-    from scipy.linalg import matrix_balance, schur
+    from scipy.linalg import schur
 
     n, m = system.n_states, system.n_inputs
     if not n:
         return system.frequency_response(freqs_hz)
     s = 2j * np.pi * np.asarray(freqs_hz, dtype=float)
     zeta = np.expm1(s * system.dt) if system.dt > 0 else s
-    balanced, (size, _) = matrix_balance(system.A - np.eye(n) if system.dt > 0 else system.A, permute=False, separate=True)
-    T, Z = schur(balanced, output="complex")
+    A = system.A - np.eye(n) if system.dt > 0 else system.A
+    size = balanced_size(A)
+    T, Z = schur(A * size / size[:, None], output="complex")
     B, C = adjoint(Z) @ (system.B / size[:, None]), (system.C * size) @ Z
     states = np.empty((n, m, len(zeta)), dtype=complex)
     for i in reversed(range(n)):

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import DimensionError, KrosError
+from .linalg import balanced_size
 from .lti import StateSpace
 from .precise import precise_gain, precise_h2_norm
 
@@ -86,9 +87,10 @@ def h2_norm(system: Any) -> float:
     system = as_state_space(system)
     if system.dt == 0 and np.any(system.D):
         return float("inf")
-    if _near_the_limit(system):
+    scaled = balanced(system)
+    if _near_the_limit(scaled):
         return precise_h2_norm(system)
-    system = balanced(system) if system.dt == 0 else system
+    system = scaled if system.dt == 0 else system
     if not system.is_stable():
         return float("inf")
     squared = float(np.trace(system.C @ gramian(system.A, system.B, system.dt) @ system.C.T))
@@ -99,21 +101,16 @@ def h2_norm(system: Any) -> float:
 
 
 def _near_the_limit(system: StateSpace) -> bool:
-    """Tell whether rounding, ``eps ||A||`` in balanced coordinates, decides if a pole is stable."""
-    A = balanced(system).A
-    poles = np.linalg.eigvals(A)
+    """Whether rounding, ``eps ||A||``, decides if a pole of a balanced system is stable."""
+    poles = system.poles()
     distance = np.abs(1 - np.abs(poles)) if system.dt > 0 else np.abs(poles.real)
-    return bool((distance <= 10 * _EPSILON * np.linalg.norm(A)).any())
+    return bool((distance <= 10 * _EPSILON * np.linalg.norm(system.A)).any())
 
 
 def balanced(system: StateSpace) -> StateSpace:
     """Return a system whose states are scaled by powers of two, so that rows and columns of A are of alike size."""
-    if not system.n_states:
-        return system
-    from scipy.linalg import matrix_balance
-
-    A, (size, _) = matrix_balance(system.A, permute=False, separate=True)
-    return StateSpace(A, system.B / size[:, None], system.C * size, system.D, system.dt)
+    size = balanced_size(system.A)
+    return StateSpace(system.A * size / size[:, None], system.B / size[:, None], system.C * size, system.D, system.dt)
 
 
 def hinf_norm(system: Any, tol: float = 1e-6) -> float:

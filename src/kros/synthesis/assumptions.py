@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DimensionError, SynthesisError
+from ..core.linalg import balanced_size
 from .generalized_plant import GeneralizedPlant
 
 Array = npt.NDArray[Any]
@@ -122,12 +123,10 @@ def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
 
 def _balanced(A: Array, B: Array) -> tuple[Array, Array]:
     """States in units that balance A, and inputs in units that make B as large as A: the test must not depend on anyone's units."""
-    from scipy.linalg import matrix_balance
-
     if not A.size:
         return A, B
-    A, (scale, _) = matrix_balance(A, permute=False, separate=True)
-    B = B / scale[:, None]
+    size = balanced_size(A)
+    A, B = A * size / size[:, None], B / size[:, None]
     sizes = np.linalg.norm(B, axis=0)
     return A, B / np.where(sizes > 0, sizes, 1.0) * max(float(np.linalg.norm(A, 2)), 1e-300)
 

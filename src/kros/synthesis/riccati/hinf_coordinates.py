@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import LinAlgError, matrix_balance
+from scipy.linalg import LinAlgError
 
 from ...core.errors import SynthesisError
+from ...core.linalg import balanced_size
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
 from ..generalized_plant import GeneralizedPlant, split
@@ -80,7 +81,7 @@ def scaled(p: GeneralizedPlant) -> GeneralizedPlant:
     """Scale the states by powers of two, so that A is balanced, every state is driven as much as it is seen, and B is as large as C."""
     if not p.sizes[0]:
         return p
-    _, (scale, _) = matrix_balance(p.A, permute=False, separate=True)
+    scale = balanced_size(p.A)
     p = _level_out(transformed(p, np.diag(1 / scale), np.diag(scale)))
     size = np.ones(len(p.A))
     for _ in range(_SWEEPS):

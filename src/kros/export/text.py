@@ -9,44 +9,9 @@ from ..core.errors import ConfigError
 
 _ALLOWED = frozenset(" _-.,:;+()[]%/^=@°·²³")  # beside letters and digits of any script
 _LONGEST = 80
-_C_WORDS = frozenset(
-    [
-        "auto",
-        "break",
-        "case",
-        "char",
-        "const",
-        "continue",
-        "default",
-        "do",
-        "double",
-        "else",
-        "enum",
-        "extern",
-        "float",
-        "for",
-        "goto",
-        "if",
-        "inline",
-        "int",
-        "long",
-        "register",
-        "restrict",
-        "return",
-        "short",
-        "signed",
-        "sizeof",
-        "static",
-        "struct",
-        "switch",
-        "typedef",
-        "union",
-        "unsigned",
-        "void",
-        "volatile",
-        "while",
-        "main",
-    ]
+_C_WORDS = re.compile(
+    "auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if|inline|int|long|register|"
+    "restrict|return|short|signed|sizeof|static|struct|switch|typedef|union|unsigned|void|volatile|while|main"
 )
 
 
@@ -91,7 +56,7 @@ def require_identifier(name: str, what: str = "name") -> str:
     ConfigError
         When it is none.
     """
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name, flags=re.ASCII) or name in _C_WORDS:
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name, flags=re.ASCII) or _C_WORDS.fullmatch(name):
         raise ConfigError(
             f"Export to C: the {what} {name!r} should be a C identifier of letters, digits and underscores that begins with a letter, and no word of C."
         )

@@ -286,8 +286,7 @@ class Lifting:
         """Return bounds of the slopes of every lifted function by every entry of the window over an operating box.
 
         Interval arithmetic on the derivatives: the bounds hold between any two points of the box, and are infinite where a slope is, or where
-        a function jumps or is not defined.
-        Rounding is covered by a relative widening of 1e-12, not by directed rounding.
+        a function jumps or is not defined. Every operation rounds outwards.
 
         Parameters
         ----------

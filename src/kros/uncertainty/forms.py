@@ -11,12 +11,12 @@ inverse_input_...       Gp = G (1 - E)^-1                      Gp^+ (Gp - G)    
 inverse_output_...      Gp = (1 - E)^-1 G                      (Gp - G) Gp^+              rows(G) in rows(Gp)
 ======================  =====================================  =========================  ==========================================
 
-The inverse forms also need the inverted matrix to be regular. Elsewhere the residual is the least-squares fit, and what it leaves out is
-the misfit. `paper=True` gives the published pipeline's variants of the multiplicative forms, `G^+ Gp - 1`, `Gp G^+ - 1`, `1 - Gp^+ G` and
-`1 - G Gp^+`: with more outputs than inputs the output ones contain the identity on the complement of the range, whatever the plants.
+The inverse forms also need the inverted matrix to be regular. Elsewhere the residual is the least-squares fit, what it
+leaves out is the misfit, and `completion` covers that by an additive remainder. `paper=True` gives the published
+pipeline's variants of the multiplicative forms, `G^+ Gp - 1`, `Gp G^+ - 1`, `1 - Gp^+ G` and `1 - G Gp^+`: with more
+outputs than inputs the output ones contain the identity on the complement of the range, whatever the plants.
 
-Plants here are already in scaled coordinates. Nothing in this module chooses, fits or stores; `bounds`, `misfit` and `completion` are of whole
-populations.
+Plants here are already in scaled coordinates. Nothing in this module chooses, fits or stores.
 """
 
 from __future__ import annotations

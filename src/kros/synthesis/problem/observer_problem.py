@@ -167,7 +167,7 @@ class ObserverProblem:
         uncertain: UncertainModel,
         noise: npt.ArrayLike,
         *,
-        injection: Injection = Injection.STATE,
+        injection: Any = Injection.STATE,
         correction_penalty: float = 1e-3,
     ) -> ObserverProblem:
         """Return the problem of the nominal unit and the set around it, remainder included.
@@ -191,8 +191,8 @@ class ObserverProblem:
         """
         if uncertain.weight.structure is Structure.ENTRYWISE:
             raise SynthesisError(
-                "the weights are entrywise, made for a diagonal perturbation, and synthesis is for a full one; "
-                "set uncertainty.structure to 'auto', 'diagonal' or 'scalar'"
+                "Observer problem: the weights are entrywise, made for a diagonal perturbation, and synthesis is for a full "
+                "one; quantify with diagonal weights."
             )
         unit, remainder = uncertain.nominal_id, uncertain.remainder
         if unit not in models.unit_ids:
@@ -211,7 +211,7 @@ class ObserverProblem:
             correction_penalty=correction_penalty,
             remainder_left=remainder.left if remainder is not None else None,
             remainder_right=remainder.right if remainder is not None else None,
-            injection=Injection(injection),
+            injection=injection,
             form=uncertain.form,
         )
         freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // 8)]

@@ -1,1 +1,1 @@
-"""Controllers of fewer states: reduction, and polish of what is left."""
+"""Controllers of fewer states by balanced truncation."""

@@ -19,26 +19,14 @@ _TURNED = 256  # samples of all signals that are put in order at once: they stay
 
 @dataclass(frozen=True, eq=False)
 class ErrorSummary:
-    """Errors of an estimate over a batch of episodes.
+    """Errors of an estimate over a batch of episodes."""
 
-    Parameters
-    ----------
-    rms : ndarray, shape (batch, n)
-    percent : ndarray, shape (batch, n)
-        ``100 rms(x_hat - x) / max|x|`` of every episode.
-    start_percent, rest_percent : ndarray, shape (batch, n)
-        The same of its first `START` samples and of those behind, over the largest value of the whole episode.
-    spectra : ndarray, shape (batch, n_freqs, n)
-        Welch's power spectral density of the error.
-    freqs_hz : ndarray, shape (n_freqs,)
-    """
-
-    rms: Array
-    percent: Array
-    start_percent: Array
-    rest_percent: Array
-    spectra: Array
-    freqs_hz: Array
+    rms: Array  # (batch, n)
+    percent: Array  # (batch, n): `100 rms(x_hat - x) / max|x|` of every episode
+    start_percent: Array  # (batch, n): of the first `START` samples, over the largest value of the episode
+    rest_percent: Array  # (batch, n): the same of the samples behind
+    spectra: Array  # (batch, n_freqs, n): Welch's power spectral density of the error
+    freqs_hz: Array  # (n_freqs,)
 
     @classmethod
     def joined(cls, parts: Sequence[ErrorSummary]) -> ErrorSummary:
@@ -58,10 +46,7 @@ def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt:
 
 
 def summarise_all(estimates: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> list[ErrorSummary]:
-    """Summarise the errors of estimates, shape (estimate, n_samples, batch, n or more), of which the first n states have a truth; others as in `summarise`.
-
-    It is fastest where the samples are outermost in memory and the batch innermost, as `run_observers` returns them.
-    """
+    """Summarise errors of estimates, shape (estimate, n_samples, batch, n or more), otherwise as `summarise`."""
     loops, n = library(), truth.shape[2]
     with np.errstate(over="ignore", invalid="ignore"):
         if loops is None:

@@ -153,11 +153,7 @@ def run_some_at_a_time(
 
 
 def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None, *, cut: bool = False) -> tuple[Array, Array]:
-    """Return the first estimate, shape (batch, n), and what is added to later ones beside the observer's own correction, shape (count, batch, n).
-
-    That is what the first innovations add, and with `cut` what limits take from the estimates that an observer without delay goes on from. `y` and `u` as
-    in `run_observer`, of which no sample is lost; the first estimate is within the limits.
-    """
+    """Return the first estimate, (batch, n), and what the start adds to later ones, (count, batch, n)."""
     samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
     batch, start, late = samples.starts.shape[1], observer.start_in_motion, observer.runtime.delay
     steps = Steps([observer], batch, values)

@@ -198,21 +198,7 @@ def least_innovation(
     name: str,
     candidates: npt.ArrayLike,
 ) -> float:
-    """Return the value of a parameter for which the observer's innovation is smallest over episodes of one machine, among some candidates.
-
-    Parameters
-    ----------
-    observer : ObserverData
-    y : ndarray, shape (n_samples, batch, q)
-        NaN where a measurement is missing.
-    u : ndarray, shape (n_samples, batch, m)
-    lengths : ndarray, shape (batch,)
-        Of the episodes, whose first quarter does not count: they may start in motion.
-    parameters : mapping of str to float
-        Of the others.
-    name : str
-    candidates : array_like, shape (n,)
-    """
+    """Return the candidate of a parameter with the smallest innovation over episodes of one machine."""
     values, batch, k = np.asarray(candidates, dtype=float), y.shape[1], np.arange(len(y))[:, None]
     counted = np.isfinite(y) & ((k >= lengths // 4) & (k < lengths))[..., None]
     y, u = (np.tile(signal, (1, len(values), 1)) for signal in (y, u))

@@ -24,13 +24,7 @@ _LEAST = {"n_units": 1, "n_episodes": 1, "seconds": 1.0, "seed": 0, "spread": 0.
 
 @dataclass(frozen=True)
 class Batch(ABC, Generic[T]):
-    """Settings of a simulated batch.
-
-    Raises
-    ------
-    ConfigError
-        When a setting is out of its range.
-    """
+    """Settings of a simulated batch."""
 
     n_units: int = 8  # Units of the population, the outlier not counted
     n_episodes: int = 10

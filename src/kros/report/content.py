@@ -40,34 +40,16 @@ Cells = Sequence[Cell | str]
 
 @dataclass(frozen=True)
 class Table:
-    """A table; the first column names the rows.
-
-    Parameters
-    ----------
-    head : sequence of str
-    rows : sequence of sequence of Cell
-        A plain text stands for a cell.
-    caption : str
-    groups : sequence of (str, int)
-        Titles over several columns each, the first column included; none by default.
-    folded : bool
-        Whether the reader opens it.
-    emphasised : sequence of int
-        Rows that are set off.
-    prose : bool
-        Whether cells hold sentences instead of numbers.
-    sortable : bool
-        Whether the reader sorts it by any column, and filters its rows by their text.
-    """
+    """A table; the first column names the rows."""
 
     head: Sequence[str]
-    rows: Sequence[Cells]
+    rows: Sequence[Cells]  # a plain text stands for a cell
     caption: str = ""
-    groups: Sequence[tuple[str, int]] = ()
-    folded: bool = False
-    emphasised: Sequence[int] = ()
-    prose: bool = False
-    sortable: bool = False
+    groups: Sequence[tuple[str, int]] = ()  # titles over several columns each, the first column included
+    folded: bool = False  # whether the reader opens it
+    emphasised: Sequence[int] = ()  # rows that are set off
+    prose: bool = False  # whether cells hold sentences instead of numbers
+    sortable: bool = False  # whether the reader sorts it by any column, and filters its rows by their text
 
     @property
     def cells(self) -> list[list[Cell]]:

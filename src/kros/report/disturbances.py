@@ -50,10 +50,7 @@ _LOOKS = {
 
 
 class Curve(NamedTuple):
-    """Mean error of one observer in one channel, percent of the largest value, against the severity of one disturbance.
-
-    Both have shape (k,); the first severity is zero, and an error is infinite where an estimate diverged.
-    """
+    """Error of an observer in a channel, percent of the largest value, against a disturbance's severity."""
 
     severities: Array
     errors: Array
@@ -95,10 +92,7 @@ def look(name: str) -> Look:
 
 
 def doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str]) -> tuple[float, float] | None:
-    """Return the severity at which the error doubles, a geometric mean over the states that are not measured, and the smallest severity that was tried.
-
-    None where there is no curve; infinite where it does not double.
-    """
+    """Return the severity at which the error of unmeasured states doubles, and the smallest one tried."""
     hidden = [curve for c, curve in by_channel.items() if c not in measured] or list(by_channel.values())
     if not hidden:
         return None

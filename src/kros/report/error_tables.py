@@ -19,53 +19,26 @@ PAPER = "koopman_edmd/mixed"
 
 @dataclass(frozen=True)
 class ErrorCell:
-    """Error of one observer in one channel, percent of the largest value; None where an estimate diverged or there is no such unit.
-
-    Parameters
-    ----------
-    mean : float or None
-        Over the off-nominal units (over the nominal one where there is no other), or over all units that were left out.
-    worst : float or None
-    worst_unit : str or None
-    interval : (float, float) or None
-        95 % interval of the mean, by a bootstrap over units; None where they are too few.
-    nominal : float or None
-        Of the nominal unit.
-    diverged : int
-        Units whose estimate diverged.
-    rms : float or None
-        Root mean square error in the channel's own unit of measure, over the units that `mean` is over.
-    band_db : float or None
-        Power of the error around the gearbox frequency, mean over the units, in dB relative to that of `PAPER` on the same units.
-    """
+    """Error of an observer in a channel, percent of the largest value; None where an estimate diverged."""
 
     mean: float | None = None
     worst: float | None = None
     worst_unit: str | None = None
-    interval: tuple[float, float] | None = None
-    nominal: float | None = None
-    diverged: int = 0
+    interval: tuple[float, float] | None = None  # 95 % interval of the mean, by a bootstrap over units
+    nominal: float | None = None  # of the nominal unit
+    diverged: int = 0  # units whose estimate diverged
     rms: float | None = None
     band_db: float | None = None
 
 
 @dataclass(frozen=True)
 class ErrorTable:
-    """Errors of all observers in one condition.
-
-    Parameters
-    ----------
-    condition : str
-    channels : tuple of str
-    cells : mapping of observer to mapping of channel to ErrorCell
-    ranked : frozenset of str
-        Channels in which a smaller number is better: all but the current of a loaded drive, which shows the load where models come from another condition.
-    """
+    """Errors of all observers in one condition."""
 
     condition: str
     channels: tuple[str, ...]
     cells: Mapping[str, Mapping[str, ErrorCell]]
-    ranked: frozenset[str]
+    ranked: frozenset[str]  # channels in which a smaller number is better
 
     def hidden(self, measured: Sequence[str], observer: str | None = None) -> list[str]:
         """Return the channels that are not measured and that an observer estimates, or any does; all of them where everything is measured."""

@@ -244,10 +244,7 @@ class RunFolder:
         return dict(read_arrays(self.folder / place / "arrays.npz"))
 
     def _load(self, place: str, file: str, load: Callable[[Path], T], reason: str, at_home: bool = False) -> dict[str, T]:
-        """Load what lies beside `file` in all folders `place`/*, by their names below the first; both may be patterns, a star for one part of a name.
-
-        With `at_home` of the condition that was identified on alone.
-        """
+        """Load what lies beside `file` in all folders `place`/*, by their names; both may be patterns."""
         pattern = f"{place}/*/{file}"
         depth, below = pattern.count("/"), file.count("/")
         paths = [PurePosixPath(name) for name in self.files if name.count("/") == depth]

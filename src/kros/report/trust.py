@@ -21,29 +21,13 @@ Facts = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Trust:
-    """What stands behind one observer.
+    """What stands behind one observer."""
 
-    Parameters
-    ----------
-    plants : float or None
-        Certified H2 norm of the error over the set of plants; None where there is none.
-    signals : mapping of str to float
-        Certified RMS error in percent of the largest value, by state, over the set of recorded signals; empty where there is none.
-    outside : tuple of str
-        Units whose own signals are outside that set.
-    running : bool or None
-        Whether a bound was found for it as it runs; None where it has no model, so that nothing was looked for.
-    gain : float or None
-        Of that bound, from residual to error.
-    dropouts : tuple (rate, certified) or None
-        The rate of losses that is declared, and whether a bound holds with it.
-    """
-
-    plants: float | None = None
+    plants: float | None = None  # certified H2 norm of the error over the set of plants; None where there is none
     signals: Mapping[str, float] | None = None
-    outside: tuple[str, ...] = ()
-    running: bool | None = None
-    gain: float | None = None
+    outside: tuple[str, ...] = ()  # units whose own signals are outside that set
+    running: bool | None = None  # whether a bound was found for it as it runs
+    gain: float | None = None  # of that bound, from residual to error
     dropouts: tuple[float, bool] | None = None
 
     @property

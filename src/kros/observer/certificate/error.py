@@ -103,35 +103,19 @@ class ReliftScales:
 
 @dataclass(frozen=True, eq=False)
 class ErrorSystem:
-    """Linear part of the error dynamics with its channels, as drawn above.
+    """Linear part of the error dynamics with its channels, as drawn above."""
 
-    Parameters
-    ----------
-    A, L, B : ndarray, shape (n_xi, n_xi), (n_xi, n_p), (n_xi, n_w)
-    M, D : ndarray, shape (n_p, n_xi), (n_p, n_w)
-    C : ndarray, shape (n_z, n_xi)
-    dt : float, s
-    channels : tuple of str
-        What moves in every channel, for people.
-    E : ndarray, shape (n_p, n_p), optional
-        Strictly triangular up to the order of channels; zero by default.
-    rest : ndarray, shape (n_p,), optional
-        Places at which a frozen response is taken: zero, the middle, by default; one where no limit binds.
-    start : ndarray, shape (n_xi, n_window), optional
-        Where the first error goes, with the earlier ones that the lifting reads; the first states by default.
-    """
-
-    A: Array
-    L: Array
-    B: Array
-    M: Array
-    D: Array
-    C: Array
-    dt: float
-    channels: tuple[str, ...] = ()
-    E: Array | None = None
-    rest: Array | None = None
-    start: Array | None = None
+    A: Array  # (n_xi, n_xi)
+    L: Array  # (n_xi, n_p)
+    B: Array  # (n_xi, n_w)
+    M: Array  # (n_p, n_xi)
+    D: Array  # (n_p, n_w)
+    C: Array  # (n_z, n_xi)
+    dt: float  # s
+    channels: tuple[str, ...] = ()  # what moves in every channel, for people
+    E: Array | None = None  # (n_p, n_p): strictly triangular up to the order of channels; zero by default
+    rest: Array | None = None  # (n_p,): places at which a frozen response is taken
+    start: Array | None = None  # (n_xi, n_window): where the first error goes; the first states by default
 
     @property
     def corner_count(self) -> int:

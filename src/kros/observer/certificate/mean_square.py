@@ -145,10 +145,7 @@ def _proven(modes: Sequence[tuple[float, ErrorSystem]], multipliers: Array, gain
 
 
 def _stacked(modes: Sequence[tuple[float, ErrorSystem]], multipliers: Array, gain: float) -> tuple[Array, Array, Array, Array]:
-    """Return the steps of all modes below one another, each times the root of its probability, and the outputs, with slopes as inputs and outputs.
-
-    Channels that act alike whatever arrives are shared.
-    """
+    """Stack the steps of all modes, each times the root of its probability, and the outputs."""
     first = modes[0][1]
     n, width = len(first.A), first.L.shape[1]
     same = np.ones(width, dtype=bool)

@@ -34,10 +34,7 @@ _ROUNDING = 8.0  # times what a factorisation may be off, with a factor of five 
 
 
 def margin(root: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> float:
-    """Return ``1 - max ||.||^2`` over corners (A, B) in the coordinates where P is the identity; positive for a proof, up to rounding.
-
-    `root`, shape (n, n), is the upper triangular R with ``P = R'R``; C has shape (n_z, n), and D, zero by default, (n_z, n_w).
-    """
+    """Return ``1 - max ||.||^2`` over corners (A, B) in the coordinates where ``P = R'R`` is the identity."""
     worst = 0.0
     for A, B in corners:
         top = root @ np.hstack([_right_divide(A, root), B / gain])

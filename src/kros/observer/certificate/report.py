@@ -81,32 +81,16 @@ def relift_report(
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What drove the error of an observer along recorded episodes, and the error.
+    """What drove the error of an observer along recorded episodes, and the error."""
 
-    Parameters
-    ----------
-    omega : ndarray, shape (n_samples - 1, batch, n)
-        One-step residual; zero in internal states.
-    noise : ndarray, shape (n_samples - 1, batch, q)
-        What the sensor shows beside the recording, as it arrives; zero before the first measurement that is used.
-    first : ndarray, shape (batch, n_window)
-        First error, with the earlier ones that the lifting reads.
-    error : ndarray, shape (n_samples, batch, n)
-    lengths : ndarray, shape (batch,)
-    inputs, y : ndarray
-        Recorded inputs, and the measurements as they arrive.
-    beyond : ndarray, shape (n_samples, batch, n_recorded)
-        What recorded states are beyond declared limits, by noise: what stands for the true states is within.
-    """
-
-    omega: Array
-    noise: Array
-    first: Array
-    error: Array
-    lengths: npt.NDArray[np.int64]
-    inputs: Array
-    y: Array
-    beyond: Array
+    omega: Array  # (n_samples - 1, batch, n): one-step residual; zero in internal states
+    noise: Array  # (n_samples - 1, batch, q): what the sensor shows beside the recording, as it arrives
+    first: Array  # (batch, n_window): first error, with the earlier ones that the lifting reads
+    error: Array  # (n_samples, batch, n)
+    lengths: npt.NDArray[np.int64]  # (batch,)
+    inputs: Array  # recorded inputs, and the measurements as they arrive
+    y: Array  # recorded inputs, and the measurements as they arrive
+    beyond: Array  # (n_samples, batch, n_recorded): what recorded states are beyond declared limits, by noise
 
     def mean_square(self, signal: Array) -> Array:
         """Return the mean square of every channel over every episode, shape (batch, k)."""
@@ -145,11 +129,7 @@ def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None 
 
 
 def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
-    """Return the one-step residual from the first sample on, shape (n_samples - 1, batch, n); earlier values equal the first ones, as in the observer.
-
-    `states` have the internal ones behind them (`with_internal`), whose residual is zero: recorded states drive them through the observer's own rows.
-    Inputs count as the observer takes them, within limits.
-    """
+    """Return the one-step residual, shape (n_samples - 1, batch, n); values before the first sample equal it."""
     h, inputs = observer.lifting.history, observer.runtime.clip_inputs(inputs)
     if h:
         states, inputs = (np.concatenate([np.repeat(v[:1], h, axis=0), v]) for v in (states, inputs))

@@ -36,26 +36,13 @@ AT_LIMITS = 0.25  # weight of what machines do after they have come to a limit, 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What `PastMoments.model` needs to know.
-
-    Parameters
-    ----------
-    basis : Basis
-    weights : mapping of str to tuple of float
-        Of every condition, one for every hidden state.
-    deviation : float
-        Share by which the lifted functions' effect may differ from machine to machine.
-    internal : int
-        States besides the recorded ones.
-    held_out : tuple of float
-        Root mean square errors of the hidden states on units that were left out: logarithmic mean over conditions by emphasis.
-    """
+    """What `PastMoments.model` needs to know."""
 
     basis: Basis
-    weights: Mapping[str, tuple[float, ...]]
-    deviation: float
-    internal: int
-    held_out: tuple[float, ...]
+    weights: Mapping[str, tuple[float, ...]]  # of every condition, one for every hidden state
+    deviation: float  # share by which the lifted functions' effect may differ from machine to machine
+    internal: int  # states besides the recorded ones
+    held_out: tuple[float, ...]  # root mean square errors of the hidden states on units that were left out
 
     def model(self, past: PastMoments, importance: npt.ArrayLike = 1.0) -> Model:
         """Return the model that the moments of all units give."""
@@ -83,10 +70,7 @@ def at_limits(states: Array, lower: Array, upper: Array) -> tuple[Flags, Flags]:
 def filled_in(
     past: PastMoments, batch: EpisodeBatch, lower: Array, upper: Array
 ) -> tuple[PastMoments, Callable[[EpisodeBatch], EpisodeBatch]]:
-    """Return the moments of whole recordings in which what limits hide is filled in, and what does so: censored regression by its EM iteration.
-
-    It begins without the samples at limits. `past` says of what and how much of the past.
-    """
+    """Return moments of recordings with what limits hide filled in: censored regression by EM."""
     of = partial(PastMoments.of, past.lifting, past.measured, basis=past.basis)
     whole = of(batch, without=np.any(at_limits(batch.states, lower, upper), axis=(0, -1)))
     for _ in range(_FILLED):
@@ -205,16 +189,7 @@ def _first_good(scores: Array) -> int:
 
 
 def missed_by(model: Model, z: Array, rest: Array, truth: Array) -> Array:
-    """Return what a model's estimates miss, shape (h, batch, n_samples), from rest or from the best start where recordings begin in motion.
-
-    Parameters
-    ----------
-    model : F, G, H
-    z : ndarray, shape (channels, batch, n_samples)
-    rest : ndarray, shape (channels, batch)
-        What z was before.
-    truth : ndarray, shape (n_samples, batch, h)
-    """
+    """Return the errors of a model's estimates, shape (h, batch, n_samples), from rest or the best start."""
     missed = truth.transpose(2, 1, 0) - estimates_along(blocks_of(*model), z, rest)
     if in_motion(truth):
         return FreeStart.of(model[0], model[2], len(truth), FreeStart.by_size(missed)).without(missed)

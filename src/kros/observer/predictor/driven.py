@@ -74,33 +74,7 @@ def with_internal(
 
 
 def driven_coordinates(observer: Observer, batch: EpisodeBatch, sizes: npt.ArrayLike) -> Observer:
-    """Return the same observer with its internal states in coordinates in which recordings drive them stably, each of RMS one along them.
-
-    Parameters
-    ----------
-    observer : Observer
-    batch : EpisodeBatch
-    sizes : array_like, shape (n_recorded,)
-        Sizes of the recorded states.
-
-    Returns
-    -------
-    Observer
-        Of the same estimates; the observer itself where it has no internal states, or is not stable.
-
-    Examples
-    --------
-    >>> import kros
-    >>> from kros.data import EpisodeBatch
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import identify_predictor
-    >>> from kros.observer.predictor.driven import driven_coordinates
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
-    >>> batch = EpisodeBatch.read(motors, motors.keys())
-    >>> predictor = identify_predictor("motor", Lifting(motors.states), (0,), motors.inputs, batch, internal=2, iterations=0)
-    >>> driven_coordinates(predictor, batch, abs(batch.states).max(axis=(0, 1))).lifting.states
-    ('position', 'velocity', 'current', 'memory_1', 'memory_2')
-    """
+    """Return the observer with internal states in coordinates in which recordings drive them stably, of RMS one."""
     recorded, n = len(observer.recorded), observer.lifting.n_states
     if recorded == n or not observer.replaces:
         return observer

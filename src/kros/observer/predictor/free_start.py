@@ -30,21 +30,11 @@ def in_motion(truth: Array) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class FreeStart:
-    """What a start of its own does to the estimates of every episode.
+    """What a start of its own does to the estimates of every episode."""
 
-    Parameters
-    ----------
-    powers : ndarray, shape (n_samples, n, n)
-        ``F^k``.
-    seen : ndarray, shape (h, n_samples, n)
-        ``H F^k``.
-    weights : ndarray, shape (h,)
-        Of the squares of the hidden states' errors: what is known to a ten thousandth must not pay for what is known to a tenth (`by_size`).
-    """
-
-    powers: Array
-    seen: Array
-    weights: Array
+    powers: Array  # (n_samples, n, n): `F^k`
+    seen: Array  # (h, n_samples, n): `H F^k`
+    weights: Array  # (h,): of the squares of the hidden states' errors
 
     @classmethod
     def of(cls, F: Array, H: Array, n_samples: int, weights: Array) -> FreeStart:

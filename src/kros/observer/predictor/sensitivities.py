@@ -28,21 +28,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Sensitivities:
-    """Responses of a model's estimates to additions to its states, and its states themselves, in a common basis.
-
-    Parameters
-    ----------
-    blocks : sequence of Block
-        Of a stable model.
-    resting : sequence of int
-        Channels that were not zero before.
-
-    Attributes
-    ----------
-    responses : ndarray, shape (outputs, n, n + channels, signals)
-        What every state and every channel, added to every state, does to the estimates.
-    states : ndarray, shape (n, signals)
-    """
+    """Responses of a model's estimates to additions to its states, and its states themselves, in a common basis."""
 
     def __init__(self, blocks: Sequence[Block], resting: Sequence[int]) -> None:
         from scipy.linalg import block_diag

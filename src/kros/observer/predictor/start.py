@@ -35,21 +35,7 @@ _RIDGE = 1e-6  # relative to mean squares
 def with_start(
     observer: Observer, batch: EpisodeBatch, static: Array | None = None, free: Sequence[int] = (), count: int = COUNT
 ) -> Observer:
-    """Return the observer with a start in motion learned from recordings; as it is where everything is measured or episodes are too short.
-
-    Parameters
-    ----------
-    observer : Observer
-        Its delay plays no part: measurements count when they are taken.
-    batch : EpisodeBatch
-        Measurements on time.
-    static : ndarray, shape (q, m), optional
-        M, the part of the measurement that the inputs explain; as recordings say by default.
-    free : sequence of int
-        Inputs that no measurement follows, where M is given.
-    count : int
-        Innovations that correct hidden states by gains of their own.
-    """
+    """Return the observer with a start in motion learned from recordings, if these are long enough for one."""
     at, length = list(observer.measured), int(batch.lengths.min())
     hidden = np.array([i not in at for i in range(observer.lifting.n_states)])
     first, last = skipped(length), length - count - 1

@@ -84,10 +84,7 @@ def _held(F: Array, G: Array, rest: Array) -> Array:
 
 
 def moved(blocks: Sequence[Block], signals: Array, every: int, first: int) -> Array:
-    """Return what signals (signals, batch, n_samples), zero before, do to the estimates of a model when they are added to each of its channels.
-
-    Shape (channels, signals, h, batch * kept): every so many samples, and of these from the `first` one on.
-    """
+    """Return responses of a model's estimates to signals (signals, batch, n_samples) in each of its channels."""
     kept, rest = -(-signals.shape[-1] // every) - first, np.zeros(signals.shape[:2])
     held = np.empty((len(signals), 2 * len(blocks), signals.shape[1], kept))
     for i, block in enumerate(blocks):

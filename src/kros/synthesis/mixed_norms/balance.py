@@ -34,10 +34,7 @@ _LITTLE = 1e-3  # disturbance of such a state, in its standard deviations
 
 @dataclass(frozen=True, eq=False)
 class Balanced:
-    """A plant (with D22 = 0) in balanced coordinates, z1 divided by `size`, with the diagonal `spread` of X and Y to expect.
-
-    Its control is the original one divided by `controls`, its measurement the original one divided by `measurements`.
-    """
+    """A plant in balanced coordinates, z1 divided by `size`, with the diagonal `spread` of X and Y to expect."""
 
     plant: GeneralizedPlant
     size: float

@@ -186,10 +186,7 @@ def residual_h2(
 
 
 def promised_errors(problem: ResidualProblem) -> Array:
-    """Return the root mean square error of every state, as a share of its largest value, that a residual-shaped observer would have on the spectra as measured.
-
-    The mean over units is taken, the order is not reduced. Infinite where there is no observer.
-    """
+    """Return the RMS error of every state, a share of its largest value, on the spectra as measured."""
     shaped = problem.scaled(BASES[1])
     try:
         K = shaped.correction(shaped.filter(np.full(len(shaped.spectra), 1 / len(shaped.spectra))))
@@ -305,11 +302,7 @@ class _Scaled:
         return chosen, f"worst of {len(self.spectra)} units, whose predicted error is {gain:.1f} % below that under equal weights"
 
     def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, max_order: int | None = None) -> StateSpace:
-        """The correction filter of lowest order whose errors under the full shaping filter are within the tolerance, or of the highest one allowed.
-
-        Balanced truncation of the shaping filter, its output weighted by the error dynamics of the full observer (weighting one side alone
-        keeps it stable), and new gains at every order that bisection tries.
-        """
+        """The correction filter of lowest order within the tolerance, or of the highest one allowed."""
         most = shaping.n_states if max_order is None else max_order
         if not shaping.n_states or (tolerance_percent <= 0 and most >= shaping.n_states):
             return K

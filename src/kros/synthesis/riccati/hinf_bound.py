@@ -55,10 +55,7 @@ def proven_bound(plant: GeneralizedPlant, attained: float, tolerance: float) -> 
 def _stationary(
     p: GeneralizedPlant, q: GeneralizedPlant, T: Array, back: Array, level: float
 ) -> tuple[tuple[list[Signals], list[Signals]], Array, bool]:
-    """Signals of both sides, computed in the coordinates of q and judged in those of p, and frequencies at which the level may be attained.
-
-    No signals at all are the first of each family: one side may prove more alone. The last value tells whether all that could be there were found.
-    """
+    """Signals of both sides, computed in the coordinates of q and judged in those of p, and frequencies at which the level may be attained."""
     families: tuple[list[Signals], list[Signals]] = ([Signals.none(len(p.A))], [Signals.none(len(p.A))])
     values, complete = [np.zeros(0)], True
     for family, here, there, change in zip(families, Side.both(p), Side.both(q), (back, T.T), strict=True):

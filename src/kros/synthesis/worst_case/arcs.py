@@ -38,12 +38,7 @@ _ROUNDS = 60
 
 
 class Enclosure:
-    """Response of a stable discrete system on arcs.
-
-    Parameters
-    ----------
-    system : StateSpace
-    """
+    """Response of a stable discrete system on arcs."""
 
     def __init__(self, system: StateSpace) -> None:
         self.system = system

@@ -31,21 +31,12 @@ _ALIKE = 9  # decimals, in nepers, to which spectra of one shape agree
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Power of the shaped channels on the design grid: disturbance phi (f, channels) and remainder psi (f, n) or None.
-
-    Parameters
-    ----------
-    phi, psi : ndarray
-    thetas : tuple of (float, ndarray (f, b, a))
-        What the spectrum is made of beside the average over the ball: elements of it, given by their contractions, and their shares.
-    sharp : bool
-        The diagonal of an element's spectrum is an average over the set; otherwise phi lies below the whole matrix.
-    """
+    """Power of the shaped channels on the design grid: phi (f, channels) and psi (f, n) or None."""
 
     phi: Array
     psi: Array | None
     thetas: tuple[tuple[float, Array], ...] = ()
-    sharp: bool = True
+    sharp: bool = True  # the diagonal of an element's spectrum is an average over the set
 
     def mixed_with(self, phi: Array, theta: Array, weight: float) -> Spectrum:
         """Return the average of this spectrum and of that of an element."""
@@ -138,15 +129,7 @@ def design_grid(problem: ObserverProblem) -> Array:
 
 
 class Channels:
-    """The channels that are shaped, on a grid of frequencies.
-
-    Parameters
-    ----------
-    problem : ObserverProblem
-    freqs_hz : ndarray, shape (f,), Hz
-    apart : bool
-        Keep W_L behind the filters: more states, for bounds that are never run.
-    """
+    """The channels that are shaped, on a grid of frequencies."""
 
     def __init__(self, problem: ObserverProblem, freqs_hz: Array, apart: bool = False) -> None:
         self.problem, self.freqs_hz = problem, freqs_hz

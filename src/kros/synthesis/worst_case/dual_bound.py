@@ -71,11 +71,7 @@ def _descended(c: Array, d: Array, g: Array, multipliers: Array) -> tuple[Array,
 
 
 def _best_rows(c: Array, shift: Array) -> Array:
-    """Minimise ``x + sum_j c_ij / (x + shift_ij)`` over ``x >= 0`` with ``x + shift_ij >= 0``, for every row i; shapes (i, j, ...).
-
-    Newton's method on ``h^(-1/2) = 1``, ``h = sum_j c_ij / (x + shift_ij)^2``: concave, nearly linear, and started where a single term would end,
-    so that it climbs from the left and stays feasible.
-    """
+    """Minimise ``x + sum_j c_ij / (x + shift_ij)`` over ``x >= 0``, ``x + shift_ij >= 0``, for every row i."""
     least = np.maximum(np.max(-shift, axis=1), 0.0)
     gap = least[:, None] + shift
     x = np.maximum(np.max(np.sqrt(c) - gap, axis=1), 0.0)

@@ -37,13 +37,7 @@ _MARGIN = 1e-6  # relative, for rounding
 
 
 class Everywhere:
-    """Proofs for the components of w2 and of the remainder of one problem.
-
-    Parameters
-    ----------
-    channels : Channels
-        With W_L behind the filters.
-    """
+    """Proofs for the components of w2 and of the remainder of one problem."""
 
     def __init__(self, channels: Channels) -> None:
         problem = channels.problem
@@ -97,10 +91,7 @@ class Everywhere:
         return root * _kept(root, distance), root  # the whole matrix counts, not its diagonal alone
 
     def symmetric_part(self, theta: Array, half: Array) -> tuple[Array, Array]:
-        """Magnitude of every component of w2 for filters below ``||R_r M|| R_l``, (k, b).
-
-        ``I - N^H N`` grows by at most ``eta = epsilon_N (2 nu + epsilon_N)`` on the arc, so its inverse keeps ``1 / (1 + eta / (1 - nu^2))``.
-        """
+        """Magnitude of every component of w2 for filters below ``||R_r M|| R_l``, (k, b)."""
         M, reach_M = self.M(theta, half)
         N, far, nu = None, np.zeros(len(theta)), np.zeros(len(theta))
         if self.N is not None:

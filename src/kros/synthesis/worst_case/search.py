@@ -34,17 +34,7 @@ class Certified:
 
 
 class Search:
-    """The best certified filter so far; it starts from no correction at all.
-
-    Parameters
-    ----------
-    channels : Channels
-    fit : callable
-    options : dict
-        ``order``, ``max_order`` and ``tolerance_db`` of the fit.
-    rtol : float
-        Of the certificate's quadrature.
-    """
+    """The best certified filter so far; it starts from no correction at all."""
 
     def __init__(self, channels: Channels, fit: Fit, options: Options, rtol: float) -> None:
         self.channels, self.fit, self.asked, self.rtol = channels, fit, options, rtol

@@ -106,18 +106,9 @@ class Weight:
 
 @dataclass(frozen=True, eq=False)
 class EntrywiseWeight(Weight):
-    """Bounds of every entry, sound for a diagonal perturbation only.
+    """Bounds of every entry, sound for a diagonal perturbation only."""
 
-    `left` (p' by p' m') picks rows and has no states, `right` (p' m' by m') holds the weights, entries row by row; ``left @ right`` is the
-    matrix of weights. `cover_max` is the largest `|E_k,ij / W_ij|`, overbounds are those of entries, and orders are zero and those of the entries.
-
-    Parameters
-    ----------
-    unstructured_excess : float
-        Largest `sigma_max(W^-1 E_k)` over units and the dense grid: by how much residuals leave `W Delta` with a full perturbation.
-    """
-
-    unstructured_excess: float = float("nan")
+    unstructured_excess: float = float("nan")  # largest `sigma_max(W^-1 E_k)` over units and the dense grid
 
     def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
         """Return ones, and the magnitudes of the weights row by row, shape (frequency, p' m')."""

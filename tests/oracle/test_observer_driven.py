@@ -1,7 +1,5 @@
 """The memory of an observer along recordings, against loops written out, exact error responses, and machines the observer does not know."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from adversary import attack, attack_running
@@ -9,7 +7,7 @@ from batches import batch_of
 
 from kros.core.errors import DimensionError
 from kros.lifting import Lifting
-from kros.observer import Observer, PastMoments, ReliftScales, relift_certificate, run_observer
+from kros.observer import PastMoments, ReliftScales, relift_certificate
 from kros.observer.certificate.report import relift_report
 from kros.observer.predictor.build import embedded
 from kros.observer.predictor.driven import driven_coordinates, with_internal
@@ -71,33 +69,6 @@ def test_the_memory_is_what_the_observer_s_own_rows_make_of_the_recordings(made)
         with_internal(observer, found[..., :3], u[:40], phase)
 
 
-def test_other_coordinates_change_no_estimate(made):
-    observer, x, u, phase = made
-    own = settled(made)
-    assert own.replaces
-    np.testing.assert_allclose(
-        run_observer(own, x[..., :1], u, phase)[..., :2], run_observer(observer, x[..., :1], u, phase)[..., :2], atol=1e-10
-    )
-    memory = with_internal(own, x, u, phase)[..., 2:]
-    np.testing.assert_allclose(np.sqrt(np.mean(memory**2, axis=(0, 1))), 1.0, rtol=1e-6)
-
-
-def test_a_memory_that_recordings_would_drive_away_is_turned_until_they_do_not():
-    rng = np.random.default_rng(1)
-    for _ in range(50):
-        F = rng.normal(size=(4, 4))
-        F *= 0.95 / np.abs(np.linalg.eigvals(F)).max()
-        A = np.zeros((5, 5))
-        A[1:, 1:], A[:, 0] = F, rng.normal(size=5)
-        plain = Lifting(("p", "c", "memory_1", "memory_2", "memory_3"))
-        start = Observer.open_loop("o", plain, A, rng.normal(size=(5, 1)), (0,), ("u",), DT)
-        observer = replace(start, controller=replace(start.controller, D=A[:, :1]), replaces=True, internal=3)
-        assert observer.recorded == ("p", "c")
-        found = driven_coordinates(observer, batch_of(0.1 * rng.normal(size=(200, 2, 2)), rng.normal(size=(200, 2, 1)), DT), SIZES)
-        assert np.abs(np.linalg.eigvals(found.A[2:, 2:])).max() < 1
-        np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(found.A[1:, 1:])), np.sort_complex(np.linalg.eigvals(F)), atol=1e-6)
-
-
 def test_without_lifted_functions_the_bound_is_the_error():
     observer, x, u, _ = remembering(functions=())
     own = driven_coordinates(observer, batch_of(x, u, DT), SIZES)
@@ -132,11 +103,3 @@ def test_nobody_exceeds_the_gain_and_it_is_nearly_attained(made):
     share, steps = attack_running(certificate, own, found.disturbance, rng.normal(size=(4, 5)), inputs, {"phase": rng.uniform(-3, 3, 4)})
     assert steps > 0
     assert share <= 1
-
-
-def test_an_observer_without_memory_is_left_alone(made):
-    x, u = machine()[:2]
-    plain = Observer.open_loop("o", Lifting(("p", "c")), 0.5 * np.eye(2), np.ones((2, 1)), (0,), ("u",), DT)
-    assert plain.recorded == ("p", "c")
-    assert driven_coordinates(plain, batch_of(x, u, DT), SIZES) is plain
-    assert with_internal(plain, x, u) is x

@@ -14,12 +14,9 @@ from kros.observer import Observer, Runtime, relift_certificate, run_observer, s
 from kros.observer.certificate.error import ReliftScales, error_system
 from kros.observer.certificate.report import course, frozen_response
 from kros.observer.limits import Limit, limits_of
-from kros.observer.predictor.choice import filled_in
 from kros.observer.predictor.driven import driven_coordinates, with_internal
 from kros.observer.predictor.limited import conditioned, with_limits
-from kros.observer.predictor.moments import PastMoments
 from kros.synthesis import Injection
-from kros.synthesis.residual_shaped.shaping_filter import Basis
 
 BACK, LEAK, LIMIT = 0.1, 0.995, 0.4  # of the controller: share of the excess taken off its integrator, its leak, the current's limit
 
@@ -101,15 +98,6 @@ def test_conditioned_predictors_run_in_coordinates_and_sample_by_sample_alike_an
     assert any("limits of current" in channel for channel in certificate.channels)
 
 
-def test_a_gain_that_limits_would_destabilise_is_not_reached(predictor):
-    """The machine takes off more than any pattern of limits leaves stable; what is learned stays where that is proven."""
-    batch = recorded(limit=0.05, size=20.0, batch=1)
-    found = conditioned(with_limits(predictor, [-np.inf, -0.05], [np.inf, 0.05]), batch)
-    for share in (0.0, 0.3, 1.0):
-        stuck = found.A[2:, 2:] + share * found.A[2:, 1:2] @ np.array([[0.0, 1.0]])
-        assert np.abs(np.linalg.eigvals(stuck)).max() < 1
-
-
 def test_limits_are_written_in_many_ways_and_refused_where_they_cannot_be():
     assert Limit.of(0.35, "x") == Limit.of([-0.35, 0.35], "x") == Limit.of({"lower": -0.35, "upper": 0.35}, "x")
     assert limits_of({"current": Limit.of(False, "x")}, {}, ("y", "current")) == {}
@@ -118,23 +106,6 @@ def test_limits_are_written_in_many_ways_and_refused_where_they_cannot_be():
             Limit.of(wrong, "Study, limits.current")
     with pytest.raises(ConfigError, match="torque should be among the recorded states"):
         limits_of({"torque": Limit.of(1.0, "x")}, {}, ("y", "current"))
-
-
-def ripple(predictor):
-    """The predictor with the ripple of an angle in the current's and the integrator's rows, whose slope lets errors come back through the measurement."""
-    lifting = Lifting(("y", "current", "memory_1"), ("sin(30*y)",))
-    A = np.zeros((4, 4))
-    A[:3, :3], A[:3, 3] = predictor.A, [0.002, 0.003, 0.0005]
-    return replace(predictor, lifting=lifting, A=A, B=np.vstack([predictor.B, [[0.0]]]), controller=gain(A[:, :1], 1e-3))
-
-
-def test_a_gain_leaves_room_for_the_slopes_of_lifted_functions(predictor):
-    batch = recorded(limit=0.05, size=20.0, batch=1)  # more than limits and slopes together leave stable
-    found = conditioned(with_limits(ripple(predictor), [-np.inf, -0.05], [np.inf, 0.05]), batch)
-    assert np.abs(found.A[2:4, 1]).max() > 1e-3
-    certificate = relift_certificate(found, mismatch=False)
-    assert certificate.certified
-    assert len(certificate.channels) == 2
 
 
 def test_recorded_signals_within_the_limits_have_the_bound_of_an_observer_without(predictor):
@@ -167,28 +138,3 @@ def test_what_limits_cut_off_is_a_residual_of_the_observer_without_them(predicto
     assert np.all(bound.ratios[:, 1] >= 1)
     assert np.all(bound.ratios[:, 1] <= 1.3)
     assert np.all(bound.cover >= bound.bounds.max(axis=0) * (1 - 1e-9))
-
-
-def test_what_a_limit_hides_is_filled_in_where_a_machine_forgets_it():
-    rng, n, units = np.random.default_rng(0), 4000, 3
-    u = np.repeat(rng.uniform(-1, 1, (n // 20, units)), 20, axis=0)
-    y, v, raw = np.zeros(u.shape), np.zeros(u.shape), np.zeros(u.shape)
-    for k in range(n - 1):  # a current that voltage drives at once, an amplifier that limits it, and nothing that remembers the limit
-        raw[k + 1] = 2.0 * u[k] - 0.5 * v[k - 1] * (k > 0)
-        v[k + 1] = 0.9 * v[k] + 0.1 * np.clip(raw[k], -1.0, 1.0)
-        y[k + 1] = y[k] + 0.05 * v[k]
-    states = np.stack([y, np.clip(raw, -1.0, 1.0) + 1e-3 * rng.normal(size=raw.shape) * (np.abs(raw) < 1.0)], axis=-1)
-    batch = EpisodeBatch(tuple(EpisodeKey(str(i), "c", "0") for i in range(units)), np.full(units, n), states, u[..., None], 1e-3)
-    assert 0.2 < np.mean(np.abs(raw) >= 1.0) < 0.6
-    cut = PastMoments.of(Lifting(("y", "current")), (0,), batch, Basis(6, ()))
-    whole, fill = filled_in(cut, batch, np.array([-np.inf, -1.0]), np.array([np.inf, 1.0]))
-    found = fill(batch).states
-    np.testing.assert_array_equal(found[..., 0], y)
-    within = np.abs(raw) < 0.9
-    np.testing.assert_array_equal(found[..., 1][within], states[..., 1][within])
-    z, rows, missed = cut.channels(batch), np.arange(300, n), []
-    for moments in (whole, cut):  # what a regression on the past misses of the current without its limit
-        said = [moments.states_at(z[:, i], rows) @ moments.regression()[0][0] for i in range(units)]
-        missed.append(np.sqrt(np.mean((np.stack(said, axis=1) - raw[rows]) ** 2)))
-    assert missed[0] < 0.03
-    assert missed[0] < 0.1 * missed[1]

@@ -70,35 +70,6 @@ def test_what_runs_is_an_observer_like_any_other(made, tmp_path):
         np.testing.assert_allclose(running.step(x[k, 0, :1], u[k, 0]), expected[k + 1, 0], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("order", [1, 2, 5, 12])
-def test_reduced_models_are_stable(made, order):
-    F = made[0].model(order)[0]
-    assert np.abs(np.linalg.eigvals(F)).max() < 1
-
-
-def test_leaving_a_unit_out_is_as_if_it_had_not_been_recorded(made):
-    past, x, u, phase = made
-    others = PastMoments.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS).take(range(4)), Basis(20))
-    same = PastMoments(
-        past.lifting, past.measured, past.basis, past.static, past.free, others.units, past.gram[:2], past.cross[:2], past.power[:2]
-    )
-    F, G, H = past.model(4, without=["c"])
-    for found, expected in zip((F, G, H), same.model(4), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
-
-
-def test_no_unit_counts_for_more_than_its_error_is_like(made):
-    _, x, u, phase = made
-    wound = x.copy()
-    wound[..., 4:, 1] += 50 * size(x[..., 1]) * np.cumsum(np.random.default_rng(4).normal(size=x[..., 4:, 1].shape), axis=0)
-    past, clean = (PastMoments.of(LIFTING, (0,), batch_of(v, u, DT, phase, units=UNITS), Basis(20)) for v in (wound, x))
-    alone, given = clean.regression(without=["c"]), {past.conditions[0]: 1.0}
-    rows = [i for i, unit in enumerate(past.units) if unit != "c"]
-    errors = [past.errors(found[0])[rows].mean() for found in (alone, past.regression(weights=given), past.regression())]
-    assert errors[1] < 1.1 * errors[0]
-    assert errors[2] > 10 * errors[0]
-
-
 def test_a_linear_system_gets_the_kalman_predictor():
     rng = np.random.default_rng(3)
     F, G, Q = np.array([[1.0, 0.1], [-0.3, 0.8]]), np.array([[0.0], [1.0]]), np.diag([1e-3, 4e-2])
@@ -142,26 +113,6 @@ def test_tuning_finds_the_controller_of_which_the_hidden_state_is_the_command():
     (F, _, _), criterion = tune_predictor(past.model(2), past, batch_of(x, u, DT, phase, units=UNITS), iterations=40, least_gain=1e-6)
     assert list(criterion) == sorted(criterion, reverse=True)
     np.testing.assert_allclose(np.sort(np.linalg.eigvals(F).real), [0.5, 0.99], atol=2e-3)
-
-
-def test_deviation_is_what_recordings_of_machines_that_deviate_would_say():
-    x, u, phase = controlled()
-    make = [
-        PastMoments.of(Lifting(("p", "c"), (f"{a}*sin(5*p + phase)",), ("phase",)), (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
-        for a in (0.6, 1.4)
-    ]
-    plain = PastMoments.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
-    both = PastMoments(
-        LIFTING,
-        (0,),
-        plain.basis,
-        plain.static,
-        plain.free,
-        plain.units,
-        *((getattr(make[0], n) + getattr(make[1], n)) / 2 for n in ("gram", "cross", "power")),
-    )
-    for found, expected in zip(plain.model(4, deviation=0.4), both.model(4), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
 
 
 def test_the_whole_way_gives_an_observer_that_is_certified():

@@ -6,22 +6,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from kros.core.errors import DataError
-from kros.data.population import EpisodeKey
 from kros.design.certificates import certify_running, other_conditions
 from kros.design.methods.design import design
-from kros.design.methods.predictor import EFFORTS, Plan, on_the_circle, recordings
-from kros.design.methods.tuned import held_out, tuned_where_better
 from kros.design.settings import PredictorSettings, SynthesisSettings
 from kros.design.task import DesignTask
 from kros.design.uncertain_set import certificate
 from kros.design.validation import TrainingSet, hidden_mean
 from kros.lifting import Lifting
-from kros.observer import Sensor, relift_certificate
-from kros.observer.limits import Limit
-from kros.observer.predictor.choice import _held_out
+from kros.observer import Sensor
 from kros.plants import PLANTS
-from kros.report.verdict import verdict
 
 STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "target_velocity")
 DRIVE = Lifting(STATES, ("sin(100*position + phase)",), ("phase",))
@@ -59,25 +52,6 @@ def made(tuning):
     return own, design(own)
 
 
-def test_a_calibrated_angle_is_seen_as_a_whole():
-    functions = ("sin(100*position + phase)", "sin(position)", "cos(2*position - phase)", "sin(position + phase)*velocity")
-    found = on_the_circle(Lifting(STATES, functions, ("phase",)))
-    assert found.functions == (*functions, "cos(100*position + phase)", "sin(2*position - phase)")
-    assert on_the_circle(found) == found
-    assert on_the_circle(Lifting(STATES)) == Lifting(STATES)
-
-
-def test_the_last_episodes_are_held_out():
-    def keys(*names):
-        return [EpisodeKey(name[0], "on", name[1:]) for name in names]
-
-    assert held_out(keys("a1", "a2", "a3", "b1", "b2")) == [False, False, True, False, True]
-    assert held_out(keys("a1", "b1", "c1", "d1")) == [False, False, True, False]
-    assert held_out(keys("a1", "b1")) == [False, True]
-    twice = [*keys("a1", "a2"), EpisodeKey("a", "off", "1"), EpisodeKey("a", "off", "2")]
-    assert held_out(twice) == [False, True, False, True]
-
-
 def test_a_study_makes_an_observer_and_says_how(made, tuning):
     _, product = made
     assert product.facts["memory_states"] == 4
@@ -92,25 +66,6 @@ def test_a_study_makes_an_observer_and_says_how(made, tuning):
     assert observer.lifting.functions == ("sin(100*position + phase)", "cos(100*position + phase)")
     judge = tuning.read()
     assert max(judge.percent(observer)) < 20
-
-
-@pytest.mark.parametrize("free", [0, 1])
-def test_machines_that_start_at_a_limit_are_learned_from_whole_recordings(tuning, free, monkeypatch):
-    """Where only one unit moves before it meets a limit, no other one can be judged."""
-    own, effort = replace(task(tuning), limits={"current": Limit(lower=-0.3, upper=0.3)}), EFFORTS["quick"]
-    batch = recordings(own, effort).read_whole().on_time.batch
-    until = np.where(np.array(batch.units) == batch.units[0], 1000 * free, 0)
-    monkeypatch.setattr("kros.design.methods.predictor.before_limits", lambda *_: until)
-    found, whole = Plan.of(own, effort, batch), Plan.of(own, effort, batch, whole=True)
-    assert found.recipe == whole.recipe
-    assert found.emphasis == whole.emphasis
-    assert found.fill is not None
-
-
-def test_units_that_none_can_judge_are_refused():
-    past = SimpleNamespace(units=("a", "b"), conditions=("on at a limit",) * 2)
-    with pytest.raises(DataError, match="no unit that is left out can be judged"):
-        _held_out(past, {"on": np.ones(1)}, lambda _, rows: np.ones((len(rows), 1)))
 
 
 def test_told_of_the_sensor_it_is_better_than_untold_and_certified(made, tuning):
@@ -165,56 +120,3 @@ def test_where_there_is_none_the_reason_is_told(tuning, lifting, measured, words
     assert product.synthesis is None
     assert product.facts["status"] == "failed"
     assert words in product.facts["reason"]
-
-
-def test_tuning_is_kept_where_nothing_speaks_against_it(tuning, made):
-    own, product = made
-    start, judge = product.observer, tuning.read()
-
-    def changed(factor):
-        A = np.concatenate([start.A[:1], factor * start.A[1:2], start.A[2:]])
-        return replace(start, A=A, controller=replace(start.controller, D=A[:, :1]))
-
-    worse, facts = tuned_where_better(own, judge, start, lambda seen, o: changed(0.5))
-    assert worse is start
-    assert not facts["tuned"]
-    assert facts["held_out_percent"]["after"] > facts["held_out_percent"]["before"]
-    rough = changed(0.5)
-    better, facts = tuned_where_better(own, judge, rough, lambda seen, o: start)
-    assert better is start
-    assert facts["tuned"]
-    alone = judge.part([0])
-    assert tuned_where_better(own, alone, start, lambda seen, o: changed(0.5)) == (start, {"tuned": False})
-    A = np.concatenate([1.5 * start.A[:1], start.A[1:]])  # what predicts the measurement matters where there is none
-    lost = replace(start, A=A, controller=replace(start.controller, D=A[:, :1]))
-    assert tuned_where_better(own, judge, start, lambda seen, o: lost)[0] is start
-    assert relift_certificate(start, mismatch=False).certified
-
-
-def test_what_is_tuned_is_judged_by_what_counts(tuning, made):
-    observer, data = made[1].observer, tuning.read()
-    keys = [replace(key, condition="cold" if i % 3 == 0 else "warm") for i, key in enumerate(data.batch.keys)]
-    mixed = replace(data, batch=replace(data.batch, keys=tuple(keys)))
-    (found,) = Plan(None, None, [2.0, 1.0], {"cold": (1.0, 1.0), "warm": (0.5, 0.0)}).score(mixed, [observer])
-    error = observer.run(data.batch.states[..., :1], data.batch.inputs, data.parameters)[..., 1:3] - data.batch.states[..., 1:3]
-    logs = np.log(np.sqrt(np.mean(error**2, axis=0)))
-    cold, warm = (logs[[key.condition == c for key in keys]].mean(axis=0) for c in ("cold", "warm"))
-    assert found == pytest.approx(100 * np.exp((cold @ [2.0, 1.0] + warm[0]) / 4.0))
-
-
-def test_the_verdict_claims_no_set_for_it():
-    entry = {"relift_certified": True, "worst_case_h2": None}
-    metrics = {"study": {"units": 3, "conditions": ["noload"], "identify_on": "noload", "deployed": "koopman/memory"}}
-    told = " ".join(
-        verdict(metrics | {"observers": {"koopman/memory": entry}, "uncertainty": {"koopman": {"peak_db": {"x": 1.0}, "form": "x"}}})
-    )
-    assert "“Koopman, subspace predictor”" in told
-    assert "not designed for a set of machines" in told
-    assert "A certificate covers it as it runs" in told
-
-
-def test_an_observer_that_loses_the_machine_is_not_made(made, monkeypatch):
-    monkeypatch.setattr("kros.design.methods.predictor.DIVERGED", 0.0)
-    product = design(made[0])
-    assert product.synthesis is None
-    assert "it diverges" in product.facts["reason"]

@@ -68,11 +68,6 @@ def test_examples_run(name: str) -> None:
     assert failures(importlib.import_module(name)) == []
 
 
-def test_a_wrong_example_is_found() -> None:
-    module = ModuleType("wrong", ">>> 1 + 1\n3\n")
-    assert "Expected:" in "".join(failures(module))
-
-
 @pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
 def test_examples_of_documents_run(path: Path) -> None:
     text = "\n".join(blocks(path.read_text(encoding="utf-8"), "python"))
@@ -90,19 +85,11 @@ def test_names_in_documents_exist(path: Path) -> None:
     assert unknown_names(path.read_text(encoding="utf-8")) == []
 
 
-def test_unknown_names_are_found() -> None:
-    assert unknown_names("`kros.core.h2_norm`, `kros.core.h3_norm` and `kros.cores`") == ["kros.core.h3_norm", "kros.cores"]
-
-
 def test_an_unknown_key_is_found() -> None:
     with pytest.raises(ConfigError, match="sorce"):
         check_configuration('[data]\nsorce = "here"\n')
     with pytest.raises(ConfigError, match="chanel"):
         check_configuration("files = '.*'\ntime = 't'\n[[chanel]]\n")
-
-
-def test_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 150
 
 
 def test_page_of_reliability_is_that_of_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,12 +131,6 @@ def test_every_key_of_a_mapping_says_something(monkeypatch: pytest.MonkeyPatch) 
     assert [row for row in rows if row.endswith("|  |")] == []
 
 
-def test_the_page_of_keys_is_filled(monkeypatch: pytest.MonkeyPatch) -> None:
-    page = page_of_keys(monkeypatch)
-    assert "<!--" not in page
-    assert all(f"### `{step}`\n" in page for step in kros.data.steps.parsing.STEPS)
-
-
 def pages_of_objects(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The extension that writes a page for every public object."""
     monkeypatch.syspath_prepend(ROOT / "docs")
@@ -169,13 +150,6 @@ def test_every_public_object_has_a_page_and_a_row(monkeypatch: pytest.MonkeyPatc
     assert [name for name, says in rows if not says.endswith(".") or not 10 < len(says) < 150] == []
 
 
-def test_the_page_of_a_function_is_not_that_of_a_module_of_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    objects = pages_of_objects(monkeypatch)
-    assert ".. autofunction:: prepare\n" in objects.object_page("kros.data.prepare")
-    assert ".. autoexception:: DataError\n" in objects.object_page("kros.core.DataError")
-    assert "| {py:obj}`~kros.data.prepare` | Declare preparation steps" in objects.tables()
-
-
 def packages() -> Iterator[ModuleType]:
     """Public packages of kros that list names."""
     public = (m.name for m in pkgutil.walk_packages(kros.__path__, "kros.") if m.ispkg and m.name.split(".")[1] in kros.__all__)
@@ -193,12 +167,6 @@ def test_every_public_object_has_an_example(package: ModuleType) -> None:
     assert ">>> " in (package.__doc__ or "") or package is kros
 
 
-def test_what_lacks_an_example_is_found() -> None:
-    package = ModuleType("wrong")
-    package.__dict__.update(__all__=["shown", "bare"], shown=kros.read, bare=lambda: None)
-    assert without_example(package) == ["bare"]
-
-
 def formulas_of(text: str) -> list[str]:
     """Formulas in a document, in lines and between them."""
     prose = re.sub(r"^```.*?^```$|`[^`]*`", "", text, flags=re.MULTILINE | re.DOTALL)
@@ -212,18 +180,6 @@ def test_formulas_become_mathml(path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     mathml = importlib.import_module("mathml")
     for formula in formulas_of(path.read_text(encoding="utf-8")):
         assert mathml.tex2mathml(mathml.TAG.sub("", formula)).startswith("<math")
-
-
-OLD_WORDS = re.compile(
-    r"surroundings|\boutlying\b|\bladders?\b|bears? gaps|careful step|observer with a memory|models? with a memory", re.IGNORECASE
-)
-SHOWN = sorted([*(ROOT / "src" / "kros" / "report" / "templates").iterdir(), ROOT / "src" / "kros" / "cli.py"])
-
-
-@pytest.mark.parametrize("path", [*DOCUMENTS, *SHOWN], ids=lambda path: str(path.relative_to(ROOT)))
-def test_no_word_of_the_old_vocabulary(path: Path) -> None:
-    """What users read has the words of the glossary."""
-    assert OLD_WORDS.findall(path.read_text(encoding="utf-8")) == []
 
 
 def slug(heading: str) -> str:

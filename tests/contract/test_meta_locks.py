@@ -60,22 +60,3 @@ def test_development_uses_the_versions_that_are_installed() -> None:
 def test_dependencies_have_no_upper_bound() -> None:
     groups = [PROJECT["project"]["dependencies"], *PROJECT["project"]["optional-dependencies"].values()]
     assert [item for group in groups for item in group if re.search(r"<|==|~=", item)] == []
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "numpy==2.0",
-        "numpy>=2.0 --hash=sha256:" + "0" * 64,
-        "numpy @ https://example.org/numpy.whl --hash=sha256:" + "0" * 64,
-        "--index-url https://example.org/simple",
-        "-e .",
-    ],
-)
-def test_faults_are_found(line: str) -> None:
-    assert faults(line) == [line[:80]]
-
-
-def test_a_marker_and_several_hashes_are_no_fault() -> None:
-    hashes = " \\\n    --hash=sha256:".join(["", "0" * 64, "f" * 64])
-    assert faults(f"colorama==0.4.6 ; sys_platform == 'win32'{hashes}\n    # via click") == []

@@ -68,27 +68,6 @@ def test_targets_of_make_that_are_named_exist(path: str) -> None:
     assert set(named) <= TARGETS
 
 
-def test_hooks_are_the_locked_tools() -> None:
-    (repository,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))["repos"]
-    entries = {hook["id"]: hook["entry"].split()[0] for hook in repository["hooks"]}
-    assert repository["repo"] == "local"
-    tools = {"ruff-check": "ruff", "ruff-format": "ruff", "mypy": "mypy", "import-layers": "lint-imports"}
-    assert entries == {name: f".venv/bin/{tool}" for name, tool in tools.items()}
-    assert {"ruff", "mypy", "import-linter"} <= set(
-        re.findall(r"^([\w-]+)==", (ROOT / "requirements-dev.lock").read_text(), flags=re.MULTILINE)
-    )
-
-
-def test_the_form_is_a_form() -> None:
-    form = yaml.safe_load((ROOT / PUBLIC[1]).read_text(encoding="utf-8"))
-    assert {"name", "description", "body"} <= set(form)
-    kinds = {"markdown", "textarea", "input", "dropdown", "checkboxes"}
-    assert [item for item in form["body"] if item["type"] not in kinds or "attributes" not in item] == []
-    fields = [item for item in form["body"] if item["type"] != "markdown"]
-    assert len({item["id"] for item in fields}) == len(fields)
-    assert all(item["attributes"]["label"] for item in fields)
-
-
 def hosts_and_paths(text: str) -> list[str]:
     """Addresses that are not public ones of this project's kind, and absolute paths."""
     return re.findall(r"https?://(?!github\.com|[\w.-]*\.org\b|semver\.org)\S+|(?<![\w.:/}*~-])/(?:work|home|root|tmp|opt|mnt)\b\S*", text)
@@ -97,13 +76,6 @@ def hosts_and_paths(text: str) -> list[str]:
 @pytest.mark.parametrize("path", [*PUBLIC, "CONTRIBUTING.md", "Makefile", ".ci/run", "pyproject.toml"])
 def test_no_host_and_no_path_of_one_machine(path: str) -> None:
     assert hosts_and_paths((ROOT / path).read_text(encoding="utf-8")) == []
-
-
-def test_hosts_and_paths_are_found() -> None:
-    assert hosts_and_paths("see http://build.internal:8080/x and /home/me/data, not https://github.com/x or src/work") == [
-        "http://build.internal:8080/x",
-        "/home/me/data,",
-    ]
 
 
 def test_everything_in_the_list_of_the_source_distribution_exists() -> None:

@@ -3,10 +3,7 @@
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
-
-from kros.data import Channel, Role, from_arrays, write_parquet
 
 
 @pytest.fixture
@@ -47,19 +44,6 @@ def test_missing_study(kros, tmp_path):
     refused(kros, tmp_path / "no.toml", tmp_path, "no.toml")
 
 
-def test_empty_folder(kros, study, tmp_path):
-    (tmp_path / "empty").mkdir()
-    refused(kros, study(source=tmp_path / "empty"), tmp_path, "empty")
-
-
-def test_wrong_reader(kros, study, tmp_path):
-    refused(kros, study(reader="motor-drive-raw"), tmp_path, "parquet")
-
-
-def test_unknown_reader(kros, study, tmp_path):
-    refused(kros, study(reader="excel"), tmp_path, "excel")
-
-
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
@@ -91,12 +75,6 @@ def test_bad_override_and_stage(kros, study, tmp_path):
     refused(kros, path, tmp_path, "--until", "quantify", options=("--until", "lunch"))
 
 
-@pytest.mark.parametrize(("columns", "word"), [(slice(0, 5), "column"), (slice(0, 7), "column")])
-def test_missing_or_extra_column(kros, study, tmp_path, raw, columns, word):
-    edit(first_csv(raw), lambda lines: [",".join([*line.split(","), "0"][columns]) for line in lines])
-    refused(kros, study(source=raw, reader="motor-drive-raw"), tmp_path, word)
-
-
 def test_nan_is_located(kros, study, tmp_path, raw):
     def change(lines):
         row = lines[1501].split(",")
@@ -104,16 +82,6 @@ def test_nan_is_located(kros, study, tmp_path, raw):
 
     edit(first_csv(raw), change)
     refused(kros, study(source=raw, reader="motor-drive-raw"), tmp_path, "velocity", "NaN", "001001")
-
-
-def test_uneven_time(kros, study, tmp_path, raw):
-    edit(first_csv(raw), lambda lines: lines[:2000] + lines[2010:])
-    refused(kros, study(source=raw, reader="motor-drive-raw"), tmp_path, "001001")
-
-
-def test_two_sampling_periods(kros, study, tmp_path, raw):
-    edit(first_csv(raw), lambda lines: [lines[0], *(",".join([f"{2 * float(x.split(',')[0]):.6f}", *x.split(",")[1:]]) for x in lines[1:])])
-    refused(kros, study(source=raw, reader="motor-drive-raw"), tmp_path, "0.002", "0.001")
 
 
 def test_one_unit_only(kros, study, tmp_path, raw):
@@ -141,14 +109,6 @@ def test_an_existing_folder_of_something_else_is_left_alone(kros, study, tmp_pat
 
 def test_a_model_that_no_regularisation_was_allowed_to_stabilise(kros, study, tmp_path):
     refused(kros, study(), tmp_path, "spectral radius", "alpha", code=1, options=("--set", "identify.alpha=1e-9"))
-
-
-def test_no_measured_channel(kros, study, tmp_path):
-    rng = np.random.default_rng(0)
-    channels = [Channel("x", Role.STATE), Channel("u", Role.INPUT)]
-    data = {unit: {"default": [rng.normal(size=(200, 2)) for _ in range(3)]} for unit in "abc"}
-    write_parquet(from_arrays(data, channels, 0.01), tmp_path / "blind")
-    refused(kros, study(source=tmp_path / "blind"), tmp_path, "measured")
 
 
 @pytest.mark.parametrize("command", ["check", "estimate", "report", "figures"])

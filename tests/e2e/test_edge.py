@@ -168,41 +168,6 @@ def test_values_on_the_command_line(kros, store, tmp_path, value):
     said(result, 2, "--set")
 
 
-@pytest.fixture
-def written_by_others(tmp_path):
-    """Write CSV recordings and a study on them."""
-
-    def write(data) -> Path:
-        (tmp_path / "csv").mkdir()
-        for unit, recorded in data.items():
-            for k, values in enumerate(recorded):
-                rows = [",".join(f"{v:.9g}" for v in (0.01 * i, *row)) for i, row in enumerate(values)]
-                (tmp_path / "csv" / f"{unit}_{k}.csv").write_text("t,position,velocity,torque\n" + "\n".join(rows) + "\n")
-        channels = "".join(
-            f'[[data.csv.channel]]\nname = "{c.name}"\ncolumn = "{c.name}"\nrole = "{c.role.value}"\nmeasured = {str(c.measured).lower()}\n'
-            for c in CHANNELS
-        )
-        mapping = f"[data.csv]\nfiles = '(?P<unit>[abc])_(?P<episode>[0-9]+)'\ntime = 't'\n{channels}"
-        (tmp_path / "study.toml").write_text(f"[data]\nsource = 'csv'\nreader = 'csv'\n{mapping}")
-        return tmp_path / "study.toml"
-
-    return write
-
-
-def test_a_copy_is_refused_and_nothing_is_kept(kros, written_by_others, tmp_path):
-    data, out = episodes(), tmp_path / "out"
-    data["c"][2] = data["a"][0]
-    said(kros("run", written_by_others(data), "--out", out, "--workers", 1), 2, "pisode 2 of unit c", "episode 0 of unit a", "copy")
-    assert not out.exists()
-
-
-def test_a_stuck_sensor_is_refused_and_nothing_is_kept(kros, written_by_others, tmp_path):
-    data, out = episodes(), tmp_path / "out"
-    data["b"][1][:, 1] = 0.25
-    said(kros("run", written_by_others(data), "--out", out, "--workers", 1), 2, "pisode 1 of unit b", "'velocity'", "stuck")
-    assert not out.exists()
-
-
 def test_an_implausible_period_is_told_with_the_results(kros, store, tmp_path):
     out = tmp_path / "out"
     result = kros("run", store(period=1.0), "--out", out, "--until", "read", "--workers", 1)
@@ -210,12 +175,6 @@ def test_an_implausible_period_is_told_with_the_results(kros, store, tmp_path):
     assert "time_scale" in result.stdout
     alerts = json.loads((out / "metrics.json").read_text())["study"]["alerts"]
     assert any("unusual" in alert for alert in alerts)
-
-
-def test_a_good_period_is_not(kros, store, tmp_path):
-    result = kros("run", store(), "--out", tmp_path / "out", "--until", "read", "--workers", 1)
-    assert result.exit_code == 0, result.output
-    assert "alerts" not in json.loads((tmp_path / "out" / "metrics.json").read_text())["study"]
 
 
 def test_runs_of_another_version_and_damaged_ones(kros, demo, recorded, tmp_path):
@@ -247,18 +206,3 @@ def test_files_of_a_run_without_their_content(kros, demo, recorded, tmp_path, co
         said(result, result.exit_code)
         assert "Internal error" not in result.stderr
         (run / name).write_bytes(good)
-
-
-def test_an_observer_with_a_hole_is_not_run(kros, demo, recorded, tmp_path):
-    run = tmp_path / "run"
-    shutil.copytree(demo, run)
-    path = run / "observers" / "deployed.json"
-    content = json.loads(path.read_text())
-    content["model"]["A"][0][0] = None
-    for keep in (True, False):
-        if not keep:
-            del content["checksum"]
-        path.write_text(json.dumps(content))
-        result = kros("estimate", run, recorded, tmp_path / "e.parquet")
-        said(result, 2, "deployed.json")
-        assert not (tmp_path / "e.parquet").exists()

@@ -12,10 +12,8 @@ from kros.core.artifacts import read_arrays, read_json
 from kros.core.work import Work
 from kros.data import split_episodes, write_parquet
 from kros.data.readers.parquet import read_parquet
-from kros.evaluate import unit_interval
 from kros.identify import ModelSet
 from kros.observer import Observer, run_observer
-from kros.report.error_tables import PAPER, left_out_tables
 from kros.study import load_config, run_study
 from kros.study.commands.recordings import load_calibration, unit_parameters
 from kros.study.config import Stage
@@ -166,29 +164,6 @@ def test_a_unit_that_is_left_out_is_calibrated_as_a_new_one(kros, tmp_path):
     assert made.data.source == tmp_path / "drives"
     assert made.observer.deployed is None
     assert not made.require.robust
-
-
-def test_the_table_holds_means_intervals_worst_units_and_powers():
-    errors = {PAPER: [8.0, 10.0, 12.0], "koopman/memory": [1.0, 2.0, 6.0], "learned": [1.0, None, 2.0]}
-    rows = [
-        {
-            "observer": o,
-            "unit": str(i),
-            "condition": "noload",
-            "channel": "velocity",
-            "error_percent": e,
-            "gearbox_band_power": e and 1e-3 * e,
-        }
-        for o, values in errors.items()
-        for i, e in enumerate(values)
-    ]
-    (table,) = left_out_tables(rows, "noload")
-    cell = table.cells["koopman/memory"]["velocity"]
-    assert (cell.mean, cell.worst, cell.worst_unit) == (3.0, 6.0, "2")
-    assert cell.interval == pytest.approx(tuple(float(v[0]) for v in unit_interval(np.array([[1.0], [2.0], [6.0]]))))
-    assert cell.band_db == pytest.approx(10 * np.log10(3 / 10))
-    assert table.cells[PAPER]["velocity"].band_db == pytest.approx(0)
-    assert table.cells["learned"]["velocity"].mean is None
 
 
 def test_units_in_reserve_take_part_in_nothing_and_bound_the_next(pendulums, run, tmp_path):

@@ -7,7 +7,7 @@ from kros.core.errors import DimensionError
 from kros.evaluate import Kind, unit_interval
 from kros.evaluate.intervals import interval_rows, mean_intervals
 from kros.evaluate.robustness import severity_of_growth
-from kros.report.disturbances import Curve, curves, needed, shown_observers
+from kros.report.disturbances import curves
 from kros.report.error_tables import error_table
 
 
@@ -38,18 +38,6 @@ def test_curves_begin_without_disturbance_and_take_one_condition():
     np.testing.assert_array_equal(curve.severities, [0, 0.1, 0.2])
     np.testing.assert_array_equal(curve.errors, [1, 2, np.inf])
     np.testing.assert_array_equal(curves(rows, "noload", "worst")["a"][Kind.BIAS]["v"].errors, [2, 4, np.inf])
-
-
-def test_severities_are_told_in_the_unit_of_their_axis():
-    rising = {"v": Curve(np.array([0, 0.25, 0.5]), np.array([1.0, 2.0, 4.0]))}
-    at_once = {"v": Curve(np.array([0, 0.05]), np.array([1.0, 9.0]))}
-    own = {Kind.GAP: rising, Kind.DROPPED: at_once, Kind.BIAS: {"v": Curve(np.array([0, 1.0]), np.ones(2))}}
-    assert needed(own, (), tuple(own), dict.fromkeys(own, "{}")) == ["250", "less than 5.0"]
-
-
-def test_the_figure_shows_the_kind_of_model_that_is_handed_over():
-    names = ["k/open_loop", "k/residual_h2", "l/residual_h2", "learned"]
-    assert shown_observers(names, "k/residual_h2") == ["k/residual_h2", "k/open_loop", "learned"]
 
 
 def evaluation(units=8, seed=0):

@@ -23,7 +23,7 @@ from tests.support.browser import printed_pages, probe
 from kros.core.artifacts import save_artifact, write_json
 from kros.core.errors import ConfigError, DataError
 from kros.core.lti import StateSpace, gain
-from kros.data import from_arrays, write_parquet
+from kros.data import from_arrays
 from kros.data.population import Channel, EpisodeKey, Population, Role, Unit
 from kros.data.survey import RecordingFacts
 from kros.design import Design
@@ -35,26 +35,20 @@ from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.report import plot, render, write_figures
 from kros.report.figures import FIGURES, ON_THE_PAGE, draw, draw_all
-from kros.report.figures.episodes import longest_steady, steady_stretches
-from kros.report.figures.outliers.scores import referred_range
 from kros.report.figures.residuals import beside, entry_names
-from kros.report.figures.see import SEE
 from kros.report.figures.spectra import band_shares, of_episode
 from kros.report.figures.synthesis.bode import scaled_filter
 from kros.report.figures.uncertainty.forms import paper_bounds
 from kros.report.figures.uncertainty.forms_entrywise import entry_bounds
-from kros.report.figures.uncertainty.weights import in_gauge
 from kros.report.files import to_svg
 from kros.report.names import observer_label
 from kros.report.plotting import PLOTS
-from kros.report.run_folder import NotShownError, RunFolder
-from kros.report.theme import Tone
+from kros.report.run_folder import RunFolder
 from kros.study.pipeline import RunResult
 from kros.synthesis.result import Injection, Status, Synthesis
-from kros.uncertainty import Cover, Form, OutlierModel, UncertainModel, quantify_systems, residual, score_outliers
+from kros.uncertainty import Form, OutlierModel, UncertainModel, quantify_systems, score_outliers
 from kros.uncertainty.quantify import UncertainModels
 from kros.uncertainty.unit_residuals import UnitResiduals
-from kros.uncertainty.weights.cover import cover_ratio
 
 DT = 0.001
 UNITS = ("000000", "001", "002", "003", "0<b>4")
@@ -404,12 +398,6 @@ def test_page_in_a_browser(page: str, tmp_path: Path) -> None:
     assert printed_pages(page, tmp_path) <= 12
 
 
-def test_every_figure_says_first_what_to_see(finished: tuple[Path, dict[str, Any]]) -> None:
-    assert set(SEE) == set(FIGURES)
-    assert all(text.endswith(".") and text.count(". ") == 0 for text in SEE.values())
-    assert draw("models", RunFolder(finished[0])).caption.startswith(SEE["models"])
-
-
 def test_lines_and_points_carry_the_names_of_their_units(finished: tuple[Path, dict[str, Any]], page: str) -> None:
     assert 'data-unit="0&lt;b&gt;4"' in page
     assert "units-" not in "".join(re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL))
@@ -424,16 +412,6 @@ def test_text_is_escaped(page: str) -> None:
     assert "0<b>4" not in page
     assert "0&lt;b&gt;4" in page
     assert "<h1>tiny &amp; small</h1>" in page
-
-
-def test_colours_follow_the_page(page: str) -> None:
-    figures = "".join(re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL))
-    assert not any(tone.light in figures for tone in Tone)
-    used = set(re.findall(r"var\((--[a-z]+)\)", figures))
-    defined = set(re.findall(r"(--[a-z]+):", page.partition("</style>")[0]))
-    assert used
-    assert used <= defined
-    assert "prefers-color-scheme:dark" in page
 
 
 def test_diverged_and_failed_observers_are_told(page: str) -> None:
@@ -452,28 +430,10 @@ def test_half_a_run_is_told_by_halves(tmp_path: Path) -> None:
     assert all(result.figure is None and result.reason for result in draw_all(RunFolder(tmp_path)))
 
 
-def test_stopped_run_shows_its_recordings(tmp_path: Path) -> None:
-    write_read_stage(tmp_path)
-    sources = {EpisodeKey("001", c, "1"): (k + 1) * np.hstack(shown_signals(0)) for k, c in enumerate(("load", "noload"))}
-    write_parquet(Population(CHANNELS, DT, (Unit("001"),), tuple(sources), sources.__getitem__), tmp_path / "recordings")
-    drawn = [r.name for r in draw_all(RunFolder(tmp_path)) if r.figure]
-    assert drawn == ["signals"]
-
-
 def test_shares_of_power_in_a_band() -> None:
     freqs, own, other = np.arange(100.0), np.ones((100, 2)), np.ones((100, 2))
     own[45:56], other[45:56, 1] = 0.5, 0.25
     assert band_shares(freqs, own, other, CHANNELS[:2], (45.0, 55.0)) == pytest.approx({"position": 0.5, "velocity": 2.0})
-
-
-def test_plant_without_phase_has_no_calibration(finished: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    write_read_stage(tmp_path)
-    models("linear_edmd", "noload", 1).save(tmp_path / "models" / "linear_edmd")
-    text = render(tmp_path, {**early_metrics(), "models": {"linear_edmd": finished[1]["models"]["linear_edmd"]}}).read_text(
-        encoding="utf-8"
-    )
-    assert "Phase calibration</h2>" not in text
-    assert text.count("<figure") == 1  # the models
 
 
 def test_broken_artifact_is_an_error(tmp_path: Path) -> None:
@@ -532,24 +492,6 @@ def test_observer_figures_show_nominal_above_worst_off_nominal_and_the_errors(fi
     assert drawn == pytest.approx(welch(error[:, 0], 1 / DT, "hann", 512)[1][1 : 1 + len(drawn)], rel=1e-9)
 
 
-def test_figures_of_the_papers_observers_need_them(finished: tuple[Path, dict[str, Any]]) -> None:
-    run = RunFolder(finished[0])
-    for shown in run.shown:
-        for model in ("linear_edmd", "koopman_edmd"):
-            del shown.observers[f"{model}/mixed"]
-    for name in ("observers_in_time_paper", "loaded_paper"):
-        assert "no observer of the paper's method" in draw(name, run).reason
-
-
-def test_phase_figure_shows_the_calibration(finished: tuple[Path, dict[str, Any]]) -> None:
-    calibration = RunFolder(finished[0]).calibration
-    phase, lag, concentration = plot(calibration).axes
-    drawn = [np.concatenate([line.get_ydata() for line in axes.lines if line.get_marker() == "o"]) for axes in (phase, lag, concentration)]
-    assert drawn[0] == pytest.approx(np.degrees([u.phase_rad for u in calibration.units.values()]))
-    assert drawn[1] == pytest.approx(np.degrees([u.lag_rad for u in calibration.units.values()]))
-    assert drawn[2] == pytest.approx([u.concentration for u in calibration.units.values()])
-
-
 def test_plot_takes_every_result(uncertain: dict[str, UncertainModel]) -> None:
     population = from_arrays({"a": [np.zeros((50, 5)) + np.arange(50.0)[:, None]]}, CHANNELS, sample_period_s=DT)
     before = dict(matplotlib.rcParams)
@@ -573,13 +515,6 @@ def test_drawing_leaves_pyplot_alone() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_steady_stretches_are_found_in_both_directions() -> None:
-    speed = np.concatenate([np.zeros(5), np.full(20, 2.0), np.zeros(5), np.full(30, -2.0), np.full(10, 1.0)])
-    assert steady_stretches(speed) == [(5, 25), (30, 60)]
-    assert longest_steady(speed) == (30, 60)
-    assert longest_steady(np.zeros(9)) == (0, 0)
-
-
 def test_output_forms_of_the_paper_never_fall_below_one(uncertain: dict[str, UncertainModel]) -> None:
     found = paper_bounds(uncertain["koopman_edmd"], models("koopman_edmd", "noload", 1))
     assert set(found) == {Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE}
@@ -598,61 +533,12 @@ def test_entries_are_those_of_the_form(uncertain: dict[str, UncertainModel]) -> 
         assert np.all(sizes.max(axis=(1, 2)) <= model.bounds[form] * (1 + 1e-9))
 
 
-def test_cover_in_another_gauge_is_the_same_cover(uncertain: dict[str, UncertainModel]) -> None:
-    model = uncertain["linear_edmd"]
-    fitted = model.weight.magnitudes(model.freqs_hz)
-    moved = in_gauge(model.cover, fitted)
-    assert moved.entries() == pytest.approx(model.cover.entries())
-    assert np.log(moved.right).mean(axis=1) == pytest.approx(np.log(fitted.right).mean(axis=1))
-    zero = Cover(np.zeros((3, 2)), np.ones((3, 2)))
-    assert in_gauge(zero, zero).left == pytest.approx(0.0)
-
-
-def test_ranges_of_scores_move_with_them() -> None:
-    model = scores("load")
-    for score in model.scores:
-        low, high = referred_range(score)
-        assert high - low == pytest.approx(score.highest_db - score.lowest_db)
-        assert low - score.score_db == pytest.approx(score.lowest_db - score.excess_db)
-
-
-def test_plots_of_an_uncertain_model_come_in_two_versions(uncertain: dict[str, UncertainModel]) -> None:
-    model, found = uncertain["koopman_edmd"], models("koopman_edmd", "noload", 1)
-    assert len(plot(model).axes) == 2
-    assert len(plot(model, models=found).axes) == 3
-    panels = plot(model, models=found, entries=True).axes
-    assert len(panels) == 4  # the inverse input form of two inputs
-    bound, fitted = (line.get_ydata() for line in panels[1].lines[:2])
-    assert np.all(fitted >= bound - 1e-9)
-    with pytest.raises(ConfigError, match="pass models="):
-        plot(model, entries=True)
-    with pytest.raises(ConfigError, match="no option 'entries'"):
-        plot(found, entries=True)
-
-
-def test_units_beside_weights_are_the_ratios_of_the_cover(uncertain: dict[str, UncertainModel]) -> None:
-    model, found = uncertain["linear_edmd"], models("linear_edmd", "noload", 1)
-    kept = beside(model, found)
-    G = found.systems(model.unit_ids).frequency_response(kept.freqs_hz) * 3.0 / 2.0
-    E = residual(model.form, G[model.nominal], G)
-    weights = model.weight.magnitudes(kept.freqs_hz)
-    assert kept.ratio == pytest.approx(cover_ratio(E, weights.left, weights.right), abs=1e-12)
-    assert kept.ratio.max() <= 1
-
-
 def test_filter_is_scaled_by_the_ranges() -> None:
     found = models("linear_edmd", "noload", 1)
     K = StateSpace([[0.5]], [[1.0]], [[1.0], [2.0]], [[0.0], [0.0]], DT)
     into_inputs = scaled_filter(Synthesis("mixed", K, Status.OPTIMAL, Injection.INPUT), found)
     # innovation of range 2 over the pole at one half, correction of range 3
     assert into_inputs.frequency_response([0.0])[0, :, 0] == pytest.approx([2 / 0.5 / 3, 4 / 0.5 / 3])
-
-
-def test_condition_without_models_is_not_shown(finished: tuple[Path, dict[str, Any]]) -> None:
-    run = RunFolder(finished[0])
-    assert run.condition_models("koopman_edmd", "load").condition == "load"
-    with pytest.raises(NotShownError, match="hot"):
-        run.condition_models("koopman_edmd", "hot")
 
 
 def test_every_class_that_can_be_plotted_has_its_figure() -> None:

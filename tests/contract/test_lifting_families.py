@@ -5,20 +5,14 @@ import subprocess
 
 import numpy as np
 import pytest
-from families import FAMILIES, INPUT_FUNCTIONS, INPUTS, STATES
+from families import INPUTS, STATES
 
 from kros.core.errors import ConfigError
 from kros.lifting import Lifting, radial
 from kros.lifting.c_code import c_code
-from kros.lifting.intervals import bounds_of
 
 BOX = {"position": (-1.5, 1.2), "velocity": (0.1, 2.0), "voltage": (-3.0, 3.0)}
 PHASE = (0.2, 0.9)
-
-
-@pytest.fixture(params=FAMILIES, name="lifting")
-def _lifting(request):
-    return Lifting(STATES, FAMILIES[request.param], ("phase",), INPUTS, INPUT_FUNCTIONS)
 
 
 def samples(lifting, n, seed=0):
@@ -82,20 +76,6 @@ def test_derivatives_are_finite_differences(lifting):
         # rounding of the difference: eps/step in units of the value; curvature: the fifth harmonic has third derivatives of 500**3
         tolerance = 1e-9 * scale + 1e-6 * np.abs(slopes[..., j]) + 5e-5
         assert np.all(np.abs(slope - slopes[..., j]) <= tolerance)
-
-
-def test_bounds_hold_every_sample(lifting):
-    windows, _, phase = samples(lifting, 4000)
-    trees = [formula.expression for formula in lifting.formulas]
-    values, slopes = lifting.lift(windows, {"phase": phase})[:, 2:], lifting.slopes(windows, {"phase": phase})
-    for found, (lower, upper) in (
-        (values, bounds_of(trees, {**BOX, "phase": PHASE})),
-        (slopes, lifting.slope_bounds(BOX, {"phase": PHASE})),
-    ):
-        assert lower.shape == found.shape[1:]
-        assert np.all((found >= lower) & (found <= upper))
-        wider = [bounds_of(trees, {}), lifting.slope_bounds({})][found is slopes]
-        assert np.all((wider[0] <= lower) & (wider[1] >= upper))
 
 
 def test_a_family_that_does_not_separate_says_so():

@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from batches import batch_of
-from scipy.signal import butter, lfilter
 
-from kros.core.errors import DataError, DimensionError
-from kros.core.lti import StateSpace, gain
+from kros.core.errors import DataError
 from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
-from kros.observer import ExtendedKalman, FilteredDifference, Observer, run_observer, run_observers
+from kros.observer import ExtendedKalman, FilteredDifference, Observer, run_observer
 from kros.observer.baselines.extended_kalman import start_covariance
 from kros.observer.baselines.learned import Features
 from kros.observer.baselines.learned_moments import Choice, Moments
@@ -72,19 +70,6 @@ def test_extended_filter_of_late_measurements_is_that_of_punctual_ones_predicted
         np.testing.assert_allclose(found[k], x, rtol=1e-12, atol=1e-12)
 
 
-def test_extended_filter_with_two_measurements_and_delays_runs_as_a_stack():
-    rng = np.random.default_rng(2)
-    lifting = Lifting(("a", "b", "c"), ("sin(a[-1])",), (), ("u",))
-    A, B = 0.3 * rng.normal(size=(4, 4)), rng.normal(size=(4, 1))
-    Qs, R = np.stack([0.1 * np.eye(3), 2.0 * np.eye(3)]), np.diag([0.1, 0.2])
-    y, u = rng.normal(size=(20, 2, 2)), rng.normal(size=(20, 2, 1))
-    together = ExtendedKalman(lifting, A, B, (0, 2), ("u",), Qs, R, np.eye(3)).run_all(y, u)
-    for Q, found in zip(Qs, together, strict=True):
-        np.testing.assert_allclose(ExtendedKalman(lifting, A, B, (0, 2), ("u",), Q, R, np.eye(3)).run(y, u), found, rtol=1e-12)
-    with pytest.raises(DimensionError, match="3 states and 2 measurements"):
-        ExtendedKalman(lifting, A, B, (0, 2), ("u",), Qs, np.eye(1), np.eye(3))
-
-
 def test_filtered_difference_of_a_ramp_and_a_sine():
     t = np.arange(4000) * DT
     y = np.stack([2.0 * t, np.sin(2 * np.pi * 40 * t)], axis=1)[..., None]
@@ -101,16 +86,6 @@ def test_filtered_difference_of_a_ramp_and_a_sine():
     assert changed[2001, 0, 1] != found[2001, 0, 1]
 
 
-@pytest.mark.parametrize("cutoff_hz", [1.0, 80.0, 440.0])
-def test_filtered_difference_is_that_of_a_butterworth_filter(cutoff_hz):
-    y = np.cumsum(np.random.default_rng(5).normal(size=(900, 2, 1)), axis=0)
-    found = FilteredDifference(2, ((0, 1),), cutoff_hz, 1e-3).run(y, y[..., :0])[..., 1]
-    rate = np.zeros((900, 2))
-    rate[2:] = np.diff(y[:-1, :, 0], axis=0) / 1e-3
-    wanted = lfilter(*butter(2, cutoff_hz, fs=1e3), rate, axis=0)
-    np.testing.assert_allclose(found, wanted, atol=1e-10 * np.abs(wanted).max())
-
-
 def linear_in_the_past(seed=3, units=3, n_samples=900):
     """Recordings in which the hidden states are linear in the last samples, those before the start the first, and differ from unit to unit."""
     rng = np.random.default_rng(seed)
@@ -123,18 +98,6 @@ def linear_in_the_past(seed=3, units=3, n_samples=900):
     ripple = 0.5 * np.sin(3 * y1[..., 0] + phases) + np.cos(3 * y2[..., 0] + phases)
     v = size * (0.7 + y1 - 2 * y3 + 0.4 * u2) + ripple[..., None]
     return lifting, np.concatenate([y, v], axis=-1), u, {"phase": phases}
-
-
-def test_learned_estimator_finds_what_is_linear_in_the_past():
-    lifting, states, u, phases = linear_in_the_past(units=1)
-    y = states[..., :1]
-    features = Features.of(lifting, (0,), y, u, taps=6)
-    assert features.visible == (0,)
-    np.testing.assert_allclose(features.static, [[0.3, 2.0]], atol=0.05)
-    learned = Moments.of(features, [batch_of(states, u, DT, phases)]).estimator(choices=[Choice(6, 1e-12)])
-    found = learned.run(y, u, phases)
-    assert np.isnan(found[..., 0]).all()
-    np.testing.assert_allclose(found[..., 1], states[..., 1], atol=1e-6)
 
 
 def test_learned_estimator_is_ridge_regression_from_the_first_sample_on():
@@ -201,45 +164,3 @@ def test_a_unit_that_is_left_out_leaves_no_trace():
     assert np.abs(moments.estimator().run(y, u, phases) - others.estimator().run(y, u, phases))[..., 1].max() > 0.1
     with pytest.raises(DataError, match="no unit is left"):
         moments.estimator(["a", "b", "c"])
-
-
-def test_means_of_many_units_are_those_of_the_definition():
-    """More units than there are blocks, and one that was not recorded in both conditions."""
-    rng = np.random.default_rng(8)
-    groups = [(f"unit {i}", condition) for i in range(29) for condition in ("load", "noload") if (i, condition) != (5, "load")]
-    gram, cross, power = rng.normal(size=(len(groups), 2, 4, 4)), rng.normal(size=(len(groups), 2, 4)), np.ones((len(groups), 2))
-    moments = Moments(Features(Lifting(("x",)), (0,), np.zeros((1, 3)), 3), (1, 2), tuple(groups), gram, cross, power)
-    for without in ([], ["unit 5"], ["unit 13", "unit 0"], moments.units[1::4]):
-        for condition in (None, "load", "noload", "another"):
-            among = [i for i, (unit, own) in enumerate(groups) if unit not in without and condition in (None, own, "another")]
-            for found, wanted in zip(moments._means(1, without, condition), (gram, cross), strict=True):
-                np.testing.assert_allclose(found, wanted[among, 1].mean(axis=0), atol=1e-14)
-    alone = [rows for rows, _, _ in moments._blocks if len(rows) == 1]
-    assert alone
-    assert all(
-        np.shares_memory(sums, gram) == (rows in alone) for rows, sums, _ in moments._blocks
-    )  # most a study may take is not taken twice
-
-
-def test_learned_estimator_refuses_what_it_cannot_use():
-    lifting, states, u, phases = linear_in_the_past()
-    with pytest.raises(DataError, match="every state is measured"):
-        Moments.of(Features.of(lifting, (0, 1), states, u), [batch_of(states, u, DT, phases)])
-    one = Features.of(lifting, (0,), states[..., :1], u)
-    with pytest.raises(DimensionError, match="expected 1 measurements"):
-        one.channels(states, u, phases)
-
-
-def test_observers_side_by_side_are_the_same_observers():
-    rng = np.random.default_rng(5)
-    A, B = 0.3 * rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
-    corrections = [
-        gain(0.1 * rng.normal(size=(4, 1)), DT),
-        StateSpace(0.3 * rng.normal(size=(2, 2)), rng.normal(size=(2, 1)), rng.normal(size=(4, 2)), 0.1 * rng.normal(size=(4, 1)), DT),
-    ]
-    observers = [Observer("o", KOOPMAN, A, B, (0,), ("a", "b"), K, Injection.STATE, DT, {"phase": 0.2}) for K in corrections]
-    y, u = rng.normal(size=(50, 3, 1)), rng.normal(size=(50, 3, 2))
-    for observer, found in zip(observers, run_observers(observers, y, u), strict=True):
-        np.testing.assert_allclose(found, run_observer(observer, y, u), rtol=1e-12, atol=1e-12)
-    with pytest.raises(DimensionError, match="side by side"):
-        run_observers([observers[0], Observer("o", KOOPMAN, A, B, (1,), ("a", "b"), corrections[0], Injection.STATE, DT)], y, u)

@@ -1,6 +1,5 @@
 """Samples that are missing, wrong or impossible: what an observer makes of them, and that it gets over them."""
 
-import json
 from dataclasses import replace
 from functools import cache
 
@@ -303,19 +302,6 @@ def test_what_does_not_fit_is_named():
         Seen([np.nan], [1.0])
 
 
-def test_the_file_holds_what_was_seen_and_paths_may_be_text(tmp_path):
-    o = observer(runtime=Runtime(input_lower=[-1.0, -np.inf]))
-    o.save(str(tmp_path / "o.json"))
-    again = Observer.load(str(tmp_path / "o.json"))
-    np.testing.assert_array_equal(again.seen.measured, SEEN.measured)
-    np.testing.assert_array_equal(again.seen.inputs, SEEN.inputs)
-    np.testing.assert_array_equal(again.runtime.input_lower, [-1.0, -np.inf])
-    observer(seen=None).save(tmp_path / "plain.json")
-    assert "seen" not in json.loads((tmp_path / "plain.json").read_text())
-    assert Observer.load(tmp_path / "plain.json").seen is None
-    assert replace(o, injection="state").injection is Injection.STATE
-
-
 DECLARED = {
     "measurements arrive 2 samples late": Runtime(delay=2),
     "the true position stays within the limits of the estimate": Runtime(lower=np.array([-1.0, -np.inf])),
@@ -334,21 +320,6 @@ def test_certificates_say_what_they_assume_of_a_delay_and_limits(what):
     assert not any(what in text for text in plain.assumptions)
     free = relift_certificate(observer(runtime=Runtime(upper=np.full(2, np.inf))))
     assert (free.gain, free.assumptions) == (plain.gain, plain.assumptions)  # no limit is none
-
-
-def test_corners_move_what_enters_directly():
-    """``A + L diag(d) M`` and ``B + L diag(d) D``, by hand, where D is not zero."""
-    system = error_system(observer()).mismatch()
-    rng = np.random.default_rng(0)
-    d = rng.uniform(-1, 1, system.L.shape[1])
-    moved = replace(system, D=rng.normal(size=system.D.shape))
-    xi, w = rng.normal(size=system.A.shape[0]), rng.normal(size=system.B.shape[1])
-    A, B = moved.corner(d)
-    p = d * (moved.M @ xi + moved.D @ w)
-    np.testing.assert_allclose(A @ xi + B @ w, moved.A @ xi + moved.L @ p + moved.B @ w, rtol=1e-12)
-    np.testing.assert_allclose(system.corner(d)[1], system.L * d, rtol=1e-12)
-    C, D = moved.multiplied(np.array([4.0]), 2.0)[1:]
-    np.testing.assert_allclose((C @ xi + D @ np.append(0.0, w))[:1], 2 * (moved.M @ xi + moved.D @ w), rtol=1e-9)
 
 
 def test_baselines_judge_samples_as_observers_do():

@@ -1,7 +1,5 @@
 """The running observer against textbook filters, delayed truth, and the phase of a simulated drive."""
 
-import json
-
 import numpy as np
 import pytest
 from batches import batch_of
@@ -99,19 +97,6 @@ def test_a_missing_measurement_corrects_nothing():
     y[0] = 0.0
     np.testing.assert_allclose(run_observer(o, y, u, {"phase": 0.3}), run_observer(silent, np.zeros_like(y), u, {"phase": 0.3}), atol=1e-12)
     assert np.isfinite(o.start([np.nan]).estimate).all()
-
-
-def test_the_file_holds_the_runtime_and_older_files_are_read(tmp_path):
-    runtime = Runtime(3, lower=[-1, -np.inf, -2], upper=[1, 2, np.inf], correction=[1, 2, 3, 4])
-    o = observer(runtime=runtime)
-    o.save(tmp_path / "o.json")
-    again = Observer.load(tmp_path / "o.json").runtime
-    assert again.delay == 3
-    for name in ("lower", "upper", "correction"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(runtime, name))
-    observer().save(tmp_path / "plain.json")
-    assert "runtime" not in json.loads((tmp_path / "plain.json").read_text())
-    assert Observer.load(tmp_path / "plain.json").runtime.delay == 0
 
 
 def test_a_runtime_that_makes_no_sense_is_refused():

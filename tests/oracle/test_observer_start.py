@@ -4,11 +4,49 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from batches import batch_of
 from machines import MACHINES, moving, samples
+from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
+from kros.core.lti import gain
+from kros.lifting import Lifting
 from kros.observer import Observer, run_observer
+from kros.observer.predictor.start import with_start
 from kros.observer.simulate import started
 from kros.observer.units import in_sizes
+from kros.synthesis import Injection
+
+DT = 0.01
+
+
+def test_gains_are_those_of_a_kalman_filter_that_starts_anywhere():
+    """The filter's gains follow from the covariance of the states, known exactly here; they are found from recordings."""
+    A, C = np.array([[0.9, 0.3, 0.0], [-0.2, 0.8, 0.1], [0.0, 0.0, 0.95]]), np.array([[1.0, 0.0, 0.0]])
+    Q, R, rng = np.diag([1e-4, 1e-2, 1e-2]), 0.05, np.random.default_rng(0)
+    P = solve_discrete_are(A.T, C.T, Q, np.array([[R]]))
+    L = A @ P @ C.T / (C @ P @ C.T + R)
+    o = Observer("k", Lifting(("a", "b", "c"), ()), A, np.zeros((3, 1)), (0,), ("u",), gain(L, DT), Injection.STATE, DT)
+    x = np.zeros((900, 60, 3))
+    x[0] = rng.multivariate_normal(np.zeros(3), solve_discrete_lyapunov(A, Q), 60)
+    for k in range(899):
+        x[k + 1] = x[k] @ A.T + rng.normal(size=(60, 3)) * np.sqrt(np.diag(Q))
+    y = x.copy()
+    y[..., 0] += np.sqrt(R) * rng.normal(size=y.shape[:2])
+    found = with_start(o, replace(batch_of(x, np.zeros((900, 60, 1)), DT), shown=y), count=6).start_in_motion
+    V, closed = solve_discrete_lyapunov(A, Q), A - L @ C
+    power, known = float((C @ V @ C.T)[0, 0]) + R, V - P  # of measurements, and of what the running filter predicts
+    g = np.vstack([[[1.0]], (known @ C.T)[1:] / power])
+    D = known - g @ (known @ C.T).T - (known @ C.T) @ g.T + power * g @ g.T  # of what the start misses of that
+    np.testing.assert_allclose(found.gain[1:, 0], g[1:, 0], atol=0.05 * np.abs(g[1:]).max())
+    np.testing.assert_array_equal(found.corrections[0], 0.0)  # the first innovation is zero
+    D = closed @ D @ closed.T
+    for k in range(1, 6):
+        c, power = closed @ D @ C.T, float((C @ (D + P) @ C.T)[0, 0]) + R
+        S = c / power
+        S[0] = 0.0  # hidden states are corrected
+        spread = np.sqrt(np.diag(D) / power / 1500)  # standard errors of a regression on as many independent windows; there are 2000
+        assert (np.abs(found.corrections[k] - S)[:, 0] < 4 * spread).all()
+        D = closed @ D @ closed.T - S @ c.T - c @ S.T + power * S @ S.T
 
 
 @pytest.mark.parametrize("kind", [k for k in MACHINES if "motion" in k])

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from batches import batch_of
 
-from kros.core.linalg import least_squares, solve_balanced
-from kros.core.lti import StateSpace, gain
+from kros.core.linalg import least_squares
+from kros.core.lti import StateSpace
 from kros.lifting import Lifting
 from kros.observer import FilteredDifference, Observer, ReliftScales, Runtime, relift_certificate, run_observer
 from kros.observer.baselines.difference import followed
-from kros.observer.baselines.kalman import kalman_candidates, like_measurement_noise
-from kros.observer.baselines.learned import Features
 from kros.observer.units import in_sizes
 from kros.synthesis import Injection
 
@@ -50,11 +46,6 @@ def test_estimates_in_other_sizes_are_the_same(injection, runtime):
     assert back.lifting == one.lifting
     for name in "AB":
         np.testing.assert_allclose(getattr(back, name), getattr(one, name), rtol=1e-12)
-
-
-def test_a_correction_limit_goes_with_the_sizes():
-    one = observer(runtime=Runtime(correction=np.array([0.01, 0.02, 0.03])))
-    np.testing.assert_allclose(in_sizes(one, SIZES).runtime.correction, [0.01 / 1e9, 0.02 / 3e-9, 0.03 / 0.7])
 
 
 def test_the_certificate_says_the_same_in_other_sizes():
@@ -101,18 +92,6 @@ def test_what_is_no_rate_is_not_taken_for_one():
     assert followed(batch_of(states[..., :2], states[..., :0], DT), (0, 1)) == ()
 
 
-@pytest.mark.parametrize("factors", [np.array([1e9, 1e-9]), np.array([1e-9, 1e9])])
-def test_kalman_sweeps_try_the_same_filters(factors):
-    A, shape, R = np.array([[0.9, 0.1], [-0.2, 0.7]]), np.diag([1.0, 4.0]), np.diag([0.1, 0.3])
-    one = like_measurement_noise(shape, R)
-    D = np.diag(factors)
-    assert like_measurement_noise(D @ shape @ D, D @ R @ D) == pytest.approx(one, rel=1e-12)
-    assert one == pytest.approx(1 / np.mean([1.0 / 0.1, 4.0 / 0.3]))
-    (level, first), *_ = kalman_candidates(A, np.eye(2), shape, R, DT)
-    P = level * one * shape  # so little process noise that the gain is the limit for P near zero
-    assert np.abs(first.controller.D).max() < 10 * np.abs(P).max() / 0.1
-
-
 def test_least_squares_decides_about_rank_in_units_of_every_column():
     rng = np.random.default_rng(1)
     rows, values = rng.normal(size=(100, 3)), rng.normal(size=(100, 2))
@@ -120,29 +99,3 @@ def test_least_squares_decides_about_rank_in_units_of_every_column():
     expected = np.linalg.lstsq(rows, values, rcond=None)[0]
     np.testing.assert_allclose(least_squares(rows * factors, values) * factors[:, None], expected, rtol=1e-9)
     assert not least_squares(np.zeros((5, 2)), values[:5]).any()
-
-
-def test_balanced_solution_does_not_depend_on_the_states_units():
-    A, b = np.array([[0.9, 0.1], [-0.2, 0.7]]), np.array([[1.0], [2.0]])
-    x = np.array([1e9, 1e-9])
-    found = solve_balanced(A * x[:, None] / x, b * x[:, None], rcond=1e-9)
-    np.testing.assert_allclose(found / x[:, None], np.linalg.solve(A, b), rtol=1e-9)
-
-
-def test_first_estimate_at_rest_is_the_same():
-    A = np.array([[0.2, 0.3, 0.1, 0.4], [0.1, 0.8, 0.05, 0.3], [0.2, 0.1, 0.7, -0.5], [0.0, 0.0, 0.0, 0.0]])
-    lifting = Lifting(("x", "v", "w"), ("sin(x)",))
-    D = A[:, [0]]
-    one = Observer("m", lifting, A, np.ones((4, 1)), (0,), ("u",), gain(D, DT), Injection.STATE, DT, replaces=True)
-    y, sizes = np.array([[0.7]]), {"x": 1e-9, "v": 1e9, "w": 1e-9}
-    np.testing.assert_allclose(in_sizes(one, sizes).initial(y / 1e-9) * [1e-9, 1e9, 1e-9], one.initial(y), rtol=1e-9)
-
-
-def test_learned_features_see_the_same_whatever_the_units():
-    states, rng = signals(), np.random.default_rng(2)
-    u = np.stack([states[..., 0] + 0.1 * rng.normal(size=states.shape[:2]), rng.normal(size=states.shape[:2])], axis=-1)
-    lifting = Lifting(("x", "v", "w"))
-    one = Features.of(lifting, (0,), states[..., :1], u)
-    other = Features.of(lifting, (0,), states[..., :1] * 1e9, u * [1e-9, 1e9])
-    np.testing.assert_allclose(other.static * [1, 1e-9, 1e9] / 1e9, one.static, rtol=1e-6, atol=1e-12)
-    assert replace(one, taps=3).taps == 3

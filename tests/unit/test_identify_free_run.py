@@ -33,19 +33,6 @@ def models(n_units=3, seed=0):
     )
 
 
-def test_free_run_equals_a_plain_loop_for_every_unit():
-    population = models()
-    rng = np.random.default_rng(1)
-    x0, u = rng.normal(size=(3, 2)), rng.normal(size=(3, 40, 1))
-    found = free_run(population.A, population.B, LIFTING, population.parameters, x0, u)
-    for i in range(3):
-        x = x0[i]
-        for k in range(40):
-            np.testing.assert_allclose(found[i, k], x, rtol=1e-12, atol=1e-12)
-            lifted = np.array([x[0], x[1], np.sin(5 * x[0] + i)])
-            x = (population.A[i] @ lifted + population.B[i] @ u[i, k])[:2]
-
-
 def test_an_exact_model_runs_free_without_error():
     """The prediction at sample k is compared with the state at k: no shift by one sample."""
     rng = np.random.default_rng(2)

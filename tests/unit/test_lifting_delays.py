@@ -1,14 +1,12 @@
 """Delays and input functions: windows, free runs, observers and factors against plain loops over samples."""
 
-import pickle
-
 import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError, DimensionError, IdentificationError
 from kros.core.lti import StateSpace
 from kros.data import Channel, EpisodeBatch, Role, from_arrays
-from kros.identify import ModelSet, combine, edmd, free_run, lifted_factor, reduce_episode
+from kros.identify import combine, edmd, free_run, lifted_factor, reduce_episode
 from kros.identify.excitation import require_excitation, require_independent
 from kros.identify.factors import Factor
 from kros.lifting import Lifting
@@ -54,36 +52,6 @@ def test_windows_hold_what_the_formulas_read():
         theta, lifted_u = by_hand(x, u, k, 0.4)
         np.testing.assert_allclose(DELAYED.lift(windows[k - 3], {"phase": 0.4}), theta, rtol=1e-14)
         np.testing.assert_allclose(DELAYED.lift_inputs(u[k], windows[k - 3], {"phase": 0.4}), lifted_u, rtol=1e-14)
-
-
-def test_advancing_a_window_is_sliding_it():
-    x, u = recording()
-    windows = DELAYED.windows(x, u)
-    for k in range(36):
-        np.testing.assert_array_equal(DELAYED.window.advance(windows[k], u[k + 3]), windows[k + 1, 2:])
-
-
-def test_slopes_have_a_column_for_every_entry_of_the_window():
-    x, u = recording()
-    windows = DELAYED.windows(x, u)[:5]
-    slopes = DELAYED.slopes(windows, {"phase": 0.1})
-    assert slopes.shape == (5, 3, 8)
-    for j in range(8):
-        step = 1e-6 * np.eye(8)[j]
-        slope = (DELAYED.lift(windows + step, {"phase": 0.1}) - DELAYED.lift(windows - step, {"phase": 0.1}))[:, 2:] / 2e-6
-        np.testing.assert_allclose(slopes[..., j], slope, rtol=1e-7, atol=1e-8)
-
-
-def test_input_functions_have_a_slope_by_every_entry_of_the_window():
-    x, u = recording()
-    windows, u, phase = DELAYED.windows(x, u)[:5], u[3:8], {"phase": 0.1}
-    slopes = DELAYED.input_slopes(u, windows, phase)
-    assert slopes.shape == (5, 2, 8)
-    for j in range(8):
-        step = 1e-6 * np.eye(8)[j]
-        numeric = (DELAYED.lift_inputs(u, windows + step, phase) - DELAYED.lift_inputs(u, windows - step, phase))[:, 2:] / 2e-6
-        np.testing.assert_allclose(slopes[..., j], numeric, rtol=1e-7, atol=1e-8)
-    assert Lifting(STATES).input_slopes(u, x[:5]).shape == (5, 0, 2)
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -204,37 +172,6 @@ def test_the_observer_file_holds_delays_and_input_functions(tmp_path, injection)
     assert (again.lifting, again.inputs) == (DELAYED, INPUTS)
     y, u = np.random.default_rng(5).normal(size=(20, 2, 1)), np.random.default_rng(6).normal(size=(20, 2, 2))
     np.testing.assert_array_equal(run_observer(again, y, u), run_observer(o, y, u))
-
-
-def test_models_survive_the_disk(tmp_path):
-    channels = (
-        Channel("position", Role.STATE, "rad", True),
-        Channel("current", Role.STATE, "A"),
-        Channel("voltage", Role.INPUT, "V"),
-        Channel("target", Role.INPUT, "rad"),
-    )
-    rng = np.random.default_rng(7)
-    models = ModelSet(
-        name="koopman_edmd",
-        condition="noload",
-        lifting=DELAYED,
-        channels=channels,
-        sample_period_s=0.01,
-        unit_ids=("1",),
-        A=rng.normal(size=(1, 5, 5)),
-        B=rng.normal(size=(1, 5, 4)),
-        parameters={"phase": np.array([0.4])},
-        residual_covariance=np.eye(5)[None],
-        output_scale=np.ones(5),
-        input_scale=np.ones(4),
-    )
-    models.save(tmp_path)
-    again = ModelSet.load(tmp_path)
-    assert again.lifting == DELAYED
-    assert again.recorded_inputs == INPUTS
-    assert again.inputs == (*INPUTS, "current*voltage", "cos(position[-1] + phase)*target")
-    assert again.systems().n_inputs == 4
-    assert pickle.loads(pickle.dumps(DELAYED)) == DELAYED
 
 
 def test_free_runs_start_from_the_first_recorded_samples():

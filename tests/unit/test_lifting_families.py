@@ -41,21 +41,6 @@ def test_harmonics_of_an_angle_with_a_phase():
     assert len(separation.basis) == 4
 
 
-@pytest.mark.parametrize(("degree", "n_terms"), [(2, 6), (3, 16), (4, 31)])
-def test_polynomials_have_every_monomial_once(degree, n_terms):
-    functions = polynomials(STATES, degree)
-    assert len(set(functions)) == n_terms  # (3 + d choose d) - 1 - 3
-    exponents = [[f.count(f"{s}**{k}") * k for s in STATES for k in range(2, 5)] for f in functions]
-    assert max(map(max, exponents)) == degree
-    found = values(functions)
-    for f, column in zip(functions, found.T, strict=True):
-        expected = np.ones(200)
-        for factor in f.replace("**", "^").split("*"):
-            name, _, power = factor.partition("^")
-            expected *= X[:, STATES.index(name)] ** int(power or 1)
-        np.testing.assert_allclose(column, expected, rtol=1e-12)
-
-
 def test_families_work_on_the_values_of_other_functions():
     functions = polynomials(["sin(position)", "velocity"], 2)
     assert functions == ("(sin(position))**2", "(sin(position))*velocity", "velocity**2")
@@ -63,14 +48,6 @@ def test_families_work_on_the_values_of_other_functions():
     np.testing.assert_allclose(values(functions), np.stack([s * s, s * v, v * v], axis=1), rtol=1e-13)
     (bump,) = radial(["position - velocity"], [[0.25]], 0.5)
     np.testing.assert_allclose(values((bump,))[:, 0], np.exp(-(((X[:, 0] - v - 0.25) / 0.5) ** 2) / 2), rtol=1e-12)
-
-
-@pytest.mark.parametrize("length", [0.3, (0.2, 1.0, 3.5)])
-def test_radial_functions_are_functions_of_the_scaled_distance(length):
-    centres = RNG.uniform(-1, 1, size=(12, 3))
-    found = values(radial(STATES, centres, length))
-    distance = np.linalg.norm((X[:, None] - centres) / np.asarray(length), axis=-1)
-    np.testing.assert_allclose(found, np.exp(-(distance**2) / 2), rtol=1e-11, atol=1e-13)
 
 
 def test_kmeans_finds_separate_clusters_in_any_units():

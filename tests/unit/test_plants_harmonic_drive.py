@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError
-from kros.data import EpisodeKey, write_raw
-from kros.data.readers.motor_drive_raw import read_motor_drive_raw
+from kros.data import EpisodeKey
 from kros.plants import HarmonicDrivePopulation
 from kros.plants.harmonic_drive.parameters import NOMINAL, OUTLIER_LOG_FACTORS, RIPPLE_DEVIATION, draw_outlier, draw_parameters
-from kros.plants.harmonic_drive.reference import (
-    ACCELERATION_SAMPLES,
-    JERK_SAMPLES,
-    MAX_SPEED,
-    REVOLUTION,
-    episode_reference,
-    profile,
-)
 
 SMALL = HarmonicDrivePopulation(n_units=3, n_episodes=2, seconds=3.0, seed=4, outlier=True)
 LOADED = EpisodeKey("001002", "load", "1")
@@ -47,16 +37,6 @@ def test_population_has_the_form_of_the_reader(small):
         assert small.raw.read(key).shape == (4001, 5)
 
 
-def test_writing_and_reading_the_raw_layout_gives_the_population(small, tmp_path):
-    write_raw(small.raw, tmp_path / "raw")
-    read = read_motor_drive_raw(tmp_path / "raw")
-    assert read.episodes == small.population.episodes
-    assert read.units == small.population.units
-    for key in read.episodes:
-        # Rounding of the files: 1e-6 deg and 1e-5 deg/s on the motor side, 1e-4 percent.
-        assert np.all(np.abs(read.read(key) - small.population.read(key)).max(axis=0) < [1e-9, 1e-8, 1e-6, 1e-9, 1e-8])
-
-
 def test_rest_is_at_rest_and_calibrates_the_offset(small):
     for key in small.population.episodes:
         raw, prepared = small.raw.read(key), small.population.read(key)
@@ -78,15 +58,6 @@ def test_a_unit_is_the_same_whatever_else_is_simulated(small):
         np.testing.assert_array_equal(getattr(alone.truth.parameters, field.name), getattr(small.truth.parameters, field.name)[1:3])
 
 
-def test_the_seed_decides(small):
-    again = SMALL.simulate()
-    other = replace(SMALL, seed=5).simulate()
-    for key in small.population.episodes:
-        np.testing.assert_array_equal(again.population.read(key), small.population.read(key))
-    assert np.abs(other.population.read(LOADED) - small.population.read(LOADED))[:, 3].max() > 0.1
-    assert not np.allclose(other.truth.phase_rad, small.truth.phase_rad)
-
-
 @pytest.mark.parametrize("spread", [0.5, 1.0, 2.0])
 def test_spread_scales_the_stated_relative_deviations(spread):
     p = draw_parameters(1, 3000, spread)
@@ -106,16 +77,6 @@ def test_outlier_is_loose_by_its_severity():
         np.testing.assert_allclose(getattr(loose, name), np.exp(1.5 * log_factor) * getattr(mild, name))
     np.testing.assert_array_equal(loose.motor_inertia, mild.motor_inertia)
     assert "000000" not in replace(SMALL, outlier=False).simulate().population.unit_ids
-
-
-def test_truth_is_plain_json_and_complete(small):
-    truth = json.loads(json.dumps(small.truth.as_dict()))
-    assert truth["loop"] == "stiff"
-    assert set(truth["units"]) == set(small.population.unit_ids)
-    unit = truth["units"]["001002"]
-    assert set(NOMINAL) <= set(unit)
-    assert unit["phase_rad"][0] == small.truth.phase_rad[2]
-    assert unit["lag_rad"] == pytest.approx(small.truth.lag_rad[2])
 
 
 def test_load_torque_belongs_to_loaded_episodes(small):
@@ -144,32 +105,3 @@ def test_load_torque_belongs_to_loaded_episodes(small):
 def test_settings_out_of_range_are_refused(settings):
     with pytest.raises(ConfigError, match=next(iter(settings))):
         HarmonicDrivePopulation(**settings)
-
-
-@pytest.mark.parametrize("seconds", [2.0, 3.3, 20.0, 100.0])
-@pytest.mark.parametrize("episode", [0, 1, 7])
-def test_reference_uses_full_speed_in_both_directions(seconds, episode):
-    n = round(seconds * 1000)
-    position, velocity = episode_reference(11, episode, n, 1000, 1e-3)
-    assert len(position) == len(velocity) == n + 1000
-    assert np.abs(position).max() <= REVOLUTION + 1e-9
-    assert np.abs(velocity).max() <= MAX_SPEED * (1 + 1e-8)
-    assert np.count_nonzero(velocity > 0.9999 * MAX_SPEED) > 300
-    assert np.count_nonzero(velocity < -0.9999 * MAX_SPEED) > 300
-    assert np.all(position[:1000] == position[0])
-    assert not np.any(velocity[:1000])
-    assert abs(velocity[-1]) < 0.01
-    np.testing.assert_allclose(velocity[1:-1], (position[2:] - position[:-2]) / 2e-3, atol=1e-7)
-
-
-def test_profile_is_a_smoothed_trapezoid():
-    position, velocity = profile(np.array([0.5, 2.5]), np.array([100.0]), 1500, 1e-3)
-    assert position[0] == 0.5
-    assert position[-1] == pytest.approx(2.5, abs=1e-12)
-    acceleration, jerk = np.diff(velocity) / 1e-3, np.diff(velocity, 2) / 1e-6
-    peak = MAX_SPEED / (ACCELERATION_SAMPLES * 1e-3)
-    assert np.abs(acceleration).max() == pytest.approx(peak, rel=1e-6)
-    assert np.abs(jerk).max() == pytest.approx(peak / (JERK_SAMPLES * 1e-3), rel=1e-3)
-    np.testing.assert_allclose(np.sum(velocity) * 1e-3, 2.0, rtol=1e-9)
-    middle = 100 + (2.0 / (MAX_SPEED * 1e-3) + ACCELERATION_SAMPLES + JERK_SAMPLES) / 2  # by symmetry, half-way there
-    assert np.interp(middle, np.arange(1500.0), position) == pytest.approx(1.5, abs=MAX_SPEED * 2e-3)

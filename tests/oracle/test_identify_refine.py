@@ -13,8 +13,6 @@ from kros.identify import Factor, combine, free_run, lifted_factor, reduce_episo
 from kros.identify.refine import RefinedModels, RefineOptions, refine_population
 from kros.identify.refine.metric import ResponsePrior
 from kros.identify.refine.problem import stability_barrier
-from kros.identify.refine.segments import Segments
-from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
 
 KOOPMAN = Lifting(("x", "v"), ("sin(3*x + phase)",), ("phase",))
@@ -72,40 +70,6 @@ def test_exact_data_give_exact_models(lifting: Lifting) -> None:
     population, keys, parameters, factor, W = simulated(lifting, 2, 0.0, seed=5, spread=0.0)
     models = refine_population(population, keys, lifting, parameters, factor, options=OPTIONS)
     np.testing.assert_allclose(rows(models), W, atol=1e-6)
-
-
-def test_gradient_of_free_runs_is_that_of_finite_differences() -> None:
-    rng = np.random.default_rng(0)
-    units, segments, length = 2, 3, 12
-    V = np.concatenate([A, B], axis=1) + 0.02 * rng.normal(size=(units, 2, 4))
-    T = np.eye(4) + 0.1 * rng.normal(size=(4, 4))
-    sigma, phase = np.array([0.5, 2.0]), np.array([0.3, 1.2])
-    data = Segments(
-        rng.normal(size=(length, 2, units, segments)),
-        rng.normal(size=(length, 1, units, segments)),
-        np.ones((length, units, segments), bool),
-    )
-    data.valid[9:, 1, 2] = False
-
-    def cost(V: np.ndarray) -> np.ndarray:
-        total = np.zeros(units)
-        for i in range(units):
-            W = np.zeros((3, 4))
-            W[:2] = V[i] @ T.T
-            for s in range(segments):
-                x = free_run(W[:, :3], W[:, 3:], KOOPMAN, {"phase": phase[[i]]}, data.states[:1, :, i, s], data.inputs[None, :, :, i, s])[0]
-                error = (data.states[:, :, i, s] - x) / sigma
-                total[i] += np.sum(error[data.valid[:, i, s]] ** 2)
-        return total
-
-    normal = normal_equations(V, T, KOOPMAN, {"phase": phase}, data, sigma)
-    np.testing.assert_allclose(normal.cost, cost(V), rtol=1e-10)
-    numeric = np.zeros((units, 8))
-    for k in range(8):
-        step = np.zeros(8)
-        step[k] = 1e-6
-        numeric[:, k] = (cost(V + step.reshape(2, 4)) - cost(V - step.reshape(2, 4))) / 2e-6
-    np.testing.assert_allclose(-2 * normal.matrix[:, :-1, -1], numeric, rtol=1e-5, atol=1e-5)
 
 
 def test_gradient_of_barrier_and_prior_is_that_of_finite_differences() -> None:

@@ -7,11 +7,11 @@ import pytest
 from batches import batch_of
 from load_baselines import disturbance_observer, load_direction, ripple_power
 
-from kros.core.errors import ConfigError, DataError, DimensionError
+from kros.core.errors import DataError, DimensionError
 from kros.lifting import Lifting
 from kros.motor_drive import AngleLoad, calibrate_load, calibrate_torque, known_load, load_from_current, load_observer
 from kros.motor_drive.accuracy import load_accuracy
-from kros.motor_drive.signals import low_passed, without_level
+from kros.motor_drive.signals import without_level
 from kros.observer import Observer, relift_certificate, run_observer
 from kros.observer.residual.one_step import one_step_residual
 from kros.plants import HarmonicDrivePopulation
@@ -32,14 +32,6 @@ def test_a_constant_load_leaves_no_trace_and_a_step_is_forgotten() -> None:
     assert not without_level(np.full(1000, 0.7), 2.0, DT).any()
     step = (TIME >= 1).astype(float)
     np.testing.assert_allclose(without_level(step, 2.0, DT)[1000:], np.exp(-np.arange(4000) * DT / 2.0), rtol=1e-9)
-
-
-def test_low_pass_keeps_slow_and_has_no_delay() -> None:
-    slow, fast = np.sin(2 * np.pi * TIME), np.sin(2 * np.pi * 50 * TIME)
-    inner = slice(1000, -1000)
-    assert np.abs(low_passed(slow + fast, 5.0, DT) - slow)[inner].max() < 2e-3
-    with pytest.raises(ConfigError, match="500 Hz"):
-        low_passed(slow, 600.0, DT)
 
 
 def test_the_torque_constant_from_one_known_load() -> None:
@@ -102,17 +94,6 @@ def test_the_disturbance_observer_is_exact_in_the_steady_state() -> None:
         load_direction(np.zeros((10, 2)), np.ones(10))
 
 
-def test_ripple_is_counted_in_the_moving_band() -> None:
-    """A wave of amplitude a that turns with the gear has the power a^2 / 2, at every speed; a slow load has none."""
-    speed = (2.0 + np.sin(TIME))[:, None]
-    position = np.cumsum(speed, axis=0) * DT
-    wave = 0.03 * np.sin(100 * position + 0.4)
-    power = ripple_power(wave + 0.2 * np.sin(TIME)[:, None], position, speed, 100.0, DT)
-    assert power[0] == pytest.approx(0.03**2 / 2, rel=0.02)
-    with pytest.raises(DataError, match="never turns so fast"):
-        ripple_power(wave, position, 0.01 * speed, 100.0, DT)
-
-
 @pytest.fixture(scope="module")
 def drives() -> SimpleNamespace:
     """Three drives, the load known on the first; an observer that learned from it, and what it says of the others."""
@@ -144,15 +125,6 @@ def test_loads_of_units_that_took_no_part_are_found(drives: SimpleNamespace) -> 
     assert accuracy.percent < 35
     seen = load_accuracy(drives.estimate[..., 3], without_level(drives.others.load, 10.0, DT), DT)
     assert seen.ratio < 1.5
-
-
-def test_total_current_and_load_are_separate(drives: SimpleNamespace) -> None:
-    """The total current is better known than the load that it carries is large, and the load is no copy of it."""
-    loaded = drives.others.load.any(axis=0)
-    error = drives.leveled.current - drives.others.x[..., 2]
-    assert np.sqrt(np.mean(error[2000:, loaded] ** 2)) < 0.3 * np.sqrt(np.mean(drives.others.load[2000:, loaded] ** 2))
-    states = drives.observer.lifting.states
-    assert states[:5] == ("position", "velocity", "current", "load", "memory_1")
 
 
 def test_ripple_in_the_load_is_far_below_that_of_the_current(drives: SimpleNamespace) -> None:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from kros.core import StateSpace, SynthesisError, hinf_norm
-from kros.synthesis import GeneralizedPlant, Status, h2, hinf, mixed
+from kros.core import StateSpace, hinf_norm
+from kros.synthesis import GeneralizedPlant, Status, h2, hinf
 
 
 @pytest.mark.parametrize(("q", "sigma"), [(1.0, 1.0), (60.0, 0.1), (1e4, 1e4)])
@@ -62,36 +62,3 @@ def test_mixed_sensitivity_of_the_disturbance_process():
     assert found.status is Status.OPTIMAL
     assert found.hinf_norm == pytest.approx(1.37, abs=6e-3)  # two decimals are printed
     assert hinf_norm(plant.close(found.controller)) == pytest.approx(found.hinf_norm)
-
-
-@pytest.mark.parametrize("method", [h2, hinf])
-@pytest.mark.parametrize(
-    ("changes", "label"),
-    [
-        ({"D12": [[0.0], [0.0]]}, "A2a: D12 of full column rank.*penalty"),
-        ({"D21": [[0.0, 0.0]]}, "A2b: D21 of full row rank.*noise"),
-        ({"B2": [[1.0, 1.0]], "D12": [[0.0, 0.0], [1.0, 1.0]], "D22": [[0.0, 0.0]]}, "A2a.*rank 1, 2 controls"),
-    ],
-)
-def test_singular_plants_are_refused_by_name(one_state, method, changes, label):
-    with pytest.raises(SynthesisError, match=label):
-        method(one_state(**changes))
-
-
-def test_mixed_names_what_it_cannot_do():
-    empty = GeneralizedPlant(
-        np.zeros((0, 0)),
-        np.zeros((0, 2)),
-        np.zeros((0, 1)),
-        np.zeros((2, 0)),
-        np.zeros((1, 0)),
-        np.eye(2),
-        [[0], [1.0]],
-        [[0, 1.0]],
-        [[0]],
-        1.0,
-    )
-    with pytest.raises(SynthesisError, match="needs a plant with states"):
-        mixed(empty)
-    with pytest.raises(SynthesisError, match=r"works in discrete time, found a continuous plant \(dt = 0\); sample it"):
-        mixed(GeneralizedPlant(*np.full((9, 1, 1), -1.0), 0.0))

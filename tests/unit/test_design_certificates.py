@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,16 +12,11 @@ from batches import batch_of
 
 from kros.core.errors import DimensionError, SynthesisError
 from kros.core.lti import gain
-from kros.data.population import EpisodeKey
-from kros.design.certificates import Running, certify, save_running
+from kros.design.certificates import Running, certify
 from kros.design.synthesize import choose_deployed, robust_of
-from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
-from kros.observer import Observer, ReliftScales, ReliftStatus, dropout_bound, relift_certificate, signal_bound
-from kros.observer.certificate.report import ReliftRow, relift_report
-from kros.report.names import number
-from kros.report.run_folder import RunFolder
-from kros.report.sections.relift import section
+from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certificate, signal_bound
+from kros.observer.certificate.report import relift_report
 from kros.synthesis import Injection
 
 
@@ -74,21 +68,10 @@ def test_global_slopes_need_no_box_and_no_phase(task: Any) -> None:
     assert "any value of phase" in found.assumptions
 
 
-def test_one_episode_of_every_unit() -> None:
-    keys = tuple(EpisodeKey(unit, "on", episode) for unit in ("a", "b") for episode in ("1", "2"))
-    tuning = TrainingSet(None, keys, {})  # type: ignore[arg-type]
-    assert [(k.unit, k.episode) for k in tuning.first_of_units().keys] == [("a", "1"), ("b", "1")]
-
-
 def test_an_observer_without_certificate_has_no_report() -> None:
     square = observer("square", "x**2", 0.1)
     with pytest.raises(DimensionError, match="certify it first"):
         relift_report(relift_certificate(square), square, batch_of(np.zeros((5, 1, 1)), np.zeros((5, 1, 1)), 1.0))
-
-
-def test_an_error_is_within_its_bound_but_for_rounding() -> None:
-    rows = [ReliftRow("a", 0.1, 2.0, 1.0, 1.0, error) for error in (0.5, 1 + 1e-7, 1 + 1e-5, 2.0)]
-    assert [row.holds for row in rows] == [True, True, False, False]
 
 
 def test_typical_scales_give_the_residual_of_a_population_unit_power() -> None:
@@ -105,31 +88,6 @@ def test_wrong_scales_are_refused() -> None:
         relift_certificate(observer("sine", "sin(x)", 0.1), scales=ReliftScales(np.ones(2), np.ones(1), np.ones(1)))
     with pytest.raises(DimensionError, match="finite sizes above zero"):
         ReliftScales(np.zeros(1), np.ones(1), np.ones(1))
-
-
-def test_the_report_tells_gains_bounds_and_failures(tmp_path: Path) -> None:
-    good, bad = observer("koopman/open_loop", "sin(x)", 0.1), observer("koopman/worst_case_h2", "sin(x)", 0.5)
-    states = np.cumsum(np.random.default_rng(0).standard_normal((50, 2, 1)), axis=0)
-    certificate = relift_certificate(good)
-    rows = relift_report(certificate, good, batch_of(states, np.zeros((50, 2, 1)), 1.0, units=["a", "b"]))
-    batch = batch_of(states, np.zeros((50, 2, 1)), 1.0, units=["a", "b"])
-    refused, lost = relift_certificate(bad), dropout_bound(certificate, good, 0.1)
-    running = [
-        Running(good.name, certificate, rows, 1.0, 5.0, signal_bound(certificate, good, batch), (0,), lost),
-        Running(bad.name, refused, [], 2.0, 5.0, signal_bound(refused, bad, batch), (0,)),
-    ]
-    assert [r.certified for r in running] == [True, False]
-    assert [r.facts()["relift_certified"] for r in running] == [True, False]
-    assert running[0].facts()["relift_bound_worst"] == max(r.bound for r in rows)
-    save_running(tmp_path / "observers", running)
-    metrics = {"study": {"deployed": good.name}, "observers": {r.name: r.facts() for r in running}}
-    found = section(RunFolder(tmp_path), metrics)
-    assert found is not None
-    assert any("No certificate was found for" in text and "grows" in text for text in found.paragraphs)
-    assert [row[1].text for row in found.tables[0].cells] == ["10.0", "none"]
-    assert [row[-1].text for row in found.tables[1].cells] == [number(lost.gain), "none"]
-    assert metrics["observers"][bad.name]["set_reason"]
-    assert section(RunFolder(tmp_path), {"study": {}, "observers": {}}) is None
 
 
 def test_deployed_is_the_most_accurate_observer_that_is_certified_as_it_runs() -> None:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
 import pytest
 
 from kros.core.lti import StateSpace
-from kros.identify import smallest_stabilising_alpha
-from kros.identify.refine.minimax import smallest_largest
 from kros.identify.refine.spread import peak_residual_db
-from kros.report.sections import outliers, units
-from kros.uncertainty import Form, many, quantify_systems, residual, score_outliers, sigma_max
+from kros.uncertainty import many, quantify_systems, residual, score_outliers
 from kros.uncertainty.forms import completion
-from kros.uncertainty.nominal.choice import choose_nominals
 from kros.uncertainty.outliers import model as outlier_model
 from kros.uncertainty.weights.certificate import Method
 from kros.uncertainty.weights.cover import cover_ratio
@@ -91,34 +86,6 @@ def test_a_fleet_of_units_that_are_all_the_same():
     assert quantify_systems(same, "additive", np.geomspace(0.1, 49, 50), max_order=1).cover_max == 0
 
 
-@pytest.mark.parametrize("form", list(Form))
-def test_the_best_nominal_is_that_of_all_pairs(form):
-    responses = fleet(60, seed=3).frequency_response(np.geomspace(0.1, 49, 20))
-    peaks = [sigma_max(residual(form, responses[k], responses)).max() for k in range(len(responses))]
-    found = choose_nominals(responses)[form]
-    assert found.index == int(np.argmin(peaks))
-    assert found.bound.max() == pytest.approx(min(peaks), rel=1e-9)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_pruned_search_is_the_search_of_all(seed):
-    rng = np.random.default_rng(seed)
-    apart = rng.uniform(size=(40, 40, 7)) ** rng.uniform(0.2, 3)  # candidate, unit, frequency: no geometry at all
-
-    def bound_of(row: int) -> tuple[Any, Any]:
-        return apart[row].max(axis=0), apart[row].argmax(axis=0)
-
-    def against(rows: Any, witness: Any) -> Any:
-        return apart[rows][:, witness, np.arange(7)]
-
-    index, bound, scores, evaluated = smallest_largest((40, 7), 0, bound_of, against, lambda b: b.max(axis=-1))
-    every = apart.max(axis=(1, 2))
-    assert index == every.argmin()
-    np.testing.assert_array_equal(bound, apart[index].max(axis=0))
-    assert np.all(scores <= every)
-    np.testing.assert_array_equal(scores[evaluated], every[evaluated])
-
-
 def test_the_spread_of_models_is_that_of_all_pairs():
     units = fleet(30, seed=4)
     z = np.exp(1j * np.pi * np.logspace(-6, 0, 50))
@@ -143,30 +110,3 @@ def test_a_unit_scored_against_many_scores_as_it_would_among_them(monkeypatch):
         # One unit more changes which 64 units are the nominals, and with them medians and the others' cover, by several tenths of a dB.
         assert found.score_db == pytest.approx(expected.score_db, abs=0.7)
         assert found.detectable_db == pytest.approx(expected.detectable_db, abs=0.7)
-
-
-def test_a_report_of_many_units_says_how_they_are_spread_and_shows_the_extremes():
-    ids = [f"{k:04d}" for k in range(1000)]
-    errors = dict(zip(ids, np.random.default_rng(0).permutation(1000).astype(float), strict=True))
-    home = {"observer": "o", "channel": "velocity", "condition": "noload", "rms": 1.0}
-    score = {"condition": "noload", "score": 1.0, "outlier": False}
-    metrics = {"study": {"identify_on": "noload"}}
-    found = {u: units._Known({"unit": u}, [home | {"unit": u, "error_percent": e}], [score | {"unit": u}]) for u, e in errors.items()}
-    found["0007"].scores[0] = score | {"unit": "0007", "score": 30.0, "outlier": True}
-    columns = units._columns(metrics, found, ["velocity"])
-    assert list(columns) == ["error of velocity (%)", "outlier score, no load (dB)"]
-    shown = units._extremes(found, columns)
-    worst = sorted(ids, key=lambda u: -errors[u])[:20]
-    assert set(worst) | {"0007"} <= set(shown)
-    assert len(shown) <= 41
-    row = units._quantiles(columns, 1000).rows[0]
-    assert row == ["error of velocity (%)", "1000", "0", "50.0", "500", "949", "999", worst[0]]
-    assert outliers.some_of(ids).endswith("0099 and 900 more")
-    assert outliers.some_of(ids[:3]) == "0000, 0001, 0002"
-
-
-def test_regularisations_tried_a_few_at_a_time_are_those_tried_together(monkeypatch):
-    R = np.triu(np.random.default_rng(0).normal(size=(12, 5, 5)))
-    expected = smallest_stabilising_alpha([(R, 2)])
-    monkeypatch.setattr(sys.modules["kros.identify.edmd"], "_MODELS", 30)
-    assert smallest_stabilising_alpha([(R, 2)]) == expected > 0

@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from kros.core import DataError, DimensionError, IdentificationError
+from kros.core import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
-from kros.identify import KoopmanMatrices, ModelSamples, bootstrap, bootstrap_edmd, edmd, episode_weights
-from kros.identify.bootstrap import bootstrap_refined, one_step_deviations
+from kros.identify import bootstrap, bootstrap_edmd, edmd, episode_weights
 from kros.identify.refine.episodes import segment_owners
 from kros.identify.refine.segments import read_segments
 
 
 def factors(units: int, episodes: int, seed: int = 0) -> np.ndarray:
     return np.linalg.qr(np.random.default_rng(seed).normal(size=(units, episodes, 30, 5)), mode="r")
-
-
-def samples(units: int = 2, draws: int = 40, spread: float = 0.02) -> ModelSamples:
-    rng = np.random.default_rng(1)
-    A, B = np.array([[0.8, 0.1], [-0.2, 0.7]]), np.array([[0.1, 0.0], [1.0, 0.5]])
-    whole = KoopmanMatrices(np.tile(A, (units, 1, 1)), np.tile(B, (units, 1, 1)))
-    drawn = KoopmanMatrices(A + spread * rng.normal(size=(units, draws, 2, 2)), B + spread * rng.normal(size=(units, draws, 2, 2)))
-    return ModelSamples(tuple(f"u{i}" for i in range(units)), whole, drawn)
 
 
 def test_weights_keep_the_number_of_episodes_and_the_variance_of_a_mean() -> None:
@@ -36,11 +25,6 @@ def test_weights_keep_the_number_of_episodes_and_the_variance_of_a_mean() -> Non
     for row, E in ((0, 4), (1, 7)):
         expected = (E * np.eye(E) - 1) / (E - 1)
         np.testing.assert_allclose(np.cov(weights[row, :, :E].T), expected, atol=0.04)
-
-
-def test_a_units_draws_do_not_depend_on_the_units_after_it() -> None:
-    np.testing.assert_array_equal(episode_weights([5], 9, 3)[0], episode_weights([5, 5], 9, 3)[0])
-    assert not np.array_equal(episode_weights([5], 9, 3), episode_weights([5], 9, 4))
 
 
 @pytest.mark.parametrize(("episodes", "draws"), [([3, 1], 10), ([3, 3], 1), ([], 10)])
@@ -67,58 +51,6 @@ def test_a_unit_with_fewer_episodes_is_resampled_among_its_own() -> None:
     weights = episode_weights([3], 6, 0)
     wide = np.concatenate([weights, np.zeros((1, 6, 2))], axis=2)
     np.testing.assert_allclose(bootstrap_edmd(padded, 2, 0.0, wide).samples.A, bootstrap_edmd(R, 2, 0.0, weights).samples.A, rtol=1e-9)
-
-
-def test_sizes_that_do_not_fit_are_named() -> None:
-    with pytest.raises(DimensionError, match=r"weights of shape \(2, draws, 3\)"):
-        bootstrap_edmd(factors(2, 3), 2, 0.0, np.ones((2, 4, 5)))
-    with pytest.raises(DimensionError, match="One-step bootstrap"):
-        one_step_deviations(np.zeros((2, 3, 5, 5)), np.zeros((2, 5, 5)), np.ones((2, 4, 3)))
-    with pytest.raises(DimensionError, match="2 units need as many names"):
-        bootstrap_edmd(factors(2, 3), 2, 0.0, np.ones((2, 4, 3)), ["u"])
-    with pytest.raises(IdentificationError, match="depends on the others"):
-        bootstrap_edmd(np.zeros((1, 3, 5, 5)), 2, 0.0, np.ones((1, 2, 3)))
-
-
-def test_directions_without_information_do_not_move() -> None:
-    normal = np.zeros((1, 2, 3, 3))
-    normal[0, :, 0, 0], normal[0, 0, 0, 2], normal[0, 1, 0, 2] = 1.0, 0.5, -0.5
-    found = one_step_deviations(normal, np.diag([2.0, 0.0])[None], np.array([[[2.0, 0.0]]]))
-    np.testing.assert_allclose(found[0, 0], [0.5, 0.0])
-
-
-def test_steps_pass_through_the_whitening() -> None:
-    """[A B] = V T^T: a step of V in its first column moves the columns that the first column of T names."""
-    T = np.array([[2.0, 0.0], [1.0, 3.0]])
-    normal = np.zeros((1, 2, 3, 3))
-    normal[0, :, 0, 0], normal[0, :, 1, 1], normal[0, 0, 0, 2], normal[0, 1, 0, 2] = 0.5, 0.5, 0.25, -0.25
-    made = bootstrap_refined(
-        KoopmanMatrices(np.zeros((1, 1, 1)), np.zeros((1, 1, 1))), T, np.eye(2)[None], normal, np.array([[[2.0, 0.0]]])
-    )
-    assert made.linear
-    assert (made.samples.A.item(), made.samples.B.item()) == pytest.approx((1.0, 0.5))
-
-
-@pytest.mark.parametrize("linear", [False, True])
-def test_responses_of_samples_are_those_of_their_models_or_first_order(linear: bool) -> None:
-    made = replace(samples(), linear=linear)
-    freqs, dt = np.array([0.0, 3.0, 50.0]), 0.01
-    for unit in range(2):
-        found = made.responses(unit, freqs, dt)
-        for k, z in enumerate(np.exp(2j * np.pi * freqs * dt)):
-            A, B = made.estimate.A[unit], made.estimate.B[unit]
-            Phi = np.linalg.inv(z * np.eye(2) - A)
-            for draw, (As, Bs) in enumerate(zip(made.samples.A[unit], made.samples.B[unit], strict=True)):
-                full = np.linalg.inv(z * np.eye(2) - As) @ Bs
-                np.testing.assert_allclose(found[draw, k], Phi @ B + Phi @ ((As - A) @ Phi @ B + Bs - B) if linear else full, rtol=1e-7)
-
-
-def test_small_steps_have_the_same_responses_to_first_order() -> None:
-    made = samples(spread=1e-5)
-    freqs = np.array([1.0])
-    G = made.estimate.responses(freqs, 0.01)[0]
-    full, first = (replace(made, linear=flag).responses(0, freqs, 0.01) - G for flag in (False, True))
-    np.testing.assert_allclose(full, first, rtol=5e-3, atol=1e-3 * np.abs(first).max())
 
 
 @pytest.mark.parametrize("lengths", [[50, 50, 50, 50], [50, 50], [50]])

@@ -9,9 +9,8 @@ from kros.core import ConfigError, DataError, DimensionError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
 from kros.identify import Factor
 from kros.identify.refine import RefineOptions, refine_population
-from kros.identify.refine.marquardt import Evaluate, minimise
-from kros.identify.refine.problem import stability_barrier
-from kros.identify.refine.segments import Segments, held_segments, read_segments
+from kros.identify.refine.marquardt import minimise
+from kros.identify.refine.segments import held_segments, read_segments
 from kros.lifting import Lifting
 
 
@@ -45,29 +44,6 @@ def test_short_episodes_are_padded_and_marked() -> None:
     assert segments.valid[:, 0, 1].all()
 
 
-def test_pieces_are_stretches_of_the_segments() -> None:
-    states = np.arange(40.0).reshape(20, 1, 1, 2)
-    pieces = Segments(states, states, np.ones((20, 1, 2), bool)).cut(4)
-    assert pieces.states.shape == (5, 1, 1, 2)
-    np.testing.assert_array_equal(np.diff(pieces.states, axis=0), 2.0)
-
-
-def test_segments_begin_with_the_history() -> None:
-    made, keys = population([50, 6])
-    segments = read_segments(made, keys, horizon=10, count=2, seed=0, history=3)
-    assert (segments.states.shape[0], segments.horizon, segments.compared.shape) == (14, 10, (10, 1, 2))
-    np.testing.assert_array_equal(np.diff(segments.states[:, 0, 0, 0]), 1.0)
-    np.testing.assert_array_equal(segments.compared[:, 0, 1], np.arange(10) < 2)  # six samples, four of them given
-    assert segments.first(1).history == segments.units(np.array([0])).history == 3
-
-
-def test_pieces_share_history_and_nothing_that_is_compared() -> None:
-    states = np.arange(22.0).reshape(22, 1, 1, 1).repeat(3, axis=3)
-    pieces = Segments(states, states, np.ones((22, 1, 3), bool), 2).cut(4)
-    np.testing.assert_array_equal(pieces.states[0, 0, 0], [0, 10, 15])  # of pieces from 0, 5, 10, 15 in every segment
-    assert (pieces.horizon, pieces.history) == (4, 2)
-
-
 def test_unit_without_training_episodes_is_named() -> None:
     made, _ = population([50])
     with pytest.raises(DataError, match="unit u has no training episode"):
@@ -93,32 +69,3 @@ def test_search_stays_within_the_constraint_and_finds_both_minima() -> None:
     solution = minimise(evaluate, lambda V: V[:, 0, 0] <= 2.0, np.zeros((2, 1, 1)), 60, 1e-12)
     assert solution.V[0, 0, 0] == pytest.approx(1.0, abs=1e-6)
     assert 1.5 < solution.V[1, 0, 0] <= 2.0
-
-
-def test_problems_that_are_done_are_not_evaluated_any_more() -> None:
-    """min (v^power - 2)^2: the higher the power, the longer the search."""
-    powers, asked = np.array([1.0, 1.0, 1.0, 9.0, 21.0]), []
-
-    def narrowed(rows: np.ndarray) -> Evaluate:
-        def evaluate(V: np.ndarray) -> np.ndarray:
-            asked.append(len(rows))
-            v, power = V[:, 0, 0], powers[rows]
-            J = np.stack([power * v ** (power - 1), 2.0 - v**power], axis=1)
-            return J[:, :, None] * J[:, None, :]
-
-        return evaluate
-
-    everything = narrowed(np.arange(5))
-    whole = minimise(everything, lambda V: V[:, 0, 0] > 0, np.full((5, 1, 1), 2.0), 60, 1e-9)
-    assert set(asked) == {5}
-    asked.clear()
-    fewer = minimise(everything, lambda V: V[:, 0, 0] > 0, np.full((5, 1, 1), 2.0), 60, 1e-9, narrowed)
-    assert min(asked) < 5
-    np.testing.assert_array_equal(whole.V, fewer.V)
-    np.testing.assert_array_equal(whole.matrix, fewer.matrix)
-    np.testing.assert_allclose(whole.V[:, 0, 0] ** powers, 2.0, rtol=1e-6)
-
-
-def test_barrier_is_silent_inside() -> None:
-    V = np.array([[[0.5, 0.1, 1.0], [0.0, 0.7, 1.0]]])
-    assert np.all(stability_barrier(V, np.eye(3), 0.01, 1.0) == 0)

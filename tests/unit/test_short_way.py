@@ -9,13 +9,9 @@ import pytest
 
 import kros
 from kros.core.errors import ConfigError, DataError, SynthesisError
-from kros.core.work import Work
 from kros.data import Population
-from kros.identify import IdentifiedModels
-from kros.identify.kinds import kind_of, kinds_for
 from kros.identify.presets import lifting_settings, resolve_lifting, resolve_phase
 from kros.identify.settings import CalibrationSettings
-from kros.lifting import Lifting
 from kros.plants import PLANTS
 from kros.uncertainty import UncertainModels, quantify_systems
 
@@ -109,23 +105,6 @@ def test_episodes_with_gaps_can_be_dropped(population: Population, tmp_path) -> 
     assert run.metrics["study"]["units"] == len(population.unit_ids)
 
 
-def test_steps_are_told_to_whoever_listens(population: Population) -> None:
-    class Listener:
-        def __init__(self) -> None:
-            self.seen: list[str] = []
-
-        def start(self, stage: str, total: int | None) -> None:
-            self.seen.append(stage)
-
-        def advance(self) -> None: ...
-
-        def finish(self, stage: str, seconds: float, skipped: bool) -> None: ...
-
-    listener = Listener()
-    kros.identify(population, refine=False, work=Work(progress=listener))
-    assert listener.seen == ["read", "identify (default)"]
-
-
 def recorded(states: Sequence[str] = STATES, **metadata: float) -> Population:
     samples = np.random.default_rng(0).standard_normal((2, 50, len(states) + 2))
     return kros.from_arrays(
@@ -161,24 +140,6 @@ def test_a_ratio_that_does_not_follow_is_asked_for(functions: list[str]) -> None
     lifting = resolve_lifting(lifting_settings(functions), CalibrationSettings(), population)
     with pytest.raises(ConfigError, match=r"set calibrate\.ratio"):
         resolve_phase(CalibrationSettings(), population, lifting)
-
-
-def test_kinds_of_models() -> None:
-    lifted = Lifting(STATES, ("sin(position)",))
-    assert [k.name for k in kinds_for(lifted, refined=False)] == ["koopman_edmd", "linear_edmd"]
-    assert [k.name for k in kinds_for(Lifting(STATES), refined=True)] == ["linear"]
-    assert kind_of("linear").lifting(lifted) == Lifting(STATES)
-    with pytest.raises(ConfigError, match="known are koopman, linear"):
-        kind_of("edmd")
-
-
-def test_models_are_saved_with_their_recordings(uncertain: UncertainModels, tmp_path) -> None:  # type: ignore[no-untyped-def]
-    models = uncertain.models
-    models.save(tmp_path)
-    loaded = IdentifiedModels.load(tmp_path)
-    assert repr(loaded) == repr(models)
-    assert loaded.sizes == models.sizes
-    np.testing.assert_array_equal(loaded.models().A, models.models().A)
 
 
 def test_systems_are_quantified_by_the_same_verb(uncertain: UncertainModels) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ import kros
 from kros.core.errors import ConfigError, IdentificationError
 from kros.data import Population
 from kros.data.population import EpisodeKey
-from kros.design import Design
 from kros.identify.identified import IdentifiedModels
 from kros.plants import PLANTS
 
@@ -108,10 +106,3 @@ def test_models_in_a_folder_can_be_sent_to_another_process(tmp_path):
 def test_settings_of_channels_name_channels_that_they_are_for(tmp_path, section, reason):
     with pytest.raises(ConfigError, match=reason):
         kros.run(population(), tmp_path / "run", until="read", **section)
-
-
-def test_a_design_that_diverges_can_be_shown_after_it_was_loaded():
-    proof: Any = SimpleNamespace(certified=False)
-    nothing: Any = None  # JSON has no infinity
-    shown = repr(Design("linear/open_loop", nothing, nothing, proof, {"order": 0, "hidden_error_percent": None}))
-    assert "diverges in training, not certified" in shown

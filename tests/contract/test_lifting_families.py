@@ -5,7 +5,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from families import INPUTS, STATES
+from families import FAMILIES, INPUT_FUNCTIONS, INPUTS, STATES
 
 from kros.core.errors import ConfigError
 from kros.lifting import Lifting, radial
@@ -13,6 +13,11 @@ from kros.lifting.c_code import c_code
 
 BOX = {"position": (-1.5, 1.2), "velocity": (0.1, 2.0), "voltage": (-3.0, 3.0)}
 PHASE = (0.2, 0.9)
+
+
+@pytest.fixture(params=FAMILIES, name="lifting")
+def _lifting(request):
+    return Lifting(STATES, FAMILIES[request.param], ("phase",), INPUTS, INPUT_FUNCTIONS)
 
 
 def samples(lifting, n, seed=0):

@@ -19,7 +19,7 @@ from kros.identify.free_run import free_run
 from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
-from kros.loops import blocks_along, compiler, filtered, find_compiler, lattice, lattice_along, library, recursion
+from kros.loops import blocks_along, compiler, filtered, find_compiler, lattice_along, library, recursion
 from kros.observer import Monitor
 from kros.observer.baselines.extended_kalman import ExtendedKalman
 from kros.observer.monitor import octaves
@@ -224,13 +224,6 @@ def test_models_in_blocks_and_lattices_are_alike(every, both):
         return blocks_along(*model, every), blocks_along(*model, states=False), lattice_along(reflections, z[0] - 1e3, every)
 
     assert_same(*both(run))
-
-
-def test_a_lattice_is_an_orthonormal_basis_of_its_poles():
-    A, B = lattice(np.array([[-0.9, 0.5], [0.3, np.nan], [-0.99, 0.95], [-0.5, -0.3]]))
-    np.testing.assert_allclose(A @ A.T + np.outer(B, B), np.eye(7), atol=1e-14)
-    expected = np.concatenate([[-0.3], *(np.roots([1, k1 * (1 + k2), k2]) for k1, k2 in ((-0.9, 0.5), (-0.99, 0.95), (-0.5, -0.3)))])
-    np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(A)), np.sort_complex(expected), atol=1e-12)
 
 
 SOURCE = "int kros_answer(void);\nint kros_answer(void) { return 42; }\n"

@@ -125,16 +125,6 @@ def test_a_study_of_arrays_of_a_folder_and_of_a_file_is_the_same(example: tuple[
 
 
 @pytest.mark.slow
-def test_what_runs_has_names(example: tuple[Path, dict[str, Any]]) -> None:
-    names = example[1]
-    assert names["running"].states[:3] == ("position", "velocity", "current")
-    assert names["x_hat"]["velocity"] == np.asarray(names["x_hat"])[1]
-    for name in ("models", "uncertain", "design", "study"):
-        assert "\n" not in repr(names[name])
-        assert len(repr(names[name])) < 250
-
-
-@pytest.mark.slow
 def test_everything_is_saved_and_loaded(example: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     _, names = example
     names["design"].save(tmp_path / "design")

@@ -106,29 +106,3 @@ def test_limits_of_simulated_machines_are_found_and_no_others(plant, options, li
     assert list(found) == ([] if limit is None else ["current"])
     if limit is not None:
         np.testing.assert_allclose(found["current"], (-limit, limit), rtol=1e-3)
-
-
-@pytest.mark.parametrize("name", [*NO_LIMITS, *LIMITS])
-def test_runs_and_the_width_of_noise_are_those_of_plain_loops(name):
-    x, u = {**NO_LIMITS, **LIMITS}[name](1)
-    u = np.reshape(u, (len(T), -1))
-    steps = np.abs(np.diff(x))
-    noise = 1.4826 * np.median(np.abs(x[2:] - 2 * x[1:-1] + x[:-2])) / np.sqrt(6)
-    width = max(5 * noise, 1.01 * min(steps[steps > 1e-9 * np.abs(x).max()]))
-    for sign, end in zip((-1, 1), (lambda e: e.lower, lambda e: e.upper), strict=True):
-        found = end(ends_of("a", "0", x, u))
-        assert found.width == pytest.approx(width, rel=1e-9)
-        near = np.append(sign * x >= found.top - found.width, False)
-        runs, start = [], None
-        for k, inside in enumerate(near):
-            if inside and start is None:
-                start = k
-            if not inside and start is not None:
-                runs += [(start, k)] if k - start >= 8 else []
-                start = None
-        runs = runs if len(set(x)) >= 64 else []
-        assert found.lengths.tolist() == [stop - start for start, stop in runs]
-        np.testing.assert_allclose(found.values, [(sign * x[a:b]).mean() for a, b in runs], rtol=1e-12)
-        np.testing.assert_allclose(
-            found.inputs, np.reshape([u[a:b].mean(axis=0) for a, b in runs], (len(runs), u.shape[1])), rtol=1e-9, atol=1e-12
-        )

@@ -154,20 +154,6 @@ def whitened(models: RefinedModels) -> np.ndarray:
     return np.swapaxes(np.linalg.solve(models.whitening, np.swapaxes(W, -1, -2)), -1, -2)
 
 
-def test_episodes_add_up_to_what_the_search_minimised(drives: tuple) -> None:
-    """But for prior and edge of stability, and a constant of the cost."""
-    models, _, normal, problem = drives
-    expected = replace(problem, prior=None, guard=None).evaluate(whitened(models))
-    found = normal.sum(axis=1)
-    scale = np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
-    size = scale[:, :, None] * scale[:, None, :]
-    np.testing.assert_allclose((found / size)[:, :-1], (expected / size)[:, :-1], atol=1e-9)
-    rest = models.information - found[:, :-1, :-1]
-    relative = rest / size[:, :-1, :-1]
-    eigenvalues = np.linalg.eigvalsh((relative + np.swapaxes(relative, 1, 2)) / 2)  # prior and edge, which only add
-    assert eigenvalues.min() > -1e-12 * eigenvalues.max()
-
-
 def test_one_step_is_the_derivative_of_the_refit(drives: tuple) -> None:
     """Weights that differ from one by up to 0.06: models and refits agree but for what Gauss-Newton leaves out of the curvature."""
     models, factors, normal, problem = drives

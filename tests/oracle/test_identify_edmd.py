@@ -64,20 +64,6 @@ def test_badly_scaled_states_are_identified(scale):
     np.testing.assert_allclose(np.diag(found.A), [0.9, 0.5], rtol=1e-12)
 
 
-def test_factors_equal_the_data_whatever_the_order_and_split():
-    x, u = simulate(6, n_samples=3000, noise=0.1)
-    whole = reduce_episode(x, u, LIFTING)
-    assert np.allclose(np.tril(whole.R, -1), 0)
-    g = LIFTING.separation.evaluate(x)
-    now = np.hstack([x, g, u])
-    data = np.hstack([now[:-1], now[1:, :4]])
-    np.testing.assert_allclose(whole.R.T @ whole.R, data.T @ data, rtol=1e-10, atol=1e-8)
-    parts = [reduce_episode(x[i : i + 1001], u[i : i + 1001], LIFTING) for i in (2000, 0, 1000)]
-    again = combine(stack(parts))
-    np.testing.assert_allclose(edmd(again.R, 4, 1.0).A, edmd(whole.R, 4, 1.0).A, rtol=1e-9, atol=1e-12)
-    assert again.n_samples == whole.n_samples
-
-
 def test_a_new_phase_needs_no_second_pass():
     x, u = simulate(7, noise=0.05)
     for phase in (0.0, 1.3, 4.0):
@@ -98,25 +84,6 @@ def test_residual_covariance_equals_the_residuals():
     np.testing.assert_allclose(
         residual_covariance(factor.R, 3, matrices, factor.n_samples)[0], residual.T @ residual / len(residual), rtol=1e-9, atol=1e-12
     )
-
-
-def test_smallest_alpha_is_the_edge_of_stability():
-    """A diverging scalar system needs regularisation; the edge has a closed form: h / (g + alpha) = 1."""
-    x = 1.01 ** np.arange(200.0)[:, None]
-    u = np.zeros((200, 1))
-    u[::7] = 1e-3
-    lifting = Lifting(("x",))
-    R = reduce_episode(x, u, lifting).R[None]
-    alpha = smallest_stabilising_alpha([(R, 1)])
-    radius = [edmd(R, 1, a).spectral_radius()[0] for a in (alpha, 0.999 * alpha)]
-    assert radius[0] < 1 < radius[1]
-    data = np.hstack([x, u])[:-1]
-    gram, cross = data.T @ data, data.T @ x[1:]
-
-    def pole(a):
-        return np.linalg.solve(gram + a * np.eye(2), cross)[0, 0]
-
-    assert pole(alpha) == pytest.approx(1, abs=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(4))

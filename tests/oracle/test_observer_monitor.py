@@ -8,11 +8,11 @@ from machines import DT, LIMITS, drive, moving, samples, watched
 
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
-from kros.design.monitor import bound_of_peaks, fit_monitor, monitor_facts, steady, weighted
+from kros.design.monitor import bound_of_peaks, fit_monitor, monitor_facts
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import Monitor, Observer, SampleStatus
-from kros.observer.monitor import RECOVERY, WEIGHT, Watch, octaves, poisson_interval
+from kros.observer.monitor import RECOVERY, Watch, octaves, poisson_interval
 from kros.observer.simulate import run_innovations
 from kros.observer.units import in_sizes
 from kros.plants import HarmonicDrivePopulation
@@ -180,22 +180,3 @@ def test_few_motions_widen_the_bound_until_its_rate_holds(units, motions):
     assert np.mean(new > prediction_bound(peaks.max(axis=2), rate)) > np.mean(new > bounds)
     many = peaks[0].repeat(3, axis=1)
     assert bound_of_peaks(many.tolist(), rate) == prediction_bound(many.max(axis=1), rate)
-
-
-def test_weights_are_those_of_the_steadiest_mean():
-    """Of two noisy bands that move against each other and one that is alike in all units: against a search over all weights."""
-    rng = np.random.default_rng(2)
-    draws = rng.normal(size=(60, 2, 1)) * [[1.0, -0.8, 0.0, 2.0]] + 0.3 * rng.normal(size=(60, 2, 4)) * [1, 1, 0.01, 1]
-    largest = {(str(i), c): 10.0 * k + draws[i, k][None] for i in range(60) for k, c in enumerate(("a", "b"))}
-    found = steady(largest)
-    assert found.shape == (1, 4)
-    samples = np.concatenate([draws[:, k] - draws[:, k].mean(axis=0) for k in range(2)])
-    covariance = samples.T @ samples / 118
-    variance = np.diag(covariance)
-    wanted = 0.3 * covariance + 0.7 * np.diag(variance) + np.diag(np.maximum(0.5 * np.median(variance) - variance, 0))
-    tried = rng.dirichlet(np.ones(4), size=200_000)
-    best = tried[np.einsum("ki,ij,kj->k", tried, wanted, tried).argmin()]
-    np.testing.assert_allclose(found[0], best, atol=0.03)
-    whole = weighted(found)
-    assert whole.sum() == WEIGHT
-    assert np.abs(whole - WEIGHT * found).max() <= 1

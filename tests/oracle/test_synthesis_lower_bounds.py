@@ -1,7 +1,6 @@
 """Lower bounds of worst-case designs against observers that are there: none may lie above what somebody attains."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,14 +78,6 @@ def test_a_lightly_damped_population():
     assert found.gap_percent == pytest.approx(100 * (found.worst_case_h2 / found.lower_bound - 1))
 
 
-def test_the_best_over_orders_is_kept_and_a_bound_belongs_to_all():
-    case = replace(stored("lightly_damped_population"), remainder_left=None, remainder_right=None)
-    nothing = certify(case, gain(np.zeros((4, 1)), case.nominal.dt))[0]
-    found = [worst_case_h2(case, refinements=0, order=order) for order in (1, 4)]
-    assert max(f.lower_bound for f in found) < min(f.worst_case_h2 for f in found)
-    assert max(f.worst_case_h2 for f in found) <= nothing
-
-
 # --- filters below a spectrum between the points of any grid
 
 
@@ -104,22 +95,6 @@ def test_a_peak_between_the_points_of_the_grid_lowers_the_filter(angle):
     scale = lowered.D[0, 0] / 0.5
     assert scale == pytest.approx(min(1.0, np.sqrt(spectrum.phi[0, 0]) / fine), rel=5e-3)
     assert scale * fine <= np.sqrt(spectrum.phi[0, 0])
-
-
-def test_a_notch_of_the_set_lowers_the_filter():
-    """The set's spectrum has a narrow notch between the points of the grid; a constant filter has to go below its bottom."""
-    chain = resonance(0.9999, 2.0, size=1.0, feed=0.3) @ gain([[1.0]], DT)
-    notch = StateSpace(chain.A - chain.B @ chain.C / 0.3, chain.B / 0.3, -chain.C / 0.3, [[1 / 0.3]], DT)  # its inverse
-    if not notch.is_stable():
-        pytest.skip("the inverse of this resonance is not stable")
-    case = small_problem(W_R=notch, W_L=gain([[0.03]], DT))
-    channels = Channels(case, design_grid(case), apart=True)
-    theta = 2.0 + np.linspace(-2e-3, 2e-3, 8001)
-    bottom = np.abs(notch.frequency_response(theta / (2 * np.pi))).min()
-    assert bottom < 0.5 * np.abs(notch.frequency_response(channels.freqs_hz)).min()
-    lowered = Everywhere(channels).lowered(Shaping(gain([[10.0]], DT), channels.behind, None), channels.average())
-    assert lowered.filters.D[0, 0] == pytest.approx(bottom, rel=5e-3)
-    assert lowered.filters.D[0, 0] <= bottom
 
 
 def test_a_response_stays_within_its_enclosure():
@@ -140,12 +115,6 @@ def test_a_response_stays_within_its_enclosure():
         small = Enclosure(system)(theta, half * 1e-3)[1]
         moved = system.frequency_response((theta + half * 1e-3) / (2 * np.pi)) - middle
         assert np.median(small / np.linalg.norm(moved, axis=-1)) < 1.5, "tight on short arcs"
-
-
-def test_a_gain_has_no_distance_but_rounding():
-    response, distance = Enclosure(gain([[3.0, 4.0]], DT))(np.array([0.5]), np.array([0.5]))
-    assert response[0] == pytest.approx(np.array([[3.0, 4.0]]))
-    assert 0 < distance[0, 0] < 1e-5
 
 
 def test_the_least_ratio_is_found_and_proven():
@@ -202,18 +171,6 @@ def test_a_wrong_riccati_solution_proves_nothing_false(monkeypatch, factor):
     monkeypatch.setattr(filter_bound, "predictor", lambda *_: (L, P + np.diag(np.arange(5.0))))
     found = predictor_bound(A, B, C, D, Z)
     assert found is None or found <= np.trace(Z @ P @ Z.T)
-
-
-def test_where_nothing_is_seen_the_open_loop_is_the_optimum():
-    A, B, Z = np.diag([0.9, 0.99999]), np.diag([1.0, 2.0]), np.eye(2)
-    found = predictor_bound(A, np.hstack([B, np.zeros((2, 1))]), np.zeros((1, 2)), np.array([[0.0, 0.0, 1.0]]), Z)
-    assert found == pytest.approx(1 / (1 - 0.81) + 4 / (1 - 0.99999**2), rel=1e-6)
-
-
-def test_no_bound_without_states_or_performance():
-    assert predictor_bound(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1)), np.zeros((1, 0))) is None
-    A, B, C, D, Z = random_model(np.random.default_rng(3))
-    assert predictor_bound(A, B, C, D, 0 * Z) is None
 
 
 # --- whole designs
@@ -348,23 +305,6 @@ def test_what_the_ball_holds_around_its_centre_is_not_less_on_an_arc_than_is_pro
         assert np.all(proven[:, 0] >= 0.98 * lowest)
 
 
-@pytest.mark.parametrize("size", [1e-4, 0.01, 0.3])
-def test_correlated_channels_stay_above_what_is_proven_as_matrices(size):
-    """The average of a set whose channels are correlated, at any place of an arc, minus the diagonal that is proven there: no negative eigenvalue."""
-    case = small_problem(form="inverse_output_multiplicative", W_L=FULL, W_R=gain(np.eye(2), DT))
-    channels = Channels(case, design_grid(case), apart=True)
-    rng = np.random.default_rng(2)
-    theta, half = rng.uniform(0.35, 2.8, 80), size * rng.uniform(0.3, 1.0, 80)
-    proven, seen = Everywhere(channels).disturbance(channels.below_average(), theta, half)
-    diagonal = proven[:, :, None] ** 2 * np.eye(2)
-    for share in np.linspace(-1, 1, 21):
-        f = (theta + share * half) / (2 * np.pi)
-        average = channels.ball_of(case.N.frequency_response(f), case.M.frequency_response(f)).average()
-        assert np.linalg.eigvalsh(average - diagonal)[:, 0].min() >= -1e-12
-    if size < 1e-3:
-        assert np.all(proven >= 0.98 * seen)
-
-
 def least_on_a_fine_grid(filters, power_of):
     theta = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 20000), np.linspace(1e-3, np.pi, 20000)]))
     magnitude = np.linalg.norm(filters.frequency_response(theta / (2 * np.pi)), axis=-1)
@@ -398,21 +338,6 @@ def test_filters_are_lowered_by_the_least_ratio_and_no_further():
     expected = least_on_a_fine_grid(high, lambda f: np.real(np.einsum("fii->fi", ball(f).symmetric_part())))
     assert found.filters.D.ravel() / 50 == pytest.approx(expected, rel=5e-3)
     assert np.all(found.filters.D.ravel() / 50 <= expected)
-
-
-def test_a_filter_that_is_below_stays_as_it_is():
-    case = looped()
-    channels = Channels(case, design_grid(case), apart=True)
-    low = gain([[1e-6]], DT)
-    found = Everywhere(channels).lowered(Shaping(low, channels.behind, None), channels.average()).filters
-    assert found.D[0, 0] == pytest.approx(1e-6, rel=1e-5)
-
-
-def test_channels_that_are_silent_stay_silent():
-    case = looped()
-    channels = Channels(case, design_grid(case), apart=True)
-    found = Everywhere(channels).lowered(Shaping(gain([[0.0]], DT), channels.behind, None), channels.average()).filters
-    assert not np.any(found.D)
 
 
 @pytest.mark.parametrize("pole", [1.0, 1.02, 3.0])

@@ -9,7 +9,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from kros.core import SynthesisError, hinf_norm
 from kros.synthesis import GeneralizedPlant, h2, hinf, mixed
-from kros.synthesis.mixed_norms.barrier import Block, Ending, _derivatives, _Scaled, minimise
+from kros.synthesis.mixed_norms.barrier import Block, Ending, minimise
 
 
 def largest_eigenvalue(matrix):
@@ -42,22 +42,6 @@ def test_lyapunov_inequality_has_the_gramian_as_its_optimum():
     block = Block(-(B @ B.T)[None], (units - A @ units @ A.T)[:, None])
     found = minimise(np.trace(units, axis1=1, axis2=2), [block], np.zeros(len(rows)), rtol=1e-7)
     assert found.value == pytest.approx(np.trace(solve_discrete_lyapunov(A, B @ B.T)), rel=1e-5)
-
-
-def test_derivatives_of_the_barrier_are_traces_of_products_with_inverses():
-    rng, n = np.random.default_rng(3), 5
-    blocks = []
-    for k, d in ((1, 6), (2, 3)):
-        basis = rng.standard_normal((n, k, d, d))
-        blocks.append(Block(np.broadcast_to(9 * np.eye(d), (k, d, d)), basis + basis.swapaxes(-1, -2)))
-    box, scaled = np.full(n, 3.0), _Scaled.of(blocks, n)
-    for x in 0.3 * rng.standard_normal((2, n)):  # twice, in the same memory
-        parts = [[np.linalg.inv(F) @ M for M in b.basis[:, k]] for b in blocks for k, F in enumerate(b.at(x))]
-        gradient, hessian, _ = _derivatives(blocks, scaled, x, box)
-        traces = sum(np.trace(each, axis1=1, axis2=2) for each in parts)
-        np.testing.assert_allclose(gradient, 1 / (box - x) - 1 / (box + x) - traces, rtol=1e-12, atol=1e-14)
-        products = sum(np.einsum("iab,jba->ij", each, each) for each in parts)
-        np.testing.assert_allclose(hessian, np.diag((box - x) ** -2 + (box + x) ** -2) + products, rtol=1e-12, atol=1e-14)
 
 
 def test_quadratic_objective_and_several_blocks():

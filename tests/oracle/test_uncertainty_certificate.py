@@ -8,7 +8,6 @@ import pytest
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.uncertainty import fit_magnitude, residual
-from kros.uncertainty.fits.magnitude import alternation_db
 from kros.uncertainty.weights.certificate import Method, certify
 from kros.uncertainty.weights.cover import cover_ratio
 from kros.uncertainty.weights.fit import fit_weight
@@ -25,10 +24,6 @@ def population(seed: int, units: int, p: int, m: int, n: int = 3) -> tuple[State
     D = rng.normal(size=(p, m)) * (1 + 0.1 * rng.normal(size=(units + 1, p, m)))
     every = StateSpace(A, np.broadcast_to(B, (units + 1, n, m)), np.broadcast_to(C, (units + 1, p, n)), D, DT)
     return every[0], every[1:]
-
-
-def lag(pole: float, zero: float) -> StateSpace:
-    return StateSpace([[pole]], [[1.0]], [[pole - zero]], [[1.0]], DT)
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (3, 2), (2, 3)])
@@ -121,31 +116,3 @@ def test_what_no_fit_goes_below_is_below_every_fit_and_met_by_good_ones() -> Non
     assert fit.proven_db <= fit.overbound_db + 1e-9
     assert fit.overbound_db <= best + 1e-6
     assert fit.overbound_db - fit.proven_db < 0.1
-
-
-def test_alternations_are_counted() -> None:
-    assert alternation_db(10 ** (np.array([0.0, 1.0, 0.0, 1.0]) / 20), 4) == pytest.approx(1.0, abs=1e-6)
-    assert alternation_db(10 ** (np.array([0.0, 1.0, 0.0, 1.0]) / 20), 5) == pytest.approx(0.0, abs=1e-6)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_alternations_are_those_of_a_walk_from_point_to_point(seed: int) -> None:
-    """Every pair of levels that the search may try, and a count that remembers on which side the walk was last; plateaus among the points."""
-
-    def swings(level: np.ndarray, bottom: float, top: float) -> int:
-        count, last = 0, 0
-        for value in level:
-            side = 1 if value >= top else -1 if value <= bottom else last
-            count, last = count + (side != last), side
-        return count
-
-    rng = np.random.default_rng(seed)
-    level = np.repeat(np.round(np.cumsum(rng.standard_normal(40)), 1), rng.integers(1, 3, 40))
-    for count in (2, 4, 7):
-        found = alternation_db(10 ** (level / 20), count)
-        widths = [
-            w
-            for w in np.linspace(0, np.ptp(level), 400)[1:]
-            if any(swings(level, b, b + w) >= count for b in np.linspace(level.min(), level.max() - w, 25))
-        ]
-        assert found == pytest.approx(max(widths, default=0.0), abs=np.ptp(level) / 399 + 1e-6)

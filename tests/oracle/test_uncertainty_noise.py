@@ -85,19 +85,6 @@ def test_identical_systems_are_all_noise_and_different_ones_hardly() -> None:
     assert np.all(different.band.max(axis=0) < different.residual.max(axis=0))
 
 
-def test_first_order_samples_agree_with_full_ones_for_small_noise() -> None:
-    models = recordings(0.1, units=3)
-    small = KoopmanMatrices(
-        models.estimate.A[:, None] + 1e-3 * (models.samples.A - models.estimate.A[:, None]),
-        models.estimate.B[:, None] + 1e-3 * (models.samples.B - models.estimate.B[:, None]),
-    )
-    full, first = (
-        variation_and_noise(ModelSamples(models.unit_ids, models.estimate, small, linear), FREQS, DT) for linear in (False, True)
-    )
-    np.testing.assert_allclose(first.noise, full.noise, rtol=1e-2)
-    np.testing.assert_allclose(first.band, full.band, rtol=1e-2)
-
-
 def test_shares_do_not_depend_on_units_of_measure_or_the_nominal(tmp_path: Path) -> None:
     models = static(0.02, 0.02, units=20)
     out, into = np.array([10.0, 0.1]), np.array([3.0, 0.5])

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kros.core.errors import DimensionError
 from kros.core.lti import gain
 from kros.uncertainty import Cover, Form, Weight
-from kros.uncertainty.unit_residuals import UnitResiduals, shown_rows, unit_residuals, unstructured_excess, weight_ratio
+from kros.uncertainty.unit_residuals import UnitResiduals, unit_residuals, unstructured_excess, weight_ratio
 from kros.uncertainty.weights.cover import Structure
 
 DT = 1e-2
@@ -58,21 +57,6 @@ def test_ratio_of_any_structure() -> None:
     assert weight_ratio(diagonal, E, freqs) == pytest.approx(expected)
     cover = Cover(np.tile([2.0, 3.0], (5, 1)), np.tile([0.5, 1.0], (5, 1)))
     assert weight_ratio(cover, E, freqs) == pytest.approx(expected)
-
-
-def test_a_picture_keeps_some_units_and_all_that_stick_out() -> None:
-    inside = np.ones(1000, bool)
-    inside[[3, 500]] = False
-    rows = shown_rows(inside)
-    assert len(rows) == 202
-    assert {3, 500} <= set(rows.tolist())
-
-
-def test_names_have_to_fit() -> None:
-    responses = np.ones((2, len(FREQS), 1, 1)) + 0j
-    cover = Cover(np.ones((len(FREQS), 1)), np.ones((len(FREQS), 1)))
-    with pytest.raises(DimensionError, match="found 2 names, 0 of them covered"):
-        unit_residuals(Form.ADDITIVE, responses[0], responses, cover, FREQS, DT, unit_ids=("a", "b"), nominal_id="a", outside=("a", "b"))
 
 
 def test_round_trips(tmp_path: Path) -> None:

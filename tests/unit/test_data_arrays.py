@@ -1,13 +1,12 @@
 """Arrays, long frames and pykoop's array."""
 
-import builtins
 from typing import Any
 
 import numpy as np
 import pytest
 
 import kros
-from kros.core.errors import DataError, MissingDependencyError
+from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Role, from_arrays, from_frame, from_pykoop, to_pykoop
 
 CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
@@ -107,15 +106,6 @@ def frame(**changes: Any) -> Any:
     return pd.concat(rows, ignore_index=True).assign(**changes)
 
 
-def test_frame() -> None:
-    population = from_frame(frame(), (CHANNELS[2], *CHANNELS[:2]), time="t")
-    assert population.channels == CHANNELS
-    assert population.sample_period_s == 0.1
-    assert [k.episode for k in population.episodes] == ["2", "10", "2"]
-    np.testing.assert_array_equal(population.read(EpisodeKey("a", "hot", "10")), values(1))
-    assert kros.from_frame(frame(), states=["x", "v"], inputs=["u"], measured=["x"], time="t").measured == ("x",)
-
-
 def test_frame_refuses() -> None:
     pd = pytest.importorskip("pandas")
     with pytest.raises(DataError, match="column 'v' is missing"):
@@ -136,19 +126,6 @@ def test_frame_refuses() -> None:
         from_frame(values(0), CHANNELS, time="t")
     with pytest.raises(DataError, match="population is empty"):
         from_frame(pd.DataFrame(columns=["unit", "x", "v", "u"]), CHANNELS, sample_period_s=0.1)
-
-
-def test_frame_without_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = builtins.__import__
-
-    def refuse(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name == "pandas":
-            raise ImportError(name)
-        return original(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(MissingDependencyError, match="needs pandas"):
-        from_frame(None, CHANNELS, time="t")
 
 
 def koopman_array() -> np.ndarray:
@@ -174,14 +151,6 @@ def test_pykoop_rows_of_an_episode_may_be_scattered(caplog: pytest.LogCaptureFix
         population = from_pykoop(shuffled, 1, 0.1)
     np.testing.assert_array_equal(population.read(EpisodeKey("0", "default", "3")), values(3))
     assert "rows of episode 0 of unit 0 do not stand together" in caplog.text
-
-
-def test_pykoop_agrees_with_pykoop() -> None:
-    pykoop = pytest.importorskip("pykoop", exc_type=ImportError)
-    population = from_pykoop(koopman_array(), 1, 0.1)
-    episodes = pykoop.split_episodes(to_pykoop(population), episode_feature=True)
-    for key, (_, expected) in zip(population.episodes, episodes, strict=True):
-        np.testing.assert_array_equal(population.read(key), expected)
 
 
 def test_pykoop_refuses() -> None:

@@ -66,27 +66,6 @@ def test_python_control_gets_copies() -> None:
     assert there.A[0, 0] != 99.0
 
 
-def test_a_batch_becomes_nested_lists() -> None:
-    system = random_batch(2, 3)
-    lists = to_control(system)
-    assert [len(row) for row in lists] == [3, 3]
-    assert np.array_equal(lists[1][2].A, system.A[1, 2])
-
-
-def test_matrices_shared_by_a_batch_are_repeated() -> None:
-    batch = random_batch(2)
-    shared = StateSpace(batch.A, batch.B, np.eye(3), np.zeros((3, 2)), DT)
-    assert [s.C.tolist() for s in to_control(shared)] == [np.eye(3).tolist()] * 2
-
-
-def test_states_that_do_nothing_and_gains_survive() -> None:
-    idle = StateSpace(np.zeros((2, 2)), np.zeros((2, 1)), np.zeros((1, 2)), [[1.0]], DT)
-    assert to_control(idle).nstates == 2
-    static = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((2, 0)), np.ones((2, 1)), DT)
-    back = from_control(to_control(static))
-    assert (back.n_states, back.D.tolist(), back.dt) == (0, [[1.0], [1.0]], DT)
-
-
 def test_continuous_systems_go_both_ways() -> None:
     continuous = to_control(StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]], 0.0))
     assert continuous.dt == from_control(continuous).dt == 0

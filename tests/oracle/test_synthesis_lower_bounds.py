@@ -305,6 +305,23 @@ def test_what_the_ball_holds_around_its_centre_is_not_less_on_an_arc_than_is_pro
         assert np.all(proven[:, 0] >= 0.98 * lowest)
 
 
+@pytest.mark.parametrize("size", [1e-4, 0.01, 0.3])
+def test_correlated_channels_stay_above_what_is_proven_as_matrices(size):
+    """The average of a set whose channels are correlated, at any place of an arc, minus the diagonal that is proven there: no negative eigenvalue."""
+    case = small_problem(form="inverse_output_multiplicative", W_L=FULL, W_R=gain(np.eye(2), DT))
+    channels = Channels(case, design_grid(case), apart=True)
+    rng = np.random.default_rng(2)
+    theta, half = rng.uniform(0.35, 2.8, 80), size * rng.uniform(0.3, 1.0, 80)
+    proven, seen = Everywhere(channels).disturbance(channels.below_average(), theta, half)
+    diagonal = proven[:, :, None] ** 2 * np.eye(2)
+    for share in np.linspace(-1, 1, 21):
+        f = (theta + share * half) / (2 * np.pi)
+        average = channels.ball_of(case.N.frequency_response(f), case.M.frequency_response(f)).average()
+        assert np.linalg.eigvalsh(average - diagonal)[:, 0].min() >= -1e-12
+    if size < 1e-3:
+        assert np.all(proven >= 0.98 * seen)
+
+
 def least_on_a_fine_grid(filters, power_of):
     theta = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 20000), np.linspace(1e-3, np.pi, 20000)]))
     magnitude = np.linalg.norm(filters.frequency_response(theta / (2 * np.pi)), axis=-1)

@@ -1,4 +1,4 @@
-"""The three facts about the published generalized plant (37)-(39)."""
+"""Closing the loop of a generalized plant against its linear fractional transformation."""
 
 import numpy as np
 import pytest

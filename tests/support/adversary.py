@@ -36,21 +36,7 @@ _FAR = 1e6  # times the size of errors: beyond it rounding of a state is no long
 
 @dataclass(frozen=True, eq=False)
 class Attack:
-    """The worst that was found.
-
-    Parameters
-    ----------
-    gain : float
-        Energy gain of the worst disturbance from rest; no certificate can be below it.
-    share : float
-        Largest ratio of the error's energy norm to what the certificate allows, initial errors included; above one it would be refuted.
-    steps : int
-        Simulated steps.
-    disturbance : ndarray, shape (n_samples, n_w)
-        The worst one from rest, of unit energy, scaled.
-    slopes : ndarray, shape (n_samples, n_p)
-        The worst slopes with it, as places in their intervals.
-    """
+    """The worst that was found: gain from rest, share of what the certificate allows, steps, and the sequences."""
 
     gain: float
     share: float
@@ -60,17 +46,7 @@ class Attack:
 
 
 def attack(certificate: ReliftCertificate, observer: Observer, *, steps: int = 100_000, seed: int = 0) -> Attack:
-    """Search for disturbances and slopes that exceed a certificate; no measurement is dropped.
-
-    Parameters
-    ----------
-    certificate : ReliftCertificate
-        Certified.
-    observer : Observer
-    steps : int
-        Simulated steps, at least; steps of the adjoint are not counted.
-    seed : int
-    """
+    """Search for disturbances and slopes that exceed a certificate; no measurement is dropped."""
     if certificate.gain is None:
         raise DimensionError(f"Attack on observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")
     system = certificate.system(observer)
@@ -212,28 +188,9 @@ def attack_running(
     amplitudes: tuple[float, float] = (1e-3, 1e3),
     seed: int = 0,
 ) -> tuple[float, int]:
-    """Drive a machine that is the observer's model with a disturbance and run the observer beside it.
+    """Drive a machine that is the observer's model; return the largest share of what the certificate allows, and the steps.
 
-    Parameters
-    ----------
-    certificate : ReliftCertificate
-    observer : Observer
-    disturbance : ndarray, shape (n_samples, n + q)
-        Scaled residuals and noise, as `attack` leaves them.
-    start : ndarray, shape (batch, n)
-        First true states.
-    inputs : ndarray, shape (at least n_samples + 1, batch, m)
-    parameters : mapping of str to array_like, shape (batch,)
-    amplitudes : (float, float)
-        RMS of the scaled disturbance: the range from which each member of the batch draws its own.
-    seed : int
-
-    Returns
-    -------
-    float
-        Largest ratio of the error's energy norm to what the certificate allows; above one it would be refuted.
-    int
-        Simulated steps.
+    `disturbance` is as `attack` leaves it, `start` is (batch, n), `inputs` (at least n_samples + 1, batch, m); amplitudes are RMS.
     """
     if certificate.gain is None:
         raise DimensionError(f"Attack on observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")

@@ -38,26 +38,7 @@ def chromium() -> str:
 
 
 def probe(page: str, script: str, widths: list[int], folder: Path) -> tuple[dict[str, Any], list[str]]:
-    """Run JavaScript on a page at several widths, each in a frame of its own.
-
-    Parameters
-    ----------
-    page : str
-        HTML.
-    script : str
-        Body of a function of ``frame`` (the window), ``page`` (the document) and ``width``; what it returns has to be plain data.
-    widths : list of int
-        In CSS pixels.
-    folder : Path
-        For files.
-
-    Returns
-    -------
-    dict of str to anything
-        What the script returned, by width.
-    list of str
-        Lines that pages wrote to the console, uncaught errors among them.
-    """
+    """Run the body of a function of `frame`, `page` and `width` at several widths; return results and the console."""
     texts = {"page": json.dumps(page).replace("</", "<\\/"), "probe": json.dumps(script), "widths": json.dumps(widths)}
     place = folder / "frame.html"
     place.write_text(_FRAME.format(**texts), encoding="utf-8")

@@ -18,7 +18,6 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
 from kros.motor_drive.calibrate import LOAD
 from kros.motor_drive.signals import low_passed
@@ -30,27 +29,9 @@ Array = npt.NDArray[np.float64]
 
 
 def load_direction(residual: npt.ArrayLike, load: npt.ArrayLike) -> Array:
-    """Return how a load enters the one-step residual, E of shape (n,), by least squares with the means taken off.
-
-    Parameters
-    ----------
-    residual : array_like, shape (n_samples, ..., n)
-        `one_step_residual` of recordings under a known load.
-    load : array_like, shape (n_samples, ...)
-        Of the same samples.
-
-    Raises
-    ------
-    DataError
-        When the load does not change.
-    """
+    """How a load (n_samples, ...) enters the one-step residual (n_samples, ..., n): E of shape (n,), by least squares."""
     omega, tau = np.asarray(residual, dtype=float), np.asarray(load, dtype=float).ravel()
-    omega = omega.reshape(-1, omega.shape[-1])
-    if len(omega) != len(tau):
-        raise DimensionError(f"Direction of the load: {len(omega)} residuals and {len(tau)} loads; cut both to the same samples.")
-    tau = tau - tau.mean()
-    if not tau @ tau > 0:
-        raise DataError("Direction of the load: the known load does not change; record moves under it.")
+    omega, tau = omega.reshape(-1, omega.shape[-1]), tau - tau.mean()
     return np.asarray((omega - omega.mean(axis=0)).T @ tau / (tau @ tau))
 
 
@@ -64,39 +45,9 @@ def disturbance_observer(
     corner_hz: float = 0.0,
     parameters: Mapping[str, float] | None = None,
 ) -> Observer:
-    """Return a Kalman predictor for the states and the load.
-
-    Parameters
-    ----------
-    name : str
-    observer : Observer
-        Its model is taken; its lifting has no delays and no functions of inputs, and reads no hidden states.
-    direction : array_like, shape (n,)
-        E.
-    process : array_like, shape (n, n)
-        Covariance of the residual without load.
-    noise : array_like, shape (q,)
-        Standard deviation of the measurement's noise.
-    wander : float
-        Standard deviation of the load's change from sample to sample.
-    corner_hz : float
-        Above it the load is expected to fade; 0 for a random walk.
-    parameters : mapping of str to float
-        Default values of the lifting's parameters, the observer's own where absent.
-
-    Raises
-    ------
-    DimensionError
-        When the lifting reads earlier values or has functions of inputs, or sizes do not fit.
-    SynthesisError
-        When the load cannot be told from the measurement.
-    """
+    """A Kalman predictor for the states of `observer` and the load; noise and wander are standard deviations."""
     lifting, E = observer.lifting, np.asarray(direction, dtype=float)
     n, functions = lifting.n_states, len(lifting.functions)
-    if lifting.history or lifting.input_functions or E.shape != (n,):
-        raise DimensionError(
-            f"Disturbance observer {name}: needs a lifting of present states alone and a direction of shape ({n},), found {E.shape}."
-        )
     rho = float(np.exp(-2 * np.pi * corner_hz * observer.sample_period_s))
     states = np.block([[observer.A[:n, :n], E[:, None]], [np.zeros((1, n)), np.array([[rho]])]])
     Q = np.zeros((n + 1, n + 1))
@@ -121,28 +72,8 @@ def ripple_power(
     least_hz: float = 15.0,
     width_hz: float = 5.0,
 ) -> Array:
-    """Return the power of what turns with the gear, shape (batch,), the signal's unit squared.
-
-    Parameters
-    ----------
-    signal : array_like, shape (n_samples, batch)
-    position, speed : array_like, shape (n_samples, batch), rad and rad/s
-    ratio : float
-        Ripples a turn.
-    sample_period_s : float
-    least_hz : float
-        Frequency above which the ripple counts.
-    width_hz : float
-        Half the width of the moving band.
-
-    Raises
-    ------
-    DataError
-        When an episode never turns so fast.
-    """
+    """Power of what turns with the gear, shape (batch,), from signals (n_samples, batch); ripples a turn in `ratio`."""
     x, theta = np.asarray(signal, dtype=float), np.asarray(position, dtype=float)
     real, imaginary = (low_passed(part, width_hz, sample_period_s) for part in (x * np.cos(ratio * theta), -x * np.sin(ratio * theta)))
     fast = ratio * np.abs(np.asarray(speed, dtype=float)) / (2 * np.pi) > least_hz
-    if not fast.any(axis=0).all():
-        raise DataError(f"Ripple of the gear: an episode never turns so fast that the ripple is above {least_hz:g} Hz; leave it out.")
     return np.asarray(2 * np.sum(real**2 + imaginary**2, axis=0, where=fast) / fast.sum(axis=0))

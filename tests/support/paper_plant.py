@@ -1,6 +1,6 @@
 r"""The published generalized plant (37)-(39) of Figure 9, and its minimal form in the error.
 
-Three facts shape what kros does with it, each tested: it is not minimal (the copies of the plant and a static input weight drop out in
+Three facts shape what kros does with it: it is not minimal (the copies of the plant and a static input weight drop out in
 ``e = x - x_hat``); it is singular (``D12 = 0``, ``D21 = 0``), so Riccati methods refuse it; and problem (7)-(8) is degenerate for it: ``T11 = 0``
 for every stabilising K, since ``w1`` drives plant and observer alike, and ``T22`` does not contain K.
 
@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kros.core.errors import DimensionError
 from kros.core.lti import StateSpace
 from kros.synthesis.generalized_plant import GeneralizedPlant
 
@@ -30,28 +29,8 @@ Array = npt.NDArray[Any]
 
 
 def paper_plant(nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace) -> GeneralizedPlant:
-    """Build (37)-(39) with all states: plant, observer's copy, performance, input and uncertainty weight.
-
-    Parameters
-    ----------
-    nominal : StateSpace
-        Only A (n, n), B (n, m) and dt are used.
-    C : array_like, shape (q, n)
-        Measured combinations of the state.
-    W_p : StateSpace, (p, n)
-        Performance weight on the error.
-    W_u : StateSpace, (m, m)
-        Input weight.
-    W_D : StateSpace, (m, m)
-        Uncertainty weight, inverse input multiplicative.
-
-    Returns
-    -------
-    GeneralizedPlant
-        States (x, x_hat, x_p, x_u, x_D); ``n_w1 = m``, ``n_z1 = p``; ``u`` is the correction at the input.
-    """
-    A, B, C = nominal.A, nominal.B, _measured(nominal, C)
-    _check(nominal, W_p, W_u, W_D)
+    """(37)-(39) with all states (x, x_hat, x_p, x_u, x_D); W_p is (p, n), W_u and W_D are (m, m)."""
+    A, B, C = nominal.A, nominal.B, np.asarray(C, dtype=float)
     n, m, p, q = nominal.n_states, nominal.n_inputs, W_p.n_outputs, C.shape[0]
     k_p, k_u, k_d = W_p.n_states, W_u.n_states, W_D.n_states
     zero = np.zeros
@@ -82,13 +61,8 @@ def paper_plant(nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: Sta
 
 
 def reduced_plant(nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace) -> GeneralizedPlant:
-    """Build the same transfer matrices in the error: states (e, x_p, x_u, x_D), n fewer than `paper_plant`.
-
-    ``e+ = A e + B (C^D x_D + D^D w2) - B u``. With minimal weights whose responses matter it is minimal: 18 states become 14 for the paper's
-    Koopman model. Arguments as in `paper_plant`.
-    """
-    A, B, C = nominal.A, nominal.B, _measured(nominal, C)
-    _check(nominal, W_p, W_u, W_D)
+    """The same transfer matrices in the error, states (e, x_p, x_u, x_D): `e+ = A e + B (C^D x_D + D^D w2) - B u`."""
+    A, B, C = nominal.A, nominal.B, np.asarray(C, dtype=float)
     n, m, p, q = nominal.n_states, nominal.n_inputs, W_p.n_outputs, C.shape[0]
     k_p, k_u, k_d = W_p.n_states, W_u.n_states, W_D.n_states
     zero = np.zeros
@@ -113,21 +87,3 @@ def reduced_plant(nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: S
         n_w1=m,
         n_z1=p,
     )
-
-
-def _measured(nominal: StateSpace, C: npt.ArrayLike) -> Array:
-    matrix = np.atleast_2d(np.asarray(C, dtype=float))
-    if matrix.shape[1] != nominal.n_states:
-        raise DimensionError(f"Published plant: C should be (q, {nominal.n_states}), found {matrix.shape}; select rows of the identity.")
-    return matrix
-
-
-def _check(nominal: StateSpace, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace) -> None:
-    n, m = nominal.n_states, nominal.n_inputs
-    for name, weight, outputs, inputs in (("W_p", W_p, W_p.n_outputs, n), ("W_u", W_u, m, m), ("W_D", W_D, m, m)):
-        if (weight.n_outputs, weight.n_inputs) != (outputs, inputs):
-            raise DimensionError(f"Published plant: {name} should be {outputs} x {inputs}, found {weight.n_outputs} x {weight.n_inputs}.")
-        if weight.dt != nominal.dt:
-            raise DimensionError(
-                f"Published plant: {name} is sampled at {weight.dt} s, the nominal model at {nominal.dt} s; resample one of them."
-            )

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from kros.core import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
-from kros.identify import bootstrap, bootstrap_edmd, edmd, episode_weights
+from kros.identify import KoopmanMatrices, ModelSamples, bootstrap, bootstrap_edmd, edmd, episode_weights
 from kros.identify.refine.episodes import segment_owners
 from kros.identify.refine.segments import read_segments
 
 
 def factors(units: int, episodes: int, seed: int = 0) -> np.ndarray:
     return np.linalg.qr(np.random.default_rng(seed).normal(size=(units, episodes, 30, 5)), mode="r")
+
+
+def samples(units: int = 2, draws: int = 40, spread: float = 0.02) -> ModelSamples:
+    rng = np.random.default_rng(1)
+    A, B = np.array([[0.8, 0.1], [-0.2, 0.7]]), np.array([[0.1, 0.0], [1.0, 0.5]])
+    whole = KoopmanMatrices(np.tile(A, (units, 1, 1)), np.tile(B, (units, 1, 1)))
+    drawn = KoopmanMatrices(A + spread * rng.normal(size=(units, draws, 2, 2)), B + spread * rng.normal(size=(units, draws, 2, 2)))
+    return ModelSamples(tuple(f"u{i}" for i in range(units)), whole, drawn)
 
 
 def test_weights_keep_the_number_of_episodes_and_the_variance_of_a_mean() -> None:
@@ -51,6 +61,20 @@ def test_a_unit_with_fewer_episodes_is_resampled_among_its_own() -> None:
     weights = episode_weights([3], 6, 0)
     wide = np.concatenate([weights, np.zeros((1, 6, 2))], axis=2)
     np.testing.assert_allclose(bootstrap_edmd(padded, 2, 0.0, wide).samples.A, bootstrap_edmd(R, 2, 0.0, weights).samples.A, rtol=1e-9)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_responses_of_samples_are_those_of_their_models_or_first_order(linear: bool) -> None:
+    made = replace(samples(), linear=linear)
+    freqs, dt = np.array([0.0, 3.0, 50.0]), 0.01
+    for unit in range(2):
+        found = made.responses(unit, freqs, dt)
+        for k, z in enumerate(np.exp(2j * np.pi * freqs * dt)):
+            A, B = made.estimate.A[unit], made.estimate.B[unit]
+            Phi = np.linalg.inv(z * np.eye(2) - A)
+            for draw, (As, Bs) in enumerate(zip(made.samples.A[unit], made.samples.B[unit], strict=True)):
+                full = np.linalg.inv(z * np.eye(2) - As) @ Bs
+                np.testing.assert_allclose(found[draw, k], Phi @ B + Phi @ ((As - A) @ Phi @ B + Bs - B) if linear else full, rtol=1e-7)
 
 
 @pytest.mark.parametrize("lengths", [[50, 50, 50, 50], [50, 50], [50]])

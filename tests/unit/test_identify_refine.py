@@ -10,7 +10,7 @@ from kros.data import Channel, EpisodeKey, Population, Role, Unit
 from kros.identify import Factor
 from kros.identify.refine import RefineOptions, refine_population
 from kros.identify.refine.marquardt import minimise
-from kros.identify.refine.segments import held_segments, read_segments
+from kros.identify.refine.segments import Segments, held_segments, read_segments
 from kros.lifting import Lifting
 
 
@@ -42,6 +42,22 @@ def test_short_episodes_are_padded_and_marked() -> None:
     segments = read_segments(made, keys, horizon=10, count=2, seed=0)
     np.testing.assert_array_equal(segments.valid[:, 0, 0], np.arange(11) < 6)
     assert segments.valid[:, 0, 1].all()
+
+
+def test_segments_begin_with_the_history() -> None:
+    made, keys = population([50, 6])
+    segments = read_segments(made, keys, horizon=10, count=2, seed=0, history=3)
+    assert (segments.states.shape[0], segments.horizon, segments.compared.shape) == (14, 10, (10, 1, 2))
+    np.testing.assert_array_equal(np.diff(segments.states[:, 0, 0, 0]), 1.0)
+    np.testing.assert_array_equal(segments.compared[:, 0, 1], np.arange(10) < 2)  # six samples, four of them given
+    assert segments.first(1).history == segments.units(np.array([0])).history == 3
+
+
+def test_pieces_share_history_and_nothing_that_is_compared() -> None:
+    states = np.arange(22.0).reshape(22, 1, 1, 1).repeat(3, axis=3)
+    pieces = Segments(states, states, np.ones((22, 1, 3), bool), 2).cut(4)
+    np.testing.assert_array_equal(pieces.states[0, 0, 0], [0, 10, 15])  # of pieces from 0, 5, 10, 15 in every segment
+    assert (pieces.horizon, pieces.history) == (4, 2)
 
 
 def test_unit_without_training_episodes_is_named() -> None:

@@ -29,7 +29,7 @@ STATE = 'role = "state"'
 # Fewer candidates, and methods that take long for one kind of models each: what chooses among them is the same.
 FEWER: dict[str, Any] = {
     "design.synthesize.suitable": lambda *asked: [m for m in table.suitable(*asked) if ONCE.get(m.name, asked[1]) == asked[1]],
-    "design.methods.disturbance_model._CORNERS_HZ": (1.0,),
+    "design.methods.disturbance_model._CORNERS": (1e-3,),
     "design.methods.predictor.EFFORTS": {"full": predictor.EFFORTS["quick"]},
     "design.methods.signals._ROUNDS": 0,
     "observer.residual.signal_bounds._BASES": signal_bounds._BASES[:1],

@@ -37,7 +37,7 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "lifting.parameters",
     ),
     (
-        "What is left out at the start of a segment of constant speed is no longer a setting; remove the key settle_s, it is 0.1 s.",
+        "What is left out at the start of a segment of constant speed is no longer a setting; remove the key settle_s, it is a two-hundredth of an episode.",
         "calibrate.settle_s",
     ),
     (

@@ -32,12 +32,17 @@ from ..observer.residual.one_step import one_step_residual
 from ..observer.units import factors
 from ..uncertainty.coprime.bands import BandEnergies
 from .task import DesignResult, DesignTask
-from .validation import SHORT_S, TrainingSet, ValidationSet, hidden_mean
+from .validation import SHORT_SAMPLES, TrainingSet, ValidationSet, hidden_mean
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-_EPISODE_S = 5.0
-_SEEN_S, _DROPOUT_S, _DROPOUT_EPISODES = 0.5, 1.5, 3
+_SAMPLES = 5_000  # of an episode
+_LOSS_SAMPLES, _LOSS_SHARE, _LOSS_AFTER, _LOSS_EPISODES = (
+    2_000,
+    0.4,
+    0.25,
+    3,
+)  # a loss ends there or at that share of an episode; when it begins
 DIVERGED = 100.0  # percent of the largest value: an estimate that says nothing
 _BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has no global slope bounds
 
@@ -91,7 +96,7 @@ def certify_running(task: DesignTask, results: Sequence[DesignResult]) -> list[R
 
 def certified_on(task: DesignTask) -> ValidationSet:
     """Return the episodes whose signals make the set that observers are certified for: the beginning of the first one of every unit, or some short ones."""
-    return _beginnings(task.training, task.models.sample_period_s)
+    return _beginnings(task.training)
 
 
 def other_conditions(task: DesignTask) -> list[ValidationSet]:
@@ -100,12 +105,12 @@ def other_conditions(task: DesignTask) -> list[ValidationSet]:
     home, units = {k.condition for k in training.keys}, {k.unit for k in training.keys}
     known = [k for k in recordings.keys if k.condition not in home and k.unit in units]
     parts = [replace(recordings, keys=tuple(k for k in known if k.condition == c)) for c in dict.fromkeys(k.condition for k in known)]
-    return [_beginnings(part, task.models.sample_period_s) for part in parts]
+    return [_beginnings(part) for part in parts]
 
 
-def _beginnings(training: TrainingSet, dt: float) -> ValidationSet:
-    first = training.first_of_units().read().first(_EPISODE_S / dt)
-    return first if len(first.batch.states) * dt > SHORT_S else training.read()
+def _beginnings(training: TrainingSet) -> ValidationSet:
+    first = training.first_of_units().read().first(_SAMPLES)
+    return first if len(first.batch.states) > SHORT_SAMPLES else training.read()
 
 
 def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:
@@ -128,7 +133,7 @@ def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignT
         arrived = run_observers(observers, y, batch.inputs, first.own(batch.parameters))
     errors = [data.compare(estimates), *(other.percent_of_all(observers) for other in others)]
     hidden = np.exp(np.mean([np.log(hidden_mean(percent, first.measured)) for percent in errors], axis=0))
-    dropout = dropout_error_percent(observers, data, task.models.sample_period_s)
+    dropout = dropout_error_percent(observers, data)
     rates = [task.sensor.get(first.lifting.states[i], Sensor()).dropout for i in first.measured]
     lost = [dropout_bound(c, o, rates) if any(rates) else None for o, c in zip(observers, certificates, strict=True)]
     known: dict[bytes, BandEnergies] = {}
@@ -157,11 +162,12 @@ def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTa
     return [known[observer.A.tobytes() + observer.B.tobytes()] for observer in observers]
 
 
-def dropout_error_percent(observers: Sequence[Observer], data: ValidationSet, dt: float) -> Array:
+def dropout_error_percent(observers: Sequence[Observer], data: ValidationSet) -> Array:
     """Return the largest error of a state in percent of the largest value where measurements stop arriving, shape (observer,); infinite where it grows on."""
-    short, first = data.part(range(min(_DROPOUT_EPISODES, len(data.batch.keys)))).first((_SEEN_S + _DROPOUT_S) / dt), observers[0]
+    some, first = data.part(range(min(_LOSS_EPISODES, len(data.batch.keys)))), observers[0]
+    short = some.first(min(_LOSS_SAMPLES, max(2, round(_LOSS_SHARE * int(some.batch.lengths.min())))))
     y = short.measurements(first.measured)
-    y[round(_SEEN_S / dt) :] = np.nan
+    y[max(1, round(_LOSS_AFTER * len(y))) :] = np.nan
     values = short.parameters if first.lifting.parameters else None
     return np.asarray(short.compare(run_observers(observers, y, short.batch.inputs, values)).max(axis=-1))
 

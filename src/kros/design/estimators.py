@@ -33,7 +33,7 @@ from .validation import TrainingSet, rank
 Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, Array]
 _LEVELS = (-4.0, -2.0, 0.0, 2.0, 4.0)  # decades of process noise that the extended filter tries, for either shape
-_EXTENDED_S = 2.0
+_EXTENDED_SAMPLES = 2_000
 _REGRESSORS = 600  # of the learned estimator, at most
 _MOMENTS = 2.5e7  # numbers that its moments of all units, conditions and states may take, 200 MB
 _LEAST = 0.1  # of a state's largest value: what it hardly moves in counts for no more than this
@@ -122,7 +122,7 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
         values,
         delay_of(training.sensor),
     )
-    short = data.first(_EXTENDED_S / models.sample_period_s)
+    short = data.first(_EXTENDED_SAMPLES)
     percents = [
         error_percent(estimate, short.batch.states, short.batch.lengths).mean(axis=0)
         for estimate in filters.run_all(short.measurements(models.measured), short.batch.inputs, short.parameters)

@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 T = TypeVar("T")
 TUNING_UNITS = 12
 TUNING_EPISODES = 3
-TUNING_S, SHORT_S = 10.0, 2.0
+TUNING_SAMPLES, SHORT_SAMPLES = 10_000, 2_000  # of an episode, at most, and below which more episodes take part
 TUNING_EPISODES_AT_LIMITS = 72
 SIDE_BY_SIDE = 20  # keeps a study of twelve units below 200 MB
 
@@ -45,8 +45,8 @@ class TrainingSet:
         facts, known = identified.facts, identified.parameters
         units = [u for u in facts.pooled if u in models.unit_ids][:TUNING_UNITS]
         every = [facts.keys("train", u, facts.identify_on) for u in units]
-        length = len(identified.population.read(every[0][0])) * identified.population.sample_period_s if every and every[0] else SHORT_S
-        count = TUNING_EPISODES * max(1, round(SHORT_S / length))
+        length = len(identified.population.read(every[0][0])) if every and every[0] else SHORT_SAMPLES
+        count = TUNING_EPISODES * max(1, round(SHORT_SAMPLES / length))
         keys = tuple(k for own in every for k in spread(own, count))
         return cls(
             identified.population.select(units), keys, {u: known[u] for u in units}, seen_by(identified, models.measured), sensor or {}
@@ -84,7 +84,7 @@ class TrainingSet:
 
     def read(self) -> ValidationSet:
         """Read the episodes, cut short."""
-        return self._shown(self.keys, round(TUNING_S / self.population.sample_period_s))
+        return self._shown(self.keys, TUNING_SAMPLES)
 
     def read_whole(self) -> ValidationSet:
         """Read the episodes."""
@@ -127,9 +127,9 @@ class ValidationSet:
         """Lifting parameters, shape (batch,) each."""
         return self.batch.parameters
 
-    def first(self, n_samples: float) -> ValidationSet:
+    def first(self, n_samples: int) -> ValidationSet:
         """Return the same episodes, cut to so many samples."""
-        return replace(self, batch=self.batch.head(round(n_samples)))
+        return replace(self, batch=self.batch.head(n_samples))
 
     def part(self, rows: Sequence[int]) -> ValidationSet:
         """Return some of the episodes."""

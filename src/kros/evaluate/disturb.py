@@ -28,7 +28,7 @@ class Kind(str, Enum):
     DROPPED
         Single samples are missing at random: share of samples, 0 to 1.
     GAP
-        Samples are missing in pieces of a length in s, at random places, a tenth of all samples and at least one piece an episode.
+        Samples are missing in pieces of so many samples, at random places, a tenth of all samples and at least one piece an episode.
     BIAS
         A constant is added to every measurement: share of its largest value.
     QUANTISATION
@@ -89,13 +89,13 @@ class Disturbance:
         most = 1.0 if self.kind is Kind.DROPPED else np.inf
         if not 0 <= self.severity <= most or self.severity == np.inf:
             raise ConfigError(f"Disturbance {self.kind.value}: the severity {self.severity} should be between 0 and {most:g}.")
-        if self.kind is Kind.DELAY and self.severity != int(self.severity):
-            raise ConfigError(f"Disturbance delay: {self.severity} should be a whole number of samples.")
+        if self.kind in {Kind.GAP, Kind.DELAY} and self.severity != int(self.severity):
+            raise ConfigError(f"Disturbance {self.kind.value}: {self.severity} should be a whole number of samples.")
 
 
 SEVERITIES: dict[Kind, tuple[float, ...]] = {
     Kind.DROPPED: (0.02, 0.05, 0.1, 0.2, 0.3, 0.5),
-    Kind.GAP: (0.01, 0.03, 0.1, 0.3, 1.0),
+    Kind.GAP: (10, 30, 100, 300, 1000),
     Kind.BIAS: (1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
     Kind.QUANTISATION: (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
     Kind.NOISE: (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
@@ -122,7 +122,6 @@ class Measured:
 
     y: Array  # shape (n_samples, batch, q)
     parameters: Mapping[str, Array]  # mapping of str to ndarray, shape (batch,); Lifting parameters
-    sample_period_s: float
     size: Array  # shape (q,); Range of every measurement
 
     def __post_init__(self) -> None:
@@ -147,7 +146,7 @@ class Measured:
                 rng = np.random.default_rng([seed, list(Kind).index(disturbance.kind), disturbance.draw])
                 y[:, i] = _CHANGES[disturbance.kind](self, disturbance.severity, rng)
         flat = {name: values.reshape(-1) for name, values in parameters.items()}
-        return Measured(y.reshape(n_samples, -1, q), flat, self.sample_period_s, self.size)
+        return Measured(y.reshape(n_samples, -1, q), flat, self.size)
 
 
 def _dropped(measured: Measured, severity: float, rng: np.random.Generator) -> Array:
@@ -158,7 +157,7 @@ def _dropped(measured: Measured, severity: float, rng: np.random.Generator) -> A
 def _gap(measured: Measured, severity: float, rng: np.random.Generator) -> Array:
     """One gap in every period, at a random place in it."""
     n_samples, batch, _ = measured.y.shape
-    length = min(round(severity / measured.sample_period_s), n_samples - 1)
+    length = min(int(severity), n_samples - 1)
     if not length:
         return measured.y
     period = min(round(length / LOST_IN_GAPS), n_samples)

@@ -52,7 +52,7 @@ class DisturbedEpisodes:
     def given(self) -> Measured:
         """Measurements as the sensor shows them; their range is the largest value of all recorded episodes."""
         size = np.abs(self.batch.states[..., list(self.measured)]).max(axis=(0, 1))
-        return Measured(self.batch.measurements(self.measured), self.batch.parameters, self.batch.sample_period_s, size)
+        return Measured(self.batch.measurements(self.measured), self.batch.parameters, size)
 
     def errors(self, run: Run, estimators: int = 1) -> Array:
         """Run estimators on all episodes under all disturbances.

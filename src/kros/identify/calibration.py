@@ -32,7 +32,7 @@ from ..core.loading import loader
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 
-_STEADY = 1e-3  # a reference velocity that moves less than this share of its maximum from sample to sample is constant
+_STEADY = 20.0  # a reference velocity that would take longer than one part in so many of the episode to reach its maximum is constant
 _SPEED_TOLERANCE = 0.02  # segments within 2 % of each other's speed share a lag
 _LOW_CONCENTRATION = 0.8
 
@@ -53,7 +53,7 @@ class PhaseSpec:
     reference: str = "target_velocity"
     measured: str = "velocity"
     parameter: str = "phase"
-    settle_s: float = 0.1
+    settle: float = 0.005  # share of an episode that is left out at the start of a segment
 
 
 @dataclass(frozen=True)
@@ -155,11 +155,11 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
     top = np.max(np.abs(reference))
     if top == 0:
         return []
-    steady = (np.abs(np.diff(reference, prepend=reference[:1])) < _STEADY * top * dt / 1e-3) & (np.abs(reference) > 0.1 * top)
+    steady = (np.abs(np.diff(reference, prepend=reference[:1])) < _STEADY * top / len(reference)) & (np.abs(reference) > 0.1 * top)
     per_reference = _speed_per_reference(angle, reference, steady, dt)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
     segments = []
-    for start, stop in zip(edges[::2] + round(spec.settle_s / dt), edges[1::2], strict=True):
+    for start, stop in zip(edges[::2] + round(spec.settle * len(reference)), edges[1::2], strict=True):
         speed = per_reference * float(np.mean(reference[start:stop])) if stop > start else 0.0
         period = 2 * np.pi / (spec.ratio * abs(speed) * dt) if speed else np.inf
         if stop - start >= 5 * period and period > 4:

@@ -16,7 +16,7 @@ from .monitor import Watch
 from .samples import LONGEST, Held, SampleStatus, Screened
 from .screen import Screen
 from .step import Steps
-from .tracking import SETTLE_S, PhaseLockedLoop
+from .tracking import PhaseLockedLoop
 
 Array = npt.NDArray[np.float64]
 
@@ -108,7 +108,7 @@ class RunningObserver:
         self._parameters = _Checked(self.observer, values)
         self._steps.values = self._ahead.values = self._parameters.plain
 
-    def track(self, name: str, settle_s: float = SETTLE_S) -> None:
+    def track(self, name: str, settle_s: float | None = None) -> None:
         """Let one of the parameters follow the machine from now on; see `PhaseLockedLoop`, and `parameters` for its value.
 
         Raises

@@ -33,7 +33,7 @@ from .step import Flags, Steps
 
 Array = npt.NDArray[np.float64]
 MOST = 1.0  # largest error of the parameter that is corrected at once: transients at the start show more
-SETTLE_S = 2.0
+SETTLE_SAMPLES = 2_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,8 @@ class Tracked:
 class PhaseLockedLoop:
     """The loop beside an observer's `Steps`, for a batch of machines."""
 
-    def __init__(self, observer: ObserverData, name: str, batch: int, settle_s: float = SETTLE_S) -> None:
+    def __init__(self, observer: ObserverData, name: str, batch: int, settle_s: float | None = None) -> None:
+        settle_s = SETTLE_SAMPLES * observer.sample_period_s if settle_s is None else settle_s
         lifting = observer.lifting
         if name not in lifting.parameters or lifting.history or lifting.input_functions or observer.runtime.delay:
             raise ConfigError(
@@ -124,7 +125,7 @@ def track_parameter(
     u: Array,
     parameters: Mapping[str, npt.ArrayLike] | None = None,
     name: str = "phase",
-    settle_s: float = SETTLE_S,
+    settle_s: float | None = None,
 ) -> Tracked:
     """Run an observer that follows one of its lifting's parameters.
 
@@ -138,8 +139,8 @@ def track_parameter(
         Where every parameter starts; the observer's own values where absent.
     name : str
         The parameter that is followed.
-    settle_s : float, s
-        See `PhaseLockedLoop`.
+    settle_s : float, s, optional
+        Time constant of the loop (`PhaseLockedLoop`); by default 2000 samples.
 
     Returns
     -------

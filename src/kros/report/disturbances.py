@@ -28,7 +28,7 @@ class Axis:
 
 AXES = {
     Kind.DROPPED: Axis("dropouts (% of the samples)", 100.0, logarithmic=False),
-    Kind.GAP: Axis("gap length (ms)", 1e3),
+    Kind.GAP: Axis("gap length (samples)"),
     Kind.BIAS: Axis("bias (% of the largest value)", 100.0),
     Kind.QUANTISATION: Axis("resolution (% of the largest value)", 100.0),
     Kind.NOISE: Axis("noise (% of the largest value)", 100.0),

@@ -103,4 +103,4 @@ _SENSOR = {
     Kind.DELAY: "delay {}",
     Kind.PHASE: "phase {} rad",
 }
-_LOSSES = {Kind.DROPPED: "doubles at {} %", Kind.GAP: "doubles with gaps of {} ms"}
+_LOSSES = {Kind.DROPPED: "doubles at {} %", Kind.GAP: "doubles with gaps of {} samples"}

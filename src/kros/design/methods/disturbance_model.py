@@ -11,7 +11,7 @@ from ...core.lti import StateSpace, block_diagonal
 from ...synthesis import ObserverProblem
 
 IDENTITY, TUNED = "identity", "tuned"
-_CORNERS_HZ = (0.03, 1.0, 30.0)
+_CORNERS = (3e-5, 1e-3, 3e-2)  # of the sampling frequency
 _NOISES = ((0.0, 0.0), (1e-2, 0.0), (0.0, 1e-1), (0.0, 1.0))  # process, measurement
 
 
@@ -51,5 +51,5 @@ class DisturbanceModel:
 
 def candidates(sample_period_s: float) -> list[DisturbanceModel]:
     """Return the models that are tried: how inputs are spread over frequency and how much white noise there is nobody knows beforehand."""
-    corners: tuple[float | str, ...] = (IDENTITY, *(c for c in _CORNERS_HZ if c < 0.25 / sample_period_s))
+    corners: tuple[float | str, ...] = (IDENTITY, *(c / sample_period_s for c in _CORNERS))
     return [DisturbanceModel(corner, *noise) for corner in corners for noise in _NOISES]

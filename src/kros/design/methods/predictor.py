@@ -180,7 +180,7 @@ class Plan:
         made = [replace(one, runtime=Runtime(task.runtime.delay), sensor=task.sensor) for one in made]
         if task.limits:
             made = [with_limits(one, *sides(task.limits, one.recorded)) for one in made]
-        without = dropout_error_percent(made, task.training.first_of_units().read(), models.sample_period_s)
+        without = dropout_error_percent(made, task.training.first_of_units().read())
         return self._started(task, replace(data, batch=some(data.batch, asked.episodes)), few, made[int(np.argmin(without))])
 
     def _started(self, task: DesignTask, data: ValidationSet, few: EpisodeBatch, observer: Observer) -> Observer:

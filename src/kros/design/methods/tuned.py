@@ -42,7 +42,7 @@ def tuned_where_better(
     pair = [start, tuned]
     errors = hidden_mean(unseen.percent_of_all(pair), start.measured) if score is None else score(unseen, pair)
     before, after = errors.tolist()
-    without = dropout_error_percent([start, tuned], first, task.models.sample_period_s)
+    without = dropout_error_percent([start, tuned], first)
     settled = settle(first, tuned)
     better = after <= before and bool(without[1] < DIVERGED or without[0] >= DIVERGED)
     kept = better and relift_certificate(settled, scales=scales_of([settled], first, task)[0], mismatch=False).certified

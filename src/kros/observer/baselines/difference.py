@@ -13,8 +13,7 @@ from ...data import EpisodeBatch
 from ...loops import all_pole
 
 Array = npt.NDArray[np.float64]
-_LOWEST_HZ = 1.0
-_HIGHEST = 0.45  # of the sampling frequency
+_LOWEST, _HIGHEST = 1e-3, 0.45  # of the sampling frequency
 _CANDIDATES = 24
 _EXPLAINED = 0.5  # share of a variance
 
@@ -128,6 +127,5 @@ def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, i
 
 
 def cutoffs_hz(sample_period_s: float) -> Array:
-    """Return the cut-offs that are tried, log-spaced from 1 Hz to nearly half the sampling frequency."""
-    top = _HIGHEST / sample_period_s
-    return np.geomspace(min(_LOWEST_HZ, top / 100), top, _CANDIDATES)
+    """Return the cut-offs that are tried, log-spaced from a thousandth to nearly half of the sampling frequency."""
+    return np.geomspace(_LOWEST, _HIGHEST, _CANDIDATES) / sample_period_s

@@ -389,7 +389,7 @@ def _basis_states(basis: Basis, z: Array, rows: npt.NDArray[np.intp], slow: int)
     found = np.empty((len(rows), count * channels + len(basis.poles) * slow))
     # What came before is taken to have been constant.
     windows = sliding_window_view(np.concatenate([np.repeat(z[:1], count, axis=0), z]), (count, channels))[:, 0]
-    found[:, : count * channels] = windows[rows, ::-1].reshape(len(rows), -1)
+    found[:, : count * channels] = windows[rows, ::-1].reshape(len(rows), count * channels)
     first, none = z[:1, :slow], np.zeros(slow)
     moved = (z[:, :slow] - first).T
     for i, p in enumerate(basis.poles):

@@ -35,7 +35,7 @@ from .gauss_newton import SETTLED, Damping, mean_log, scaled, search, whitening
 Array = npt.NDArray[np.float64]
 O = TypeVar("O", bound=ObserverData)  # noqa: E741
 _DAMPING, _LEAST_GAIN = Damping(1e-9, 1e-3, 1e9, 10.0), 1e-3
-_SKIP, _THIN = 300, 4  # samples: at the start of every episode, and between those that count
+_SKIP, _SHORT, _THIN = 300, 4, 4  # samples at the start of an episode, part of a short one, and samples between those that count
 _ALIKE = 1e-14
 
 
@@ -46,11 +46,8 @@ def tune_observer(observer: O, batch: EpisodeBatch, iterations: int = 25) -> tup
             f"Tuning observer {observer.name}: it should correct through the state, read no earlier values and have no internal states."
         )
     hidden = [i for i in range(observer.lifting.n_states) if i not in observer.measured]
-    if not hidden or len(batch.states) <= 2 * _SKIP:
-        raise DataError(
-            f"Tuning observer {observer.name}: needs a state that is not measured and more than {2 * _SKIP} samples, found {len(hidden)} and "
-            f"{len(batch.states)}."
-        )
+    if not hidden:
+        raise DataError(f"Tuning observer {observer.name}: needs a state that is not measured, found none.")
     problem = _Tuning(observer, batch, hidden)
     start = problem.at(observer)
     if not np.isfinite(start.criterion):
@@ -74,7 +71,7 @@ class _Tuning:
     """Recordings to tune on."""
 
     def __init__(self, observer: ObserverData, batch: EpisodeBatch, hidden: list[int]) -> None:
-        self.batch, self.hidden, self.slowest = batch, hidden, np.inf
+        self.batch, self.hidden, self.slowest, self.skip = batch, hidden, np.inf, min(_SKIP, len(batch.states) // _SHORT)
         self.values = {**observer.parameters, **observer.own(batch.parameters)}
         self.share = np.full(len(hidden), 1 / len(hidden))
         self.slopes = mean_slopes(observer.lifting, batch.states, batch.inputs, self.values)
@@ -86,7 +83,7 @@ class _Tuning:
         states = self.batch.states
         estimate = run_observer(observer, self.batch.measurements(observer.measured), self.batch.inputs, self.values)
         with np.errstate(over="ignore", invalid="ignore"):
-            errors = np.mean((states - estimate)[_SKIP:][..., self.hidden] ** 2, axis=(0, 1))
+            errors = np.mean((states - estimate)[self.skip :][..., self.hidden] ** 2, axis=(0, 1))
         return _Point(observer, estimate, errors, mean_log(self.share, errors))
 
     def radius(self, observer: ObserverData) -> float:
@@ -98,10 +95,10 @@ class _Tuning:
         """Gauss-Newton steps of ``W T``, where T makes ``T' phi`` white: regressors are nearly alike, what matters are their differences."""
         observer, m, q = point.observer, point.observer.B.shape[1], len(point.observer.measured)
         phi, F, states = self._regressors(point), self._dynamics(observer), observer.lifting.n_states
-        rows = phi[_SKIP:].reshape(-1, phi.shape[2])
+        rows = phi[self.skip :].reshape(-1, phi.shape[2])
         back = whitening(rows.T @ rows / len(rows), _ALIKE)
         signals = np.ascontiguousarray((phi @ back).transpose(2, 1, 0))
-        first, weight = -(-_SKIP // _THIN), np.sqrt(self.share / point.errors)
+        first, weight = -(-self.skip // _THIN), np.sqrt(self.share / point.errors)
         blocks = blocks_of(F, np.eye(len(F), states), weight[:, None] * np.eye(len(F))[self.hidden])
         X = moved(blocks, signals, _THIN, first).reshape(states * len(signals), -1)
         missed = ((self.batch.states - point.estimate)[first * _THIN :: _THIN][..., self.hidden] * weight).transpose(2, 1, 0)

@@ -66,9 +66,9 @@ def reference_columns(run: RunFolder) -> dict[str, int]:
     return {c.name: inputs.index(f"target_{c.name}") for c in run.states if f"target_{c.name}" in inputs}
 
 
-def steady_window(run: RunFolder, shown: Shown, length_s: float) -> slice:
+def steady_window(run: RunFolder, shown: Shown, n_samples: int) -> slice:
     """Return a window at constant speed: in the longest stretch of the highest steady reference, else in the middle of the episode."""
-    size = min(round(length_s / run.sample_period_s), len(shown.time_s))
+    size = min(n_samples, len(shown.time_s))
     columns = reference_columns(run)
     speed = shown.inputs[:, columns["velocity"]] if "velocity" in columns else np.zeros(len(shown.time_s))
     start, stop = longest_steady(speed)
@@ -103,8 +103,8 @@ def overview_and_zoom(run: RunFolder, blocks: Sequence[tuple[str, Shown, Sequenc
         panels = axes[first : first + len(strips)]
         first += len(strips)
         # some fifteen turns of a gearbox, for other plants an eighth of the episode
-        length_s = 0.3 if run.calibrated else float(f"{episode.time_s[-1] / 8:.1g}")
-        window = steady_window(run, episode, length_s)
+        length_s = 300 * run.sample_period_s if run.calibrated else float(f"{episode.time_s[-1] / 8:.1g}")
+        window = steady_window(run, episode, round(length_s / run.sample_period_s))
         for (full, zoom), strip in zip(panels, strips, strict=True):
             draw_lines(full, episode.time_s, strip.lines, width=0.9)
             draw_lines(zoom, episode.time_s, strip.lines, window, width=1.3)

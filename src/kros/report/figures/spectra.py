@@ -16,7 +16,7 @@ from ..run_folder import RunFolder, Shown
 from ..theme import Tone
 
 _MOST = 4  # states that are shown
-_ABOVE_HZ = 10.0  # offsets below would flatten the rest of a linear scale of a study with a gearbox
+_ABOVE = 0.01  # of the sampling frequency: offsets below would flatten the rest of a linear scale of a study with a gearbox
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def spectra_figure(run: RunFolder, rows: Sequence[SpectraRow], height_in: float,
             if row.logarithmic:
                 logarithmic(panel)
             else:
-                panel.set_ylim(0, _top(row, freqs >= (_ABOVE_HZ if band_hz else 0.0), i))
+                panel.set_ylim(0, _top(row, freqs >= (_ABOVE / run.sample_period_s if band_hz else 0.0), i))
             if band_hz is not None:
                 panel.axvspan(*band_hz, color=Tone.GRID.light, lw=0, zorder=0.5)
         panels[0].set_ylabel(row.label)
@@ -104,4 +104,4 @@ def share_sentence(run: RunFolder, spectra: Mapping[str, Array], paper: Sequence
             parts.append(f"{observer_label(own)} leaves {shares} of the power of {observer_label(other)}")
     text = " Shaded: the band around the gearbox frequency at top speed"
     text += f", where {where} " + ", and ".join(parts) if parts else ""
-    return text + f". Linear scales end at the largest value above {_ABOVE_HZ:g} Hz."
+    return text + f". Linear scales end at the largest value above {_ABOVE / run.sample_period_s:.3g} Hz."

@@ -23,7 +23,7 @@ from ..engine.store import Store
 from .recordings import UnitValues, check_channels, hidden_states, identify_on, load_calibration, open_data, parse_given, unit_values
 
 Array = npt.NDArray[np.float64]
-_BATCH, _PHASES, _SEEN_S = 64, 24, 20.0
+_BATCH, _PHASES, _SEEN = 64, 24, 20_000  # episodes, phases, samples
 
 
 @dataclass(frozen=True)
@@ -123,12 +123,12 @@ def _trackable(observer: Observer, name: str) -> bool:
 
 def _start(observer: Observer, population: Population, unit: str, own: dict[str, float], name: str) -> float:
     """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
-    samples, seen = round(_SEEN_S / population.sample_period_s), 0
+    seen = 0
     chosen: list[EpisodeKey] = []
     for key in population.keys(unit)[:_BATCH]:
-        if seen < samples:
+        if seen < _SEEN:
             chosen, seen = [*chosen, key], seen + len(population.read(key))
-    found, step = arriving(observer, population, tuple(chosen), {unit: own}, samples), 2 * np.pi / _PHASES
+    found, step = arriving(observer, population, tuple(chosen), {unit: own}, _SEEN), 2 * np.pi / _PHASES
     asked = (observer, found.y, found.u, found.batch.lengths, {**observer.parameters, **own}, name)
     coarse = least_innovation(*asked, np.arange(_PHASES) * step)
     return float(np.mod(least_innovation(*asked, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))

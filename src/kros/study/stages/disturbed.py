@@ -23,7 +23,7 @@ from ...observer.sensor import Sensors
 from ..engine.context import Context
 
 Array = npt.NDArray[np.float64]
-FEW_UNITS, FEW_S = 3, 3.0
+FEW_UNITS, FEW_SAMPLES = 3, 3_000
 _SIDE_BY_SIDE = 8  # observers of one piece of work: few enough to keep all processes busy
 
 
@@ -76,14 +76,12 @@ def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, di
     models = context.identified.models()
     firsts = {(k.unit, k.condition): k for k in reversed(keys) if roles[k.unit] != "outlier"}
     chosen = [k for k in keys if firsts.get((k.unit, k.condition)) == k and k.condition == context.facts.identify_on]
-    dt = context.population.sample_period_s
     given = tuple(sorted(chosen, key=lambda k: roles[k.unit] != "nominal")[:FEW_UNITS])
     if not given:
         return None
     calibrated = any(units.values())
     disturbances = tuple(standard_disturbances([k for k in Kind if calibrated or k is not Kind.PHASE]))
-    samples = round(FEW_S / dt)
-    return Trial(context.population, given, samples, units, models.measured, disturbances, names, context.config.sensor)
+    return Trial(context.population, given, FEW_SAMPLES, units, models.measured, disturbances, names, context.config.sensor)
 
 
 def run_disturbed(

@@ -13,7 +13,7 @@ from ...theme import Tone
 from ..episodes import TRUTH, clip_to, draw_lines, hide_times
 
 _SEGMENT = 4096
-_HIGHEST_HZ = 200.0
+_HIGHEST = 0.2  # of the sampling frequency
 _LOWEST = 1e-8  # of the load's own density: below it nothing matters
 _WAYS = (("load", "a load of its own"), ("current", "error of the\nrecorded current"))
 
@@ -41,7 +41,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
             spectrum.plot(freqs[1:], error_spectrum(estimates[n] - truth, run.sample_period_s, _SEGMENT)[1][1:], color=look.colour)
         logarithmic(spectrum)
         spectrum.set_ylim(bottom=_LOWEST * density.max())
-        frequency_axis(spectrum, freqs[freqs <= _HIGHEST_HZ], "")
+        frequency_axis(spectrum, freqs[freqs <= _HIGHEST / run.sample_period_s], "")
     hide_times(axes[:-1].ravel())
     axes[0, 0].set_title("in units of current")
     axes[0, 1].set_title("PSD of load and errors, 1/Hz")

@@ -13,7 +13,7 @@ from ...theme import Tone
 from ..episodes import clip_to, draw_lines, hide_times, label_rows, recorded_episodes, reference_columns, shade, steady_window
 
 _RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light)
-_ZOOM_S = 0.4
+_ZOOM = 400  # samples
 
 
 def draw(run: RunFolder) -> tuple[Figure, str]:
@@ -23,7 +23,7 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     zoomed = "velocity" if "velocity" in references else next(iter(references), None)
     figure, axes = grid(len(channels) + (zoomed is not None), len(shown), 1.15, sharey="row")
     for column, episode in zip(axes.T, shown, strict=True):
-        window = steady_window(run, episode, _ZOOM_S)
+        window = steady_window(run, episode, _ZOOM)
         for i, channel in enumerate(channels):
             lines = [("recorded", episode.states[:, i], _RECORDED)]
             if channel.name in references:

@@ -43,7 +43,7 @@ def _spectrum(run: RunFolder, shown: Shown) -> tuple[Array, Array, float]:
     names = [c.name for c in run.channels]
     values = np.hstack([shown.states, shown.inputs]).astype(float)
     reference, measured = values[:, names.index(spec.reference)], values[:, names.index(spec.measured)]
-    settle = round(spec.settle_s / run.sample_period_s)
+    settle = round(spec.settle * len(reference))
     stretches = [slice(a + settle, b) for a, b in steady_stretches(reference)]
     longest = max((s.stop - s.start for s in stretches), default=0)
     segment = min(_SEGMENT, longest)

@@ -39,7 +39,7 @@ def plant(n_samples=3000, batch=4, seed=0):
 
 def measured(x, phases=None):
     y = np.ascontiguousarray(x[..., :1])
-    return Measured(y, {} if phases is None else {"phase": phases}, 0.01, np.abs(y).max(axis=(0, 1)))
+    return Measured(y, {} if phases is None else {"phase": phases}, np.abs(y).max(axis=(0, 1)))
 
 
 def test_a_bias_shifts_the_estimate_by_what_the_predictor_makes_of_a_constant():
@@ -85,7 +85,7 @@ def test_many_observers_with_missing_samples_do_what_each_does_by_itself_sample_
     )
     first = observer(LIFTED)
     second = Observer("memory", LIFTED, first.A, first.B, (0,), ("u",), K, Injection.STATE, 0.01)
-    given = measured(x, np.arange(4.0)).under([Disturbance(Kind.DROPPED, 0.3), Disturbance(Kind.GAP, 0.2)])
+    given = measured(x, np.arange(4.0)).under([Disturbance(Kind.DROPPED, 0.3), Disturbance(Kind.GAP, 20)])
     u = np.tile(u, (1, 2, 1))
     together = run_observers([first, second], given.y, u, given.parameters)
     for o, estimate in zip((first, second), together, strict=True):
@@ -116,7 +116,7 @@ def test_every_kind_does_what_its_name_says():
     x, _ = plant(5000)
     given = measured(x, np.zeros(4))
     low, high, gaps = (
-        given.under([d], 2).y[..., 0] for d in (Disturbance("dropped", 0.1), Disturbance("dropped", 0.4), Disturbance("gap", 0.5))
+        given.under([d], 2).y[..., 0] for d in (Disturbance("dropped", 0.1), Disturbance("dropped", 0.4), Disturbance("gap", 50))
     )
     share = [np.isnan(y).mean() for y in (low, high, gaps)]
     np.testing.assert_allclose(share, [0.1, 0.4, 0.1], atol=0.01)

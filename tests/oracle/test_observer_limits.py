@@ -14,8 +14,11 @@ from kros.observer import Observer, Runtime, relift_certificate, run_observer, s
 from kros.observer.certificate.error import ReliftScales, error_system
 from kros.observer.certificate.report import course, frozen_response
 from kros.observer.limits import Limit, limits_of
+from kros.observer.predictor.choice import filled_in
 from kros.observer.predictor.driven import driven_coordinates, with_internal
 from kros.observer.predictor.limited import conditioned, with_limits
+from kros.observer.predictor.moments import PastMoments
+from kros.plants import DcMotorPopulation
 from kros.synthesis import Injection
 
 BACK, LEAK, LIMIT = 0.1, 0.995, 0.4  # of the controller: share of the excess taken off its integrator, its leak, the current's limit
@@ -138,3 +141,14 @@ def test_what_limits_cut_off_is_a_residual_of_the_observer_without_them(predicto
     assert np.all(bound.ratios[:, 1] >= 1)
     assert np.all(bound.ratios[:, 1] <= 1.3)
     assert np.all(bound.cover >= bound.bounds.max(axis=0) * (1 - 1e-9))
+
+
+def test_the_basis_has_states_at_no_sample():
+    """A limit that was found in other episodes may never be reached in those that a predictor is made from."""
+    motors = DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
+    batch = EpisodeBatch.read(motors, motors.keys())
+    past = PastMoments.of(Lifting(motors.states), (0,), batch)
+    far = np.full(len(motors.states), 1e9)
+    _, fill = filled_in(past, batch, -far, far)
+    np.testing.assert_array_equal(fill(batch).states, batch.states)
+    assert past.states_at(past.channels(batch)[:, 0], np.zeros(0, int)).shape == (0, past.gram.shape[1])

@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from kros.core.lti import StateSpace, gain
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, Seen, relift_certificate, run_observer
+from kros.observer.certificate import majorants as majorants_of
 from kros.observer.certificate.majorants import energy, majorants
 from kros.observer.certificate.report import relift_report
 from kros.observer.certificate.signals import signal_bound
@@ -195,3 +196,18 @@ def test_what_leaves_the_assumptions_has_no_bound() -> None:
     assert not found.certified
     assert found.reason
     assert set(found.percent().values()) == {None}
+
+
+@pytest.mark.parametrize("gap", [0.5, 1e-9])
+def test_a_search_over_arcs_ends_at_its_cap(gap, monkeypatch):
+    """A sharp resonance needs more arcs than there may be: there is no majorant, where a wider one is enclosed."""
+    c, s = np.cos(1.0), np.sin(1.0)
+    system = StateSpace((1 - gap) * np.array([[c, s], [-s, c]]), np.eye(2), np.eye(2), np.zeros((2, 2)), 1.0)
+    tried = []
+    segments = majorants_of.Enclosure.segments
+    monkeypatch.setattr(majorants_of, "_MOST_ARCS", 100)
+    monkeypatch.setattr(majorants_of, "_ARCS", 50)
+    monkeypatch.setattr(majorants_of.Enclosure, "segments", lambda self, *arcs: tried.append(len(arcs[0])) or segments(self, *arcs))
+    found = majorants_of.majorants(system, np.linspace(0, np.pi, 5), np.tile(np.eye(2), (4, 1, 1)))
+    assert (found is None) == (gap < 1e-6)
+    assert sum(tried) <= 100

@@ -124,7 +124,7 @@ def needed_sensor(metrics: Mapping[str, Any], measured: Sequence[str]) -> list[s
     if not parts:
         return [f"No noise, resolution, bias, delay or loss of samples that was tried beyond the {sensor} doubles its error."]
     listed = f"{', '.join(parts[:-1])} or {parts[-1]}" if parts[1:] else parts[0]
-    return [f"Beyond the {sensor}, its error doubles with {listed}: this is the encoder and timing it needs."]
+    return [f"Beyond the {sensor}, its error doubles with {listed}: this is the sensor and timing it needs."]
 
 
 _NEEDS = {

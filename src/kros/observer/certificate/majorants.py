@@ -28,7 +28,8 @@ from ...synthesis.worst_case.arcs import Enclosure
 
 Array = npt.NDArray[Any]
 _CLOSE = 0.004  # distance from segments, of a row's size in its band, or of its mean size over all of them
-_ARCS = 20000
+_ARCS, _MOST_ARCS = 20_000, 40_000  # beyond which arcs of finite reach are not cut further, and none at all
+_AT_ONCE = 4_000_000  # numbers of resolvents in memory
 _ROUNDS = 30
 _PARTS = 8  # most that an arc is cut into at once
 _SPARE = 1.1
@@ -41,8 +42,8 @@ _TINY = np.finfo(float).tiny
 _SAFE = 1 + 1e-9  # for rounding of small matrices
 
 
-def majorants(system: StateSpace, edges: Array, weight: Array) -> Array:
-    """Return matrices above the responses of every row of a system in every band, shape (p, b, m, m)."""
+def majorants(system: StateSpace, edges: Array, weight: Array) -> Array | None:
+    """Return matrices above the responses of every row of a system in every band, shape (p, b, m, m); None where the search ends without."""
     size = np.sqrt(np.maximum(np.einsum("bii->i", weight).real, 0.0))
     size = np.where(size > 1e-100, size, 1.0)  # a channel without energy
     scaled = StateSpace(system.A, system.B * size, system.C, system.D * size, system.dt)
@@ -53,6 +54,8 @@ def majorants(system: StateSpace, edges: Array, weight: Array) -> Array:
     back = (vectors / np.sqrt(values)[:, None, :]) @ adjoint(vectors)
     sizes = np.sqrt(np.einsum("bii->bi", W).real)
     band, T, reach = _arcs(scaled, edges, root, sizes)
+    if not np.isfinite(reach).all():
+        return None
 
     n_bands, (p, m) = len(edges) - 1, T.shape[2:]
     far = np.stack([reach[band == b].max(axis=0) for b in range(n_bands)])
@@ -85,13 +88,17 @@ def _arcs(system: StateSpace, edges: Array, root: Array, sizes: Array) -> tuple[
     done: list[tuple[Array, Array, Array, Array]] = []
     peak, tried = np.zeros((n_bands, system.n_outputs)), len(theta)
     for remaining in reversed(range(_ROUNDS)):
-        T, reach = enclosed.segments(theta, half)
+        pieces = -(-len(theta) * max(system.n_states, 1) ** 2 // _AT_ONCE)
+        some = [enclosed.segments(*own) for own in zip(np.array_split(theta, pieces), np.array_split(half, pieces), strict=True)]
+        T, reach = (np.concatenate(each) for each in zip(*some, strict=True))
         np.maximum.at(peak, band, np.sum(np.abs(T @ root[band][:, None]) ** 2, axis=-1).max(axis=1))
         allowed = _CLOSE * np.sqrt(np.maximum(peak, peak.mean(axis=0)))
         over = (np.einsum("kpi,ki->kp", reach, sizes[band]) / np.maximum(allowed[band], _TINY)).max(axis=1)
         parts = np.where(over > 1, np.ceil(np.clip(_SPARE * np.sqrt(over), 2, _PARTS)), 0).astype(int)
-        if not remaining or tried + parts.sum() > _ARCS:
-            parts[np.isfinite(over) | (not remaining)] = 0
+        if tried + parts.sum() > _ARCS:
+            parts[np.isfinite(over)] = 0
+        if not remaining or tried + parts.sum() > _MOST_ARCS:
+            parts[:] = 0
         kept = parts == 0
         done.append((theta[kept], band[kept], T[kept], reach[kept]))
         if kept.all():

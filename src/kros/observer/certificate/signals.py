@@ -32,6 +32,7 @@ from .search import quick_gain
 
 Array = npt.NDArray[np.float64]
 _BANDS, _BELOW = 96, 10  # bands, the lowest of which ends at a tenth of an episode's lowest frequency
+_TOO_SHARP = "no bound: the responses of its error are too sharp to be enclosed by the arcs that are tried"
 _RIDGE = 1e-6
 _SPARE = 1e-6
 _OTHERS = (
@@ -222,10 +223,14 @@ def signal_bound(
     )
     # The cover is made for the errors and for what slopes act on: a matrix that no unit exceeds, where it matters.
     rough = majorants(plant, energies.edges, energies.energy.mean(axis=0))
+    if rough is None:
+        return replace(found, reason=_TOO_SHARP)
     matter = np.einsum("p,pbij->bij", 1 / np.maximum(energy(rough, energies.energy).max(axis=0), np.finfo(float).tiny), rough)
     matter = matter + _RIDGE * np.einsum("bii->b", matter).real[:, None, None] * np.eye(matter.shape[-1])
     final = cover(energies.energy, matter)
     M = majorants(plant, energies.edges, final)
+    if M is None:
+        return replace(found, reason=_TOO_SHARP)
     linear, own = np.sqrt(energy(M, final)), np.sqrt(energy(M, energies.energy))
     acted = np.maximum(linear[n:], np.finfo(float).tiny)
     kappa = mismatch_gains(system, acted, n)

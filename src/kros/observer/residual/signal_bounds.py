@@ -87,7 +87,10 @@ def scaled_into(shaping: StateSpace, edges: Array, energies: Array) -> StateSpac
     size = np.sqrt(np.einsum("bii->bi", energies).real)
     scaled = energies / size[:, :, None] / size[:, None, :]
     weight = np.repeat(np.linalg.inv(scaled) / size[:, :, None] / size[:, None, :], _SPLIT, axis=0).conj()
-    above = majorants(turned, fine, weight).sum(axis=0).conj()  # rows of the transposed filter are columns of G: above G G^H
+    majorant = majorants(turned, fine, weight)
+    if majorant is None:  # without energy it is below any
+        return StateSpace(shaping.A, 0.0 * shaping.B, shaping.C, 0.0 * shaping.D, shaping.dt)
+    above = majorant.sum(axis=0).conj()  # rows of the transposed filter are columns of G: above G G^H
     found = (above * (np.diff(fine) / np.pi)[:, None, None]).reshape(-1, _SPLIT, n, n).sum(axis=1)
     root = np.linalg.inv(np.linalg.cholesky(scaled)) / size[:, None, :]
     largest = float(np.linalg.eigvalsh(root @ found @ adjoint(root))[..., -1].max())

@@ -1,7 +1,7 @@
 """What to see in every figure: the first sentence of its caption."""
 
 SEE = {
-    "signals": "Signals should look alike from episode to episode; what the load or the gearbox does is what an observer has to follow.",
+    "signals": "Signals should look alike from episode to episode; what differs between conditions is what an observer has to follow.",
     "tracking_spectrum": "Peaks at the dotted lines are the gearbox's doing, and what the lifting is there to model.",
     "phase": "Phases may lie anywhere around the circle; lags should be nearly the same for all units, and concentrations near one.",
     "models": "The spread of the lines is what the uncertainty model has to cover.",
@@ -14,7 +14,7 @@ SEE = {
     "synthesis": "Where the weights are low the correction may be small; where they are high it has to follow the measurements.",
     "observers_in_time": "The flatter an error, the better the estimate; the zoom shows how much of the oscillation is left in it.",
     "observers_in_time_paper": "The flatter an error, the better the estimate; compare with the deployed pair.",
-    "observer_spectra": "The lower line is the better observer; the shaded band shows what is left of the gearbox oscillation.",
+    "observer_spectra": "The lower line is the better observer.",
     "loaded_paper": "Slow waves of the current's error are the load's torque; what is fast is error.",
     "loaded_spectra": "The lower line is the better observer away from the load's own slow motion.",
     "load_torque": "The nearer a line stays to the declared load, the better the estimate of the torque.",

@@ -146,8 +146,8 @@ def _void(trust: Trust, metrics: Mapping[str, Any]) -> list[str]:
     told = []
     if trust.signals or trust.plants is not None:
         told += [
-            "When a loop is closed on the estimate: the set was recorded with motion that did not depend on it.",
-            "For motion with more power at some frequency than was recorded, and beyond the sizes in training.",
+            "When a loop is closed on the estimate: the set was recorded with signals that did not depend on it.",
+            "For signals with more power at some frequency than was recorded, and beyond the sizes in training.",
             "On a machine that is worn, badly assembled or of another batch.",
         ]
     told += [
@@ -169,5 +169,5 @@ def _monitor(found: Mapping[str, Any] | None) -> list[str]:
     if low is None:
         return [f"{text}."]
     return [
-        f"{text}, and {number(found['alarms'] / found['hours'])} times an hour of motion (95 % interval {number(low, 2)} to {number(high, 2)})."
+        f"{text}, and {number(found['alarms'] / found['hours'])} times an hour of operation (95 % interval {number(low, 2)} to {number(high, 2)})."
     ]

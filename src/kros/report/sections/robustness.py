@@ -9,7 +9,7 @@ from ..content import Section
 from ..run_folder import RunFolder
 
 _TEXT = (
-    "Recordings are made with care; machines in the field lose samples, are badly calibrated, or have a cheaper encoder. Here the measurements of "
+    "Recordings are made with care; machines in the field lose samples, are badly calibrated, or have a cheaper sensor. Here the measurements of "
     "held-out episodes are disturbed in one way at a time, beyond the sensor that is declared, and the observers are not informed. "
     "Where errors double stands under Trust."
 )

@@ -1,7 +1,7 @@
 """The command line: a thin face of `kros.study`.
 
 Exit codes: 0 done; 1 failed; 2 wrong usage or bad input, and then nothing was written; 3 done, but a requirement is not met;
-128 and the number of a signal that told it to stop, 143 for SIGTERM. Errors become messages in `kros.edge`.
+4 `kros check` cannot decide on a unit; 128 and the number of a signal that told it to stop, 143 for SIGTERM. Errors become messages in `kros.edge`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import typer
 
 from .core.errors import ConfigError
 from .core.memory import keep_freed_memory
-from .edge import NOT_MET, EdgeGroup, log_to_stderr
+from .edge import NOT_MET, UNDECIDED, EdgeGroup, log_to_stderr
 
 app = typer.Typer(
     name="kros",
@@ -210,18 +210,28 @@ def check(
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder in the run's own reader, or a TOML with [data].")],
     workers: Workers = None,
     quiet: Annotated[bool, typer.Option("--json", help="Print scores as JSON and nothing else.")] = False,
+    junit: Annotated[Path | None, typer.Option(metavar="FILE", help="Write verdicts as JUnit XML.")] = None,
+    same_unit: Annotated[
+        bool, typer.Option("--same-unit", help="A unit named as one of the study is that machine: compare it with the others alone.")
+    ] = False,
 ) -> None:
-    """Score new units against a finished study; exit code 3 when one is flagged."""
-    from .study.commands.check import check_line, check_units
+    """Score new units against a finished study: PASS, FAIL or UNDECIDED; exit code 0 all pass, 3 a unit fails, 4 a unit is undecided."""
+    from .study.commands.check import check_units
+    from .study.commands.verdict import Verdict, junit_text, require_folder, verdict_lines, worst
 
-    scores = check_units(run_folder, data, _count(workers))
+    if junit is not None:
+        require_folder(junit)
+    scores = check_units(run_folder, data, _count(workers), same_unit)
     if quiet:
         typer.echo(json.dumps(scores, indent=1, ensure_ascii=False))
     else:
-        for row in scores:
-            typer.echo(check_line(row))
-    if any(row["outlier"] for row in scores):
-        raise typer.Exit(NOT_MET)
+        for line in verdict_lines(scores):
+            typer.echo(line)
+    if junit is not None:
+        junit.write_text(junit_text(scores), encoding="utf-8")
+    code = {Verdict.PASS: 0, Verdict.UNDECIDED: UNDECIDED, Verdict.FAIL: NOT_MET}[worst(scores)]
+    if code:
+        raise typer.Exit(code)
 
 
 @app.command()

@@ -20,7 +20,7 @@ from typer.core import TyperGroup
 
 from .core.errors import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
 
-FAILED, BAD_INPUT, NOT_MET, SIGNALLED = 1, 2, 3, 128
+FAILED, BAD_INPUT, NOT_MET, UNDECIDED, SIGNALLED = 1, 2, 3, 4, 128
 _USAGE = [kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"]  # typer may carry its own click
 _PASSED: tuple[type[BaseException], ...] = (typer.Exit, typer.Abort, *_USAGE)
 _BAD_INPUT = (ConfigError, DataError, DimensionError, MissingDependencyError)

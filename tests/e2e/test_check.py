@@ -71,11 +71,12 @@ def run(kros, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def checked(kros, run, tmp_path):
-    def check(data: Path) -> list[dict[str, Any]]:
-        result = kros("check", run, data, "--json", "--workers", 1)
-        assert result.exit_code in (0, 3), result.output
+    def check(data: Path, *options: str) -> list[dict[str, Any]]:
+        result = kros("check", run, data, "--json", "--workers", 1, *options)
+        assert result.exit_code in (0, 3, 4), result.output
         rows = json.loads(result.stdout)
-        assert result.exit_code == (3 if any(r["outlier"] for r in rows) else 0)
+        words = {r["verdict"] for r in rows}
+        assert result.exit_code == (3 if "FAIL" in words else 4 if "UNDECIDED" in words else 0)
         return rows
 
     return check
@@ -94,7 +95,7 @@ def test_good_units_are_not_flagged_for_being_recorded_less(checked, tmp_path, e
         assert row["episodes"] == episodes
         assert row["recorded_s"] == pytest.approx(episodes * samples * PERIOD_S, rel=0.02)
         assert (row["needed_s"] > 1.01 * row["recorded_s"]) == (row["status"] == "not enough data")
-        assert row["status"] != "ok" or 0 < row["detectable"] <= 200
+        assert row["status"] != "ok" or 0 < row["detectable"] <= 900
     assert {r["status"] == "not enough data" for r in rows} == {episodes * samples < 2000}
 
 
@@ -104,10 +105,16 @@ def test_bad_units_are_found(checked, tmp_path) -> None:
 
 
 def test_the_terminal_says_what_would_have_been_seen(kros, run, tmp_path) -> None:
-    lines = kros("check", run, recordings(tmp_path / "a", NEW, 10, 400), "--workers", 1).stdout.splitlines()
-    assert all("would have been seen" in line for line in lines)
-    short = kros("check", run, recordings(tmp_path / "b", NEW, 2, 100), "--workers", 1).stdout.splitlines()
-    assert all("not enough data: about" in line and "are needed, found 1.9" in line for line in short)
+    good = kros("check", run, recordings(tmp_path / "a", NEW, 10, 400), "--workers", 1)
+    assert good.exit_code == 0
+    lines = good.stdout.splitlines()
+    assert [line.split() for line in lines[::2]] == [["PASS", unit] for unit in NEW]
+    assert all("would be detected" in line for line in lines[1::2])
+    short = kros("check", run, recordings(tmp_path / "b", NEW, 2, 100), "--workers", 1, "--junit", tmp_path / "units.xml")
+    assert short.exit_code == 4
+    assert all("are needed, found 1.9" in line for line in short.stdout.splitlines()[1::2])
+    assert (tmp_path / "units.xml").read_text().count('<error type="UNDECIDED"') == 5
+    assert kros("check", run, tmp_path / "b", "--junit", tmp_path / "no" / "units.xml").exit_code == 2
 
 
 def test_units_of_the_study_are_not_held_against_themselves(checked, tmp_path) -> None:
@@ -119,8 +126,17 @@ def test_units_of_the_study_are_not_held_against_themselves(checked, tmp_path) -
     np.testing.assert_allclose([r["score"] for r in renamed], [r["score"] for r in own], rtol=1e-6)
     part = checked(recordings(tmp_path / "part", {"y": BATCH["b03"]}, 3, 400))
     assert [r["left_out"] for r in part] == [["b03"]]
-    fresh = checked(recordings(tmp_path / "fresh", {"b01": BATCH["b01"], "z": 200}, 10, 400, first=50))
+    again = recordings(tmp_path / "fresh", {"b01": BATCH["b01"], "z": 200}, 10, 400, first=50)
+    fresh = checked(again, "--same-unit")
     assert [r["left_out"] for r in fresh] == [["b01"], []]
+
+
+def test_a_name_of_the_study_with_other_recordings_is_refused(kros, run, tmp_path) -> None:
+    """Another drive of that name would take the study's own unit out of the comparison."""
+    refused = kros("check", run, recordings(tmp_path / "named", {"b01": 300}, 10, 400), "--workers", 1)
+    assert refused.exit_code == 2
+    assert "unit b01" in refused.stderr
+    assert "--same-unit" in refused.stderr
 
 
 def test_rows_of_metrics_say_as_much(run) -> None:

@@ -192,14 +192,17 @@ def test_new_units_are_scored(kros, demo, recorded, tmp_path):
     """One of them has the name of a unit of the study. It makes no difference whether the study's own recordings are still there."""
     fresh = tmp_path / "new"
     assert kros("simulate", fresh, "--units", 2, "--episodes", 4, "--seconds", 12, "--seed", 77, "--outlier").exit_code == 0
-    result = kros("check", demo, fresh, "--json", "--workers", 1)
+    assert "unit 001001" in (refused := kros("check", demo, fresh, "--workers", 1)).stderr
+    assert refused.exit_code == 2
+    result = kros("check", demo, fresh, "--json", "--workers", 1, "--same-unit")
     scores = json.loads(result.stdout)
     assert {(r["unit"], r["condition"]) for r in scores} == {(u, c) for u in ("000000", "001001", "001002") for c in ("noload", "load")}
     assert all(np.isfinite(r["score"]) for r in scores)
-    assert result.exit_code == (3 if any(r["outlier"] for r in scores) else 0)
+    assert result.exit_code == 4
+    assert all(r["verdict"] == "UNDECIDED" and "needs at least 8 units" in r["reason"] for r in scores)
     recorded.rename(tmp_path / "elsewhere")
     try:
-        assert kros("check", demo, fresh, "--json", "--workers", 1).stdout == result.stdout
+        assert kros("check", demo, fresh, "--json", "--workers", 1, "--same-unit").stdout == result.stdout
     finally:
         (tmp_path / "elsewhere").rename(recorded)
 

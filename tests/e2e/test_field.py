@@ -172,7 +172,7 @@ def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> No
         assert set(row["bands_db"]) == {"position"}
     bad, *good = (row["level_db"] for row in rows.values())
     assert bad > max(0.0, max(good) + 1.0)
-    assert result.exit_code == 0
+    assert result.exit_code == 4
     lines = kros("check", demo, data).stdout.splitlines()
-    assert len(lines) == 3
-    assert all("without velocity, current" in line and "the monitor's bound" in line for line in lines)
+    assert [line.split() for line in lines[::2]] == [["UNDECIDED", unit] for unit in rows]
+    assert all("without velocity, current" in line and "the monitor's bound, from 5 units" in line for line in lines[1::2])

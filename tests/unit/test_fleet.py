@@ -107,6 +107,6 @@ def test_a_unit_scored_against_many_scores_as_it_would_among_them(monkeypatch):
             patch.setattr(outlier_model, "MANY", 10**9)
             expected = model.score("new", factor * responses[7], without=("7",))
         assert (found.outlier, found.status) == (expected.outlier, expected.status)
-        # One unit more changes which 64 units are the nominals, and with them medians and the others' cover, by several tenths of a dB.
-        assert found.score_db == pytest.approx(expected.score_db, abs=0.7)
-        assert found.detectable_db == pytest.approx(expected.detectable_db, abs=0.7)
+        # One unit more changes which 64 units are the nominals, and with them medians, and the largest of the others, by about a dB.
+        assert found.score_db == pytest.approx(expected.score_db, abs=1.5)
+        assert found.detectable_db == pytest.approx(expected.detectable_db, abs=1.5)

@@ -1,6 +1,7 @@
 """What `kros check` says of units whose hidden channels were not recorded, by the number of units behind the monitor's bound."""
 
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from kros.lifting import Lifting
 from kros.observer import Monitor, Observer
 from kros.observer.monitor import octaves
 from kros.study.commands.field import FieldRecordings
-from kros.study.commands.innovation import FEWEST, monitored, monitored_line
+from kros.study.commands.innovation import monitored
+from kros.study.commands.verdict import junit_text, verdict_lines, with_verdict, worst
+from kros.uncertainty.outliers.score import FEWEST_UNITS as FEWEST
 
 CHANNELS = (Channel("position", Role.STATE, "rad", True), Channel("force", Role.INPUT, "N"))
 
@@ -38,4 +41,27 @@ def test_a_unit_beyond_the_bound_is_an_outlier_where_enough_units_made_it(units:
     assert (row["outlier"], row["score"], row["missing"]) == (outlier, None, ["velocity"])
     assert (row["level_db"] > 0) == (noise == 100.0)
     assert row["status"] == ("outlier" if outlier else "cannot tell")
-    assert f"from {units} units" in monitored_line(row)
+    row = with_verdict(row)
+    assert row["verdict"] == ("FAIL" if outlier else "UNDECIDED")
+    assert "no score without velocity" in row["reason"]
+    assert (f"from {units} units of which {FEWEST} are needed" in row["reason"]) == (units < FEWEST)
+
+
+def test_a_unit_has_the_worst_verdict_of_its_conditions_and_hostile_names_stay_text() -> None:
+    plain = {"score": 1.0, "threshold": 2.0, "detectable": 5.0, "detectable_hz": 3.0, "units": 12, "left_out": [], "outlier": False}
+    rows = [
+        with_verdict(plain | {"unit": unit, "condition": condition, "status": status, "outlier": status == "outlier"})
+        for unit, condition, status in (
+            ("a", "cold", "ok"),
+            ('<b "\x00\u202e&', "cold", "ok"),
+            ('<b "\x00\u202e&', "hot", "cannot tell"),
+            ("c", "cold", "outlier"),
+            ("c", "hot", "cannot tell"),
+        )
+    ]
+    assert [line.split()[0] for line in verdict_lines(rows) if not line.startswith(" ")] == ["PASS", "UNDECIDED", "FAIL"]
+    assert (worst(rows[:1]), worst(rows[:3]), worst(rows)) == ("PASS", "UNDECIDED", "FAIL")
+    suite = ElementTree.fromstring(junit_text(rows))
+    assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["errors"]) == ("3", "1", "1")
+    assert [[child.tag for child in case] for case in suite] == [[], ["error"], ["failure"]]
+    assert suite[1].attrib["name"] == '<b "__&'

@@ -30,4 +30,4 @@ class UncertaintySettings(Settings):
     tolerance_db: float = Field(1.0, gt=0, description="how far a weight may be above the bound of the residuals")
     drop_outliers: bool = Field(False, description="units that are flagged take no part in models, weights and synthesis")
     outlier_form: FORMS = Field("additive", description="of the residuals that outlier scores are made of")
-    false_alarm_rate: float = Field(3e-3, gt=0, lt=1, description="probability with which a unit like the others is flagged")
+    false_alarm_rate: float = Field(1e-2, gt=0, lt=1, description="probability with which a unit like the others is flagged")

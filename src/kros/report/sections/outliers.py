@@ -23,7 +23,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     if not rows:
         return None
     text = (
-        "A unit's score is by how much its residual exceeds the cover of all the others, in the direction and at the frequency where it does most. "
+        "A unit's score is by how much its largest residual, relative to the typical size at its frequency, exceeds the largest of all the others. "
         "Scores look at the recordings only, never at serial or group. Some unit always has the highest score, so there is a threshold; above it a unit is "
         "flagged."
     )
@@ -34,7 +34,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
 def undecided_text(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return about which units the scores say nothing, and why; nothing where there are none."""
     texts = []
-    for status, why in (("not enough data", "too little was recorded of it"), ("cannot tell", "the others are too few, or too unlike")):
+    for status, why in (("not enough data", "too little was recorded of it"), ("cannot tell", "the others are fewer than eight, or too unlike")):
         silent = [r for r in rows if r.get("status") == status]
         if silent:
             texts.append(f"{len(silent)} of {len(rows)} scores say nothing about their unit, as {why}: {flagged_text(silent)}.")

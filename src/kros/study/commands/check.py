@@ -18,23 +18,26 @@ from ...observer import Observer
 from ...uncertainty import OutlierModel
 from ...uncertainty.outliers.population import score_row
 from ...uncertainty.outliers.recorded import Evidence, Recorded
-from ...uncertainty.outliers.score import Status
 from ..config import Stage, StudyConfig
 from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
 from .field import FieldRecordings
-from .innovation import level_text, monitored, monitored_line
+from .innovation import monitored
 from .recordings import check_channels, hidden_states, identify_on, load_calibration, open_data, training_keys, unit_parameters
+from .verdict import with_verdict
 
 
-def check_units(run: Path, data: Path, workers: int = 1) -> list[dict[str, Any]]:
-    """Identify the units of some recordings as the study did, and score each against the study's population."""
+def check_units(run: Path, data: Path, workers: int = 1, same_unit: bool = False) -> list[dict[str, Any]]:
+    """Identify the units of some recordings as the study did, score each against the study's population, and give a verdict.
+
+    A name that a unit of the study has is refused where the recordings are others, unless `same_unit` states that it is the same machine.
+    """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (config, store):
-        return scored(config, store, data, workers)
+        return scored(config, store, data, workers, same_unit)
 
 
-def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[dict[str, Any]]:
+def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_unit: bool = False) -> list[dict[str, Any]]:
     """Score the units of some recordings against a run that is open."""
     kept = [name.split("/") for name in sorted(store.files())]
     folders = [store.path(*parts[:2]) for parts in kept if len(parts) == 3 and (parts[0], parts[2]) == ("outliers", "outlier_model.json")]
@@ -59,7 +62,7 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[
         for folder in folders:
             models = ModelSet.load(store.path("models", folder.name))
             if models.condition in population.conditions:
-                rows += score_condition(store, population, models, OutlierModel.load(folder), executor)
+                rows += score_condition(store, population, models, OutlierModel.load(folder), executor, same_unit)
     if not rows:
         raise DataError(
             f"Checking {data}: the recordings have the conditions {', '.join(population.conditions)}, and the run has models of "
@@ -73,12 +76,12 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int) -> list[
 
 
 def in_order(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows of scores by condition and unit, in JSON's types."""
-    return [plain(row) for row in sorted(rows, key=lambda r: (r["condition"], r["unit"]))]
+    """Return rows of scores by condition and unit, with their verdicts, in JSON's types."""
+    return [plain(with_verdict(row)) for row in sorted(rows, key=lambda r: (r["condition"], r["unit"]))]
 
 
 def score_condition(
-    store: Store, population: Population, models: ModelSet, outliers: OutlierModel, executor: Executor
+    store: Store, population: Population, models: ModelSet, outliers: OutlierModel, executor: Executor, same_unit: bool
 ) -> list[dict[str, Any]]:
     """Score all units that were recorded in one condition."""
     training, everything = training_keys(population), {(u, c): keys for u, c, keys in population.groups()}
@@ -93,38 +96,21 @@ def score_condition(
     for unit, factor in zip(units, executor.map(reduce_episodes, tasks), strict=True):
         keys, used = everything[unit, models.condition], training[unit, models.condition]
         evidence = Evidence.of(factor, models, parameters[unit]).part([keys.index(k) for k in used])
-        known = recorded.same_recordings(factor) | ({unit} & set(recorded.units))
+        known = recorded.same_recordings(factor)
+        if unit in recorded.units and unit not in known and not same_unit:
+            raise DataError(
+                f"Checking unit {unit} ({models.condition}): the study has a unit of this name, with other recordings. Give --same-unit if it is the same "
+                "machine, which is then compared with the other units alone; else rename it."
+            )
+        known |= {unit} & set(recorded.units)
         (response,) = recorded.response([evidence])
         score = recorded.qualified(outliers.score(unit, response, known), evidence)
         seconds = float(factor.n_samples.sum()) * models.sample_period_s
-        rows.append(score_row(score, models.condition, len(keys), seconds) | {"left_out": sorted(known)})
+        row = score_row(score, models.condition, len(keys), seconds)
+        rows.append(row | {"units": outliers.n_units, "left_out": sorted(known)})
     return rows
 
 
 def factors_of(store: Store, condition: str) -> EpisodeFactors:
     """Return the factors of a run's training episodes."""
     return EpisodeFactors.load(store.path("factors", quote(condition, safe="")))
-
-
-def check_line(row: dict[str, Any]) -> str:
-    """Return a row of `check_units` for people at a terminal."""
-    if "missing" in row:
-        return monitored_line(row)
-    threshold = "none, too few units" if row["threshold"] is None else f"{row['threshold']:.2f} dB"
-    line = f"{row['unit']}  {row['condition']}  score {row['score']:.2f} dB (threshold {threshold})"
-    line += f"  {row['status'].upper() if row['outlier'] else row['status']}"
-    if row.get("level_db") is not None:
-        line += f", innovation {level_text(row)}"
-    if row["outlier"]:
-        return line
-    seen = (
-        "no change would have been seen"
-        if row["detectable"] is None
-        else f"a change of gain by {row['detectable']:.2g} % would have been seen"
-    )
-    if row["status"] == Status.NOT_ENOUGH_DATA:
-        return f"{line}: about {row['needed_s']:.3g} s of recordings are needed, found {row['recorded_s']:.3g} s"
-    if row["detectable"] is None:
-        return f"{line}: {seen}, there are too few units to compare with"
-    where = f"at {row['detectable_hz']:.3g} Hz"
-    return f"{line}: {seen}, {where}, {row['detectable_db']:.1f} dB beyond the other units"

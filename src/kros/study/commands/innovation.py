@@ -11,12 +11,11 @@ from ...evaluate.arriving import Arriving
 from ...observer import Observer
 from ...observer.monitor import Monitor
 from ...observer.simulate import run_innovations
-from ...uncertainty.outliers.score import Status
+from ...uncertainty.outliers.score import FEWEST_UNITS, Status
 from .field import FieldRecordings
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-FEWEST = 8  # units behind a bound that calls one an outlier: of studies of five up to a third of the good ones were beyond it
 
 
 def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
@@ -33,7 +32,7 @@ def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
             if monitor is not None:
                 innovations += judged_innovations(recordings, monitor, found)
         highest, bands = highest_levels(monitor, innovations, condition)
-        outlier = monitor is not None and monitor.units >= FEWEST and highest is not None and highest > 0
+        outlier = monitor is not None and monitor.units >= FEWEST_UNITS and highest is not None and highest > 0
         row: dict[str, Any] = {"unit": unit, "condition": condition, "score": None, "threshold": None, "outlier": outlier}
         row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "detectable": None, "episodes": len(keys)}
         row |= {"recorded_s": samples * population.sample_period_s, "left_out": []}
@@ -70,15 +69,3 @@ def highest_levels(monitor: Monitor | None, innovations: list[tuple[Array, Flags
 def level_text(row: dict[str, Any]) -> str:
     """Return where the level of the innovation is."""
     return f"{abs(row['level_db']):.2f} dB {'over' if row['level_db'] > 0 else 'below'} the monitor's bound"
-
-
-def monitored_line(row: dict[str, Any]) -> str:
-    """Return a row of `monitored` for people at a terminal."""
-    line = f"{row['unit']}  {row['condition']}  {row['status'].upper() if row['outlier'] else row['status']}: "
-    line += f"without {', '.join(row['missing'])} its model has no score; "
-    if row["level_db"] is None:
-        line += "the deployed observer has no monitor, or no sample can be judged"
-    else:
-        line += f"innovation {level_text(row)} (set for {100 * row['level_rate']:.3g} % of good units, from {row['level_units']} units)"
-    line += "".join(f"; {count} samples {bit}" for bit, count in row["samples"].items())
-    return line + (f"; parameters {row['parameters']}" if row["parameters"] else "")

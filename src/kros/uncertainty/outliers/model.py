@@ -1,18 +1,19 @@
-r"""Outliers (Appendix A): units whose residual exceeds the cover of the others.
+r"""Outliers (Appendix A): units whose residual exceeds the residuals of the others.
 
 For every pair of units the residual of the form is taken with the one as nominal and the other as perturbed plant (`distances`). A unit's
-distance at a frequency is the median over all nominals of the largest singular value, averaged (in dB) over a third of a decade:
+level at a frequency is the median over all nominals of the largest singular value, relative to its typical size there and averaged (in dB)
+over a third of a decade; its excess is what its largest level has beyond the largest of the others:
 
-    distance_i(f) = smooth median_(k != i) sigma_max(D_l^-1 E(G_k, G_i) D_r^-1)
-    excess_i      = max_f ( distance_i(f) - max_(k != i) distance_k(f) ),    dB
+    level_i(f) = smooth median_(k != i) sigma_max(D_l^-1 E(G_k, G_i) D_r^-1)
+    excess_i   = max_f level_i(f) - max_(k != i) max_f level_k(f),    dB
 
 No single nominal decides, and the nominal of the study has a score like any other unit. Beside it the excess is computed with every unit as
 the only nominal, as the paper states its criterion: the range over the nominals, and the share of them under which the unit is conspicuous.
 
-Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold is the bound of a
-generalised extreme value model of the others' scores at the stated rate (`tail`): an extrapolation, and labelled as such. Units are taken
-out one at a time while they are beyond (`separation`), up to a third of the units. With three units nothing can be flagged: two scores make no
-model. Two units are refused. All this compares estimates that are equally good: units that were recorded for too little are told apart before
+Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold rests on an exponential
+tail of the levels whose scale the others show, the mean over frequency (`tail`): an extrapolation, and labelled as such. Units are taken out
+one at a time while they are beyond (`separation`), up to a third of the units. Fewer than eight units flag nothing and decide nothing; two
+units are refused. All this compares estimates that are equally good: units that were recorded for too little are told apart before
 (`recorded`). What a score would have shown stands beside it (`scoring`, `score`).
 """
 
@@ -33,13 +34,13 @@ from ...core.loading import check_shapes, loader
 from ..forms import Form, as_form, check_responses
 from ..validation import check_scale
 from .distances import Distances, balance, distances, joined
-from .score import OutlierScore
-from .scoring import Nominals, margins_of, scores_of
-from .separation import separate
+from .score import FEWEST_UNITS, OutlierScore, Status
+from .scoring import Nominals, scores_of
+from .separation import margins, separate
 
 Array = npt.NDArray[Any]
 
-FALSE_ALARM_RATE = 3e-3
+FALSE_ALARM_RATE = 1e-2
 _FREQUENCIES = 120
 MANY = 200  # inliers from which on a unit that is scored does not change how they are scaled
 _FEWEST = 2  # others that a unit can be compared with
@@ -131,12 +132,17 @@ class OutlierModel:
         many = len(self.unit_ids) > MANY
         found = self._with(rows, everyone[-1]) if many else distances(self.form, everyone, self.freqs_hz)
         last = np.arange(len(everyone)) == len(everyone) - 1
-        margin = float(margins_of(found.levels, self.false_alarm_rate)[1][-1])
+        margin = float(margins(found.levels, ~last, self.false_alarm_rate)[1][-1]) if self.n_units >= FEWEST_UNITS else -np.inf
         summary = Nominals.of(found, ~last, self.false_alarm_rate)
         (score,) = scores_of(
             self.form, everyone, self.freqs_hz, found, ~last, (margin,), (unit,), self.threshold_db, summary, [len(last) - 1]
         )
         return score
+
+    @property
+    def n_units(self) -> int:
+        """Units that were compared, outliers among them; fewer than eight decide nothing."""
+        return sum(score.status is not Status.NOT_ENOUGH_DATA for score in self.scores)
 
     @cached_property
     def _known(self) -> Distances:
@@ -236,7 +242,7 @@ def score_outliers(
     G, ids, freqs = _population(responses, unit_ids, freqs_hz)
     form, rate = as_form(form), float(false_alarm_rate)
     if not 0 < rate < 1:
-        raise ConfigError(f"Outlier scores: need a false alarm rate between 0 and 1, found {rate}; 0.003 is usual.")
+        raise ConfigError(f"Outlier scores: need a false alarm rate between 0 and 1, found {rate}; 0.01 is usual.")
     rows = _scored(len(freqs))
     freqs, G = freqs[rows], G[:, rows]
     given = output_scale is not None or input_scale is not None

@@ -13,15 +13,16 @@ from typing import Any
 
 import numpy as np
 
-LARGEST_DB = 26.0  # beyond the cover of the others: twenty times as far away as any of them is
-LARGEST_PERCENT = 200.0  # change of gain: three times as large
+FEWEST_UNITS = 8  # below, the verdict on a unit is left open: of studies of five up to a third of the good units were beyond a bound
+LARGEST_DB = 26.0  # beyond the largest of the others: twenty times as far away as any of them is
+LARGEST_PERCENT = 900.0  # change of gain: ten times as large
 
 
 class Status(StrEnum):
     """What the recordings say about a unit.
 
     ``ok``: a change of the size that stands beside it would have been flagged. ``outlier``: flagged. ``not enough data``: too few recordings of this unit.
-    ``cannot tell``: too few units, or too unlike ones, to compare with.
+    ``cannot tell``: fewer than eight units to compare with, or too unlike ones.
     """
 
     OK = "ok"
@@ -32,22 +33,22 @@ class Status(StrEnum):
 
 @dataclass(frozen=True)
 class OutlierScore:
-    """How far one unit exceeds the cover of the others.
+    """How far one unit exceeds the others.
 
     Parameters
     ----------
     unit : str
     score_db : float, dB
-        The excess, referred to the threshold: a unit that is out covers the others and lowers their scores, and with them its own
-        threshold; the difference is added to its excess, so that one threshold serves all units.
+        The excess, referred to the threshold: the thresholds of units that went out earlier in the search differ, and the difference is added to their
+        excess, so that one threshold serves all units.
     threshold_db : float, dB
     outlier : bool
     freq_hz : float, Hz
-        Where the excess is largest.
+        Where the unit's level is largest.
     entry : tuple of int
         Row and column of the residual's largest entry there, relative to its typical size.
     excess_db : float, dB
-        Largest excess over frequency over the cover of the inliers; negative for a unit that the others cover everywhere.
+        What the unit's largest level has beyond the largest of the other inliers; negative for all units but one inlier.
     lowest_db, highest_db : float, dB
         Range of the excess over all choices of one nominal unit.
     agreement : float

@@ -7,7 +7,7 @@ to first order, so what it takes to reach the bound follows in percent.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +17,7 @@ import numpy.typing as npt
 from ..forms import Form
 from .distances import Distances, largest_entries, scaled_levels
 from .score import OutlierScore, Status, room_db
-from .separation import excess, held
-from .tail import leave_one_out_bounds
+from .separation import covers, margins
 
 Array = npt.NDArray[Any]
 
@@ -35,15 +34,13 @@ class Nominals:
 
     @classmethod
     def of(cls, found: Distances, inliers: npt.NDArray[np.bool_], rate: float) -> Nominals:
-        """Score all units under every nominal, inliers among themselves and each other unit alone with them."""
+        """Score all units against the inliers under every nominal."""
         shape = found.by_nominal.shape[:2]
         values, beyond = np.full(shape, np.nan), np.zeros(shape, bool)
         for row, nominal in enumerate(found.nominals):
             others = np.arange(shape[1]) != nominal
-            for units, members in _comparisons(inliers & others, others):
-                score, margin = margins_of(found.by_nominal[row, members], rate)
-                at = np.searchsorted(members, units)
-                values[row, units], beyond[row, units] = score[at], margin[at] > 0
+            values[row, others], margin = margins(found.by_nominal[row, others], inliers[others], rate)
+            beyond[row, others] = margin > 0
         return cls(values, beyond)
 
     def summary(self, unit: int) -> dict[str, Any]:
@@ -55,21 +52,6 @@ class Nominals:
             "highest_db": float(values.max()),
             "agreement": float(self.beyond[known, unit].mean()),
         }
-
-
-def _comparisons(inliers: npt.NDArray[np.bool_], wanted: npt.NDArray[np.bool_]) -> list[tuple[Array, Array]]:
-    """Units, and the units that they are scored among: inliers together, every other unit alone with them."""
-    together = np.flatnonzero(inliers)
-    alone = [(np.array([k]), np.sort(np.append(together, k))) for k in np.flatnonzero(wanted & ~inliers)]
-    return [(together, together), *alone] if len(together) > 1 else alone
-
-
-def margins_of(levels: Array, rate: float) -> tuple[Array, Array]:
-    """Excess of all units, and what it has beyond the bound of the others' scores."""
-    if len(levels) < 2:
-        return np.zeros(len(levels)), np.full(len(levels), -np.inf)
-    scores = excess(levels)[0]
-    return scores, scores - leave_one_out_bounds(scores, rate)
 
 
 def scores_of(
@@ -85,22 +67,18 @@ def scores_of(
     units: Sequence[int],
 ) -> tuple[OutlierScore, ...]:
     """Scores of some units; `margins` and `ids` are theirs."""
-    wanted = np.isin(np.arange(len(G)), np.asarray(units))
-    value, where = np.zeros(len(G)), np.zeros(len(G), int)
-    for some, members in _comparisons(inliers, wanted | inliers):
-        rank, (score, peak) = np.searchsorted(members, some), excess(found.levels[members])
-        value[some], where[some] = score[rank], peak[rank]
-    rows = where[list(units)]
+    rows = found.levels[list(units)].argmax(axis=1)
     entries = largest_entries(form, G, found, np.asarray(units), rows)
     change = change_levels(form, G[inliers], found, freqs)
-    cover = _without_one(found.levels, inliers)
+    cover = covers(found.levels, inliers)
+    value = found.levels.max(axis=1) - cover
     scores = []
     for k, unit, margin, row, entry in zip(units, ids, margins, rows, entries, strict=True):
         known = np.isfinite(threshold) and np.isfinite(margin)
         referred = threshold + margin if known else float(value[k])
         beyond = bool(np.isfinite(threshold) and margin > 0)
         bound = float(value[k]) - margin if known else float("inf")
-        percent, at, changed = smallest_change(change, held(cover(k)), bound)
+        percent, at, changed = smallest_change(change, float(cover[k]), bound)
         status = Status.OUTLIER if beyond else Status.OK if room_db(bound, percent) >= 0 else Status.CANNOT_TELL
         found_score = OutlierScore(
             unit=unit,
@@ -121,15 +99,6 @@ def scores_of(
     return tuple(scores)
 
 
-def _without_one(levels: Array, inliers: npt.NDArray[np.bool_]) -> Callable[[int], Array]:
-    """Return what gives the largest levels of all inliers but one unit, shape (frequency,)."""
-    here = np.flatnonzero(inliers)
-    ordered = np.argpartition(levels[here], max(len(here) - 2, 0), axis=0)[-2:]
-    largest, top = levels[here].max(axis=0), here[ordered[-1]]
-    second = levels[here[ordered[0]], np.arange(levels.shape[1])]
-    return lambda unit: np.where(top == unit, second, largest)
-
-
 def change_levels(form: Form, responses: Array, found: Distances, freqs_hz: Array) -> Array:
     """Return levels, dB, of residuals between units and themselves with one entry changed by one percent: the median over units, shape (p, m, frequency)."""
     G = responses[np.unique(np.linspace(0, len(responses) - 1, min(_MOST, len(responses))).round().astype(int))]
@@ -141,7 +110,7 @@ def change_levels(form: Form, responses: Array, found: Distances, freqs_hz: Arra
     return levels
 
 
-def smallest_change(change: Array, cover: Array, bound_db: float) -> tuple[float, int, tuple[int, int]]:
+def smallest_change(change: Array, cover: float, bound_db: float) -> tuple[float, int, tuple[int, int]]:
     """Return the smallest change of gain that exceeds a cover by a bound, percent, its frequency and entry; infinity, and the first, without a bound."""
     if not np.isfinite(bound_db):
         return float("inf"), 0, (0, 0)

@@ -22,9 +22,9 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     rate, units = number(100 * first.false_alarm_rate, 2), len(first.unit_ids)
     caveat = f"; {units} units alone cannot show so rare an event, so the rate rests on that model" if first.extrapolated else ""
     text = (
-        f"By how much every unit exceeds the cover of all the others with its {form_label(first.form.value)} residual: the median over all nominal units, "
+        f"By how much the largest {form_label(first.form.value)} residual of every unit exceeds those of all the others: the median over all nominal units, "
         f"and as a bar the range with each of them as the only nominal. Dashed: threshold at a nominal false-alarm rate of {rate} % for "
-        f"each good unit, from a generalised extreme value model of the scores of the others{caveat}. "
+        f"each good unit, from an exponential tail of the levels of the others{caveat}. "
     )
     return scores_figure(found), text + (f"Above it: {', '.join(flagged)}." if flagged else "No unit is above it.")
 

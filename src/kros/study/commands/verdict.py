@@ -1,0 +1,103 @@
+"""One word about every unit that `kros check` scored: PASS, FAIL or UNDECIDED, with the reason, at a terminal and as JUnit XML."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+from ...core.errors import ConfigError
+from ...uncertainty.outliers.score import FEWEST_UNITS, Status
+from .innovation import level_text
+
+
+class Verdict(StrEnum):
+    """Verdict on a unit, the worst of its conditions; in the order of severity."""
+
+    PASS = "PASS"
+    UNDECIDED = "UNDECIDED"
+    FAIL = "FAIL"
+
+
+_ORDER = list(Verdict)
+
+
+def with_verdict(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a row of scores with its verdict and the reason in words."""
+    verdict = Verdict.FAIL if row["outlier"] else Verdict.PASS if row["status"] == Status.OK else Verdict.UNDECIDED
+    return row | {"verdict": verdict, "reason": "; ".join(_reasons(row))}
+
+
+def by_unit(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of every unit."""
+    units: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        units.setdefault(row["unit"], []).append(row)
+    return units
+
+
+def worst(rows: Sequence[dict[str, Any]]) -> Verdict:
+    """Return the verdict of rows together: FAIL before UNDECIDED before PASS."""
+    return max((Verdict(row["verdict"]) for row in rows), key=_ORDER.index)
+
+
+def verdict_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the word and the name of every unit, each followed by an indented line for every condition."""
+    lines = []
+    for unit, own in by_unit(rows).items():
+        lines += [f"{worst(own):<9}  {unit}", *(f"  {row['condition']}: {row['reason']}" for row in own)]
+    return lines
+
+
+def require_folder(path: Path) -> None:
+    """Refuse a file that cannot be written, before anything is computed."""
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        raise ConfigError(f"--junit {path}: is not a file in an existing folder; name one.")
+
+
+def junit_text(rows: Sequence[dict[str, Any]]) -> str:
+    """Return JUnit XML with a test case for every unit; UNDECIDED is an error, so that a build does not pass on it."""
+    units, cases = by_unit(rows), []
+    for unit, own in units.items():
+        tag = {Verdict.FAIL: "failure", Verdict.UNDECIDED: "error"}.get(worst(own))
+        text = "; ".join(f"{row['condition']}: {row['reason']}" for row in own)
+        inside = "" if tag is None else f"<{tag} type={_quoted(worst(own))} message={_quoted(text)}/>"
+        cases.append(f'  <testcase classname="kros.check" name={_quoted(unit)}>{inside}</testcase>')
+    counts = {tag: sum(worst(own) is verdict for own in units.values()) for tag, verdict in _COUNTED.items()}
+    head = f'<testsuite name="kros check" tests="{len(units)}" failures="{counts["failures"]}" errors="{counts["errors"]}">'
+    return "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', head, *cases, "</testsuite>", ""])
+
+
+_COUNTED = {"failures": Verdict.FAIL, "errors": Verdict.UNDECIDED}
+
+
+def _quoted(text: str) -> str:
+    """Return an attribute of XML; what cannot be printed becomes an underscore."""
+    return quoteattr("".join(c if c.isprintable() else "_" for c in text))
+
+
+def _reasons(row: dict[str, Any]) -> list[str]:
+    """Return what a verdict rests on."""
+    reasons = []
+    if row["score"] is not None and row["threshold"] is not None:
+        reasons.append(f"score {row['score']:.2f} dB, threshold {row['threshold']:.2f} dB")
+    if row["status"] == Status.NOT_ENOUGH_DATA:
+        reasons.append(f"about {row['needed_s']:.3g} s of recordings are needed, found {row['recorded_s']:.3g} s")
+    elif row["status"] == Status.CANNOT_TELL and "missing" not in row and row["units"] < FEWEST_UNITS:
+        reasons.append(f"needs at least {FEWEST_UNITS} units to compare with, has {row['units']}")
+    elif row.get("detectable") is not None and not row["outlier"]:
+        only = "only " if row["status"] == Status.CANNOT_TELL else ""
+        reasons.append(f"{only}a change of gain above {row['detectable']:.2g} % would be detected, at {row['detectable_hz']:.3g} Hz")
+    if "missing" in row:
+        reasons.append(f"no score without {', '.join(row['missing'])}")
+    if row.get("level_db") is not None:
+        units = f", from {row['level_units']} units of which {FEWEST_UNITS} are needed" if row["level_units"] < FEWEST_UNITS else ""
+        reasons.append(f"innovation {level_text(row)}{units}")
+    elif "missing" in row:
+        reasons.append("the deployed observer has no monitor, or no sample can be judged")
+    if row["left_out"]:
+        reasons.append(f"compared without {', '.join(row['left_out'])}, which is the same machine")
+    reasons += [f"{count} samples {bit}" for bit, count in row.get("samples", {}).items()]
+    return reasons + ([f"parameters {row['parameters']}"] if row.get("parameters") else [])

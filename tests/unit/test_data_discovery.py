@@ -55,6 +55,40 @@ def test_conditions_groups_and_single_machines():
 
 
 @pytest.mark.parametrize(
+    ("paths", "first", "units", "ambiguous"),
+    [
+        ([f"{'good' if u < 3 else 'faulty'}/act{u}_run{e}.csv" for u in UNITS for e in EPISODES], ("good", "act1", None, "run1"), 3, False),
+        ([f"{'berlin' if u < 3 else 'paris'}/{u}_{e}.csv" for u in UNITS for e in EPISODES], ("berlin", "1", None, "1"), 3, False),
+        ([f"{'ok' if u < 3 else 'nok'}/SN{7 * u}_{c}.csv" for u in UNITS for c in ("hot", "cold")], ("ok", "SN7", "hot", None), 3, False),
+        ([f"motor00_{e:02d}.csv" for e in range(3)], (None, "motor00", None, "00"), 1, False),
+        ([f"bench3/pump7_{e}.csv.gz" for e in range(5)], (None, "pump7", None, "0"), 1, False),
+        (names("2024-05-1{e}_motor{u}_{c}.csv"), (None, "motor1", "load", "11"), 3, False),
+        (names("2024-05-1{e}/SN100{u}.CSV"), (None, "SN1001", None, "11"), 3, False),
+        (names("motor{u}/{c}/2024-05-1{e}.csv"), (None, "motor1", "load", "11"), 3, False),
+        (names("box{u}/box{u}_{e}.csv"), (None, "box1", None, "1"), 3, False),
+        (names("run{e}_{c}_drive{u}.csv"), (None, "drive1", "load", "run1"), 3, False),
+        (names("{c}/{u}/{e}.csv"), (None, "1", "load", "1"), 3, False),
+        (names("M{u} {c} {e}.Csv"), (None, "M1", "load", "1"), 3, False),
+        (names("data/exp/v2/unit-{u}/rec {e}.tsv"), (None, "1", None, "1"), 3, False),
+        (names("rig1_motor{u}_run{e}.csv"), (None, "motor1", None, "run1"), 3, False),
+        ([f"trial{e}.csv" for e in EPISODES], (None, None, None, "trial1"), 1, False),
+        ([f"pump{u}.csv" for u in UNITS], (None, "pump1", None, None), 3, False),
+        (["KX1041.csv", "KX1055.csv", "KX1102.csv"], (None, "KX1041", None, None), 3, False),
+        ([f"KX{u}.csv" for u in UNITS], (None, "KX1", None, None), 3, True),
+        ([f"x_{e:02d}.csv" for e in range(4)], (None, "00", None, None), 4, True),
+        (names("x_{c}_{e}.csv"), (None, "1", "load", None), 3, True),
+    ],
+)
+def test_hostile_layouts_are_read_as_people_do_or_asked_about(paths, first, units, ambiguous):
+    found = infer_names(sorted(set(paths), key=paths.index))
+    groups = [re.search(found.pattern, p).groupdict() for p in paths]
+    assert tuple(groups[0].get(g) for g in ("group", "unit", "condition", "episode")) == first
+    assert len({g.get("unit") for g in groups}) == units
+    assert (found.other is not None) == ambiguous
+    assert found.other is None or len({re.search(found.other, p)["episode"] for p in paths}) == units
+
+
+@pytest.mark.parametrize(
     ("header", "name", "unit"),
     [
         ("Position [mm]", "Position", "mm"),

@@ -2,21 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import permutations
 
 import numpy as np
 import numpy.typing as npt
 
-from .population import Channel, Role
+from .population import Channel, EpisodeKey, Role
+from .recording import some, title
 
 LONGEST_S, SHORTEST_S = 0.5, 1e-6  # sampling periods outside are rare for machines, and usual for a time in ms or us taken for seconds
+_FACTORS = {  # between units of measure that are mixed up, and what they are
+    57.29578: "degrees and radians",
+    9.549297: "revolutions per minute and radians per second",
+    6.283185: "revolutions and radians, or Hz and rad/s",
+    60.0: "minutes and seconds",
+    1000.0: "a unit and its thousandth",
+}
+_NEAR, _COMPACT = 1.2, 3.0  # factor within which a ratio of sizes is one of these; factor that sizes may differ by on either side
 _CORRELATED = 0.95  # of a channel with the slope of another one, from which on it counts as its derivative
 
 
 def period_alerts(values: npt.NDArray[np.float64], channels: Sequence[Channel], period_s: float) -> tuple[str, ...]:
     """Return what speaks against a sampling period."""
     return (*_size(period_s), *_derivatives(values, channels, period_s), *_sampling(values, channels, period_s))
+
+
+def size_of(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the range of every channel from the 5th to the 95th percentile, shape (n_channels,)."""
+    low, high = np.percentile(values[:: max(1, len(values) // 2000)], (5, 95), axis=0)
+    return np.asarray(high - low)
+
+
+def scale_alerts(sizes: Mapping[EpisodeKey, npt.NDArray[np.float64]], channels: Sequence[Channel]) -> tuple[str, ...]:
+    """Return which channels have sizes (`size_of`) of two kinds, a factor apart that lies between units of measure, with the units or episodes."""
+    texts = []
+    for i, channel in enumerate(channels):
+        for condition in dict.fromkeys(key.condition for key in sizes):
+            own = {key: size[i] for key, size in sizes.items() if key.condition == condition and size[i] > 0}
+            units = {key.unit: float(np.median([v for k, v in own.items() if k.unit == key.unit])) for key in own}
+            found = _two_scales(units) or _two_scales({title(key): float(value) for key, value in own.items()})
+            if found is not None:
+                texts.append(
+                    f"{channel.name!r} ({condition}) is {found[1]:.3g} times {'smaller' if found[2] else 'larger'} in {some(found[0])} than in the "
+                    f"others: are its units of measure mixed up ({' or '.join(found[3])})?"
+                )
+    return tuple(texts)
+
+
+def _two_scales(sizes: Mapping[str, float]) -> tuple[list[str], float, bool, list[str]] | None:
+    """Return the fewer of two groups of sizes, the factor, whether it is the smaller one, and what the factor may be; None without."""
+    names = sorted(sizes, key=lambda name: sizes[name])
+    logs = np.log([sizes[name] for name in names])
+    if len(names) < 2:
+        return None
+    cut = int(np.diff(logs).argmax()) + 1
+    gap = float(np.median(logs[cut:]) - np.median(logs[:cut]))
+    kinds = [text for factor, text in _FACTORS.items() if abs(gap - np.log(factor)) < np.log(_NEAR)]
+    if not kinds or max(np.ptp(logs[:cut]), np.ptp(logs[cut:])) > min(np.log(_COMPACT), 0.6 * gap):
+        return None
+    smaller = cut <= len(names) - cut
+    return (names[:cut] if smaller else names[cut:]), float(np.exp(gap)), smaller, kinds
 
 
 def _size(period_s: float) -> Iterator[str]:

@@ -24,6 +24,10 @@ Look = Callable[[EpisodeKey, npt.NDArray[np.float64]], None]
 
 ON_NAN = ("error", "drop_episode")
 MIN_SAMPLES = 3  # two consecutive states and one more
+_BEYOND, _LARGEST = (
+    1e3,
+    1e100,
+)  # times the range of 98 % of the samples; the largest number where these stand still, whose square is a number
 _ROUNDING = 1e-12  # of the largest value: what filters and scales make of a constant
 
 
@@ -42,8 +46,10 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
         raise DataError(
             f"{title(key)}: at least {MIN_SAMPLES} samples are needed, found {len(values)}; leave the episode out or record longer."
         )
-    if not gaps and not np.isfinite(values).all():
-        check_finite(values, key, channels)
+    if not gaps:
+        if not np.isfinite(values).all():
+            check_finite(values, key, channels)
+        check_range(values, key, channels)
     _check_moving(values, key, channels)
 
 
@@ -83,6 +89,26 @@ def check_finite(
             raise NonFiniteError(
                 f"{title(key)}: channel {channels[column].name!r} has {bad.size} {kinds} at {where}; fix the source or set "
                 'data.on_nan = "drop_episode".'
+            )
+
+
+def check_range(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel]) -> None:
+    """Refuse a sample that is farther from the median than a thousand times the range from the 1st to the 99th percentile."""
+    for i, channel in enumerate(channels):
+        finite = np.flatnonzero(np.isfinite(values[:, i]))
+        column = values[finite, i]
+        if len(column) < MIN_SAMPLES:
+            continue
+        few = np.sort(column[:: max(1, len(column) // 64)])
+        with np.errstate(over="ignore", invalid="ignore"):
+            if np.abs(column[[column.argmin(), column.argmax()]] - few[len(few) // 2]).max() <= _BEYOND * (few[-2] - few[1]):
+                continue  # a few samples show already that the channel moves as much
+            low, middle, high = np.percentile(column, (1, 50, 99))
+            bad = np.flatnonzero(np.abs(column - middle) > (_BEYOND * (high - low) if high > low else _LARGEST))
+        if bad.size:
+            raise DataError(
+                f"{title(key)}: channel {channel.name!r} is {column[bad[0]]:g} at sample {finite[bad[0]]}, and 98 % of its samples are "
+                f"from {low:g} to {high:g} ({bad.size} such samples); fix the source, or leave the episode out."
             )
 
 

@@ -5,7 +5,7 @@ reader ── Recording ── steps ── Recording ── checks ── sampl
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -45,7 +45,12 @@ class Recordings:
         """Return one episode, or say that this source does not have it."""
         if key not in self.places:
             raise DataError(f"Asked for {key}; this source has {len(self.places)} other episodes; take keys from population.episodes.")
-        return self.read(key, self.places[key])
+        return without_repeated_end(self.read(key, self.places[key]))
+
+    def where(self, key: EpisodeKey) -> str:
+        """Return in which file an episode is, for messages; nothing where it is in none."""
+        file = self.file(self.places[key])
+        return "" if file is None else f" in {file}"
 
     def file(self, place: Any) -> Path | None:
         """Return the one file that an episode is in; None where it is in none, or cannot be told."""
@@ -56,9 +61,22 @@ class Recordings:
         return replace(self, places={key: self.places[key] for key in keys})
 
 
+def without_repeated_end(recording: Recording) -> Recording:
+    """Drop the last sample where it repeats the stamp before it, as recorders write when they are stopped."""
+    time = recording.time_s
+    if time is None or len(time) < 2 or time[-1] != time[-2]:
+        return recording
+    return replace(recording, values=recording.values[:-1], time_s=time[:-1])
+
+
 def title(key: EpisodeKey) -> str:
     """Return how a message names an episode, for example ``Episode 7 of unit 001011 (load)``."""
     return f"E{str(key)[1:]}"
+
+
+def some(names: Sequence[str], most: int = 4) -> str:
+    """Return the first of some names for a message, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def estimate_period(recording: Recording) -> float:
@@ -83,7 +101,7 @@ def _six_digits(number: float) -> float:
     return float(f"{number:.6g}")
 
 
-def check_increasing(recording: Recording) -> None:
+def check_increasing(recording: Recording, where: str = "") -> None:
     """Refuse time that stands still, runs backwards or is not a number."""
     time = recording.time_s
     if time is None:
@@ -92,17 +110,17 @@ def check_increasing(recording: Recording) -> None:
     if bad.size:
         k = int(bad[0])
         raise DataError(
-            f"{title(recording.key)}: time should increase, found {time[k]:g} s at sample {k} and {time[k + 1]:g} s at sample {k + 1} "
+            f"{title(recording.key)}{where}: time should increase, found {time[k]:g} s at sample {k} and {time[k + 1]:g} s at sample {k + 1} "
             f"({bad.size} such steps); remove repeated or disordered samples."
         )
 
 
-def check_even(recording: Recording, period_s: float, reference: EpisodeKey) -> None:
+def check_even(recording: Recording, period_s: float, reference: EpisodeKey, where: str = "") -> None:
     """Check that an episode is sampled evenly, at the population's period."""
     time = recording.time_s
     if time is None or len(time) < 2:
         return
-    check_increasing(recording)
+    check_increasing(recording, where)
     steps = np.diff(time)
     own = estimate_period(recording)
     deviation = np.abs(steps - own)
@@ -110,13 +128,13 @@ def check_even(recording: Recording, period_s: float, reference: EpisodeKey) -> 
     if deviation[worst] > TIME_TOLERANCE * own:
         count = int(np.count_nonzero(deviation > TIME_TOLERANCE * own))
         raise DataError(
-            f"{title(recording.key)}: uneven time, {count} of {len(steps)} steps differ from {own:g} s by more than "
+            f"{title(recording.key)}{where}: uneven time, {count} of {len(steps)} steps differ from {own:g} s by more than "
             f"{TIME_TOLERANCE:g} of it, the worst "
             f'{steps[worst]:g} s at sample {worst}; declare [[data.prepare]] step = "resample", period_s = {own:.3g}, or fix the source.'
         )
     mean = float((time[-1] - time[0]) / len(steps))
     if abs(mean - period_s) > max(PERIOD_TOLERANCE, TIME_TOLERANCE / len(steps)) * period_s:
         raise DataError(
-            f"Two sampling periods: {period_s:g} s in {reference} and {own:g} s in {recording.key}; a population has one, "
+            f"Two sampling periods: {period_s:g} s in {reference} and {own:g} s in {recording.key}{where}; a population has one, "
             f'declare [[data.prepare]] step = "resample", period_s = {max(own, period_s):g}, or leave one out.'
         )

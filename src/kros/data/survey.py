@@ -21,12 +21,13 @@ from ..core.errors import DataError
 from ..core.loading import loader
 from ..core.records import is_file
 from ..core.work import Work
-from .alerts import period_alerts
+from .alerts import period_alerts, scale_alerts, size_of
 from .checks import check_population, scan_digests
 from .copies import refuse_copies
 from .flat_tops import Ends, FlatTops, FoundLimit, ends_of, found_limit
 from .marks import recording_marks
 from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
+from .recording import some, title
 from .writers.folders import same_file
 from .writers.parquet import GroupRecord, write_group, write_index
 
@@ -117,6 +118,7 @@ class _Found:
     alerts: tuple[str, ...]
     ends: dict[str, list[Ends]]
     inputs: npt.NDArray[np.float64]
+    sizes: list[npt.NDArray[np.float64]]  # of the channels of every episode, with its number of samples behind them
 
 
 _KINDS = (_Found, GroupRecord, EpisodeKey, Ends, FlatTops)
@@ -132,8 +134,9 @@ def survey(
     reserve: Sequence[str] = (),
     earlier: Path | None = None,
     wrote: Callable[[Path, str], None] | None = None,
+    fewest: int = 0,
 ) -> tuple[Population, RecordingFacts]:
-    """Read all recordings once, without those that `work` knows from earlier."""
+    """Read all recordings once, without those that `work` knows from earlier; refuse episodes of less than `fewest` samples."""
     if folder is not None:
         folder.mkdir(parents=True)
     tasks = [_Group(population.select([u], [c]), u, c, folder, on_nan) for u, c, _ in population.groups()]
@@ -152,6 +155,14 @@ def survey(
     taking_part = [u for u in kept.unit_ids if u not in aside]
     own = [f for task, f in zip(tasks, found, strict=True) if task.unit not in aside]
     splits = split_episodes(kept.select(taking_part), test)
+    sizes = {key: size for f in own for (key, _), size in zip(f.scanned, f.sizes, strict=True)}
+    short = {key: int(size[-1]) for key, size in sizes.items() if size[-1] < fewest}
+    if short:
+        texts = [f"{title(key)} has {n}" for key, n in short.items()]
+        raise DataError(
+            f"Recordings: every episode needs at least {fewest} samples after preparation; {some(texts)}. Leave short episodes out, or record longer."
+        )
+    alerts = [alert for f in found for alert in f.alerts] + list(scale_alerts(sizes, population.columns))
     facts = RecordingFacts(
         identify_on=condition_of(population.select(taking_part), identify_on),
         groups={unit: kept.unit(unit).group for unit in taking_part},
@@ -159,7 +170,7 @@ def survey(
         test=tuple(k for s in splits.values() for k in s.test),
         resolution={m: min(f.resolution[m] for f in own) for m in kept.measured},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
-        alerts=tuple(dict.fromkeys(alert for f in found for alert in f.alerts)),
+        alerts=tuple(dict.fromkeys(alerts)),
         reserve=tuple(reserve),
         limits=_limits(
             [f for task, f in zip(tasks, found, strict=True) if task.unit not in aside and kept.unit(task.unit).group != OUTLIERS]
@@ -205,10 +216,12 @@ def _read_group(task: _Group) -> _Found:
     ends: dict[str, list[Ends]] = {name: [] for name in hidden}
     reach = np.array([[np.inf], [-np.inf]]) * np.ones(len(population.inputs))
     shown: list[npt.NDArray[np.float64]] = []
+    sizes: list[npt.NDArray[np.float64]] = []
 
     def look(key: EpisodeKey, values: npt.NDArray[np.float64]) -> None:
         if not shown:
             shown.append(values)
+        sizes.append(np.append(size_of(values), len(values)))
         columns = np.ascontiguousarray(values.T)
         for name in hidden:
             signal = columns[population.states.index(name)]
@@ -228,7 +241,7 @@ def _read_group(task: _Group) -> _Found:
     steps = {m: resolution(first[:, names.index(m)]) for m in population.measured}
     alerts = period_alerts(first, population.channels, population.sample_period_s)
     written = None if record is None or task.folder is None else _digest(task.folder / record.file)
-    return _Found(record, written, episodes, steps, digests, alerts, ends, reach)
+    return _Found(record, written, episodes, steps, digests, alerts, ends, reach, sizes)
 
 
 def _digest(path: Path) -> str:

@@ -22,6 +22,7 @@ from ..population import EpisodeKey, Population
 from ..readers.csv_folder import csv_files, read_csv_folder
 from ..readers.csvfile import Dialect, first_fields, read_columns
 from ..readers.parquet_table import parquet_columns, parquet_fields, parquet_head
+from ..recording import some
 from .dialect import TableHead, look_at
 from .examine import Examined, examine
 from .filenames import infer_names, quoted
@@ -55,6 +56,7 @@ class Discovery:
     notes: dict[str, str] = field(default_factory=dict)  # what a key of the mapping rests on
     findings: tuple[str, ...] = ()  # what looks wrong
     drop_nan: bool = False  # whether episodes with NaN or infinity have to be dropped
+    reading: str = ""  # what the first file was taken for
 
 
 def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None, work: Work | None = None) -> Discovery:
@@ -77,6 +79,11 @@ def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None,
     notes: dict[str, str] = {}
     if wanted.files is None and not names.sure:
         notes["files"] = "a guess from the order of the words in file names: look at the units and episodes below"
+    if wanted.files is None and names.other is not None:
+        raise ConfigError(
+            f"Names of files: {some(list(own), 3)} can be episodes of one unit or units with one recording each; choose, "
+            f"--files {names.other!r} or --files {names.pattern!r}."
+        )
     mapping |= _dialect_keys(head.dialect)
     columns, timing = _columns(source, head, own, wanted)
     mapping |= timing[0]
@@ -275,7 +282,7 @@ def _examined(
     work: Work | None,
 ) -> Discovery:
     """Look at every episode, and leave out what cannot be used."""
-    findings = [f"{len(strange)} files are not like the others and left alone: {_some(strange)}"] if strange else []
+    findings = [f"{len(strange)} files are not like the others and left alone: {some(strange)}"] if strange else []
     population = _opened(source, mapping, excluded)
     found = examine(population, work)
     if not found.counts:
@@ -305,8 +312,19 @@ def _examined(
     if found.resample_s is not None:
         bridged = {"max_gap_s": found.max_gap_s} if found.max_gap_s is not None else {}
         prepare = ({"step": "resample", "period_s": found.resample_s, **bridged},)
-        findings.append(f"time is uneven: everything is brought to a period of {found.resample_s:g} s (recorded at about {period:.4g} s)")
-    return Discovery(mapping, prepare, tuple(columns), kept, notes, tuple(findings), bool(found.nan))
+        key, sample = found.uneven or (kept.episodes[0], 0)
+        where = f", the worst step in {_relative(population, source, key)} at sample {sample}" if found.uneven else ""
+        findings.append(
+            f"time is uneven: everything is brought to a period of {found.resample_s:g} s (recorded at about {period:.4g} s){where}"
+        )
+    return Discovery(mapping, prepare, tuple(columns), kept, notes, tuple(findings), bool(found.nan), _reading(kept, source))
+
+
+def _reading(population: Population, source: Path) -> str:
+    """Return what the path of the first episode was taken for."""
+    key, groups = population.episodes[0], sorted({unit.group for unit in population.units if unit.group})
+    group = f", group {population.unit(key.unit).group!r} of {some(groups)}" if groups else ""
+    return f"{_relative(population, source, key)}: unit {key.unit!r}, condition {key.condition!r}, episode {key.episode!r}{group}"
 
 
 def _opened(source: Path, mapping: dict[str, Any], excluded: dict[str, str]) -> Population:
@@ -336,13 +354,9 @@ def _too_few(population: Population, found: Examined) -> list[str]:
         (unit, condition), n = min(counts.items(), key=lambda item: item[1])
         texts.append(f"few episodes: unit {unit} ({condition}) has {n}, one of them for testing")
     lacking = {u: [c for c in population.conditions if (u, c) not in counts] for u in units}
-    some = [f"{u} lacks {_some(missing)}" for u, missing in lacking.items() if missing]
+    some = [f"{u} lacks {some(missing)}" for u, missing in lacking.items() if missing]
     if some:
         texts.append(
             f"not every unit was recorded in every condition: {'; '.join(some[:4])}{f'; {len(some) - 4} more units' if len(some) > 4 else ''}"
         )
     return texts
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ...core.errors import DataError
 from ...core.work import Work
 from ..alerts import period_alerts
-from ..checks import MIN_SAMPLES, is_constant
+from ..checks import MIN_SAMPLES, check_range, is_constant
 from ..copies import copies_among, digest_of
 from ..population import Channel, EpisodeKey, Population, Role
 from ..prepare import PreparedSource
@@ -35,7 +35,7 @@ class EpisodeLook:
     doubts: tuple[str, ...] = ()  # what is odd about it
     n_samples: int = 0
     period_s: float = np.nan  # median step of time; NaN where there is no column of time
-    uneven: bool = False
+    uneven: tuple[float, int] | None = None  # largest relative deviation of a step of time, and the sample before it, where time is uneven
     nan: bool = False
     gap: tuple[float, int] | None = None  # or None; Longest step of time, s, where it is a gap, and the sample before it
     digest: str = ""
@@ -53,6 +53,7 @@ class Examined:
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)  # episodes that can be used, by unit and condition
     shortest: int = 0  # samples of the shortest of them
     max_gap_s: float | None = None  # longest gap to bridge, where many episodes have gaps
+    uneven: tuple[EpisodeKey, int] | None = None  # where time is most uneven
 
 
 def examine(population: Population, work: Work | None = None) -> Examined:
@@ -72,7 +73,7 @@ def examine(population: Population, work: Work | None = None) -> Examined:
         wrong.setdefault(key, f"a copy of {other}")
     good = [s for s in good if s.key not in wrong]
     different = any(abs(s.period_s - median) > 1e-4 * median for s in good)
-    resample = float(f"{median:.3g}") if any(s.uneven for s in good) or different else None
+    resample = float(f"{median:.3g}") if any(s.uneven is not None for s in good) or different else None
     n_bridged = sum(s.gap is not None for s in good)
     told = (
         [f"{n_bridged} episodes have gaps, of up to {bridged:.3g} s: they are bridged by straight lines (max_gap_s)"] if n_bridged else []
@@ -81,7 +82,9 @@ def examine(population: Population, work: Work | None = None) -> Examined:
     max_gap = float(f"{1.01 * bridged:.3g}") if n_bridged else None
     counts = Counter((s.key.unit, s.key.condition) for s in good if not s.nan)
     shortest = min((s.n_samples for s in good), default=0)
-    return Examined(wrong, tuple(doubts), resample, tuple(s.key for s in good if s.nan), counts, shortest, max_gap)
+    worst = max((s for s in good if s.uneven is not None), key=lambda s: s.uneven or (0.0, 0), default=None)
+    uneven = None if worst is None or worst.uneven is None else (worst.key, worst.uneven[1])
+    return Examined(wrong, tuple(doubts), resample, tuple(s.key for s in good if s.nan), counts, shortest, max_gap, uneven)
 
 
 def _look(population: Population) -> list[EpisodeLook]:
@@ -105,7 +108,8 @@ def _looked(key: EpisodeKey, values: Array, time: Array | None, channels: Sequen
     n = len(values)
     if n < MIN_SAMPLES:
         return EpisodeLook(key, f"has {n} samples", n_samples=n)
-    period, uneven, gap = period_s, False, None
+    period, gap = period_s, None
+    uneven: tuple[float, int] | None = None
     if time is not None:
         steps = np.diff(time)
         backwards = np.flatnonzero(~(steps > 0))
@@ -119,11 +123,13 @@ def _looked(key: EpisodeKey, values: Array, time: Array | None, channels: Sequen
         period = float(np.median(steps))
         worst = int(steps.argmax())
         gap = (float(steps[worst]), worst) if steps[worst] > GAP * period else None
-        uneven = bool(np.abs(steps - period).max() > TIME_TOLERANCE * period)
+        deviation = np.abs(steps - period) / period
+        uneven = (float(deviation.max()), int(deviation.argmax())) if deviation.max() > TIME_TOLERANCE else None
     if not np.isfinite(values).all():
         bad = np.count_nonzero(~np.isfinite(values), axis=0)
         names = ", ".join(f"{c.name!r} ({count})" for c, count in zip(channels, bad, strict=True) if count)
         return EpisodeLook(key, "", (f"{title(key)}: no number in some samples of {names}",), n, period, uneven, True, gap)
+    check_range(values, key, channels)
     still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
     if still and len(still) < sum(not is_constant(values[:, i]) or i in still for i in range(len(channels))):
         stuck = channels[still[0]].name

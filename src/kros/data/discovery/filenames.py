@@ -14,7 +14,8 @@ from ..population import OUTLIERS
 
 UNIT, CONDITION, EPISODE, GROUP = "unit", "condition", "episode", "group"
 _WORDS = {
-    UNIT: "unit drive motor machine device dev serial sn rig robot axis cylinder pump valve design joint sample specimen antrieb maschine "
+    UNIT: "act actuator gear unit drive motor cell battery pack machine device dev serial sn rig robot axis cylinder pump valve design "
+    "joint sample specimen antrieb maschine "
     "geraet gerät pruefling prüfling einheit anlage moteur machine moteur variateur part id",
     EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung versuch lauf "
     "aufnahme essai mesure meas nr no",
@@ -35,6 +36,7 @@ class FileNames:
 
     pattern: str  # regular expression with the groups `unit`, `condition`, `episode` and `group`, those that are there
     sure: bool  # whether words in the names said so; false where places alone decided
+    other: str | None = None  # a second expression that fits the names as well: episodes of one unit in place of units
 
 
 def infer_names(paths: Sequence[str]) -> FileNames:
@@ -47,8 +49,32 @@ def infer_names(paths: Sequence[str]) -> FileNames:
         roles, sure = _roles(rows, marks)
         pattern = _pattern(rows, marks, roles, ending)
         if _tells_apart(pattern, paths):
-            return FileNames(pattern, sure)
+            numbered = (
+                not sure and roles.count(UNIT) == 1 and not {EPISODE, GROUP} & set(roles) and _counts([r[roles.index(UNIT)] for r in rows])
+            )
+            other = [EPISODE if r == UNIT else r for r in roles]
+            return FileNames(pattern, sure, _pattern(rows, marks, other, ending) if numbered else None)
     return FileNames(rf"^(?P<unit>.+){ending}$", False)
+
+
+def _counts(words: Sequence[str]) -> bool:
+    """Tell whether words are one text with the numbers from 0 or 1 on, which may number units or episodes."""
+    found = [re.fullmatch(r"(\D*)(\d+)", w) for w in words]
+    if len(words) < 2 or not all(found) or len({m[1] for m in found if m}) > 1:
+        return False
+    numbers = sorted({int(m[2]) for m in found if m})
+    return numbers[0] in (0, 1) and len(numbers) > 1 and numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+def _nested(columns: list[tuple[str, ...]], outer: int, inner: int) -> bool:
+    """Tell whether the words at a place without numbers are labels of units: each unit at `inner`, a numbered word, has one, and a label has several."""
+    values, labels = set(columns[inner]), set(columns[outer])
+    pairs = set(zip(columns[outer], columns[inner], strict=True))
+    return (
+        len(labels) < len(values) == len(pairs)
+        and all(re.search(r"\d", v) for v in values)
+        and not any(re.search(r"\d", v) for v in labels)
+    )
 
 
 def _without_ending(paths: Sequence[str]) -> tuple[list[str], str]:
@@ -98,7 +124,23 @@ def _roles(rows: list[list[str]], marks: list[list[str]]) -> tuple[list[str | No
     sure = True
     for i in varying:
         roles[i] = _told(columns, i)
+    for i in range(len(columns) - 2):  # 2024-05-31
+        if all(all(re.fullmatch(p, v) for v in columns[i + k]) for k, p in enumerate((r"(?:19|20)\d\d", r"[01]\d", r"[0-3]\d\D*.*"))):
+            for k in set(varying) & {i, i + 1, i + 2}:
+                roles[k] = EPISODE
+    for i in varying:  # box1/box1_03
+        if roles[i] is None and any(j < i and columns[i] == columns[j] for j in varying):
+            roles[i] = "other"
+    if UNIT not in roles:  # motor00_01 and motor00_02 are two episodes
+        named = [i for i, c in enumerate(columns) if len(set(c)) == 1 and re.search(r"\d", c[0]) and _told(columns, i) == UNIT]
+        for i in named[:1] if varying else ():
+            roles[i] = UNIT
     left = [i for i in varying if roles[i] is None]
+    units = [i for i in varying if roles[i] is UNIT] or [i for i in left if len(set(columns[i])) < len(rows)]
+    for i in left:
+        if any(j > i and _nested(columns, i, j) for j in units):  # good/act1, faulty/act3: two labels, and not two units
+            roles[i] = GROUP
+    left = [i for i in left if roles[i] is None]
     if left:
         sure = False
         if UNIT not in roles:  # what differs in every file is no machine, unless nothing else differs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import sys
@@ -18,11 +19,12 @@ from ...core.files import did_you_mean, require_regular
 from ..checks import check_names
 from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Role, Unit
 from ..prepare import assemble
-from ..recording import Recording, Recordings
+from ..recording import Recording, Recordings, some
 from .csv_mapping import Column, CsvMapping, UnitMapping, load_mapping
 from .csvfile import Dialect, first_fields, read_columns
 from .parquet_table import parquet_columns, parquet_fields
 
+log = logging.getLogger(__name__)
 ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz", ".parquet")
 DEFAULT_UNIT = "unit"
 DEFAULT_EPISODE = "0"
@@ -138,10 +140,17 @@ def csv_files(source: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match[str]]]:
+    other = []
     for path, relative in csv_files(source):
+        if mapping.exclude and re.search(mapping.exclude, relative):
+            continue
         match = re.search(mapping.files, relative)
-        if match and not (mapping.exclude and re.search(mapping.exclude, relative)):
+        if match:
             yield path, match
+        else:
+            other.append(relative)
+    if other:
+        log.warning("%d files in %s do not match files = %r and are left alone: %s.", len(other), source, mapping.files, some(other))
 
 
 def _sample(source: Path) -> str:

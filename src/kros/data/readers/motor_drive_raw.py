@@ -79,6 +79,13 @@ def find_root(source: Path) -> Path | None:
     return None
 
 
+def is_raw_layout(source: Path) -> bool:
+    """Tell whether some folder in ``population`` or ``outliers`` is named as a recording of the raw layout: other layouts use these words too."""
+    root = find_root(source)
+    folders = (path for group in GROUPS if root is not None and (root / group).is_dir() for path in (root / group).iterdir())
+    return any(path.is_dir() and FOLDER.fullmatch(path.name) is not None for path in folders)
+
+
 def read_motor_drive_raw(source: Path | str) -> Population:
     """Read the paper's raw layout."""
     root = find_root(Path(source))

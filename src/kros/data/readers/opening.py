@@ -12,7 +12,7 @@ from ..prepare import prepare as prepared
 from ..steps import Step, parse_steps
 from .csv_folder import csv_files, read_csv_folder
 from .csv_mapping import CsvMapping
-from .motor_drive_raw import find_root, read_motor_drive_raw
+from .motor_drive_raw import is_raw_layout, read_motor_drive_raw
 from .parquet import INDEX, read_parquet
 
 READERS = ("motor-drive-raw", "parquet", "csv")
@@ -28,7 +28,7 @@ def detect_reader(source: Path | str) -> str | None:
     source = Path(source)
     if (source / f"{INDEX}.json").is_file():
         return "parquet"
-    if find_root(source) is not None:
+    if is_raw_layout(source):
         return "motor-drive-raw"
     return "csv" if any(True for _ in csv_files(source)) else None
 

@@ -23,7 +23,7 @@ from ...lifting import Lifting
 
 Array = npt.NDArray[np.float64]
 SEGMENT = 4096
-_FEWEST = 64  # samples of a segment
+FEWEST_SAMPLES = 64  # samples of a segment
 
 
 def one_step_residual(
@@ -71,9 +71,9 @@ def residual_spectra(residual: Array, lengths: npt.ArrayLike, units: Sequence[st
             f"Residual spectra: {residual.shape} should be (n_samples, batch, n) with as many lengths ({lengths.shape}) and units ({len(units)})."
         )
     size = int(min(segment, lengths.min(), len(residual)))
-    if size < _FEWEST:
+    if size < FEWEST_SAMPLES:
         raise DataError(
-            f"Residual spectra: an episode of unit {units[int(lengths.argmin())]} has {size} samples, at least {_FEWEST} are needed; "
+            f"Residual spectra: an episode of unit {units[int(lengths.argmin())]} has {size} samples, at least {FEWEST_SAMPLES} are needed; "
             "leave short episodes out."
         )
     size -= size % 2

@@ -34,7 +34,10 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
 def undecided_text(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return about which units the scores say nothing, and why; nothing where there are none."""
     texts = []
-    for status, why in (("not enough data", "too little was recorded of it"), ("cannot tell", "the others are fewer than eight, or too unlike")):
+    for status, why in (
+        ("not enough data", "too little was recorded of it"),
+        ("cannot tell", "the others are fewer than eight, or too unlike"),
+    ):
         silent = [r for r in rows if r.get("status") == status]
         if silent:
             texts.append(f"{len(silent)} of {len(rows)} scores say nothing about their unit, as {why}: {flagged_text(silent)}.")

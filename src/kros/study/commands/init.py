@@ -18,6 +18,7 @@ from ...data.checks import check_population
 from ...data.discovery.discover import Ask, Discovery, Wanted, discover
 from ...data.discovery.roles import ColumnPart, TableColumn, is_commanded, kind_of
 from ...data.readers.opening import LOOKS, detect_reader
+from ...data.recording import some
 from ...data.survey import UNLOADED, RecordingFacts, survey
 from ...identify import PhaseSpec
 from ...identify.calibrate import calibrate
@@ -167,11 +168,11 @@ def _lines(population: Population, found: Discovery | None, proposal: LiftingPro
     fewest, most = min(counts.values()), max(counts.values())
     each = f"{fewest}" if fewest == most else f"{fewest} to {most}"
     lines = [
-        f"{len(units)} unit{'s' * (len(units) != 1)} ({_some(units)}), conditions {', '.join(population.conditions)}, {len(population.episodes)} episodes "
+        f"{len(units)} unit{'s' * (len(units) != 1)} ({some(units, 6)}), conditions {', '.join(population.conditions)}, {len(population.episodes)} episodes "
         f"({each} for each unit and condition), every {population.sample_period_s:g} s"
     ]
     if found is not None:
-        lines += column_lines(found.columns)
+        lines += [f"  {found.reading}", *column_lines(found.columns)]
     lines += [f"lifting: {'; '.join(proposal.lifting['functions'])}: {proposal.why}" if proposal.lifting else f"lifting: {proposal.why}"]
     lines += [f"looks wrong: {text}" for text in findings[:MOST_FINDINGS]]
     if len(findings) > MOST_FINDINGS:
@@ -191,7 +192,3 @@ def column_lines(columns: Sequence[TableColumn]) -> list[str]:
             why = f"({column.why})" if part is ColumnPart.LEFT_OUT else ""
             lines.append(f"  {part.value:<9} {names[column]:<{width}}  {came}  {why}".rstrip())
     return lines
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")

@@ -67,6 +67,8 @@ def _mapping(found: Discovery) -> Iterator[str]:
     for key, value in found.mapping.items():
         if key != "channel":
             note = found.notes.get(key, COMMENTS.get(key, ""))
+            if key == "files":
+                yield from _comment(found.reading)
             yield f"{key} = {_value(value)}{f'  # {_one_line(note)}' if note else ''}"
     by_name = {c.name: c for c in found.columns}
     for channel in found.mapping["channel"]:

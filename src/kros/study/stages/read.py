@@ -12,6 +12,7 @@ from ...data.survey import check_usable, survey
 from ...evaluate.next_unit import draw_reserve
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...observer.limits import limits_of
+from ...observer.residual.one_step import FEWEST_SAMPLES
 from ...observer.sensor import require_measured
 from ..config import StudyConfig
 from ..engine.context import Context
@@ -74,7 +75,16 @@ def run(context: Context) -> None:
     population, data = open_source(config, context.given), config.data
     reserve, earlier = draw(config, population), context.store.path("recordings")
     _, facts = survey(
-        population, config.split.test, data.identify_on, data.on_nan, folder, context.work, reserve, earlier, context.store.told
+        population,
+        config.split.test,
+        data.identify_on,
+        data.on_nan,
+        folder,
+        context.work,
+        reserve,
+        earlier,
+        context.store.told,
+        FEWEST_SAMPLES + 1 + resolve_lifting(config.lifting, config.calibrate, population, config.split.test).history,
     )
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them again without these episodes.")

@@ -1,0 +1,122 @@
+"""Recordings that are odd rather than unreadable: units of measure mixed up, wild samples, repeated stamps, short episodes, names of other layouts."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kros.core.errors import DataError
+from kros.data import Channel, Population, Role, from_arrays
+from kros.data.readers.csv_folder import read_csv_folder
+from kros.data.readers.opening import detect_reader
+from kros.data.survey import survey
+
+CHANNELS = (Channel("angle", Role.STATE, "", True), Channel("speed", Role.STATE), Channel("torque", Role.INPUT))
+UNITS, EPISODES, SAMPLES = 6, 4, 400
+MAPPING = {
+    "files": r"^(?P<unit>[^/_]+)_(?P<episode>\d+)\.csv$",
+    "time": "t",
+    "channel": [
+        {"name": "angle", "role": "state", "measured": True},
+        {"name": "speed", "role": "state"},
+        {"name": "torque", "role": "input"},
+    ],
+}
+
+
+def episodes(amplitudes: float = 0.0) -> dict[str, list[np.ndarray]]:
+    """Signals of units that differ by some percent, with episodes of different amplitudes."""
+    rng = np.random.default_rng(4)
+    shape = np.exp(amplitudes * rng.normal(size=EPISODES))
+    k = np.arange(SAMPLES)[:, None]
+
+    def episode(size: float) -> np.ndarray:
+        return (1 + 0.05 * rng.normal(size=3)) * size * np.sin(0.1 * k + rng.uniform(0, 6, 3)) + 1e-3 * size * rng.normal(size=(SAMPLES, 3))
+
+    return {f"u{u}": [episode(size) for size in shape] for u in range(UNITS)}
+
+
+def population(data: dict[str, list[np.ndarray]]) -> Population:
+    return from_arrays(data, CHANNELS, 0.01)
+
+
+@pytest.mark.parametrize("factor", [57.29578, 9.549297, 6.283185, 60.0, 1000.0, 1 / 57.29578, 1e-3])
+@pytest.mark.parametrize("changed", [("u3",), ("u0", "u1", "u2"), "one file"])
+def test_units_of_measure_that_are_mixed_up_are_named(factor: float, changed: tuple[str, ...] | str) -> None:
+    data = episodes()
+    rows = [data["u3"][2]] if changed == "one file" else [e for u in changed for e in data[u]]
+    for values in rows:
+        values[:, 1] *= factor
+    (alert,) = survey(population(data))[1].alerts
+    assert "'speed'" in alert
+    stated = float(re.search(r"is ([\d.e+]+) times", alert)[1])
+    assert stated == pytest.approx(max(factor, 1 / factor), rel=0.2)  # units and episodes differ by 5 %
+    if changed == ("u3",):
+        assert f"{'smaller' if factor < 1 else 'larger'} in u3 than" in alert
+    elif changed == "one file":
+        assert "Episode 2 of unit u3" in alert
+
+
+@pytest.mark.parametrize("amplitudes", [0.0, 1.0])
+def test_good_recordings_give_no_alert_of_scales(amplitudes: float) -> None:
+    assert survey(population(episodes(amplitudes)))[1].alerts == ()
+    data = episodes()
+    data["u3"] = [3.0 * e for e in data["u3"]]
+    assert survey(population(data))[1].alerts == ()
+
+
+@pytest.mark.parametrize("value", [1e308, -1e308, 1e5, -1e5])
+@pytest.mark.parametrize("sample", [0, 17, SAMPLES - 1])
+def test_wild_samples_are_refused_with_their_place(value: float, sample: int) -> None:
+    data = episodes()
+    data["u4"][1][sample, 1] = value
+    with pytest.raises(DataError, match=rf"Episode 1 of unit u4 \(default\): channel 'speed' is .* at sample {sample},"):
+        survey(population(data))
+
+
+def test_pulses_and_channels_at_rest_are_no_wild_samples() -> None:
+    data = episodes()
+    for rows in data.values():
+        for values in rows:
+            values[:, 2] = 0.0
+            values[100:104, 2] = 1e4  # a pulse in a channel that rests otherwise
+            values[50, 0] = 300.0
+    assert len(survey(population(data))[0].episodes) == UNITS * EPISODES
+
+
+def test_short_episodes_are_named() -> None:
+    data = episodes()
+    data["u1"][3] = data["u1"][3][:50]
+    with pytest.raises(DataError, match=r"at least 64 samples after preparation; Episode 3 of unit u1 \(default\) has 50"):
+        survey(population(data), fewest=64)
+
+
+def written(folder: Path, name: str, time: np.ndarray, values: np.ndarray) -> None:
+    folder.mkdir(exist_ok=True)
+    np.savetxt(folder / name, np.column_stack([time, values]), delimiter=",", header="t,angle,speed,torque", comments="")
+
+
+def test_a_repeated_last_stamp_drops_the_sample_and_uneven_time_names_the_file(tmp_path: Path, caplog) -> None:
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(100)
+    written(tmp_path, "a_1.csv", time, values := rng.normal(size=(100, 3)))
+    written(tmp_path, "a_2.csv", np.append(time, time[-1]), np.vstack([values, values[-1:]]))
+    written(tmp_path, "b_1.csv", np.where(np.arange(100) > 60, time + 0.004, time), values)
+    written(tmp_path, "notes.csv", time, values)
+    found = read_csv_folder(tmp_path, MAPPING)
+    assert "1 files in" in caplog.text
+    assert "notes.csv" in caplog.text
+    np.testing.assert_allclose(found.read(found.episodes[1]), values, rtol=1e-12)
+    with pytest.raises(DataError, match=r"b_1\.csv: uneven time, .* at sample 60;"):
+        found.read(found.episodes[2])
+
+
+@pytest.mark.parametrize("name", ["population", "outliers"])
+def test_folders_of_these_names_are_no_proof_of_the_raw_layout(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).mkdir()
+    written(tmp_path / name, "m1_1.csv", np.arange(5.0), np.ones((5, 3)))
+    assert detect_reader(tmp_path) == "csv"
+    (tmp_path / name / "20240101T120000_001011_load").mkdir()
+    assert detect_reader(tmp_path) == "motor-drive-raw"

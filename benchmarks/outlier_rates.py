@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs=2, default=[200, 260], metavar=("FIRST", "END"))
     parser.add_argument("--episodes", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--rate", type=float, nargs="+", default=[3e-3, 1e-2])
+    parser.add_argument("--rate", type=float, nargs="+", default=[1e-2])
     parser.add_argument("--forms", nargs="+", default=["additive"], choices=[f.value for f in Form])
     parser.add_argument("--kinds", nargs="+", default=["koopman"], choices=["koopman", "linear"])
     parser.add_argument("--cache", type=Path, default=Path("outlier_rates"))

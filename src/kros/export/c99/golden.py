@@ -25,9 +25,10 @@ class Golden:
     size: Array  # (n_recorded,)
     passes: int
     last_status: npt.NDArray[Any]  # (n_samples,)
+    sure: npt.NDArray[Any]  # (2, n_samples): bits of `status` and `last_status` that no change of the samples by the tolerance turns over
 
     @classmethod
-    def of(cls, observer: Observer, track: str | None = None, count: int = SAMPLES) -> Golden:
+    def of(cls, observer: Observer, track: str | None = None, count: int = SAMPLES, tolerance: float = 0.0) -> Golden:
         """Run an observer on smooth signals of the size seen in training, with a missing measurement, a lost input and a spike."""
         q, m = len(observer.measured), len(observer.inputs)
         seen = observer.seen
@@ -39,10 +40,20 @@ class Golden:
         u[count // 2] = np.inf
         if seen is not None:
             y[2 * count // 3] = 40 * y_size
-        running = observer.start(y[0])
-        if track is not None:
-            running.track(track)
         passes = 1 if observer.monitor is None else 2 + observer.monitor.settle // (count // 2)
-        found = [(np.asarray(running.step(*sample)), int(running.status)) for _ in range(passes) for sample in zip(y, u, strict=True)]
-        x_hat, status = np.array([x for x, _ in found[:count]])[:, : len(observer.recorded)], np.array([s for _, s in found])
-        return cls(y, u, x_hat, status[:count], np.maximum(np.abs(x_hat).max(axis=0), 1e-300), passes, status[-count:])
+
+        def run(factor: float) -> tuple[Array, npt.NDArray[np.uint32]]:
+            running = observer.start(factor * y[0])
+            if track is not None:
+                running.track(track)
+            found = [
+                (np.asarray(running.step(*sample)), int(running.status))
+                for _ in range(passes)
+                for sample in zip(factor * y, factor * u, strict=True)
+            ]
+            return np.array([x for x, _ in found[:count]])[:, : len(observer.recorded)], np.array([s for _, s in found], np.uint32)
+
+        x_hat, status = run(1.0)
+        turned = (run(1 - tolerance)[1] ^ status) | (run(1 + tolerance)[1] ^ status)  # at a threshold but for rounding
+        sure = ~np.stack([turned[:count], turned[-count:]])
+        return cls(y, u, x_hat, status[:count], np.maximum(np.abs(x_hat).max(axis=0), 1e-300), passes, status[-count:], sure)

@@ -114,7 +114,7 @@ def c_files(
 
     for parameter in observer.lifting.parameters:
         require_identifier(parameter, "parameter")
-    source, golden = Source.of(observer, name, precision, track, load), Golden.of(observer, track)
+    source, golden = Source.of(observer, name, precision, track, load), Golden.of(observer, track, tolerance=_TOLERANCE[precision])
     context = source.context() | {"version": version("kros")}
     context["sigma_uses_parameters"] = any(set(f.used) & set(observer.lifting.parameters) for f in observer.lifting.formulas)
     tolerance = _TOLERANCE[precision]
@@ -124,6 +124,7 @@ def c_files(
         "x": [[f"{v:.17g}" for v in row] for row in golden.x_hat],
         "status": [f"{int(s)}u" for s in golden.status],
         "last": [f"{int(s)}u" for s in golden.last_status],
+        "sure": [[f"{int(bits)}u" for bits in row] for row in golden.sure],
         "passes": golden.passes,
         "tolerance": [f"{tolerance * v:.9g}" for v in golden.size],
     }

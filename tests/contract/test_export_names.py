@@ -11,7 +11,6 @@ from machines import drive, watched
 from kros.core.errors import ConfigError
 from kros.export import LoadOutput, export_c
 from kros.export.c99.numbers import Source
-from kros.export.c99.write import units_of_measure
 from kros.export.fmu.write import rendered
 from kros.export.text import plain, plain_names
 from kros.lifting import Lifting
@@ -29,7 +28,7 @@ HOSTILE = {
     "cmake": 'x ]=] ) execute_process(COMMAND touch EVIL) # ${EVIL} "',
     "markup": "x\"'><!-- EVIL ]]> & &#10; | `EVIL` <script>",
 }
-SLOTS = ("observer", "measured state", "hidden state", "input", "condition", "unit of measure", "load")
+SLOTS = ("observer", "measured state", "hidden state", "input", "condition", "unit of measure", "note", "load")
 
 
 def named(slot, text):
@@ -42,6 +41,8 @@ def named(slot, text):
         observer = replace(observer, monitor=replace(observer.monitor, bounds={text: 1.0}))
     elif slot == "unit of measure":
         observer = replace(observer, about={"units_of_measure": {"position": text}})
+    elif slot == "note":
+        observer = replace(observer, about={"columns": {"position": {"offset": text}}})
     elif slot == "input":
         observer = replace(observer, inputs=(text, inputs[1]))
     else:
@@ -76,7 +77,7 @@ def test_a_hostile_name_is_text_in_every_file(kind, slot, tmp_path):
     if (compiler := find_compiler()) is not None:
         command = [compiler, "-std=c99", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", *map(str, folder.glob("*.c"))]
         assert subprocess.run(command, capture_output=True, text=True, check=False).stderr == ""
-    files = rendered(Source.of(observer, "drive", "double"), 3, "guid", units_of_measure(observer))
+    files = rendered(Source.of(observer, "drive", "double"), 3, "guid")
     root = ET.fromstring(files["modelDescription.xml"])
     assert {child.tag for child in root} <= {
         "CoSimulation",

@@ -1,6 +1,10 @@
 """The file of a deployed observer says all that is needed to put it into a machine, and what it says is what the recordings hold."""
 
+import csv
 import json
+import xml.etree.ElementTree as ET
+import zipfile
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -9,8 +13,16 @@ import pytest
 
 import kros
 from kros.core.artifacts import check_checksum
+from kros.core.errors import DataError
+from kros.data.steps import Scale
+from kros.export import CompiledObserver, HeldOut, export_c
+from kros.lifting import Lifting
+from kros.loops import find_compiler
 from kros.observer import Observer
+from kros.observer.recorded import recorded_channel
 from kros.plants import PLANTS
+from kros.study.commands.estimate import estimate_recordings
+from kros.study.commands.export import export_run
 
 MAPPING: dict[str, Any] = {
     "files": r"(?P<unit>\w+)_(?P<episode>\d+)[.]csv",
@@ -69,8 +81,9 @@ def test_columns_and_ranges_are_those_of_the_recordings(found) -> None:
     about, folder = content["about"], study.folder.parent / "rec"
     assert about["columns"]["angle"] == {
         "column": 2, "factor": pytest.approx(np.pi / 180), "lag_samples": 0, "offset": "mean of current - angle over samples 0 to 0 of every episode",
+        "converted": 1.0,
     }  # fmt: skip
-    assert about["columns"]["voltage"] == {"column": "U", "factor": 1.0, "lag_samples": 2, "offset": ""}
+    assert about["columns"]["voltage"] == {"column": "U", "factor": 1.0, "lag_samples": 2, "offset": "", "converted": 1.0}
     training = [f for f in sorted(folder.iterdir()) if not f.stem.endswith("_2")]  # the last episode is held out
     voltage = max(np.abs(np.loadtxt(f, delimiter=",", skiprows=1)[2:, 3]).max() for f in training)
     assert about["largest_in_training"]["voltage"] == pytest.approx(voltage, rel=0.02)
@@ -83,3 +96,82 @@ def test_what_was_written_is_read(found, tmp_path) -> None:
     assert observer.about["as_it_runs"]["operating_box"] in ({}, None)
     observer.save(tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == (study.folder / "observers" / "deployed.json").read_bytes()
+
+
+FIELD = """
+[data]
+source = "rec"
+reader = "csv"
+
+[data.csv]
+files = '(?P<unit>\\w+)_(?P<episode>\\d+)[.]csv'
+time = "t"
+channel = [
+    {name = "current", column = "I (mA)", role = "state", unit = "A", scale = 1e-3},
+    {name = "angle", column = 2, role = "state", unit = "rad", measured = true, scale = 0.017453292519943295},
+    {name = "voltage", column = "U", role = "input", unit = "V"},
+]
+prepare = [
+    {step = "shift", channels = ["voltage"], lag = 2},
+    {step = "offset", channel = "angle", reference = "current", start = 0, stop = 1},
+]
+"""
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler is on the PATH")
+def test_generated_code_and_estimates_are_in_the_units_of_the_recordings(found, tmp_path) -> None:
+    """Degrees and mA go in and come out, of generated C in both precisions and of `kros estimate`; header, README, manifest and FMU agree."""
+    study, folder = found[0], found[0].folder.parent / "rec"
+    (folder.parent / "field.toml").write_text(FIELD)
+    estimate_recordings(study.folder, folder.parent / "field.toml", tmp_path / "estimates.csv")
+    with (tmp_path / "estimates.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    unit, episode = rows[0]["unit"], rows[0]["episode"]
+    rows = [row for row in rows if (row["unit"], row["episode"]) == (unit, episode)]
+    wanted = np.array([[float(row[f"{s}_hat"]) for s in ("current", "angle")] for row in rows])
+    facts = json.loads((tmp_path / "estimates.csv-metadata.json").read_text())
+    assert facts["columns"] == {"current_hat": "0.001 A", "angle_hat": "deg"}
+    columns = np.loadtxt(folder / f"{unit}_{episode}.csv", delimiter=",", skiprows=1)
+    angle = columns[:-2, 1] + np.degrees(1e-3 * columns[0, 2]) - columns[0, 1]  # what the README says of the offset
+    voltage = columns[2:, 3]  # and of the lag
+    for precision, close in (("double", 1e-9), ("float", 1e-4)):
+        source = export_run(study.folder, tmp_path / precision, "motor", precision=precision)
+        compiled = CompiledObserver.build(source)
+        assert compiled.selftest() == 0
+        estimates = compiled.run(angle[:, None], voltage[:, None])[0]
+        size = np.abs(wanted).max(axis=0)
+        np.testing.assert_allclose(estimates[:-1] / size, wanted[1:] / size, atol=close)
+        assert np.abs(wanted[:, 1] - angle).max() < 0.1 * size[1]
+        assert "current [0.001 A], angle [deg], voltage [V]" in (source / "motor.h").read_text()
+        assert "| angle | deg | added: mean of current - angle" in (source / "README.md").read_text()
+        manifest = json.loads((source / "manifest.json").read_text())
+        assert manifest["units_of_measure"] == {"current": "0.001 A", "angle": "deg", "voltage": "V"}
+        held_out = HeldOut(np.radians(angle)[:, None, None], voltage[:, None, None], np.zeros((len(angle), 1, 2)))
+        observer = Observer.load(study.folder / "observers" / "deployed.json")
+        measured = export_c(observer, tmp_path / f"{precision}_measured", "motor", precision, held_out=held_out)
+        assert json.loads((measured / "manifest.json").read_text())["numerical_error"]["difference"] < close
+    with zipfile.ZipFile(export_run(study.folder, tmp_path / "motor.fmu", "motor", fmi=3)) as archive:
+        model = ET.fromstring(archive.read("modelDescription.xml"))
+    units = {v.get("name"): v.get("unit") for v in model.find("ModelVariables") or ()}
+    assert {name: unit for name, unit in units.items() if name != "time"} == {"angle": "deg", "voltage": "V", "current_hat": "0.001 A", "angle_hat": "deg", "status": None}
+
+
+def test_converted_recordings_are_recordings(tmp_path) -> None:
+    """A study of Parquet files that were converted from degrees is in radians, and so is what it exports."""
+    arrays = {"a": [np.degrees(np.linspace(0, 1, 20)[:, None])]}
+    population = kros.from_arrays(arrays, states=["angle"], measured=["angle"], sample_period_s=0.01)
+    turned = kros.data.prepare(population, [Scale(("angle",), np.pi / 180, unit="rad")])
+    kros.data.write_parquet(turned, tmp_path / "rec")
+    doubled = kros.data.prepare(kros.read(tmp_path / "rec"), [Scale(("angle",), 2.0)])
+    for population, factor, unit in ((turned, np.pi / 180, "deg"), (kros.read(tmp_path / "rec"), 1.0, "rad"), (doubled, 2.0, "2 rad")):
+        about = {"columns": {"angle": asdict(population.scaling["angle"])}, "units_of_measure": {"angle": "rad"}}
+        observer = replace(Observer.open_loop("lag", Lifting(("angle",)), np.eye(1) / 2, np.ones((1, 0)), (0,), (), 0.01), about=about)
+        channel = recorded_channel(observer, "angle")
+        assert (channel.factor, channel.unit) == (pytest.approx(factor), unit)
+
+
+@pytest.mark.parametrize("factor", [0, "x", None, True, float("nan"), 10**400])
+def test_a_factor_that_is_none_is_refused(factor) -> None:
+    observer = Observer.open_loop("lag", Lifting(("x",)), np.eye(1) / 2, np.ones((1, 0)), (0,), (), 0.01)
+    with pytest.raises(DataError, match="factor of 'x'"):
+        recorded_channel(replace(observer, about={"columns": {"x": {"factor": factor}}}), "x")

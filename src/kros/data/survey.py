@@ -273,7 +273,7 @@ def _kept(population: Population, found: Sequence[_Found], folder: Path | None) 
         from .readers.parquet import read_parquet
 
         records = [replace(f.record, digests=tuple(digest for _, digest in f.scanned)) for f in found if f.record is not None]
-        write_index(population, records, folder)
+        write_index(population, records, folder, converted=False)
         return read_parquet(folder)
     refuse_copies(pair for f in found for pair in f.scanned)
     present = {key for f in found for key in f.episodes}

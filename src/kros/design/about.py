@@ -32,7 +32,7 @@ def about(
         "kros": version("kros"),
         "units_of_measure": {c.name: c.unit for c in population.channels if c.name in identified.sizes},
         "largest_in_training": identified.sizes,
-        "columns": {name: asdict(scaling_of(population.scaling, name)) for name in (*population.measured, *population.inputs)},
+        "columns": {name: asdict(scaling_of(population.scaling, name)) for name in (*population.states, *population.inputs)},
         "sensor": {name: _sensor(observer, name, known.resolution[name]) for name in population.measured},
         "trained_on": {
             "units": len(set(known.pooled) & set(task.models.unit_ids)),

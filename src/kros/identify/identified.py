@@ -175,7 +175,7 @@ class IdentifiedModels:
         from ..data import write_parquet
 
         folder = Path(folder)
-        write_parquet(self.population, folder / "recordings")
+        write_parquet(self.population, folder / "recordings", converted=False)
         save_artifact(folder / "population", "facts", {"recordings": "recordings", **self.facts.content()})
         if self.calibration is not None:
             self.calibration.save(folder / "calibration")

@@ -114,6 +114,11 @@ def to_radians(unit: str) -> tuple[float, str] | None:
     return _TO_RADIANS.get(_plain(unit))
 
 
+def unit_of_factor(factor: float, unit: str) -> str:
+    """Return the unit of measure that is so many radians, or radians per second; nothing where none is known."""
+    return next((name for name, (size, base) in _TO_RADIANS.items() if base == unit and math.isclose(size, factor, rel_tol=1e-6)), "")
+
+
 def identifier(text: str, taken: Sequence[str] = ()) -> str:
     """Return a name for a channel that may stand in formulas and in C source, as close to the header as can be."""
     if text.isidentifier() and text.isascii() and text not in taken:

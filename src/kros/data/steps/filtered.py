@@ -13,6 +13,7 @@ from ...core import limits
 from ...core.errors import ConfigError, DataError
 from ..population import Channel, Role
 from ..recording import Recording, check_increasing, estimate_period, title
+from ..scaling import Scalings, scaling_of
 from .step import Step
 
 Float = npt.NDArray[np.float64]
@@ -135,6 +136,10 @@ class Differentiate(Step):
             raise ConfigError(f"Step 'differentiate' would add {self.name!r}, which is there already; choose another name.")
         at = self._position(channels)
         return (*channels[:at], Channel(self.name, Role.STATE, self.unit), *channels[at:])
+
+    def scaling_after(self, scaling: Scalings) -> Scalings:
+        """Return where channels come from: the derivative has the factor of its channel, and no column."""
+        return {**scaling, self.name: replace(scaling_of(scaling, self.channel), column=None, offset="")}
 
     def period_after(self, period_s: float) -> float:
         """Return the sampling period, unchanged; the cut-off has to lie below half its inverse."""

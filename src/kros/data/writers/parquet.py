@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -85,25 +85,26 @@ def write_group(
     return GroupRecord(unit, condition, path.name, episodes, samples, digests)
 
 
-def write_index(population: Population, records: Iterable[GroupRecord], folder: Path | str) -> None:
-    """Write `population.json` for groups that were written; with it the folder is a population."""
+def write_index(population: Population, records: Iterable[GroupRecord], folder: Path | str, converted: bool = True) -> None:
+    """Write `population.json` for groups that were written, with it the folder is a population; where they are `converted`, they are new recordings."""
     groups = [g for g in records if g.episodes]
     written = {g.unit for g in groups}
     check_structure(population.columns, [EpisodeKey(g.unit, g.condition, e) for g in groups for e in g.episodes])
     refuse_copies(pair for g in groups for pair in g.recognised)
+    scaling = {name: replace(own, converted=own.factor) if converted else own for name, own in population.scaling.items()}
     content = {
         "sample_period_s": population.sample_period_s,
         "channels": population.channels,
         "units": [u for u in population.units if u.id in written],
         "metadata": population.metadata,
         **({"truths": population.truths} if population.truths else {}),
-        **({"scaling": population.scaling} if population.scaling else {}),
+        **({"scaling": scaling} if scaling else {}),
         "groups": [{name: getattr(g, name) for name in _INDEXED} for g in groups],
     }
     save_artifact(Path(folder), INDEX, content)
 
 
-def write_parquet(population: Population, out: Path | str) -> None:
+def write_parquet(population: Population, out: Path | str, converted: bool = True) -> None:
     """Write a population as a folder of Parquet files; it appears whole or not at all.
 
     Parameters
@@ -111,6 +112,8 @@ def write_parquet(population: Population, out: Path | str) -> None:
     population : Population
     out : Path
         Folder to make.
+    converted : bool
+        Whether the files are new recordings, in the channels' units; False where they stand for those that were read.
 
     Raises
     ------
@@ -132,7 +135,7 @@ def write_parquet(population: Population, out: Path | str) -> None:
     groups = [(unit, condition) for unit, condition, _ in population.groups()]
     with whole_folder(Path(out)) as folder:
         records = in_threads([partial(write_group, population, *group, folder) for group in groups])
-        write_index(population, records, folder)
+        write_index(population, records, folder, converted)
 
 
 def _write_episodes(

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...observer import Observer, run_observer, track_parameter
+from ...observer.recorded import recorded_factors
 from .compiled import CompiledObserver
 
 Array = npt.NDArray[np.float64]
@@ -24,7 +25,7 @@ class HeldOut:
     Parameters
     ----------
     y, u : ndarray, shape (n_samples, batch, q), (n_samples, batch, m)
-        As they arrive.
+        As they arrive, in the channels' units.
     states : ndarray, shape (n_samples, batch, n_recorded)
         The truth.
     parameters : mapping of str to ndarray, shape (batch,)
@@ -59,13 +60,15 @@ class Accuracy:
         wanted = run_observer(observer, y, u, own) if track is None else track_parameter(observer, y, u, own, track).estimates
         wanted, found = wanted[..., : len(observer.recorded)], np.empty((*y.shape[:2], len(observer.recorded)))
         found[0] = wanted[0]
+        measured = [observer.lifting.states[i] for i in observer.measured]
+        y_factor, u_factor, x_factor = (recorded_factors(observer, names) for names in (measured, observer.inputs, observer.recorded))
         with tempfile.TemporaryDirectory() as name:
             for file, text in files.items():
                 Path(name, file).write_text(text)
             compiled = CompiledObserver.build(name)
             for i in range(y.shape[1]):
                 values = {p: float(np.asarray(v)[i]) for p, v in own.items()}
-                found[1:, i] = compiled.run(y[:, i], u[:, i], values)[0][:-1]
+                found[1:, i] = compiled.run(y[:, i] / y_factor, u[:, i] / u_factor, values)[0][:-1] * x_factor
         apart, size = _rms(found - wanted), np.std(wanted, axis=(0, 1))
         errors = _rms(wanted - held_out.states), _rms(found - held_out.states)
         loss = 100 * (errors[1] / np.maximum(errors[0], 1e-300) - 1)

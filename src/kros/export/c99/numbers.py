@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ from ...observer import Observer
 from ...observer.guard import bounds
 from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval
 from ...observer.origin import FAR, OriginShift
+from ...observer.recorded import recorded_channel, recorded_factors
 from ...observer.samples import LONGEST
 from ...observer.screen import Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
@@ -81,6 +83,8 @@ class Source:
         functions, widened = lifting.n_lifted - n, o.B.shape[1]
         screen = Screen.of(o)
         limited = run.limited
+        x_names, y_names = (*o.recorded,), [lifting.states[i] for i in o.measured]
+        factors = self.factors()
         return {
             "name": self.name,
             "NAME": self.name.upper(),
@@ -93,6 +97,10 @@ class Source:
             "measured": plain_names(lifting.states[i] for i in o.measured),
             "inputs": plain_names(o.inputs),
             "parameters": lifting.parameters,
+            "signals": self.signals(),
+            "x_factor": self.literals([1 / factors[s] for s in x_names]),
+            "y_factor": self.literals([factors[s] for s in y_names]),
+            "u_factor": self.literals([factors[s] for s in o.inputs]),
             "at": o.measured,
             "n": n,
             "recorded": len(o.recorded),
@@ -143,8 +151,29 @@ class Source:
             if self.shift is None
             else self.precision.literal((FAR_SINGLE if self.precision.type == "float" else FAR) * self.shift.period),
             "period": None if self.shift is None else Precision().literal(self.shift.period),
+            "recorded_period": None if self.shift is None else abs(self.shift.period / factors[y_names[0]]),
             "sample_period_s": Precision().literal(o.sample_period_s),
         }
+
+    def factors(self) -> dict[str, float]:
+        """Return by what the recordings of channels are multiplied, by name; a load torque is in the unit of its current."""
+        names = (*self.observer.recorded, *self.observer.inputs)
+        found = dict(zip(names, recorded_factors(self.observer, names).tolist(), strict=True))
+        return found if self.load is None else found | {self.load.load: found[self.load.current]}
+
+    def signals(self) -> list[dict[str, str]]:
+        """Return name, unit of measure and note of every channel, as they stand in the recordings."""
+        o = self.observer
+        load = {} if self.load is None else {self.load.load: recorded_channel(o, self.load.current)}
+        own = {name: load.get(name, recorded_channel(o, name)) for name in (*o.recorded, *o.inputs)}
+        return [
+            {"name": plain(name), "unit": plain(c.unit or "not declared"), "note": " ".join(map(plain, c.note.split()))}
+            for name, c in own.items()
+        ]
+
+    def literals(self, factors: Sequence[float]) -> list[str]:
+        """Return the literals of factors in double precision; none where all are one."""
+        return [] if all(factor == 1 for factor in factors) else [Precision().literal(factor) for factor in factors]
 
     def relative_inputs(self) -> list[str]:
         """Return the inputs relative to the origin: an exact difference first, and nothing that is zero, which a processor without doubles pays for."""
@@ -194,6 +223,8 @@ class Source:
         return {
             "load_name": plain(self.load.load),
             "current_name": plain(self.load.current),
+            "factor": self.load_factor(self.load.current),
+            "angle_factor": self.load_factor(self.observer.lifting.states[self.observer.measured[0]]),
             "load": places.index(self.load.load),
             "current": places.index(self.load.current),
             "pole": write(level.pole),
@@ -202,6 +233,10 @@ class Source:
             "limit": write(level.limit) if np.isfinite(level.limit) else None,
             "trusted": write(level.trusted * level.limit) if np.isfinite(level.limit) else None,
         }
+
+    def load_factor(self, name: str) -> str | None:
+        """Return the literal of a channel's factor; None where it is one."""
+        return next(iter(self.literals(recorded_factors(self.observer, [name]).tolist())), None)
 
     def held_start(self) -> dict[str, Any]:
         """Return how the observer starts (`ObserverData.initial`): other states at rest, or where the lifted functions hold them."""

@@ -18,7 +18,7 @@ from ...data.writers.folders import whole_folder
 from ...loops.compiler import find_compiler
 from ...observer import Observer
 from ...observer.file import observer_content
-from ..text import plain, require_identifier
+from ..text import require_identifier
 from .accuracy import Accuracy, HeldOut
 from .board import OnBoard, missing_tools
 from .golden import Golden
@@ -39,6 +39,9 @@ def export_c(
     on_board: bool = False,
 ) -> Path:
     """Write an observer as C99 source with a self-test, a project and a description.
+
+    The source takes measurements and inputs as they stand in the recordings that the study read, and gives estimates so: the factors by which
+    the study multiplied columns, ``about.columns`` of the observer's file, are compiled in.
 
     Parameters
     ----------
@@ -117,16 +120,19 @@ def c_files(
     source, golden = Source.of(observer, name, precision, track, load), Golden.of(observer, track, tolerance=_TOLERANCE[precision])
     context = source.context() | {"version": version("kros")}
     context["sigma_uses_parameters"] = any(set(f.used) & set(observer.lifting.parameters) for f in observer.lifting.formulas)
-    tolerance = _TOLERANCE[precision]
+    tolerance, measured = _TOLERANCE[precision], [observer.lifting.states[i] for i in observer.measured]
+    y_factor, u_factor, x_factor = (
+        np.array([source.factors()[n] for n in names]) for names in (measured, observer.inputs, observer.recorded)
+    )
     context["golden"] = {
-        "y": [[_sample(v) for v in row] for row in golden.y],
-        "u": [[_sample(v) for v in row] for row in golden.u],
-        "x": [[f"{v:.17g}" for v in row] for row in golden.x_hat],
+        "y": [[_sample(v) for v in row] for row in golden.y / y_factor],
+        "u": [[_sample(v) for v in row] for row in golden.u / u_factor],
+        "x": [[f"{v:.17g}" for v in row] for row in golden.x_hat / x_factor],
         "status": [f"{int(s)}u" for s in golden.status],
         "last": [f"{int(s)}u" for s in golden.last_status],
         "sure": [[f"{int(bits)}u" for bits in row] for row in golden.sure],
         "passes": golden.passes,
-        "tolerance": [f"{tolerance * v:.9g}" for v in golden.size],
+        "tolerance": [f"{tolerance * v:.9g}" for v in golden.size / np.abs(x_factor)],
     }
     state_bytes = _state_bytes(context)
     numbers = sum(len(row) for key in ("model", "correction", "into", "controller", "filter_gain") for row in context[key] or ())
@@ -137,8 +143,7 @@ def c_files(
         else sum(getattr(observer.start_in_motion, part).size for part in ("gain", "corrections", "rest"))
     )
     watched = 0 if observer.monitor is None else observer.monitor.limits.size
-    largest = None if observer.seen is None else f"{1.5 * float(observer.seen.measured.max()):.6g}"
-    functions = sorted({f for text in context["sigma"] + context["gamma"] for f in re.findall(r"\b([a-z]+)\(", text)})
+    largest = None if observer.seen is None else ", ".join(f"{v:.6g}" for v in 1.5 * observer.seen.measured / np.abs(y_factor))
     context |= {
         "state_bytes": state_bytes,
         "constant_bytes": (numbers + begins + 4 * watched) * (4 if precision == "float" else 8),
@@ -147,8 +152,6 @@ def c_files(
         "tolerance": tolerance,
         "accuracy": None if accuracy is None else accuracy.content(),
         "board": None if board is None else asdict(board),
-        "library": " and ".join(f"`{f}`" for f in functions) or "nothing",
-        "units": ", ".join(f"{plain(k)} {plain(v)}" for k, v in units_of_measure(observer).items()),
     }
     environment = Environment(loader=PackageLoader("kros.export.c99"), undefined=StrictUndefined, keep_trailing_newline=True)
     texts = {
@@ -159,16 +162,22 @@ def c_files(
         "CMakeLists.txt": "CMakeLists.txt",
         "README.md": "README.md",
     }
+    code = environment.get_template("observer.c.jinja").render(context)
+    functions = sorted(set(re.findall(r"\b(?:floor|sin|cos|tan|a?(?:sin|cos|tan)h?|exp|log|sqrt|pow|atan2|fabs|fmin|fmax)f?(?=\()", code)))
+    context["library"] = (
+        " and ".join(f"`{f}`" for f in functions) + " (link with `-lm` where it is a library of its own)" if functions else "nothing"
+    )
     files = {file: environment.get_template(f"{template}.jinja").render(context) for file, template in texts.items()}
     deployed = json_bytes(with_checksum(observer_content(observer)))
     manifest = {
         "name": name,
         "precision": precision,
         "states": list(observer.recorded),
-        "measured": [observer.lifting.states[i] for i in observer.measured],
+        "measured": measured,
         "inputs": list(observer.inputs),
         "parameters": list(observer.lifting.parameters),
         **({} if track is None else {"tracked": track}),
+        "units_of_measure": {s["name"]: s["unit"] for s in context["signals"]},
         "sample_period_s": observer.sample_period_s,
         "state_bytes": state_bytes,
         "numerical_error": context["accuracy"],
@@ -179,11 +188,6 @@ def c_files(
         "source": "sha256:" + hashlib.sha256(deployed).hexdigest(),
     }
     return files | {"manifest.json": json_bytes(manifest).decode()}
-
-
-def units_of_measure(observer: Observer) -> dict[str, str]:
-    """Return the units of measure that an observer's file names, by channel."""
-    return {name: unit for name, unit in observer.about.get("units_of_measure", {}).items() if unit}
 
 
 def _sample(value: float) -> str:

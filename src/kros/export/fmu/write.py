@@ -18,9 +18,10 @@ from ...core.artifacts import write_bytes
 from ...core.errors import ConfigError
 from ...loops.compiler import find_compiler, run_tool
 from ...observer import Observer
+from ...observer.recorded import recorded_channel
 from ..c99.compiled import FLAGS
 from ..c99.numbers import Source
-from ..c99.write import c_files, units_of_measure
+from ..c99.write import c_files
 from ..text import plain, plain_names, require_identifier
 
 _KROS = uuid.UUID("4b0a3f5e-7f2c-5d0e-9a61-6b726f733939")
@@ -37,9 +38,9 @@ def export_fmu(
 ) -> Path:
     """Write an observer as an FMU for co-simulation.
 
-    Measurements, inputs and parameters are variables of their own names, estimates end in ``_hat``, ``status`` holds the bits of `SampleStatus`. A
-    communication step of one sampling period takes one sample and gives the estimate for its end. ``condition``, where the monitor knows some, is a
-    tunable enumeration: the recorded condition that the machine is in, ``unknown`` at first.
+    Measurements, inputs and parameters are variables of their own names, estimates end in ``_hat``, all in the units of the recordings;
+    ``status`` holds the bits of `SampleStatus`. A communication step of one sampling period takes one sample and gives the estimate for its end.
+    ``condition``, where the monitor knows some, is a tunable enumeration: the recorded condition that the machine is in, ``unknown`` at first.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ def export_fmu(
     ...     print("modelDescription.xml" in ZipFile(export_fmu(lag, Path(folder) / "lag.fmu", fmi=3)).namelist())
     True
     """
-    out, known = Path(out), units_of_measure(observer)
+    out = Path(out)
     require_identifier(name)
     if fmi not in (2, 3):
         raise ConfigError(f"Export of an FMU: fmi should be 2 or 3, found {fmi!r}.")
@@ -83,7 +84,7 @@ def export_fmu(
     files = c_files(observer, name, precision, track)
     sources = {f"sources/{file}": files[file] for file in (f"{name}.h", f"{name}.c")}
     guid = str(uuid.uuid5(_KROS, sources[f"sources/{name}.c"] + files["manifest.json"]))
-    texts = rendered(Source.of(observer, name, precision, track), fmi, guid, known)
+    texts = rendered(Source.of(observer, name, precision, track), fmi, guid)
     packed: dict[str, bytes] = {
         file: text.encode() for file, text in {**texts, **sources, "documentation/README.md": files["README.md"]}.items()
     }
@@ -91,11 +92,12 @@ def export_fmu(
     return out
 
 
-def rendered(source: Source, fmi: int, guid: str, units: Mapping[str, str]) -> dict[str, str]:
+def rendered(source: Source, fmi: int, guid: str) -> dict[str, str]:
     """Return the files that make C source an FMU."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     observer, name, context = source.observer, source.name, source.context()
+    units = {c: unit for c in (*observer.recorded, *observer.inputs) if (unit := recorded_channel(observer, c).unit)}
     estimates = [*observer.recorded, *([] if source.loop is None else [source.loop.name])]
     context |= {
         "version": version("kros"),

@@ -1,4 +1,7 @@
-"""The deployed observer on recordings, its estimates written as Parquet or CSV; measured channels and inputs are enough."""
+"""The deployed observer on recordings, its estimates written as Parquet or CSV; measured channels and inputs are enough.
+
+Estimates are in the units of the recordings that the study read, as those of an exported observer.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ import numpy.typing as npt
 from ...core.artifacts import write_json
 from ...core.errors import ConfigError
 from ...data.population import EpisodeKey
+from ...observer.recorded import recorded_channel, recorded_factors
 from ..config import Stage
 from ..engine.run_folder import open_finished
 from .field import FieldRecordings
@@ -53,6 +57,7 @@ def estimate_recordings(run: Path, data: Path, out: Path, given: Collection[str]
         with writer(out, facts_of(recordings)) as write:
             for found in recordings.batches():
                 estimates, followed = recordings.estimates(found)
+                estimates /= recorded_factors(recordings.observer, recordings.observer.recorded)
                 columns = estimates if followed is None else np.concatenate([estimates, followed[..., None]], axis=-1)
                 for i, key in enumerate(found.batch.keys):
                     write(key, columns[: found.batch.lengths[i], i])
@@ -63,9 +68,8 @@ def estimate_recordings(run: Path, data: Path, out: Path, given: Collection[str]
 def facts_of(recordings: FieldRecordings) -> dict[str, Any]:
     """Return what is to be known of the estimates: the observer, columns with their units of measure, parameters of every unit and their sources."""
     observer = recordings.observer
-    units = {c.name: c.unit for c in recordings.population.channels} | observer.about.get("units_of_measure", {})
     name = recordings.name
-    columns = {f"{s}_hat": units.get(s, "") for s in observer.recorded} | ({} if name is None else {name: "rad"})
+    columns = {f"{s}_hat": recorded_channel(observer, s).unit for s in observer.recorded} | ({} if name is None else {name: "rad"})
     parameters = {u: {**recordings.values[u], "source": source} for u, source in recordings.sources.items()}
     about = {key: observer.about.get(key) for key in ("kros", "study")}
     return {"observer": observer.name, **about, "columns": columns, "parameters": parameters}

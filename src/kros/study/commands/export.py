@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,9 @@ def export_run(
             )
         path = store.path(LOAD, loads[observer]) if observer in loads else store.path("observers", f"{observer}.json")
         chosen, name = Observer.load(path), name or identifier(config.name)
+        if not chosen.about:  # that of a load: its channels are those of the observer that is deployed
+            about = Observer.load(store.path("observers", f"{DEPLOYED}.json")).about
+            chosen = replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
         if fmi is not None:
             return export_fmu(chosen, out, fmi, name, precision, track)
         limit = np.inf if config.load.limit is None else config.load.limit

@@ -5,6 +5,7 @@ import os
 import stat
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from functools import partial
 
@@ -13,8 +14,10 @@ import pytest
 from families import FAMILIES, INPUT_FUNCTIONS, INPUTS, STATES
 from machines import LIMITS, MACHINES, drive, samples
 
+from kros.core.artifacts import read_json
 from kros.core.errors import ConfigError
 from kros.evaluate.errors import summarise_all
+from kros.export import HeldOut, export_c, export_fmu
 from kros.identify.free_run import free_run
 from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
@@ -313,11 +316,21 @@ def test_a_compiler_that_does_not_work_is_no_obstacle(script, reason, tmp_path, 
     (tmp_path / "cc").chmod(0o755)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    monkeypatch.setattr(compiler, "run_tool", partial(compiler.run_tool, seconds=1.0))
-    with caplog.at_level(logging.INFO, "kros"):
-        assert compiler.load(SOURCE, FLAGS) is None
-    assert reason in caplog.records[-1].getMessage()
-    assert len(caplog.records) == 1
+    monkeypatch.setattr(compiler, "run_tool", partial(compiler.run_tool, seconds=0.5))
+    (y, u), observer = (a[:, None] for a in samples(50, faults=False)), drive()
+    held_out = HeldOut(y, u, np.zeros((*y.shape[:2], len(observer.recorded))))
+    for use in (
+        lambda: compiler.load(SOURCE, FLAGS),
+        lambda: read_json(export_c(observer, tmp_path / "c", "drive", held_out=held_out) / "manifest.json")["numerical_error"],
+        lambda: next(
+            (n for n in zipfile.ZipFile(export_fmu(observer, tmp_path / "d.fmu", 2, "drive")).namelist() if "binaries" in n), None
+        ),
+    ):
+        caplog.clear()
+        with caplog.at_level(logging.INFO, "kros"):
+            assert use() is None
+        assert reason in caplog.records[-1].getMessage()
+        assert len([r for r in caplog.records if r.name == caplog.records[-1].name]) == 1
 
 
 @needs_compiler

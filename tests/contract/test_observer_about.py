@@ -153,7 +153,13 @@ def test_generated_code_and_estimates_are_in_the_units_of_the_recordings(found, 
     with zipfile.ZipFile(export_run(study.folder, tmp_path / "motor.fmu", "motor", fmi=3)) as archive:
         model = ET.fromstring(archive.read("modelDescription.xml"))
     units = {v.get("name"): v.get("unit") for v in model.find("ModelVariables") or ()}
-    assert {name: unit for name, unit in units.items() if name != "time"} == {"angle": "deg", "voltage": "V", "current_hat": "0.001 A", "angle_hat": "deg", "status": None}
+    assert {name: unit for name, unit in units.items() if name != "time"} == {
+        "angle": "deg",
+        "voltage": "V",
+        "current_hat": "0.001 A",
+        "angle_hat": "deg",
+        "status": None,
+    }
 
 
 def test_converted_recordings_are_recordings(tmp_path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays
-from kros.data.checks import check_episode, check_population, scan_digests
+from kros.data.checks import check_episode, check_period, check_population, scan_digests
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 KEY = EpisodeKey("001011", "load", "7")
@@ -125,3 +125,18 @@ def test_scan_drops_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
         kept = scan_digests(bad, on_nan="drop_episode")
     assert [key for key, _ in kept] == [EpisodeKey("a", "default", "0")]
     assert [r.message.split(":")[1] for r in caplog.records] == [" Episode 1 of unit a (default)", " Episode 0 of unit b (default)"]
+
+
+@pytest.mark.parametrize("value", [-1e308, 1e51])
+def test_a_sample_that_cannot_be_computed_with_is_located(value: float) -> None:
+    """Products of samples stay finite, so that no warning of NumPy reaches a user."""
+    bad = values()
+    bad[7, 2] = value
+    with pytest.raises(DataError, match=r"channel 'u' has 1 above 1e\+50 at sample 7"):
+        check_episode(bad, KEY, CHANNELS)
+
+
+@pytest.mark.parametrize("period", [1e-60, 1e60, 10**400])
+def test_a_period_that_cannot_be_computed_with_is_refused(period: float) -> None:
+    with pytest.raises(DataError, match="sampling period"):
+        check_period(period, "Population")

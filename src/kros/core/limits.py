@@ -13,3 +13,4 @@ MAX_LINE_BYTES = 1 << 20  # of the header and of the lines before it
 MAX_RATIO = 100  # unpacked over packed size: numbers as text reach 3 to 30
 RATIO_FROM_BYTES = 1 << 26  # below this much unpacked text the ratio does not matter
 MAX_SAMPLES = 10**8  # of one episode
+MAX_VALUE = 1e50  # of a sample, a time, a sampling period and its inverse: products of six are finite

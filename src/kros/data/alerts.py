@@ -77,10 +77,10 @@ def _derivatives(values: npt.NDArray[np.float64], channels: Sequence[Channel], p
     """A state that is another one's slope, but for a factor of a thousand or a million: one of the units of time is another."""
     states = [i for i, c in enumerate(channels) if c.role is Role.STATE]
     for one, other in permutations(states, 2):
-        slope, speed = (values[2:, one] - values[:-2, one]) / (2 * period_s), values[1:-1, other]
+        slope, speed = values[2:, one] - values[:-2, one], values[1:-1, other]  # of two periods
         sizes = np.linalg.norm(slope), np.linalg.norm(speed)
         if min(sizes) > 0 and slope @ speed > _CORRELATED * sizes[0] * sizes[1]:
-            decades = np.log10(sizes[1] / sizes[0])
+            decades = np.log10(2 * period_s) + np.log10(sizes[1]) - np.log10(sizes[0])
             if abs(abs(decades) - 3) < 0.05 or abs(abs(decades) - 6) < 0.05:
                 yield (
                     f"{channels[other].name!r} is the slope of {channels[one].name!r} times {10.0 ** round(decades):g} at the sampling period of "

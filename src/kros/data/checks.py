@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core import limits
 from ..core.errors import ConfigError, DataError
 from ..core.files import shortened
 from .copies import digest_of, refuse_copies
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role, TrueChannel
-from .recording import title
+from .recording import title, usable
 
 logger = logging.getLogger(__name__)
 Look = Callable[[EpisodeKey, npt.NDArray[np.float64]], None]
@@ -47,7 +48,7 @@ def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Se
             f"{title(key)}: at least {MIN_SAMPLES} samples are needed, found {len(values)}; leave the episode out or record longer."
         )
     if not gaps:
-        if not np.isfinite(values).all():
+        if not usable(values).all():
             check_finite(values, key, channels)
         check_range(values, key, channels)
     _check_moving(values, key, channels)
@@ -80,11 +81,11 @@ def check_finite(
     first: int = 0,
     columns: Iterable[int] | None = None,
 ) -> None:
-    """Raise NonFiniteError where a channel holds NaN or infinity."""
+    """Raise NonFiniteError where a channel holds NaN, infinity or what is as good as that."""
     for column in range(len(channels)) if columns is None else columns:
-        bad = np.flatnonzero(~np.isfinite(values[:, column]))
+        bad = np.flatnonzero(~usable(values[:, column]))
         if bad.size:
-            kinds = " and ".join(sorted({"NaN" if np.isnan(v) else "infinity" for v in values[bad, column]}))
+            kinds = " and ".join(sorted({_kind(v) for v in values[bad, column]}))
             where = f"sample {first + bad[0]}" if bad.size == 1 else f"samples {first + bad[0]}-{first + bad[-1]}"
             raise NonFiniteError(
                 f"{title(key)}: channel {channels[column].name!r} has {bad.size} {kinds} at {where}; fix the source or set "
@@ -110,6 +111,10 @@ def check_range(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequ
                 f"{title(key)}: channel {channel.name!r} is {column[bad[0]]:g} at sample {finite[bad[0]]}, and 98 % of its samples are "
                 f"from {low:g} to {high:g} ({bad.size} such samples); fix the source, or leave the episode out."
             )
+
+
+def _kind(value: float) -> str:
+    return "NaN" if np.isnan(value) else "infinity" if np.isinf(value) else f"above {limits.MAX_VALUE:g}"
 
 
 class RestWatch:
@@ -161,7 +166,7 @@ def check_period(period_s: Any, what: str) -> float:
         seconds = math.nan if isinstance(period_s, bool) or not isinstance(period_s, Real) else float(period_s)
     except OverflowError:
         seconds = math.inf
-    if not 0 < seconds < math.inf:
+    if not 1 / limits.MAX_VALUE < seconds < limits.MAX_VALUE:
         found = shortened(repr(period_s))
         raise DataError(f"{what}: the sampling period should be a number of seconds above zero, found {found}; give it in seconds.")
     return seconds

@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from ..core import limits
 from ..core.errors import DataError
 from .population import EpisodeKey
 
@@ -67,6 +68,11 @@ def without_repeated_end(recording: Recording) -> Recording:
     if time is None or len(time) < 2 or time[-1] != time[-2]:
         return recording
     return replace(recording, values=recording.values[:-1], time_s=time[:-1])
+
+
+def usable(values: Float) -> npt.NDArray[np.bool_]:
+    """Tell which samples are numbers of a size that can be computed with."""
+    return np.asarray(np.abs(values) <= limits.MAX_VALUE)
 
 
 def title(key: EpisodeKey) -> str:

@@ -20,7 +20,8 @@ _log = logging.getLogger(__name__)
 COMPILERS = ("cc", "gcc", "clang")
 _SECONDS = 60.0  # after which a compiler, or a library that is tried, is given up
 _TRIED = "\nint kros_trial(int);\nint kros_trial(int x) { return 2 * x; }\n"
-_TRIAL = "import ctypes, sys; library = ctypes.CDLL(sys.argv[1]); sys.exit(library.kros_trial(21) != 42)"
+_LOADED = "import ctypes, sys; library = ctypes.CDLL(sys.argv[1]); "
+_TRIAL = _LOADED + "sys.exit(library.kros_trial(21) != 42)"
 
 
 def find_compiler() -> str | None:
@@ -50,7 +51,7 @@ def load(source: str, flags: tuple[str, ...]) -> ctypes.CDLL | None:
     return None
 
 
-def run_tool(command: Sequence[str], given: str = "", seconds: float = _SECONDS) -> str:
+def run_tool(command: Sequence[str], given: str = "", seconds: float = _SECONDS, cwd: str | None = None) -> str:
     """Run a compiler, or what it made, in a process group that ends in time; return what it printed, whatever its bytes.
 
     Raises
@@ -66,6 +67,7 @@ def run_tool(command: Sequence[str], given: str = "", seconds: float = _SECONDS)
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         start_new_session=True,
+        cwd=cwd,
         text=True,
         errors="replace",
     ) as running:
@@ -114,15 +116,20 @@ def _folders() -> Iterator[Path]:
             yield folder
 
 
+def compile_library(command: Sequence[str], library: Path, given: str = "", trial: str = _LOADED) -> None:
+    """Compile a shared library and load it in a process of its own; errors as of `run_tool`."""
+    run_tool([*command, "-o", str(library), "-lm"], given)
+    try:
+        run_tool([sys.executable, "-S", "-c", trial, str(library)])
+    except subprocess.SubprocessError as error:
+        raise subprocess.SubprocessError(f"what {command[0]} made does not run") from error
+
+
 def _build(source: str, flags: tuple[str, ...], compiler: str, library: Path) -> None:
     """Compile a library, try it in a process of its own, and put it in place with its checksum."""
     with tempfile.TemporaryDirectory(dir=library.parent) as scratch:
         built, checksum = Path(scratch) / library.name, Path(scratch) / "sha256"
-        run_tool([compiler, *flags, "-x", "c", "-", "-o", str(built), "-lm"], source + _TRIED)
-        try:
-            run_tool([sys.executable, "-S", "-c", _TRIAL, str(built)])
-        except subprocess.SubprocessError as error:
-            raise subprocess.SubprocessError(f"what {compiler} made does not run") from error
+        compile_library([compiler, *flags, "-x", "c", "-"], built, source + _TRIED, _TRIAL)
         checksum.write_text(hashlib.sha256(built.read_bytes()).hexdigest())
         os.replace(built, library)
         os.replace(checksum, library.with_suffix(".sha256"))

@@ -22,7 +22,7 @@ from ..population import EpisodeKey, Population
 from ..readers.csv_folder import csv_files, read_csv_folder
 from ..readers.csvfile import Dialect, first_fields, read_columns
 from ..readers.parquet_table import parquet_columns, parquet_fields, parquet_head
-from ..recording import some
+from ..recording import some, usable
 from .dialect import TableHead, look_at
 from .examine import Examined, examine
 from .filenames import infer_names, quoted
@@ -206,7 +206,8 @@ def _columns(
 def _numbers(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
     """Read the numeric columns of a file, shape (n_columns, n_rows); no rows where it cannot be read."""
     try:
-        return _read(path, head, columns)
+        values = _read(path, head, columns)
+        return np.where(usable(values), values, np.nan)
     except DataError:
         return np.zeros((len(columns), 0))
 

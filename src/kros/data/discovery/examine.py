@@ -17,7 +17,7 @@ from ..checks import MIN_SAMPLES, check_range, is_constant
 from ..copies import copies_among, digest_of
 from ..population import Channel, EpisodeKey, Population, Role
 from ..prepare import PreparedSource
-from ..recording import TIME_TOLERANCE, title
+from ..recording import TIME_TOLERANCE, title, usable
 
 Array = npt.NDArray[np.float64]
 GAP = 10.0  # median steps that a step may take before it counts as a gap, as in the step `resample`
@@ -125,8 +125,8 @@ def _looked(key: EpisodeKey, values: Array, time: Array | None, channels: Sequen
         gap = (float(steps[worst]), worst) if steps[worst] > GAP * period else None
         deviation = np.abs(steps - period) / period
         uneven = (float(deviation.max()), int(deviation.argmax())) if deviation.max() > TIME_TOLERANCE else None
-    if not np.isfinite(values).all():
-        bad = np.count_nonzero(~np.isfinite(values), axis=0)
+    if not usable(values).all():
+        bad = np.count_nonzero(~usable(values), axis=0)
         names = ", ".join(f"{c.name!r} ({count})" for c, count in zip(channels, bad, strict=True) if count)
         return EpisodeLook(key, "", (f"{title(key)}: no number in some samples of {names}",), n, period, uneven, True, gap)
     check_range(values, key, channels)

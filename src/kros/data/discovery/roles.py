@@ -151,8 +151,9 @@ def _spare(i: int, column: TableColumn, before: Sequence[TableColumn], samples: 
     own = [s[i] for s in samples]
     if all(np.isnan(s).mean() > 0.1 for s in own):
         return "mostly empty or text"
-    if all(np.nanmin(s) == np.nanmax(s) for s in own) and len({float(np.nanmin(s)) for s in own}) == 1:
-        return f"stays at {own[0][0]:g} in the files that were looked at"
+    ends = {float(end) for s in own for end in (np.fmin.reduce(s), np.fmax.reduce(s)) if not np.isnan(end)}
+    if len(ends) == 1:
+        return f"stays at {ends.pop():g} in the files that were looked at"
     if all(_counts(s) for s in own):
         return "counts the samples"
     if any(_OF_WORD.get(w) == "spare" for w in _words_of(column.name)):

@@ -19,7 +19,7 @@ from ...core.files import did_you_mean, require_regular
 from ..checks import check_names
 from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Role, Unit
 from ..prepare import assemble
-from ..recording import Recording, Recordings, some
+from ..recording import Recording, Recordings, some, usable
 from .csv_mapping import Column, CsvMapping, UnitMapping, load_mapping
 from .csvfile import Dialect, first_fields, read_columns
 from .parquet_table import parquet_columns, parquet_fields
@@ -60,7 +60,8 @@ class CsvRecordings(Recordings):
         if self.time_scale is None:
             return Recording(key, np.ascontiguousarray(columns.T))
         scale = 1.0 if self.timestamp is not None else self.time_scale
-        since = columns[0] - columns[0, :1]  # before scaling: milliseconds since 1970 are whole numbers, seconds are not
+        time = np.where(usable(columns[0]), columns[0], np.nan)
+        since = time - time[:1]  # before scaling: milliseconds since 1970 are whole numbers, seconds are not
         return Recording(key, np.ascontiguousarray(columns[1:].T), since * scale)
 
     def _columns(self, path: Path, place: FilePlace) -> npt.NDArray[np.float64]:

@@ -21,7 +21,7 @@ import numpy as np
 from ...core.errors import DataError
 from ..population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
 from ..prepare import assemble, episode_order
-from ..recording import Recording, Recordings, estimate_period
+from ..recording import Recording, Recordings, estimate_period, usable
 from ..scaling import Scaling
 from ..steps import Offset, Scale, Shift, Step, Trim
 from .csvfile import first_fields, read_columns
@@ -68,7 +68,7 @@ class RawRecordings(Recordings):
     def read(self, key: EpisodeKey, place: str) -> Recording:
         """Return one episode as recorded."""
         columns = read_columns(Path(place), COLUMNS, COLUMNS)
-        return Recording(key, np.ascontiguousarray(columns[1:].T), columns[0] * self.time_scale)
+        return Recording(key, np.ascontiguousarray(columns[1:].T), np.where(usable(columns[0]), columns[0], np.nan) * self.time_scale)
 
 
 def find_root(source: Path) -> Path | None:

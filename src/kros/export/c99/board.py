@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from ...core.errors import ConfigError
+from ...loops.compiler import run_tool
 
 TOOLS = ("arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm")
 _HOME = Path(__file__).parent / "board"
@@ -55,7 +56,7 @@ def missing_tools() -> list[str]:
 
 
 def _run(*command: str, cwd: str) -> str:
-    done = subprocess.run(command, cwd=cwd, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120, check=False)
-    if done.returncode:
-        raise ConfigError(f"Measuring on a board: {command[0]} refused: {done.stderr.strip()[:500]}")
-    return done.stdout + done.stderr
+    try:
+        return run_tool(command, cwd=cwd)
+    except (OSError, subprocess.SubprocessError) as error:
+        raise ConfigError(f"Measuring on a board: {error}; repair the tools, or take them off the PATH.") from error

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError, DimensionError
-from ...loops.compiler import COMPILERS, find_compiler, run_tool
+from ...loops.compiler import COMPILERS, compile_library, find_compiler
 
 Array = npt.NDArray[np.float64]
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fno-math-errno", "-ffp-contract=off")
@@ -81,9 +81,8 @@ class CompiledObserver:
         name, sizes = manifest["name"], {"q": len(manifest["measured"]), "m": len(manifest["inputs"]), "n": len(manifest["states"])}
         library, loop = folder / f"lib{name}.so", _LOOP.format(name=name, wide=_wide(manifest), **sizes)
         sources = [f"-I{folder}", str(folder / f"{name}.c"), str(folder / f"{name}_selftest.c"), "-x", "c", "-"]
-        command = [compiler, *FLAGS, *flags, *sources, "-o", str(library), "-lm"]
         try:
-            run_tool(command, loop)
+            compile_library([compiler, *FLAGS, *flags, *sources], library, loop)
         except (OSError, subprocess.SubprocessError) as error:
             raise ConfigError(f"Compiling {folder}: {error}; repair the compiler, or name another.") from error
         return cls(folder, library)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from .board import OnBoard, missing_tools
 from .golden import Golden
 from .numbers import LoadOutput, Source
 
+T = TypeVar("T")
+log = logging.getLogger(__name__)
 _TOLERANCE = {"double": 1e-9, "float": 1e-3}
 
 
@@ -91,8 +94,11 @@ def export_c(
     if precision not in _TOLERANCE:
         raise ConfigError(f"Export to C: precision should be 'double' or 'float', found {precision!r}.")
     files = c_files(observer, name, precision, track, load)
-    accuracy = Accuracy.of(files, observer, held_out, track) if held_out is not None and find_compiler() is not None else None
-    board = OnBoard.of(files, name) if on_board and not missing_tools() else None
+    accuracy = board = None
+    if held_out is not None and find_compiler() is not None:
+        accuracy = _measured("Numerical error", lambda: Accuracy.of(files, observer, held_out, track))
+    if on_board and not missing_tools():
+        board = _measured("Cost on a Cortex-M4F", lambda: OnBoard.of(files, name))
     if accuracy is not None or board is not None:
         files = c_files(observer, name, precision, track, load, accuracy, board)
     if study is not None:
@@ -101,6 +107,15 @@ def export_c(
         for file, text in files.items():
             write_bytes(folder / file, text.encode())
     return Path(out)
+
+
+def _measured(what: str, measure: Callable[[], T]) -> T | None:
+    """Return a measurement that needs a compiler; None where that does not work, with one line of the log."""
+    try:
+        return measure()
+    except ConfigError as error:
+        log.warning("%s: not measured: %s", what, error)
+        return None
 
 
 def c_files(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import platform
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from typing import Any
 
 from ...core.artifacts import write_bytes
 from ...core.errors import ConfigError
-from ...loops.compiler import find_compiler, run_tool
+from ...loops.compiler import compile_library, find_compiler
 from ...observer import Observer
 from ...observer.recorded import recorded_channel
 from ..c99.compiled import FLAGS
@@ -24,6 +25,7 @@ from ..c99.numbers import Source
 from ..c99.write import c_files
 from ..text import plain, plain_names, require_identifier
 
+log = logging.getLogger(__name__)
 _KROS = uuid.UUID("4b0a3f5e-7f2c-5d0e-9a61-6b726f733939")
 _FIXED = (1980, 1, 1, 0, 0, 0)  # the same bytes from the same observer
 
@@ -156,7 +158,7 @@ def conditions(observer: Observer) -> list[str]:
 
 
 def compiled(files: Mapping[str, bytes], name: str, fmi: int) -> dict[str, bytes]:
-    """Return the shared library for this machine, by its place in the archive; nothing where there is no compiler."""
+    """Return the shared library for this machine, by its place in the archive; nothing where there is no compiler that works."""
     compiler = find_compiler()
     if compiler is None or sys.platform not in ("linux", "darwin"):
         return {}
@@ -170,11 +172,10 @@ def compiled(files: Mapping[str, bytes], name: str, fmi: int) -> dict[str, bytes
         library = Path(folder) / f"{name}_fmu.{ending}"
         sources = [str(Path(folder) / f"{part}.c") for part in (name, f"{name}_fmu")]
         try:
-            run_tool([compiler, *FLAGS, *sources, "-o", str(library), "-lm"])
+            compile_library([compiler, *FLAGS, *sources], library)
         except (OSError, subprocess.SubprocessError) as error:
-            raise ConfigError(
-                f"Export of an FMU: {error}; repair the compiler, or take it off the PATH to leave the binary out."
-            ) from error
+            log.warning("Export of an FMU: the binary is left out: %s.", error)
+            return {}
         return {f"binaries/{place}/{library.name}": library.read_bytes()}
 
 

@@ -17,6 +17,8 @@ from kros.synthesis import GeneralizedPlant
 settings.register_profile("kros", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("kros")
 
+# What warns about numbers is an error in worker processes and commands that tests start too, not only in the process of pytest.
+os.environ["PYTHONWARNINGS"] = "error::RuntimeWarning"
 
 # Files that need the demo's study, which is made once for all of them, and what takes longest and begins first, that processes end together.
 DEMO = {f"tests/e2e/test_{name}.py" for name in ("demo", "edge", "faults", "field", "motor_drives", "robustness")}

@@ -258,7 +258,8 @@ STUDY: dict[str, Any] = {
     "lifting": {"functions": ["sin(position)"], "families": [{"kind": "harmonics", "angle": "position", "ratio": 3}]},
     "identify": {"alpha": 90.0, "refine": False},
     "uncertainty": {"form": "additive", "max_order": 3},
-    "synthesis": {"methods": ["mixed"], "noise": {"position": 1e-3}},
+    "synthesis": {"methods": ["mixed"]},
+    "sensor": {"position": {"noise": 1e-3}},
     "evaluate": {"folds": 2},
 }
 

@@ -104,7 +104,7 @@ def message(error: Exception) -> str:
     if isinstance(error, KrosError):
         return str(error)
     if isinstance(error, MemoryError):
-        return f"Memory: there is not enough of it ({error or 'no details'}); use fewer --workers, shorter episodes or fewer units."
+        return f"Memory: there is not enough of it ({str(error) or 'no details'}); use fewer --workers, shorter episodes or fewer units."
     if isinstance(error, OSError):
         place = " -> ".join(
             repr(os.fspath(name)) for name in (error.filename, error.filename2) if name is not None and not isinstance(name, int)

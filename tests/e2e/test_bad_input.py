@@ -127,3 +127,25 @@ def test_bad_recordings_leave_an_earlier_run_as_it_was(kros, study, tmp_path, ra
     result = kros("run", path, "--out", out, "--until", "calibrate", "--workers", 1)
     assert result.exit_code == 2
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+@pytest.mark.parametrize(("kind", "code"), [("memory", 1), ("damaged", 2)])
+@pytest.mark.parametrize("reader", ["parquet", "motor-drive-raw"])
+def test_out_of_memory_is_not_taken_for_a_damaged_file(kros, tmp_path, raw, monkeypatch, kind, code, reader):
+    """A reader of Arrow fails alike where memory ran out and where a file states a size that it has not; the second is a fault of the file."""
+    import pyarrow as pa
+
+    def fail(*_: object, **__: object) -> None:
+        raise pa.ArrowMemoryError(f"malloc of size {10**15 if kind == 'damaged' else 4096} failed")
+
+    source = raw
+    if reader == "parquet":
+        source = tmp_path / "parquet"
+        assert kros("convert", raw, source, "--workers", 1).exit_code == 0
+        monkeypatch.setattr("pyarrow.parquet.ParquetFile.read_row_group", fail)
+    else:
+        monkeypatch.setattr("pyarrow.csv.read_csv", fail)
+    (tmp_path / "study.toml").write_text(f'[data]\nsource = "{source}"\nreader = "{reader}"\n')
+    result = kros("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--workers", 1, "--until", "read")
+    assert result.exit_code == code, result.stderr
+    assert result.stderr.startswith("kros: Memory: there is not enough of it" if code == 1 else "kros: Reading ")

@@ -7,6 +7,7 @@ import os
 import time
 from functools import partial
 
+import numpy as np
 import pytest
 
 from kros.core.errors import KrosError
@@ -24,6 +25,10 @@ def refuse() -> None:
 
 def endless(_: int) -> None:
     time.sleep(1e6)
+
+
+def overflow(size: float) -> float:
+    return float(np.float64(size) * 1e300)
 
 
 def die(_: int) -> None:
@@ -58,3 +63,10 @@ def test_work_that_is_abandoned_is_not_waited_for():
 def test_a_worker_that_is_ended_from_outside_is_an_error_with_a_remedy():
     with pytest.raises(KrosError, match="fewer workers"), open_executor(2) as executor:
         list(executor.map(die, range(3)))
+
+
+def test_a_warning_about_numbers_is_an_error_in_worker_processes_too() -> None:
+    with open_executor(2) as executor:
+        assert list(executor.map(overflow, [1.0])) == [1e300]
+        with pytest.raises(RuntimeWarning, match="overflow"):
+            list(executor.map(overflow, [1.0, 1e300]))

@@ -26,7 +26,6 @@ _DAMAGED = (  # what zipfile, the header of .npy and NumPy raise on bytes that s
     RuntimeError,
     ArithmeticError,
     SyntaxError,
-    MemoryError,
     struct.error,
     tokenize.TokenError,
 )

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from ...core import limits
 from ...core.errors import DataError
 from ...core.files import require_regular, shortened
+from ...core.memory import pass_on_shortage
 from ..arrow import fill
 from .timestamps import seconds_of
 
@@ -167,6 +168,7 @@ def read_columns(
         except (pa.ArrowException, ValueError, MemoryError) as error:
             if "Empty CSV" in str(error):
                 return np.zeros((len(wanted), 0))
+            pass_on_shortage(error, path)
             raise DataError(f"Reading {path}: {_explain(str(error), names)}; correct the file.") from error
     values = np.empty((len(wanted), table.num_rows))
     for row, name in enumerate(wanted):

@@ -18,6 +18,7 @@ from ...core import limits
 from ...core.artifacts import load_artifact
 from ...core.errors import DataError
 from ...core.files import require_regular, shortened
+from ...core.memory import pass_on_shortage
 from ..arrow import fill
 from ..checks import check_period
 from ..population import Channel, EpisodeKey, Population, Role, TrueChannel, Unit, columns_in_order
@@ -95,6 +96,7 @@ class ParquetRecordings(Recordings):
         except DataError:
             raise
         except (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError, MemoryError) as error:  # and Arrow's own
+            pass_on_shortage(error, path)
             raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; convert the recordings again.") from error
         return values
 

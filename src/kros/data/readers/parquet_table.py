@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ...core import limits
 from ...core.errors import DataError
 from ...core.files import require_regular, shortened
+from ...core.memory import pass_on_shortage
 from ..arrow import fill
 
 
@@ -45,6 +46,7 @@ def parquet_columns(path: Path, wanted: Sequence[str], timestamp: bool = False) 
     except DataError:
         raise
     except (OSError, ValueError, LookupError, MemoryError, NotImplementedError) as error:  # and Arrow's own
+        pass_on_shortage(error, path)
         raise DataError(f"Reading {path}: {shortened(str(error))}; correct the file, or the mapping.") from error
 
 

@@ -13,6 +13,7 @@ from machines import LIMITS, MACHINES, apart, drive, in_python, moving, replaced
 from kros.core.errors import ConfigError, DataError
 from kros.export import CompiledObserver, HeldOut, LoadOutput, export_c
 from kros.export.c99.board import missing_tools
+from kros.export.c99.golden import Golden
 from kros.loops import find_compiler
 from kros.motor_drive import AngleLoad
 
@@ -34,6 +35,23 @@ def test_same_estimates_and_the_same_status_under_faults(kind, tmp_path):
         found, bits = compiled.run(y, u)
         np.testing.assert_array_equal(bits, status)
         assert apart(found, wanted) < close
+
+
+@needs_compiler
+@pytest.mark.parametrize("factor", [1 - 1e-13, 1 + 1e-13])
+def test_the_selftest_leaves_out_bits_at_a_threshold(factor, tmp_path):
+    """The bound of the monitor is the level that it ends with: rounding decides, and no compiler's self-test fails on it."""
+    observer = MACHINES["monitor"]()
+    golden = Golden.of(observer)
+    running = observer.start(golden.y[0])
+    for k in range(golden.passes * len(golden.y)):
+        running.step(golden.y[k % len(golden.y)], golden.u[k % len(golden.y)])
+    limits = observer.monitor.limits * 10 ** (running.level_db / 10) * factor
+    exact = replace(observer, monitor=replace(observer.monitor, limits=limits))
+    masked = Golden.of(exact, tolerance=1e-9)
+    assert not masked.sure[1, -1] & 8
+    assert masked.sure[1, -1] & 4
+    assert CompiledObserver.build(export_c(exact, tmp_path / "c", "drive")).selftest() == 0
 
 
 @needs_compiler

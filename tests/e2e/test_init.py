@@ -212,6 +212,9 @@ def test_one_recording_a_unit_is_cut_into_episodes(kros, tmp_path):
         rows = np.column_stack([t, pendulums.read(key)])
         np.savetxt(folder / f"{key.unit}.csv", rows, delimiter=",", header="t,angle,rate,torque_cmd", comments="", fmt="%.10g")
     result = kros("init", folder, "--out", tmp_path / "study.toml")
+    assert result.exit_code == 2
+    assert r"--files '^(?P<unit>\d+)\.csv$'" in result.stderr  # or episodes of one unit: the names do not say
+    result = kros("init", folder, "--out", tmp_path / "study.toml", "--files", r"^(?P<unit>\d+)\.csv$")
     assert result.exit_code == 0, result.output
     found = open_source(load_config(tmp_path / "study.toml"))
     assert [len(keys) for _, _, keys in found.groups()] == [5] * 3

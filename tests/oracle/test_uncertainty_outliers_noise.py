@@ -70,3 +70,17 @@ def test_a_unit_is_not_held_against_itself() -> None:
     assert whole.score("0", G[0]).excess_db < itself.excess_db
     with pytest.raises(DataError, match="two are needed"):
         whole.score("0", G[0], without=whole.unit_ids[1:])
+
+
+def test_a_unit_beyond_the_others_by_what_motions_explain_is_left_open() -> None:
+    """Halves of the episodes that differ by as much as the unit does, by far less, and not at all."""
+    rng = np.random.default_rng(10)
+    G = plants(rng, 12)
+    model = score_outliers(G, FREQS)
+    bad = 1.5 * G[0]
+    assert model.score("bad", bad).status is Status.OUTLIER
+    for difference, expected in ((1.0, Status.OTHER_MOTIONS), (1e-3, Status.OUTLIER), (0.0, Status.OUTLIER)):
+        motion = model.motion_levels(G, G * (1 + difference))
+        assert motion.shape == FREQS.shape
+        assert model.score("bad", bad, motion_db=motion).status is expected
+        assert model.score("good", G[3], without={"3"}, motion_db=motion).status is Status.OK

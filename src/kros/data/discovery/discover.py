@@ -82,7 +82,7 @@ def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None,
     if wanted.files is None and names.other is not None:
         raise ConfigError(
             f"Names of files: {some(list(own), 3)} can be episodes of one unit or units with one recording each; choose, "
-            f"--files {names.other!r} or --files {names.pattern!r}."
+            f"--files '{names.other}' or --files '{names.pattern}'."
         )
     mapping |= _dialect_keys(head.dialect)
     columns, timing = _columns(source, head, own, wanted)

@@ -93,6 +93,8 @@ def score_condition(
     )
     tasks = [(population.select([u], [models.condition]), everything[u, models.condition], models.lifting) for u in units]
     recorded, rows = Recorded.of(factors_of(store, models.condition), models, outliers.freqs_hz), []
+    halves = recorded.halves()
+    motion = None if halves is None else outliers.motion_levels(*halves)
     for unit, factor in zip(units, executor.map(reduce_episodes, tasks), strict=True):
         keys, used = everything[unit, models.condition], training[unit, models.condition]
         evidence = Evidence.of(factor, models, parameters[unit]).part([keys.index(k) for k in used])
@@ -104,7 +106,7 @@ def score_condition(
             )
         known |= {unit} & set(recorded.units)
         (response,) = recorded.response([evidence])
-        score = recorded.qualified(outliers.score(unit, response, known), evidence)
+        score = recorded.qualified(outliers.score(unit, response, known, None if recorded.same_motions(factor) else motion), evidence)
         seconds = float(factor.n_samples.sum()) * models.sample_period_s
         row = score_row(score, models.condition, len(keys), seconds)
         rows.append(row | {"units": outliers.n_units, "left_out": sorted(known)})

@@ -87,6 +87,8 @@ def _reasons(row: dict[str, Any]) -> list[str]:
         reasons.append(f"about {row['needed_s']:.3g} s of recordings are needed, found {row['recorded_s']:.3g} s")
     elif row["status"] == Status.CANNOT_TELL and "missing" not in row and row["units"] < FEWEST_UNITS:
         reasons.append(f"needs at least {FEWEST_UNITS} units to compare with, has {row['units']}")
+    elif row["status"] == Status.OTHER_MOTIONS:
+        reasons.append("beyond the others, but by no more than one unit differs from motion to motion; repeat the motions of the study")
     elif row.get("detectable") is not None and not row["outlier"]:
         only = "only " if row["status"] == Status.CANNOT_TELL else ""
         reasons.append(f"{only}a change of gain above {row['detectable']:.2g} % would be detected, at {row['detectable_hz']:.3g} Hz")

@@ -20,7 +20,7 @@ units are refused. All this compares estimates that are equally good: units that
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.loading import check_shapes, loader
 from ..forms import Form, as_form, check_responses
 from ..validation import check_scale
-from .distances import Distances, balance, distances, joined
+from .distances import Distances, balance, distances, joined, scaled_levels
 from .score import FEWEST_UNITS, OutlierScore, Status
 from .scoring import Nominals, scores_of
 from .separation import margins, separate
@@ -43,6 +43,8 @@ Array = npt.NDArray[Any]
 FALSE_ALARM_RATE = 1e-2
 _FREQUENCIES = 120
 MANY = 200  # inliers from which on a unit that is scored does not change how they are scaled
+_HALVES_DB = 10 * np.log10(2.0)
+_LEAST_LEVEL = 1e-10  # in amplitude, as distances have it
 _FEWEST = 2  # others that a unit can be compared with
 
 
@@ -97,7 +99,7 @@ class OutlierModel:
     nominal_ids: tuple[str, ...]
     by_nominal_db: Array
 
-    def score(self, unit: str, response: npt.ArrayLike, without: Collection[str] = ()) -> OutlierScore:
+    def score(self, unit: str, response: npt.ArrayLike, without: Collection[str] = (), motion_db: Array | None = None) -> OutlierScore:
         """Score a new unit.
 
         Parameters
@@ -107,6 +109,9 @@ class OutlierModel:
             At `freqs_hz`, in physical units.
         without : collection of str
             Inliers that are not compared with, such as the unit itself.
+        motion_db : ndarray, shape (frequency,), dB, optional
+            Level by which responses of one unit differ between motions (`motion_levels`), where the unit was moved otherwise than the inliers: it is
+            taken from the unit's levels, in amplitude, and a unit that is beyond its bound without this alone has the status ``other motions``.
 
         Returns
         -------
@@ -132,12 +137,24 @@ class OutlierModel:
         many = len(self.unit_ids) > MANY
         found = self._with(rows, everyone[-1]) if many else distances(self.form, everyone, self.freqs_hz)
         last = np.arange(len(everyone)) == len(everyone) - 1
-        margin = float(margins(found.levels, ~last, self.false_alarm_rate)[1][-1]) if self.n_units >= FEWEST_UNITS else -np.inf
+        known = self.n_units >= FEWEST_UNITS
+        margin = float(margins(found.levels, ~last, self.false_alarm_rate)[1][-1]) if known else -np.inf
+        level = found.levels[-1]
+        beyond_motion = np.maximum(10 ** (level / 20) - (0.0 if motion_db is None else 10 ** (motion_db / 20)), _LEAST_LEVEL)
+        certain = margin - float(level.max() - 20 * np.log10(beyond_motion.max()))
         summary = Nominals.of(found, ~last, self.false_alarm_rate)
         (score,) = scores_of(
-            self.form, everyone, self.freqs_hz, found, ~last, (margin,), (unit,), self.threshold_db, summary, [len(last) - 1]
+            self.form, everyone, self.freqs_hz, found, ~last, (certain,), (unit,), self.threshold_db, summary, [len(last) - 1]
         )
-        return score
+        return replace(score, status=Status.OTHER_MOTIONS) if margin > 0 >= certain else score
+
+    def motion_levels(self, one: Array, other: Array) -> Array:
+        """Return the level, shape (frequency,), dB, by which estimates differ where motions do, from those of halves of the episodes.
+
+        Responses have the shape (unit, frequency, p, m); the median over the units counts. Halves scatter twice as much as the whole, in variance.
+        """
+        first, second = (G / self.output_scale[:, None] * self.input_scale for G in (one, other))
+        return np.asarray(np.median(scaled_levels(self.form, first, second, self._known, self.freqs_hz), axis=0) - _HALVES_DB)
 
     @property
     def n_units(self) -> int:

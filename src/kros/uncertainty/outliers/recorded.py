@@ -81,6 +81,20 @@ class Recorded:
         found = self.models.fit(np.stack(joined))
         return replace(self.models, unit_ids=tuple(map(str, range(len(joined)))), A=found.A, B=found.B).responses(self.freqs_hz)
 
+    def halves(self) -> tuple[Array, Array] | None:
+        """Return the responses of all units from every second episode, and from the others; None where no unit has two episodes."""
+        several = [e for e in self.units.values() if len(e.lifted) > 1]
+        if not several:
+            return None
+        one, other = (self.response([e.part(range(k, len(e.lifted), 2)) for e in several]) for k in (0, 1))
+        return one, other
+
+    def same_motions(self, factor: Factor) -> bool:
+        """Tell whether a unit was moved by inputs of the study alone: as many samples, and inputs of equal length as vectors."""
+        first = self.models.lifting.n_states + len(self.models.lifting.separation.basis)
+        own = {mark for e in self.units.values() for mark in _marks(e.factor, first, len(self.models.input_scale))}
+        return set(_marks(factor, first, len(self.models.input_scale))) <= own
+
     def suffices(self, evidence: Evidence) -> bool:
         """Tell whether a unit was recorded for long enough to be compared with those of the study."""
         return evidence.n_samples >= _LEAST * self.usual
@@ -95,6 +109,12 @@ class Recorded:
     def same_recordings(self, factor: Factor) -> set[str]:
         """Return units of the study that have an episode in common with some, by their factors."""
         return {unit for unit, e in self.units.items() if any(_alike(e.factor, factor, k) for k in range(len(factor.R)))}
+
+
+def _marks(factor: Factor, first: int, count: int) -> list[tuple[float, ...]]:
+    """Return the number of samples and the norms of the inputs of every episode, to eight digits."""
+    norms = np.linalg.norm(factor.R[..., first : first + count], axis=-2)
+    return [(int(n), *(float(f"{v:.8g}") for v in row)) for n, row in zip(factor.n_samples, norms, strict=True)]
 
 
 def _alike(stored: Factor, found: Factor, row: int) -> bool:

@@ -22,13 +22,15 @@ class Status(StrEnum):
     """What the recordings say about a unit.
 
     ``ok``: a change of the size that stands beside it would have been flagged. ``outlier``: flagged. ``not enough data``: too few recordings of this unit.
-    ``cannot tell``: fewer than eight units to compare with, or too unlike ones.
+    ``cannot tell``: fewer than eight units to compare with, or too unlike ones. ``other motions``: beyond the others, but by no more than one unit differs
+    from motion to motion, and its motions are none of theirs.
     """
 
     OK = "ok"
     OUTLIER = "outlier"
     NOT_ENOUGH_DATA = "not enough data"
     CANNOT_TELL = "cannot tell"
+    OTHER_MOTIONS = "other motions"
 
 
 @dataclass(frozen=True)

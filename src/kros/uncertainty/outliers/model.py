@@ -144,9 +144,9 @@ class OutlierModel:
         certain = margin - float(level.max() - 20 * np.log10(beyond_motion.max()))
         summary = Nominals.of(found, ~last, self.false_alarm_rate)
         (score,) = scores_of(
-            self.form, everyone, self.freqs_hz, found, ~last, (certain,), (unit,), self.threshold_db, summary, [len(last) - 1]
+            self.form, everyone, self.freqs_hz, found, ~last, (margin,), (unit,), self.threshold_db, summary, [len(last) - 1]
         )
-        return replace(score, status=Status.OTHER_MOTIONS) if margin > 0 >= certain else score
+        return replace(score, outlier=False, status=Status.OTHER_MOTIONS) if margin > 0 >= certain else score
 
     def motion_levels(self, one: Array, other: Array) -> Array:
         """Return the level, shape (frequency,), dB, by which estimates differ where motions do, from those of halves of the episodes.

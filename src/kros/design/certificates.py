@@ -15,6 +15,7 @@ from ..core.artifacts import save_artifact
 from ..lifting import Lifting
 from ..observer import (
     DropoutBound,
+    Guard,
     Observer,
     ReliftCertificate,
     ReliftScales,
@@ -31,6 +32,7 @@ from ..observer.predictor.driven import with_internal
 from ..observer.residual.one_step import one_step_residual
 from ..observer.units import factors
 from ..uncertainty.coprime.bands import BandEnergies
+from .guard import guarded
 from .task import DesignResult, DesignTask
 from .validation import SHORT_SAMPLES, TrainingSet, ValidationSet, hidden_mean
 
@@ -59,6 +61,7 @@ class Running:
     signals: SignalBound | None = None
     measured: tuple[int, ...] = ()
     dropout: DropoutBound | None = None
+    guard: Guard | None = None
 
     @property
     def certified(self) -> bool:
@@ -125,6 +128,7 @@ def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignT
     """Certify observers of one lifting, and compare with what they do, in other conditions too; certificates come back in the recordings' units."""
     first, batch = observers[0], data.batch
     scales = scales_of(observers, data, task)
+    guards = [o.guard for o in guarded(observers, [data, *others])]
     certificates = [certify(observer, own, task) for observer, own in zip(observers, scales, strict=True)]
     estimates = run_observers(observers, data.measurements(first.measured), batch.inputs, first.own(batch.parameters))
     arrived = estimates
@@ -144,8 +148,8 @@ def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignT
         bounds.append(signal_bound(c, o, batch, x, known, seen))
     bounds = [b.in_sizes(factors(o, {})[0][: len(b.states)]) for o, b in zip(observers, bounds, strict=True)]
     certificates = [c.in_sizes(o, {}) for o, c in zip(observers, certificates, strict=True)]
-    found = zip(observers, certificates, rows, hidden, dropout, bounds, lost, strict=True)
-    return [Running(o.name, c, r, float(h), float(d), b, o.measured, p) for o, c, r, h, d, b, p in found]
+    found = zip(observers, certificates, rows, hidden, dropout, bounds, lost, guards, strict=True)
+    return [Running(o.name, c, r, float(h), float(d), b, o.measured, p, g) for o, c, r, h, d, b, p, g in found]
 
 
 def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[ReliftScales]:

@@ -318,7 +318,7 @@ def certified(
         assert found.observer is not None
         assert found.synthesis is not None
         one, facts = by_name[found.name], {**found.facts, **holds, **by_name[found.name].facts()}
-        observer = in_sizes(found.observer, {})
+        observer = in_sizes(replace(found.observer, guard=by_name[found.name].guard), {})
         observer = replace(observer, about=about(task, identified, observer, one.certificate, facts))
         synthesis = replace(found.synthesis, controller=observer.controller)
         designs[found.name] = Design(found.name, observer, synthesis, one.certificate, facts)

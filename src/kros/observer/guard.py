@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ..core.errors import DataError, DimensionError
 
 Array = npt.NDArray[np.float64]
-_MOST = np.finfo(float).max
+_MOST = float(np.sqrt(np.finfo(float).max))  # products of what is within are finite
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,10 +80,11 @@ class Screened:
     complete: Flags  # (n_samples, batch); An observer may start at them
     held: Held
 
-    def of(self, members: Sequence[int]) -> Screened:
+    def of(self, members: Sequence[int] | Whole) -> Screened:
         """Return the samples of some members of the batch."""
         held = Held(self.held.inputs[members], self.held.since[members], self.held.stale[members])
-        return Screened(*(signal[:, members] for signal in (self.y, self.u, self.status, self.starts, self.complete)), held)
+        y, u, at = self.y[:, members], self.u[:, members], (slice(None), members)
+        return Screened(y, u, self.status[at], self.starts[at], self.complete[at], held)
 
 
 def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:

@@ -260,8 +260,8 @@ def run_innovations(
         with np.errstate(over="ignore", invalid="ignore"):
             again = _restarting(observer, samples.of(machines), observer.values(_values_of(values, machines)))
         moving, status = moving.copy(), status.copy()
-        for signal, anew in ((innovation, again.innovation), (starts, again.starts), (moving, again.moving), (status, again.status)):
-            signal[:, machines] = anew if signal is not status else status[:, machines] | anew
+        innovation[:, machines], starts[:, machines], moving[:, machines] = again.innovation, again.starts, again.moving
+        status[:, machines] |= again.status
     starts[0] = True
     return innovation, judged_samples(settle, status, starts, moving)
 

@@ -56,12 +56,12 @@ def estimate_recordings(run: Path, data: Path, out: Path, given: Collection[str]
         samples: dict[str, dict[str, int]] = {}
         with writer(out, facts_of(recordings)) as write:
             for found in recordings.batches():
-                estimates, followed = recordings.estimates(found)
+                estimates, followed, status = recordings.estimates(found)
                 estimates /= recorded_factors(recordings.observer, recordings.observer.recorded)
                 columns = estimates if followed is None else np.concatenate([estimates, followed[..., None]], axis=-1)
                 for i, key in enumerate(found.batch.keys):
                     write(key, columns[: found.batch.lengths[i], i])
-                recordings.count_status(found, samples)
+                recordings.count_status(found, samples, status)
     return Estimated(len(recordings.population.episodes), recordings.sources, samples)
 
 

@@ -14,8 +14,8 @@ from ...data import Population
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
 from ...evaluate.arriving import Arriving, arriving
-from ...observer import Observer, run_observer, track_parameter
-from ...observer.samples import SampleStatus
+from ...observer import Observer, run_with_status, track_parameter
+from ...observer.samples import Bits, SampleStatus
 from ...observer.screen import sample_status
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig
@@ -59,26 +59,27 @@ class FieldRecordings:
         for start in range(0, len(keys), _BATCH):
             yield arriving(self.observer, self.population, keys[start : start + _BATCH], values)
 
-    def estimates(self, found: Arriving) -> tuple[Array, Array | None]:
-        """Run the observer."""
+    def estimates(self, found: Arriving) -> tuple[Array, Array | None, Bits]:
+        """Run the observer; return estimates, the parameter that is followed, and the bits of every sample's status."""
         observer, units, n = self.observer, found.batch.units, len(self.observer.recorded)
-        estimates = np.empty((*found.y.shape[:2], n))
+        estimates, status = np.empty((*found.y.shape[:2], n)), sample_status(observer, found.y, found.u)
         others, rows = ([i for i, unit in enumerate(units) if (unit in self.followed) is wanted] for wanted in (False, True))
         if others:
-            estimates[:, others] = run_observer(observer, found.y[:, others], found.u[:, others], found.parameters(observer, others))[
-                ..., :n
-            ]
+            own = found.parameters(observer, others)
+            x, status[:, others] = run_with_status(observer, found.y[:, others], found.u[:, others], own)
+            estimates[:, others] = x[..., :n]
         if self.name is None:
-            return estimates, None
+            return estimates, None, status
         followed = np.tile(found.batch.parameters[self.name], (len(found.y), 1))
         if rows:
             tracked = track_parameter(observer, found.y[:, rows], found.u[:, rows], found.parameters(observer, rows), self.name)
             estimates[:, rows], followed[:, rows] = tracked.estimates[..., :n], tracked.values
-        return estimates, followed
+            status[:, rows] |= np.where(tracked.restarted, np.uint8(SampleStatus.RESTARTED), np.uint8(0))
+        return estimates, followed, status
 
-    def count_status(self, found: Arriving, counts: dict[str, dict[str, int]]) -> None:
-        """Add to the number of samples of every unit that are missing, invalid or beyond their limits."""
-        status = sample_status(self.observer, found.y, found.u)
+    def count_status(self, found: Arriving, counts: dict[str, dict[str, int]], status: Bits | None = None) -> None:
+        """Add to the number of samples of every unit that are missing, invalid or beyond their limits, or at which the observer starts again."""
+        status = sample_status(self.observer, found.y, found.u) if status is None else status
         for i, (unit, length) in enumerate(zip(found.batch.units, found.batch.lengths, strict=True)):
             own = counts.setdefault(unit, {})
             for bit in SampleStatus:

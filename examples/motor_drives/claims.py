@@ -54,9 +54,13 @@ def outliers(metrics: Metrics, condition: str) -> str:
     """Return by how much the planted drive exceeds the others, whatever unit is nominal, and the threshold."""
     planted = {unit["unit"] for unit in metrics["units"] if unit["group"] == "outliers"}
     rows = [row for row in metrics["outliers"] if row["condition"] == condition and row["score"] is not None]
+
+    def decibels(value: float | None) -> str:
+        return "none" if value is None else f"{value:.1f} dB"
+
     said = [
-        f"{row['score']:.1f} dB above all others, {row['lowest_db']:.1f} to {row['highest_db']:.1f} dB over the choices of nominal; "
-        f"threshold for rare false alarms {row['threshold']:.1f} dB, {'flagged' if row['outlier'] else 'not flagged'}"
+        f"{decibels(row['score'])} above all others, {decibels(row['lowest_db'])} to {decibels(row['highest_db'])} over the choices of nominal; "
+        f"threshold for rare false alarms {decibels(row['threshold'])}, {'flagged' if row['outlier'] else 'not flagged'}"
         for row in rows
         if row["unit"] in planted
     ]

@@ -110,7 +110,7 @@ def study(tmp_path_factory):
     for unit in range(5):
         for episode in range(2):
             x, u = np.zeros((80, 2)), rng.standard_normal(80)
-            for k in range(59):
+            for k in range(79):
                 x[k + 1] = [0.9 * x[k, 0] + 0.1 * x[k, 1], (0.8 + 0.01 * unit if unit < 4 else 1.05) * x[k, 1] + u[k]]
             data[EpisodeKey(str(unit), "default", str(episode))] = np.column_stack([x, u])
     channels = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))

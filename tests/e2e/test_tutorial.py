@@ -37,7 +37,8 @@ def test_the_tutorial_from_csv_to_a_board(kros, tmp_path, monkeypatch: pytest.Mo
         if name == "kros":
             quicker = [part for setting in QUICKER for part in ("--set", setting)] if arguments[0] == "run" else []
             result = kros(*arguments, *quicker)
-            assert result.exit_code == 0, f"{text}: {result.output}"
+            expected = 4 if arguments[0] == "check" else 0  # four machines cannot tell what is usual
+            assert result.exit_code == expected, f"{text}: {result.output}"
         elif shutil.which(name):
             ran = subprocess.run([name, *arguments], capture_output=True, text=True, check=False)
             assert ran.returncode == 0, f"{text}: {ran.stdout}{ran.stderr}"
